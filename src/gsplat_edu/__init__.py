@@ -1,0 +1,41 @@
+"""3D Gaussian Splatting that runs on the computer you have, explains itself, and gives the same answer twice.
+
+The names here are the NumPy half of the system, the chapter's own. Training lives in `gsplat_edu.train`,
+differentiable rendering in `gsplat_edu.render.api`; those import torch, these do not.
+"""
+
+from gsplat_edu.camera import Camera, look_at, orbit_camera
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, C0, DILATION, T_STOP, TILE, Z_NEAR
+from gsplat_edu.errors import ArgumentError, BackendUnavailableError, ShapeError, SplatError
+from gsplat_edu.gaussian_math import build_cov3d, build_cov3d_batch, project_cov3d, quat_to_R, quat_to_R_batch
+from gsplat_edu.render.numpy_reference import render_gaussians
+from gsplat_edu.scenes import sphere_shell
+from gsplat_edu.sh import eval_sh, sh_basis
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ALPHA_MAX",
+    "ALPHA_MIN",
+    "C0",
+    "DILATION",
+    "TILE",
+    "T_STOP",
+    "Z_NEAR",
+    "ArgumentError",
+    "BackendUnavailableError",
+    "Camera",
+    "ShapeError",
+    "SplatError",
+    "build_cov3d",
+    "build_cov3d_batch",
+    "eval_sh",
+    "look_at",
+    "orbit_camera",
+    "project_cov3d",
+    "quat_to_R",
+    "quat_to_R_batch",
+    "render_gaussians",
+    "sh_basis",
+    "sphere_shell",
+]

@@ -1,0 +1,197 @@
+"""The pinhole camera: where it stands, where it looks, and what it does to points.
+
+Axes are OpenCV's, for the world and the camera alike: +x right, +y down, +z forward. The world's up is
+(0, -1, 0). Pixels are sampled at integer coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.validation import float64_array, in_range, whole_number
+
+WORLD_UP = (0.0, -1.0, 0.0)
+"""The world's up direction: +y points down."""
+
+ROTATION_TOLERANCE = 1e-4
+"""Largest entry of R R' - I that a rotation may have: room for rotations that went through float32 text."""
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Float64[np.ndarray, "3 3"]:
+    """Turn a camera towards a point.
+
+    forward = normalize(target - eye),  right = normalize(forward × up),  down = forward × right
+
+    Args:
+        eye: (3,) camera centre, world units.
+        target: (3,) point the camera looks at, world units.
+        up: (3,) the direction that is up in the image; any length.
+
+    Returns:
+        (3, 3) world-to-camera rotation with rows (right, down, forward).
+
+    Raises:
+        ShapeError: an argument is not of shape (3,).
+        ArgumentError: `target` is where `eye` is, or `up` is zero or along the viewing direction.
+    """
+    eye = float64_array("eye", eye, (3,))
+    target = float64_array("target", target, (3,))
+    up = float64_array("up", up, (3,))
+    distance = np.linalg.norm(target - eye)
+    if distance == 0.0:
+        raise ArgumentError(
+            f"target: is where eye is, {tuple(eye.tolist())}; a camera has to look somewhere else"
+        )
+    forward = (target - eye) / distance
+    right = np.cross(forward, up)
+    sine = np.linalg.norm(right)
+    if sine <= 1e-9 * np.linalg.norm(up):
+        raise ArgumentError("up: is zero or along the viewing direction; give another up direction")
+    right = right / sine
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Camera:
+    """A pinhole camera in OpenCV axes.
+
+    x_cam = R (x - eye);  u = fx x/z + cx,  v = fy y/z + cy
+
+    Args:
+        R: (3, 3) world-to-camera rotation, rows (right, down, forward).
+        eye: (3,) camera centre, world units.
+        fx: Focal length along x, px.
+        fy: Focal length along y, px.
+        cx: Column of the principal point, px.
+        cy: Row of the principal point, px.
+        H: Image height, px.
+        W: Image width, px.
+
+    Raises:
+        ShapeError: R is not (3, 3) or eye not (3,).
+        ArgumentError: R is not a rotation, a focal length is not positive, a size is not a whole number of
+            at least 1, or anything is NaN or infinite.
+    """
+
+    R: Float64[np.ndarray, "3 3"]
+    eye: Float64[np.ndarray, "3"]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    H: int
+    W: int
+
+    def __init__(
+        self, R: ArrayLike, eye: ArrayLike, fx: float, fy: float, cx: float, cy: float, H: int, W: int
+    ) -> None:
+        rotation = float64_array("R", R, (3, 3)).copy()
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise ArgumentError(
+                "R: is not a rotation; rows have to be (right, down, forward), orthonormal, det +1"
+            )
+        centre = float64_array("eye", eye, (3,)).copy()
+        rotation.flags.writeable = centre.flags.writeable = False
+        values = {
+            "R": rotation,
+            "eye": centre,
+            "fx": in_range("fx", fx, 0.0, open_low=True),
+            "fy": in_range("fy", fy, 0.0, open_low=True),
+            "cx": float(float64_array("cx", cx, ())),
+            "cy": float(float64_array("cy", cy, ())),
+            "H": whole_number("H", H, 1),
+            "W": whole_number("W", W, 1),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def looking_at(
+        cls, eye: ArrayLike, target: ArrayLike, fx: float, fy: float, H: int, W: int, up: ArrayLike = WORLD_UP
+    ) -> Camera:
+        """Make a camera at `eye` that looks at `target`, its principal point at (W/2, H/2).
+
+        Args:
+            eye: (3,) camera centre, world units.
+            target: (3,) point the camera looks at, world units.
+            fx: Focal length along x, px.
+            fy: Focal length along y, px.
+            H: Image height, px.
+            W: Image width, px.
+            up: (3,) the direction that is up in the image.
+
+        Raises:
+            ShapeError: an argument is not of shape (3,).
+            ArgumentError: as for `look_at` and the constructor.
+        """
+        H, W = whole_number("H", H, 1), whole_number("W", W, 1)
+        return cls(look_at(eye, target, up), eye, fx, fy, W / 2, H / 2, H, W)
+
+    def world_to_cam(self, points: ArrayLike) -> Float64[np.ndarray, "*batch 3"]:
+        """Move points from world to camera coordinates: x_cam = R (x - eye).
+
+        Args:
+            points: (..., 3) world units.
+
+        Returns:
+            (..., 3) camera coordinates, world units: right, down, forward.
+
+        Raises:
+            ShapeError: the last axis is not 3.
+            ArgumentError: a coordinate is NaN or infinite.
+        """
+        moved: Float64[np.ndarray, "*batch 3"] = (
+            float64_array("points", points, ("...", 3)) - self.eye
+        ) @ self.R.T
+        return moved
+
+    def project(
+        self, points_cam: ArrayLike
+    ) -> tuple[Float64[np.ndarray, "*batch"], Float64[np.ndarray, "*batch"], Float64[np.ndarray, "*batch"]]:
+        """Project points in camera coordinates to the image: u = fx x/z + cx, v = fy y/z + cy.
+
+        Args:
+            points_cam: (..., 3) camera coordinates, world units.
+
+        Returns:
+            u, v: (...) column and row, px; NaN where z <= 0, because a point beside or behind the camera has
+            no image.
+            z: (...) depth, world units.
+
+        Raises:
+            ShapeError: the last axis is not 3.
+            ArgumentError: a coordinate is NaN or infinite.
+        """
+        x, y, z = np.moveaxis(float64_array("points_cam", points_cam, ("...", 3)), -1, 0)
+        depth = np.where(z > 0, z, np.nan)
+        return self.fx * x / depth + self.cx, self.fy * y / depth + self.cy, np.array(z)
+
+
+def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius: float = 3.0) -> Camera:
+    """Make a square camera on a sphere around the origin, looking at its centre.
+
+    eye = radius (cos e sin a, sin e, -cos e cos a)
+
+    Args:
+        azimuth: Angle around the vertical axis, radians; 0 looks along +z.
+        elevation: Angle from the horizon, radians; positive is +y, which is down.
+        size: Height and width of the image, px.
+        fx: Focal length of both axes, px.
+        radius: Distance of the camera from the origin, world units.
+
+    Raises:
+        ArgumentError: the radius or focal length is not positive, the size is below 1, or the camera stands
+            straight above or below the origin, where up is not defined.
+    """
+    radius = in_range("radius", radius, 0.0, open_low=True)
+    azimuth, elevation = (
+        float(float64_array(n, a, ())) for n, a in (("azimuth", azimuth), ("elevation", elevation))
+    )
+    direction = (np.cos(elevation) * np.sin(azimuth), np.sin(elevation), -np.cos(elevation) * np.cos(azimuth))
+    return Camera.looking_at(radius * np.array(direction), (0.0, 0.0, 0.0), fx, fx, size, size)

@@ -1,0 +1,1 @@
+"""The command `gsplat-edu`: it wires data, training and evaluation together."""

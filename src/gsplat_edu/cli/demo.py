@@ -1,0 +1,48 @@
+"""`gsplat-edu demo`: the course's run with a progress bar."""
+
+from __future__ import annotations
+
+import argparse
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gsplat_edu.cli.sphere import add_options, options_from, run_sphere
+from gsplat_edu.train.events import DensifyEvent, StepEvent
+from gsplat_edu.train.trainer import Trainer
+
+SUMMARY = "learn a sphere from 24 renders of it and judge the result with a held-out camera"
+EXAMPLE = "example: gsplat-edu demo --iters 100 --size 48 --out out/quick.png"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train, showing a bar with the loss and the number of Gaussians."""
+    console = Console(highlight=False)
+    options, notice = options_from(arguments)
+    if notice:
+        console.print(notice, soft_wrap=True)
+    columns = (
+        "[progress.description]{task.description}",
+        "L1 {task.fields[loss]:.4f}  K {task.fields[count]}",
+    )
+    bar = Progress(
+        TextColumn(columns[0]),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(columns[1]),
+        TimeRemainingColumn(),
+        console=console,
+    )
+    with bar:
+        task = bar.add_task("sphere", total=options.budget.iters, loss=float("nan"), count=options.k0)
+
+        def advance(trainer: Trainer, event: StepEvent | DensifyEvent) -> None:
+            if isinstance(event, StepEvent):
+                bar.update(task, advance=1, loss=event.loss, count=event.num_gaussians)
+
+        run_sphere(options, [advance], say=lambda line: console.print(line, soft_wrap=True))

@@ -1,0 +1,214 @@
+"""The course's run: a sphere learned from 24 of its own renders, judged by a camera that was held out.
+
+`gsplat-edu demo` and `train/train_3d.py` are two faces of `run_sphere`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
+from gsplat_edu.files import check_writable
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply import save_ply
+from gsplat_edu.losses import l1
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train.density.adc import AdaptiveDensityControl
+from gsplat_edu.train.events import DensifyEvent, StepEvent
+from gsplat_edu.train.initialize import random_ball
+from gsplat_edu.train.trainer import Callback, Renderer, Trainer, TrainResult
+from gsplat_edu.validation import whole_number
+
+
+class Budget(NamedTuple):
+    """How long to train, up to how many Gaussians, at which image size."""
+
+    iters: int
+    cap: int
+    size: int
+
+
+CHAPTER = Budget(iters=800, cap=1600, size=128)
+"""The chapter's run."""
+
+REDUCED = Budget(iters=300, cap=800, size=64)
+"""What the dense torch backend trains by default: about a twentieth of the chapter's work."""
+
+
+@dataclass(frozen=True)
+class SphereOptions:
+    """Options of the run.
+
+    Args:
+        budget: Iterations, cap and image size.
+        k0: Gaussians at the start.
+        seed: Seed of the start, the splits and the view order.
+        backend: Rendering backend, by its own name.
+        out: The held-out figure, a .png; the curves and the scene go beside it.
+
+    Raises:
+        ArgumentError: an option is out of range, or `out` is no place for a .png; the message names the flag.
+    """
+
+    budget: Budget
+    k0: int
+    seed: int
+    backend: str
+    out: Path
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name, value in (*self.budget._asdict().items(), ("k0", self.k0)):
+            whole_number(f"--{name}", value, 1)
+        whole_number("--seed", self.seed, 0)
+        if self.k0 > self.budget.cap:
+            raise ArgumentError(
+                f"--k0: is {self.k0}, more than --cap {self.budget.cap}; start with fewer or raise it"
+            )
+        if self.out.suffix.lower() != ".png":
+            raise ArgumentError(
+                f"--out: {str(self.out)!r} has to end in .png; the other files are named after it"
+            )
+
+    @property
+    def files(self) -> tuple[Path, Path, Path]:
+        """The held-out figure, the curves and the scene."""
+        return self.out, self.out.with_name(f"{self.out.stem}_curves.png"), self.out.with_suffix(".ply")
+
+
+class Summary(NamedTuple):
+    """What a run comes to."""
+
+    result: TrainResult
+    initial_l1: float
+    final_l1: float
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the run's options to a command line."""
+
+    def number(flag: str, default: int, text: str) -> None:
+        parser.add_argument(
+            flag, type=whole_number_text, metavar="N", default=default, help=f"{text} (default: {default})"
+        )
+
+    for name, text in (
+        ("iters", "training iterations"),
+        ("cap", "largest number of Gaussians"),
+        ("size", "height and width of the images in px"),
+    ):
+        default = f"(default: {getattr(CHAPTER, name)}; {getattr(REDUCED, name)} on the dense backend torch)"
+        parser.add_argument(f"--{name}", type=whole_number_text, metavar="N", help=f"{text} {default}")
+    number("--k0", 400, "Gaussians at the start")
+    number("--seed", 9, "seed of the start, the splits and the view order")
+    parser.add_argument("--backend", default="auto", metavar="NAME", help="auto or torch (default: auto)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="X.png",
+        default=Path("out/sphere.png"),
+        help="figure of the held-out camera; X_curves.png and X.ply go beside it (default: %(default)s)",
+    )
+
+
+def options_from(arguments: argparse.Namespace) -> tuple[SphereOptions, str | None]:
+    """Turn what `add_options` parsed into options, with the budget of the backend that will run.
+
+    Returns:
+        The options, and a sentence where the budget is not the chapter's by default.
+
+    Raises:
+        ArgumentError: an option is out of range.
+        BackendUnavailableError: the backend does not run here.
+    """
+    backend = resolve_backend(arguments.backend)
+    default = REDUCED if backend == "torch" else CHAPTER
+    given = {
+        name: getattr(arguments, name) for name in Budget._fields if getattr(arguments, name) is not None
+    }
+    options = SphereOptions(default._replace(**given), arguments.k0, arguments.seed, backend, arguments.out)
+    reduced = [name for name in Budget._fields if name not in given and default != CHAPTER]
+    if not reduced:
+        return options, None
+    chosen, full = (" ".join(f"--{name} {getattr(b, name)}" for name in reduced) for b in (default, CHAPTER))
+    return (
+        options,
+        f"backend torch is dense and slow, so the budget is reduced: {chosen} (the chapter's: {full})",
+    )
+
+
+def run_sphere(
+    options: SphereOptions, callbacks: Sequence[Callback] = (), say: Callable[[str], None] = print
+) -> Summary:
+    """Train the sphere and write the figure, the curves and the scene.
+
+    Args:
+        options: The options.
+        callbacks: Told of every step and every densification.
+        say: Prints the lines that close the run.
+
+    Raises:
+        ArgumentError: the files cannot be written; this is found out before the training.
+    """
+    for path in options.files:
+        check_writable("--out", path)
+    capture = sphere_capture(options.budget.size)
+    renderer = functools.partial(render, backend=options.backend)
+    iters = options.budget.iters
+    middle = 3 * iters // 8  # the chapter shows 300 of its 800
+
+    def held_out(gaussians: Gaussians) -> Float32[np.ndarray, "H W 3"]:
+        with torch.no_grad():
+            return renderer(gaussians, capture.held_out.camera).image.numpy(force=True)
+
+    snapshots = {}
+
+    def take_snapshot(trainer: Trainer, event: StepEvent | DensifyEvent) -> None:
+        if event.iteration == middle:  # told of the step first, then of its densification, which shows
+            snapshots["middle"] = held_out(trainer.gaussians)
+
+    trainer = _trainer(options, capture, renderer, (take_snapshot, *callbacks))
+    start = held_out(trainer.gaussians)
+    result = trainer.run()
+    final, truth = held_out(trainer.gaussians), capture.held_out.image
+
+    figure_path, curves_path, ply_path = options.files
+    panels = [("init (iter 0)", start), (f"iter {middle}", snapshots["middle"]), (f"iter {iters}", final)]
+    save_figure(figure_path, held_out_figure([*panels, ("truth", truth)]))
+    save_figure(curves_path, curves_figure(result.losses, result.counts))
+    save_ply(ply_path, trainer.gaussians)
+    summary = Summary(result, _l1(start, truth), _l1(final, truth))
+    per_iteration = f"{1e3 * result.seconds / iters:.3f} ms/iter at {options.budget.size} px"
+    say(f"{iters} iters in {result.seconds:.1f} s -> {per_iteration}, K~{result.counts[-1]}")
+    say(f"held-out L1: init {summary.initial_l1:.4f} -> final {summary.final_l1:.4f}")
+    say(f"wrote {', '.join(str(path) for path in options.files)}")
+    return summary
+
+
+def _trainer(
+    options: SphereOptions, capture: SphereCapture, renderer: Renderer, callbacks: Sequence[Callback]
+) -> Trainer:
+    density = DensityConfig(max_gaussians=options.budget.cap)
+    config = TrainConfig(iterations=options.budget.iters, seed=options.seed, density=density)
+    generator = torch.Generator().manual_seed(options.seed)
+    gaussians = random_ball(options.k0, generator)
+    control = AdaptiveDensityControl(density, generator, gaussians)
+    return Trainer(gaussians, capture.train, config, render=renderer, density=control, callbacks=callbacks)
+
+
+def _l1(image: Float32[np.ndarray, "H W 3"], truth: Float32[np.ndarray, "H W 3"]) -> float:
+    return float(l1(torch.tensor(image), torch.tensor(truth)))

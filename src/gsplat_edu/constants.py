@@ -1,0 +1,65 @@
+"""Every constant of the renderer, once: value, unit, why it is there, where it comes from.
+
+Kerbl et al. 2023 is "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (ACM TOG 42.4);
+"its code" is the rasteriser published with it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+DILATION: Final = 0.3
+"""px², added to both diagonal entries of every screen-space covariance, so that no splat is thinner than
+about a pixel and falls between the samples. Source: Kerbl et al. 2023, its code."""
+
+ALPHA_MIN: Final = 1.0 / 255.0
+"""Alpha below this is zero: one step of an 8-bit image. It is what gives a Gaussian a finite extent.
+Source: Kerbl et al. 2023, its code."""
+
+ALPHA_MAX: Final = 0.99
+"""Alpha is clamped to this, so that 1 - alpha never reaches 0 and the transmittance behind a splat keeps a
+gradient. Source: Kerbl et al. 2023, appendix C."""
+
+Z_NEAR: Final = 0.05
+"""World units: a mean at this camera depth or nearer is culled; the projection divides by depth.
+Source: the course's convention (Kerbl et al. use 0.2)."""
+
+T_STOP: Final = 1e-4
+"""Transmittance below which nothing behind can be seen, and compositing may stop.
+Source: Kerbl et al. 2023, appendix C."""
+
+TILE: Final = 16
+"""px: edge of the square tiles in which kernels composite and stop. Source: Kerbl et al. 2023, section 6."""
+
+LAMBDA_FLOOR: Final = 0.1
+"""px⁴: floor under the discriminant when the larger eigenvalue of a screen-space covariance is taken for
+the 3-sigma box, so that rounding cannot make it negative. Source: Kerbl et al. 2023, its code."""
+
+# Spherical harmonics: normalisations of the real basis, degree 0 to 3. Each is the number that makes its
+# polynomial's square integrate to 1 over the sphere. Source: Sloan 2008, "Stupid Spherical Harmonics Tricks".
+
+C0: Final = 0.28209479177387814
+"""1 / (2 sqrt(pi)): the constant harmonic. colour = C0 * sh0 + 0.5 at degree 0."""
+
+C1: Final = math.sqrt(3.0 / (4.0 * math.pi))
+"""Degree 1: factor of x, y and z."""
+
+C2: Final = (math.sqrt(15.0 / math.pi) / 2.0, math.sqrt(5.0 / math.pi) / 4.0, math.sqrt(15.0 / math.pi) / 4.0)
+"""Degree 2: factors of the mixed products (xy, yz, xz), of 2z² - x² - y², and of x² - y²."""
+
+C3: Final = (
+    math.sqrt(35.0 / (2.0 * math.pi)) / 4.0,
+    math.sqrt(105.0 / math.pi) / 2.0,
+    math.sqrt(21.0 / (2.0 * math.pi)) / 4.0,
+    math.sqrt(7.0 / math.pi) / 4.0,
+    math.sqrt(105.0 / math.pi) / 4.0,
+)
+"""Degree 3: factors by the order |m| of the harmonic: |m| = 3, xyz, |m| = 1, m = 0, z(x² - y²)."""
+
+SH_OFFSET: Final = 0.5
+"""Added to every evaluated colour, so that all-zero coefficients are mid-grey.
+Source: Kerbl et al. 2023, its code."""
+
+SH_MAX_DEGREE: Final = 3
+"""Highest degree of spherical harmonics the system evaluates: 16 coefficients per channel."""

@@ -1,0 +1,28 @@
+"""What can go wrong, as one tree.
+
+    SplatError
+    ├── ArgumentError (also a ValueError)    an argument's value cannot be used
+    │   └── ShapeError                       an argument's shape is not the documented one
+    └── BackendUnavailableError              this machine cannot run the backend that was asked for
+
+Every message is one line that says what is wrong, where, and what to do next. The command line prints that
+line and exits with 2.
+"""
+
+from __future__ import annotations
+
+
+class SplatError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class ArgumentError(SplatError, ValueError):
+    """An argument has a value that cannot be used; the message names the argument."""
+
+
+class ShapeError(ArgumentError):
+    """An argument has the wrong shape; the message names it, the expected shape and the actual one."""
+
+
+class BackendUnavailableError(SplatError):
+    """The rendering backend that was asked for does not run here; the message says why and what does."""

@@ -1,0 +1,1 @@
+"""Judging a trained scene, and showing the judgement."""

@@ -1,0 +1,167 @@
+"""The mathematics of one Gaussian, in NumPy.
+
+Quaternion to rotation, rotation and scales to covariance, covariance to screen space. The names ending in
+`_batch` do the same for N at once; the two are tested to agree.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.validation import check_shape, first_index, float64_array
+
+
+def quat_to_R(quat: ArrayLike) -> Float64[np.ndarray, "3 3"]:
+    """Turn one quaternion into a rotation matrix.
+
+    Args:
+        quat: (4,) quaternion (w, x, y, z), any length but zero; normalised here.
+
+    Returns:
+        (3, 3) rotation; q and -q give the same.
+
+    Raises:
+        ShapeError: not of shape (4,).
+        ArgumentError: zero length, NaN or infinite.
+
+    Source: Hamilton 1844; the matrix of v -> q v q*, q of unit length.
+    """
+    R: Float64[np.ndarray, "3 3"] = _rotations("quat", float64_array("quat", quat, (4,)))
+    return R
+
+
+def quat_to_R_batch(quats: ArrayLike) -> Float64[np.ndarray, "N 3 3"]:
+    """Turn N quaternions into rotation matrices; see `quat_to_R`.
+
+    Args:
+        quats: (N, 4) quaternions (w, x, y, z), any length but zero.
+
+    Returns:
+        (N, 3, 3) rotations.
+
+    Raises:
+        ShapeError: not of shape (N, 4).
+        ArgumentError: a quaternion has zero length, or an entry is NaN or infinite.
+    """
+    R: Float64[np.ndarray, "N 3 3"] = _rotations("quats", float64_array("quats", quats, ("N", 4)))
+    return R
+
+
+def build_cov3d(scale: ArrayLike, R: ArrayLike) -> Float64[np.ndarray, "3 3"]:
+    """Build the covariance of one Gaussian from its standard deviations and its rotation.
+
+    Sigma = (R S)(R S)',  S = diag(scale)
+
+    A product of a matrix with its own transpose cannot have a negative eigenvalue, whatever its entries: so
+    gradient descent on scale and rotation never leaves the covariances.
+
+    Args:
+        scale: (3,) standard deviations along the Gaussian's own axes, world units, >= 0.
+        R: (3, 3) rotation from the Gaussian's axes to the world's.
+
+    Returns:
+        (3, 3) covariance, world units squared.
+
+    Raises:
+        ShapeError: scale is not (3,) or R not (3, 3).
+        ArgumentError: a scale is negative, or anything is NaN or infinite.
+
+    Source: Kerbl et al. 2023, eq. 6.
+    """
+    scales, R = _checked_scales("scale", scale, (3,)), float64_array("R", R, (3, 3))
+    cov3d: Float64[np.ndarray, "3 3"] = _covariances(scales, R)
+    return cov3d
+
+
+def build_cov3d_batch(scales: ArrayLike, Rs: ArrayLike) -> Float64[np.ndarray, "N 3 3"]:
+    """Build the covariances of N Gaussians; see `build_cov3d`.
+
+    Args:
+        scales: (N, 3) standard deviations, world units, >= 0.
+        Rs: (N, 3, 3) rotations.
+
+    Returns:
+        (N, 3, 3) covariances, world units squared.
+
+    Raises:
+        ShapeError: a shape differs, or the two arguments have different N.
+        ArgumentError: a scale is negative, or anything is NaN or infinite.
+    """
+    sizes: dict[str, int] = {}
+    deviations = _checked_scales("scales", scales, ("N", 3), sizes)
+    cov3ds: Float64[np.ndarray, "N 3 3"] = _covariances(
+        deviations, float64_array("Rs", Rs, ("N", 3, 3), sizes)
+    )
+    return cov3ds
+
+
+def project_cov3d(cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera) -> Float64[np.ndarray, "*batch 2 2"]:
+    """Project 3D covariances to the image, to first order around their means.
+
+    Sigma2d = J W Sigma W' J',  W = cam.R,  J = [[fx/z, 0, -fx x/z²], [0, fy/z, -fy y/z²]]
+
+    (J: Jacobian of the pinhole at the mean, x y z its camera coordinates.) The dilation is not added here.
+
+    Args:
+        cov3d: (..., 3, 3) covariances in world axes, world units squared.
+        mean_cam: (..., 3) means in camera coordinates, world units; the same leading axes.
+        cam: The camera.
+
+    Returns:
+        (..., 2, 2) screen-space covariances, px².
+
+    Raises:
+        ShapeError: a shape differs.
+        ArgumentError: a mean is not in front of the camera (z <= 0), or anything is NaN or infinite.
+
+    Source: Zwicker et al. 2001, "EWA Splatting", eq. 31; Kerbl et al. 2023, eq. 5.
+    """
+    cov3d = float64_array("cov3d", cov3d, ("...", 3, 3))
+    mean_cam = float64_array("mean_cam", mean_cam, ("...", 3))
+    check_shape("mean_cam", mean_cam.shape, (*cov3d.shape[:-2], 3), {})
+    x, y, z = np.moveaxis(mean_cam, -1, 0)
+    if not np.all(z > 0):
+        raise ArgumentError(
+            f"mean_cam{first_index(z <= 0)}: z <= 0 is not in front of the camera; cull it first"
+        )
+    zero = np.zeros_like(z)
+    rows = [[cam.fx / z, zero, -cam.fx * x / z**2], [zero, cam.fy / z, -cam.fy * y / z**2]]
+    JW = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2) @ cam.R
+    cov2d: Float64[np.ndarray, "*batch 2 2"] = JW @ cov3d @ np.swapaxes(JW, -1, -2)
+    return cov2d
+
+
+def _rotations(name: str, quats: Float64[np.ndarray, "*batch 4"]) -> Float64[np.ndarray, "*batch 3 3"]:
+    # The largest entry is divided out first, so that the norm neither overflows nor underflows.
+    largest = np.abs(quats).max(axis=-1, keepdims=True)
+    if not np.all(largest > 0):
+        raise ArgumentError(f"{name}{first_index(largest[..., 0] == 0)}: has zero length and is no rotation")
+    unit = quats / largest
+    w, x, y, z = np.moveaxis(unit / np.linalg.norm(unit, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _covariances(
+    scales: Float64[np.ndarray, "*batch 3"], Rs: Float64[np.ndarray, "*batch 3 3"]
+) -> Float64[np.ndarray, "*batch 3 3"]:
+    RS = Rs * scales[..., None, :]
+    product: Float64[np.ndarray, "*batch 3 3"] = RS @ np.swapaxes(RS, -1, -2)
+    return product
+
+
+def _checked_scales(
+    name: str, value: ArrayLike, shape: tuple[int | str, ...], sizes: dict[str, int] | None = None
+) -> Float64[np.ndarray, "*batch 3"]:
+    scales = float64_array(name, value, shape, sizes)
+    if not np.all(scales >= 0):
+        raise ArgumentError(f"{name}{first_index(scales < 0)}: is negative, but a standard deviation is not")
+    return scales

@@ -1,0 +1,162 @@
+"""The Gaussians that are learned: raw parameters, and the activations that turn them into what is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.validation import Shape, check_shape, first_index
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N Gaussians as raw parameters, which gradient descent may move anywhere.
+
+    Args:
+        means: (N, 3) centres, world units.
+        quats: (N, 4) quaternions (w, x, y, z), normalised on use.
+        log_scales: (N, 3) natural logarithm of the standard deviations in world units.
+        sh0: (N, 1, 3) spherical harmonics coefficient of degree 0.
+        sh_rest: (N, K, 3) coefficients of degree 1 and up: K = 0, 3, 8 or 15.
+        logit_opacities: (N,) logit of the opacities.
+
+    Raises:
+        ShapeError: a shape differs, or the parameters have different N.
+    """
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    log_scales: Float[Tensor, "N 3"]
+    sh0: Float[Tensor, "N 1 3"]
+    sh_rest: Float[Tensor, "N K 3"]
+    logit_opacities: Float[Tensor, " N"]
+
+    def __post_init__(self) -> None:
+        """Check that the shapes agree."""
+        sizes: dict[str, int] = {}
+        for name, shape in {
+            "means": ("N", 3),
+            "quats": ("N", 4),
+            "log_scales": ("N", 3),
+            "sh0": ("N", 1, 3),
+            "sh_rest": ("N", "K", 3),
+            "logit_opacities": ("N",),
+        }.items():
+            check_shape(name, getattr(self, name).shape, shape, sizes)
+        if sizes["K"] not in (0, 3, 8, 15):
+            raise ShapeError(
+                f"sh_rest: holds {sizes['K']} coefficients per channel, but degrees 0-3 have 0, 3, 8, 15"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of spherical harmonics that is stored."""
+        return {0: 0, 3: 1, 8: 2, 15: 3}[self.sh_rest.shape[1]]
+
+    @property
+    def scales(self) -> Float[Tensor, "N 3"]:
+        """(N, 3) standard deviations, world units: exp(log_scales)."""
+        return torch.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> Float[Tensor, " N"]:
+        """(N,) opacities in (0, 1): sigmoid(logit_opacities)."""
+        return torch.sigmoid(self.logit_opacities)
+
+    @property
+    def sh(self) -> Float[Tensor, "N K 3"]:
+        """(N, K, 3) all coefficients, degree 0 first: K = 1, 4, 9 or 16."""
+        return torch.cat([self.sh0, self.sh_rest], dim=1)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the raw parameters by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Gaussians:
+        """Return new Gaussians with the same change made to every raw parameter."""
+        return Gaussians(**{name: change(tensor) for name, tensor in self.tensors().items()})
+
+    def trainable(self) -> Gaussians:
+        """Return a copy whose parameters are leaves that collect gradients."""
+        return self.map(lambda tensor: tensor.detach().clone().requires_grad_())
+
+    @staticmethod
+    def concatenated(parts: Sequence[Gaussians]) -> Gaussians:
+        """Join Gaussians in the order given; all must store the same SH degree."""
+        tensors = [part.tensors() for part in parts]
+        return Gaussians(**{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]})
+
+
+def quat_to_R_t(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+    """Turn N quaternions into rotation matrices, differentiably.
+
+    Args:
+        quats: (N, 4) quaternions (w, x, y, z), any length but zero.
+
+    Returns:
+        (N, 3, 3) rotations.
+
+    Raises:
+        ShapeError: not of shape (N, 4).
+        ArgumentError: a quaternion has zero length, or an entry is NaN or infinite.
+
+    Differentiable in: quats.
+    """
+    check_tensor("quats", quats, ("N", 4), {})
+    length = quats.norm(dim=-1, keepdim=True)
+    if not bool((length > 0).all()):
+        raise ArgumentError(f"quats{first_index((length[:, 0] == 0).numpy(force=True))}: has zero length")
+    w, x, y, z = (quats / length).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def cov3d_t(log_scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+    """Build N covariances from raw parameters, differentiably.
+
+    Sigma = (R S)(R S)',  S = diag(exp(log_scales))
+
+    Args:
+        log_scales: (N, 3) natural logarithm of the standard deviations in world units.
+        quats: (N, 4) quaternions (w, x, y, z), any length but zero.
+
+    Returns:
+        (N, 3, 3) covariances, world units squared.
+
+    Raises:
+        ShapeError: a shape differs, or the two arguments have different N.
+        ArgumentError: a quaternion has zero length, or an entry is NaN or infinite.
+
+    Differentiable in: log_scales, quats.
+    """
+    sizes: dict[str, int] = {}
+    check_tensor("log_scales", log_scales, ("N", 3), sizes)
+    check_tensor("quats", quats, ("N", 4), sizes)
+    RS = quat_to_R_t(quats) * torch.exp(log_scales)[:, None, :]
+    return RS @ RS.mT
+
+
+def check_tensor(name: str, value: Tensor, shape: Shape, sizes: dict[str, int]) -> None:
+    """Check an argument that is a tensor.
+
+    Raises:
+        ShapeError: the shape differs; see `gsplat_edu.validation.check_shape`.
+        ArgumentError: an entry is NaN or infinite.
+    """
+    check_shape(name, value.shape, shape, sizes)
+    finite = torch.isfinite(value)
+    if not bool(finite.all()):
+        raise ArgumentError(f"{name}{first_index((~finite).numpy(force=True))}: is NaN or infinite")

@@ -1,0 +1,1 @@
+"""Scene files, one module per format."""

@@ -1,0 +1,175 @@
+"""The renderer that is trusted: project, sort, composite, one splat at a time, in float64 NumPy.
+
+It is short enough to check by eye against the equations, and everything else is measured against it.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from numpy.typing import ArrayLike
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, LAMBDA_FLOOR, T_STOP, TILE, Z_NEAR
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussian_math import project_cov3d
+from gsplat_edu.validation import first_index, float64_array, in_range, one_of
+
+Extent = Literal["box3sigma", "exact"]
+Stop = Literal["box", "tile", "none"]
+Box = tuple[slice, slice]
+
+
+class Projection(NamedTuple):
+    """The visible splats in the image, near to far; ties keep the order of the input."""
+
+    order: Int64[np.ndarray, " M"]  # which Gaussian each one is
+    means2d: Float64[np.ndarray, "M 2"]  # px
+    cov2d: Float64[np.ndarray, "M 2 2"]  # px², dilated
+
+
+def render_gaussians(
+    cam: Camera,
+    means: ArrayLike,
+    cov3ds: ArrayLike,
+    colors: ArrayLike,
+    opacities: ArrayLike,
+    bg: ArrayLike = (0, 0, 0),
+    z_near: float = Z_NEAR,
+    *,
+    extent: Extent = "box3sigma",
+    stop: Stop = "box",
+) -> tuple[Float64[np.ndarray, "H W 3"], Float64[np.ndarray, "H W"]]:
+    """Render Gaussians as seen by a camera.
+
+    alpha_i = min(0.99, o_i exp(-d' Sigma2d_i^-1 d / 2)), 0 below 1/255;  d = pixel - mean
+    image = sum_i T_i alpha_i c_i + T_final bg,  T_i = product over j nearer than i of (1 - alpha_j)
+
+    Args:
+        cam: The camera; pixels are sampled at integer coordinates.
+        means: (N, 3) centres, world units.
+        cov3ds: (N, 3, 3) covariances, world units squared, symmetric and positive semi-definite.
+        colors: (N, 3) any range.
+        opacities: (N,) 0 to 1.
+        bg: (3,) background colour.
+        z_near: Means at this camera depth or nearer are culled, world units, >= 0.
+        extent: Which pixels a splat may reach. "box3sigma": the box of the chapter, radius
+            ceil(3 sqrt(lambda_max)), which cuts faint tails. "exact": every pixel with alpha >= 1/255.
+        stop: When nothing more is drawn. "box": a splat is skipped when its whole box is below 1e-4
+            transmittance. "tile": a 16x16 tile ends when all its pixels are. "none": never.
+
+    Returns:
+        image: (H, W, 3) float64, not clipped; an empty scene is the background.
+        transmittance: (H, W) T_final, in [0, 1].
+
+    Raises:
+        ShapeError: a shape differs, or the arguments have different N.
+        ArgumentError: NaN or infinite numbers, an opacity outside 0 to 1, a covariance that is not one.
+
+    Source: Kerbl et al. 2023, eq. 2-5; Zwicker et al. 2001 for the projection.
+    """
+    means, cov3ds, colors, opacities = _checked(means, cov3ds, colors, opacities)
+    bg, z_near = float64_array("bg", bg, (3,)), in_range("z_near", z_near, 0.0)
+    one_of("extent", extent, ("box3sigma", "exact"))
+    one_of("stop", stop, ("box", "tile", "none"))
+    splats = project(cam, means, cov3ds, z_near)
+    image = np.zeros((cam.H, cam.W, 3))
+    # Whole tiles are kept; pixels outside the image have no transmittance and keep no tile alive.
+    padded = np.pad(np.ones((cam.H, cam.W)), ((0, -cam.H % TILE), (0, -cam.W % TILE)))
+    transmittance = padded[: cam.H, : cam.W]
+    for i, mean2d, cov2d in zip(*splats, strict=True):
+        box = _box(mean2d, cov2d, opacities[i], cam, extent)
+        T = transmittance[box]
+        if T.size == 0 or (stop == "box" and T.max() < T_STOP):
+            continue
+        alpha = _alpha(mean2d, cov2d, opacities[i], box)
+        if stop == "tile":
+            alpha = np.where(_in_live_tile(padded, box), alpha, 0.0)
+        image[box] += (T * alpha)[..., None] * colors[i]
+        T *= 1.0 - alpha
+    return image + transmittance[..., None] * bg, transmittance.copy()
+
+
+def _checked(
+    means: ArrayLike, cov3ds: ArrayLike, colors: ArrayLike, opacities: ArrayLike
+) -> tuple[
+    Float64[np.ndarray, "N 3"],
+    Float64[np.ndarray, "N 3 3"],
+    Float64[np.ndarray, "N 3"],
+    Float64[np.ndarray, " N"],
+]:
+    sizes: dict[str, int] = {}
+    means = float64_array("means", means, ("N", 3), sizes)
+    cov3ds = float64_array("cov3ds", cov3ds, ("N", 3, 3), sizes)
+    colors = float64_array("colors", colors, ("N", 3), sizes)
+    opacities = float64_array("opacities", opacities, ("N",), sizes)
+    if np.any(outside := (opacities < 0) | (opacities > 1)):
+        raise ArgumentError(f"opacities{first_index(outside)}: is outside 0 to 1")
+    return means, cov3ds, colors, opacities
+
+
+def project(
+    cam: Camera, means: Float64[np.ndarray, "N 3"], cov3ds: Float64[np.ndarray, "N 3 3"], z_near: float
+) -> Projection:
+    """Project what is in front of the camera to screen-space ellipses and sort it near to far.
+
+    Sigma2d = J W Sigma W' J' + 0.3 I
+
+    Raises:
+        ArgumentError: a covariance projects to something that is not positive definite.
+    """
+    means_cam = cam.world_to_cam(means)
+    index = np.flatnonzero(means_cam[:, 2] > z_near)
+    index = index[np.argsort(means_cam[index, 2], kind="stable")]
+    u, v, _ = cam.project(means_cam[index])
+    cov2d = project_cov3d(cov3ds[index], means_cam[index], cam) + DILATION * np.eye(2)
+    improper = ~((np.linalg.det(cov2d) > 0) & (cov2d[:, 0, 0] > 0))
+    if np.any(improper):
+        raise ArgumentError(
+            f"cov3ds[{index[improper][0]}]: is not positive semi-definite, so it is no covariance"
+        )
+    return Projection(index, np.stack([u, v], axis=-1), cov2d)
+
+
+def _box(
+    mean2d: Float64[np.ndarray, "2"],
+    cov2d: Float64[np.ndarray, "2 2"],
+    opacity: float,
+    cam: Camera,
+    extent: Extent,
+) -> Box:
+    """Bound the pixels a splat may reach, as (rows, columns) inside the image."""
+    if extent == "box3sigma":
+        mid, det = np.trace(cov2d) / 2.0, np.linalg.det(cov2d)
+        reach = np.ceil(3.0 * np.sqrt(mid + np.sqrt(max(LAMBDA_FLOOR, mid * mid - det))))
+    else:  # alpha = ALPHA_MIN on the ellipse d' Sigma^-1 d = 2 ln(o / ALPHA_MIN)
+        level = 2.0 * np.log(max(opacity, ALPHA_MIN) / ALPHA_MIN)
+        reach = np.sqrt(level * np.diag(cov2d))
+    low = np.clip(np.floor(mean2d) - np.floor(reach), 0, (cam.W, cam.H)).astype(int)
+    high = np.clip(np.ceil(mean2d) + np.ceil(reach) + 1, 0, (cam.W, cam.H)).astype(int)
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _alpha(
+    mean2d: Float64[np.ndarray, "2"], cov2d: Float64[np.ndarray, "2 2"], opacity: float, box: Box
+) -> Float64[np.ndarray, "h w"]:
+    """Evaluate alpha at every pixel of a box."""
+    (A, B), (_, C) = np.linalg.inv(cov2d)
+    dx = np.arange(box[1].start, box[1].stop) - mean2d[0]
+    dy = np.arange(box[0].start, box[0].stop)[:, None] - mean2d[1]
+    power = -0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy
+    alpha = np.minimum(ALPHA_MAX, opacity * np.exp(power))
+    return np.where(alpha < ALPHA_MIN, 0.0, alpha)
+
+
+def _in_live_tile(padded: Float64[np.ndarray, "th tw"], box: Box) -> Bool[np.ndarray, "h w"]:
+    """Say of each pixel of a box whether some pixel of its tile still lets 1e-4 of the light through."""
+    (y0, x0), (y1, x1) = ((s.start // TILE for s in box), (-(-s.stop // TILE) for s in box))
+    tiles = padded[y0 * TILE : y1 * TILE, x0 * TILE : x1 * TILE].reshape(y1 - y0, TILE, x1 - x0, TILE)
+    live: Bool[np.ndarray, "th tw"] = (
+        (tiles.max(axis=(1, 3)) >= T_STOP).repeat(TILE, axis=0).repeat(TILE, axis=1)
+    )
+    rows, columns = (slice(s.start - t * TILE, s.stop - t * TILE) for s, t in zip(box, (y0, x0), strict=True))
+    return live[rows, columns]

@@ -1,0 +1,34 @@
+"""How to render: the choices that are not the scene's and not the camera's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.validation import float64_array, whole_number
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Choices of one render.
+
+    Args:
+        background: Colour behind everything, RGB.
+        sh_degree: Highest degree of spherical harmonics to use; less where the Gaussians store less.
+        dense_chunk: Splats that the dense torch backend evaluates at once. It decides speed, not the image
+            (beyond rounding); 16 keeps a chunk in a core's cache at 128 px (benchmarks/RESULTS.md).
+
+    Raises:
+        ShapeError: the background is not of shape (3,).
+        ArgumentError: a value is outside its range.
+    """
+
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sh_degree: int = SH_MAX_DEGREE
+    dense_chunk: int = 16
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        float64_array("background", self.background, (3,))
+        whole_number("sh_degree", self.sh_degree, 0)
+        whole_number("dense_chunk", self.dense_chunk, 1)

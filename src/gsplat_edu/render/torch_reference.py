@@ -1,0 +1,162 @@
+"""The dense renderer: the mathematics of the NumPy reference, batched in torch for autograd.
+
+Every splat is evaluated at every pixel: no boxes and no early stop, which changes cost and not values. The
+names end in _t, as in the course, and take any float dtype.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, SH_OFFSET, Z_NEAR
+from gsplat_edu.errors import ShapeError
+from gsplat_edu.gaussians import check_tensor
+from gsplat_edu.sh import basis_terms, num_coefficients
+from gsplat_edu.validation import whole_number
+
+
+class DenseRender(NamedTuple):
+    """What `render_t` returns."""
+
+    image: Float[Tensor, "H W 3"]
+    transmittance: Float[Tensor, "H W"]
+    means2d: Float[Tensor, "M 2"]  # px, near to far; keeps its gradient when asked to
+    visible: Int64[Tensor, " M"]  # which Gaussian each row of means2d is
+
+
+class _Screen(NamedTuple):
+    """The visible splats in the image, near to far."""
+
+    means2d: Float[Tensor, "M 2"]
+    conics: Float[Tensor, "M 3"]  # inverse of the dilated 2D covariance: xx, xy, yy, px^-2
+    visible: Int64[Tensor, " M"]
+
+
+def eval_sh_t(degree: int, sh: Float[Tensor, "N K 3"], dirs: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Evaluate the colours of N Gaussians, differentiably: max(0, sum_i b_i(d) sh_i + 0.5).
+
+    Args:
+        degree: Highest degree to use, 0 to 3.
+        sh: (N, K, 3) coefficients, K >= (degree + 1)².
+        dirs: (N, 3) unit vectors from the camera to each Gaussian.
+
+    Returns:
+        (N, 3) colours, 0 and up.
+
+    Raises:
+        ShapeError: a shape differs, N differs, or K is too small for the degree.
+        ArgumentError: the degree is not 0, 1, 2 or 3, or an entry is NaN or infinite.
+
+    Differentiable in: sh, and dirs as free variables of the polynomials.
+    """
+    count = num_coefficients(degree)
+    sizes: dict[str, int] = {}
+    check_tensor("sh", sh, ("N", "K", 3), sizes)
+    check_tensor("dirs", dirs, ("N", 3), sizes)
+    if sizes["K"] < count:
+        raise ShapeError(
+            f"sh: degree {degree} needs {count} coefficients per channel, got shape {tuple(sh.shape)}"
+        )
+    terms = basis_terms(degree, *(axis[:, None] for axis in dirs.unbind(-1)))
+    color = torch.full_like(sh[:, 0], SH_OFFSET)
+    for term, coefficient in zip(terms, sh.unbind(1), strict=False):
+        color = color + term * coefficient
+    return torch.clamp(color, min=0.0)
+
+
+def render_t(
+    means: Float[Tensor, "N 3"],
+    cov3ds: Float[Tensor, "N 3 3"],
+    colors: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    cam: Camera,
+    alpha_min: float = ALPHA_MIN,
+    chunk: int = 512,
+    track_means2d: bool = False,
+) -> DenseRender:
+    """Render Gaussians, differentiably, on black.
+
+    alpha_i = min(0.99, o_i exp(-d' Sigma2d_i^-1 d / 2)), 0 below alpha_min
+    image = sum_i T_i alpha_i c_i,  T_i = product over j nearer than i of (1 - alpha_j)
+
+    Args:
+        means: (N, 3) centres, world units.
+        cov3ds: (N, 3, 3) covariances, world units squared.
+        colors: (N, 3) any range.
+        opacities: (N,) 0 to 1.
+        cam: The camera; means at depth 0.05 or nearer are culled.
+        alpha_min: Alpha below this is zero. 0 makes the image smooth, for finite differences.
+        chunk: Splats evaluated at once, near to far. It bounds the size of a temporary and decides speed.
+        track_means2d: Keep the gradient of means2d, for density control.
+
+    Returns:
+        image (H, W, 3), final transmittance (H, W), means2d (M, 2) px and the indices (M,) of the visible
+        Gaussians, near to far. A scene without visible Gaussians is black, and its gradients are zero.
+
+    Raises:
+        ShapeError: a shape differs, or the arguments have different N.
+        ArgumentError: an entry is NaN or infinite, or chunk is not a whole number of at least 1.
+
+    Differentiable in: means, cov3ds, colors, opacities. Not in: the camera.
+    Source: Kerbl et al. 2023, eq. 2-5.
+    """
+    sizes: dict[str, int] = {}
+    check_tensor("means", means, ("N", 3), sizes)
+    check_tensor("cov3ds", cov3ds, ("N", 3, 3), sizes)
+    check_tensor("colors", colors, ("N", 3), sizes)
+    check_tensor("opacities", opacities, ("N",), sizes)
+    chunk = whole_number("chunk", chunk, 1)
+
+    screen = _project(means, cov3ds, cam)
+    if track_means2d and screen.means2d.requires_grad:
+        screen.means2d.retain_grad()
+    colors, opacities = colors[screen.visible], opacities[screen.visible]
+    # Empty sums tie the image to the inputs, so that backward gives zeros when nothing is visible.
+    tie = sum(tensor[:0].sum() for tensor in (screen.means2d, screen.conics, colors, opacities))
+    image = torch.zeros(cam.H, cam.W, 3, dtype=means.dtype, device=means.device) + tie
+    T = torch.ones(cam.H, cam.W, dtype=means.dtype, device=means.device)
+    for start in range(0, len(screen.visible), chunk):
+        part = slice(start, start + chunk)
+        alpha = _alpha(screen.means2d[part], screen.conics[part], opacities[part], cam, alpha_min)
+        T_after = T * torch.cumprod(1.0 - alpha, dim=0)
+        T_before = torch.cat([T[None], T_after[:-1]], dim=0)
+        image = image + torch.einsum("khw,kc->hwc", T_before * alpha, colors[part])
+        T = T_after[-1]
+    return DenseRender(image, T, screen.means2d, screen.visible)
+
+
+def _project(means: Float[Tensor, "N 3"], cov3ds: Float[Tensor, "N 3 3"], cam: Camera) -> _Screen:
+    R = torch.tensor(cam.R, dtype=means.dtype, device=means.device)
+    means_cam = (means - torch.tensor(cam.eye, dtype=means.dtype, device=means.device)) @ R.T
+    visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]
+    visible = visible[torch.argsort(means_cam[visible, 2], stable=True)]
+    x, y, z = means_cam[visible].unbind(-1)
+    means2d = torch.stack([cam.fx * x / z + cam.cx, cam.fy * y / z + cam.cy], dim=-1)
+    zero = torch.zeros_like(z)
+    rows = [[cam.fx / z, zero, -cam.fx * x / z**2], [zero, cam.fy / z, -cam.fy * y / z**2]]
+    JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
+    cov2d = JW @ cov3ds[visible] @ JW.mT
+    a, b, c = cov2d[:, 0, 0] + DILATION, cov2d[:, 0, 1], cov2d[:, 1, 1] + DILATION
+    conics = torch.stack([c, -b, a], dim=-1) / (a * c - b * b)[:, None]
+    return _Screen(means2d, conics, visible)
+
+
+def _alpha(
+    means2d: Float[Tensor, "k 2"],
+    conics: Float[Tensor, "k 3"],
+    opacities: Float[Tensor, " k"],
+    cam: Camera,
+    alpha_min: float,
+) -> Float[Tensor, "k H W"]:
+    u, v = (axis[:, None, None] for axis in means2d.unbind(-1))
+    A, B, C = (axis[:, None, None] for axis in conics.unbind(-1))
+    dx = torch.arange(cam.W, dtype=means2d.dtype, device=means2d.device) - u
+    dy = torch.arange(cam.H, dtype=means2d.dtype, device=means2d.device)[:, None] - v
+    power = -0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy
+    alpha = torch.clamp(opacities[:, None, None] * torch.exp(power), max=ALPHA_MAX)
+    return torch.where(alpha < alpha_min, torch.zeros_like(alpha), alpha)

@@ -1,0 +1,114 @@
+"""Spherical harmonics, degrees 0 to 3: colour that changes with the viewing direction.
+
+The order and signs of the 16 harmonics are those of Kerbl et al.'s code, which every scene file in the
+field follows: within a degree from m = -l to m = l, with the Condon-Shortley sign (-1)^m.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+
+from gsplat_edu.constants import C0, C1, C2, C3, SH_MAX_DEGREE, SH_OFFSET
+from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.validation import first_index, float64_array
+
+UNIT_TOLERANCE = 1e-3
+"""How far from 1 the length of a viewing direction may be."""
+
+
+def sh_basis(dirs: ArrayLike) -> Float64[np.ndarray, "*batch 16"]:
+    """Evaluate the 16 real spherical harmonics of degrees 0 to 3.
+
+    Args:
+        dirs: (..., 3) unit vectors from the camera to the point.
+
+    Returns:
+        (..., 16) values b_i, orthonormal over the sphere.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+        ArgumentError: a direction is NaN, infinite, or not of unit length.
+    """
+    dirs = float64_array("dirs", dirs, ("...", 3))
+    length = np.linalg.norm(dirs, axis=-1)
+    off = np.abs(length - 1.0) > UNIT_TOLERANCE
+    if np.any(off):
+        raise ArgumentError(f"dirs{first_index(off)}: has length {length[off][0]:g}; divide by it first")
+    x, y, z = np.moveaxis(dirs, -1, 0)
+    return np.stack([np.broadcast_to(term, x.shape) for term in basis_terms(SH_MAX_DEGREE, x, y, z)], axis=-1)
+
+
+def eval_sh(degree: int, sh: ArrayLike, dirs: ArrayLike) -> Float64[np.ndarray, "N 3"]:
+    """Evaluate the colours of N Gaussians seen from given directions.
+
+    colour = max(0, sum_i b_i(d) sh_i + 0.5)
+
+    Args:
+        degree: Highest degree to use, 0 to 3.
+        sh: (N, K, 3) coefficients, K >= (degree + 1)²; those of higher degrees are not used.
+        dirs: (N, 3) unit vectors from the camera to each Gaussian.
+
+    Returns:
+        (N, 3) colours, 0 and up, not limited to 1.
+
+    Raises:
+        ShapeError: a shape differs, N differs, or K is too small for the degree.
+        ArgumentError: the degree is not 0, 1, 2 or 3; a number is NaN or infinite; a direction is not unit.
+
+    Source: Kerbl et al. 2023, section 4 and its code.
+    """
+    count = num_coefficients(degree)
+    sizes: dict[str, int] = {}
+    sh = float64_array("sh", sh, ("N", "K", 3), sizes)
+    if sizes["K"] < count:
+        raise ShapeError(f"sh: degree {degree} needs {count} coefficients per channel, got shape {sh.shape}")
+    basis = sh_basis(float64_array("dirs", dirs, ("N", 3), sizes))
+    colors: Float64[np.ndarray, "N 3"] = np.einsum("nk,nkc->nc", basis[:, :count], sh[:, :count]) + SH_OFFSET
+    floored: Float64[np.ndarray, "N 3"] = np.maximum(colors, 0.0)
+    return floored
+
+
+def num_coefficients(degree: int) -> int:
+    """Return the number of harmonics up to a degree: (degree + 1)².
+
+    Raises:
+        ArgumentError: the degree is not 0, 1, 2 or 3.
+    """
+    if degree not in range(SH_MAX_DEGREE + 1):
+        raise ArgumentError(f"degree: is {degree!r}, but has to be 0, 1, 2 or 3")
+    return (degree + 1) ** 2
+
+
+def basis_terms(degree: int, x: Any, y: Any, z: Any) -> list[Any]:  # noqa: ANN401
+    """Write the harmonics up to `degree` as polynomials in x, y and z.
+
+    Only +, - and * are used, so that the same line serves NumPy arrays and torch tensors; the first term is
+    the plain number C0. Values are those of a spherical harmonic where x² + y² + z² = 1.
+    """
+    terms = [C0]
+    if degree >= 1:
+        terms += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        terms += [
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2.0 * zz - xx - yy),
+            -C2[0] * x * z,
+            C2[2] * (xx - yy),
+        ]
+    if degree >= 3:
+        terms += [
+            -C3[0] * y * (3.0 * xx - yy),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4.0 * zz - xx - yy),
+            C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+            -C3[2] * x * (4.0 * zz - xx - yy),
+            C3[4] * z * (xx - yy),
+            -C3[0] * x * (xx - 3.0 * yy),
+        ]
+    return terms

@@ -1,0 +1,1 @@
+"""Density control: where the scene needs more Gaussians, and which ones it can do without."""

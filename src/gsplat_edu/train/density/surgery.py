@@ -1,0 +1,57 @@
+"""Cutting and adding Gaussians without losing what the optimiser knows of those that stay."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Int64
+from torch import Tensor
+
+from gsplat_edu.gaussians import Gaussians, quat_to_R_t
+from gsplat_edu.train.optimizer import Adam
+
+
+@torch.no_grad()
+def split_children(parents: Gaussians, shrink: float, generator: torch.Generator) -> Gaussians:
+    """Draw one child per parent from the parent's own distribution, smaller than the parent.
+
+    mean' = mean + R (scale * n), n ~ N(0, I);  scale' = scale / shrink
+
+    Args:
+        parents: N Gaussians.
+        shrink: What the scales are divided by.
+        generator: Source of n.
+
+    Returns:
+        N children.
+
+    Source: Kerbl et al. 2023, section 5.2.
+    """
+    noise = torch.randn(len(parents), 3, generator=generator, dtype=parents.means.dtype)
+    offset = (quat_to_R_t(parents.quats) @ (parents.scales * noise)[..., None])[..., 0]
+    changed = {"means": parents.means + offset, "log_scales": parents.log_scales - math.log(shrink)}
+    return Gaussians(**(parents.tensors() | changed))
+
+
+@torch.no_grad()
+def replace(
+    gaussians: Gaussians, optimizer: Adam, keep: Bool[Tensor, " N"], newborn: list[Gaussians], cap: int
+) -> Gaussians:
+    """Keep some Gaussians, add others behind them, and cut from the end what is over the cap.
+
+    Args:
+        gaussians: What there is.
+        optimizer: Its moments follow: survivors keep theirs, the newborn start from zero.
+        keep: (N,) true for those that stay.
+        newborn: What is added, in this order.
+        cap: Largest number of Gaussians afterwards.
+
+    Returns:
+        The new Gaussians, leaves that collect gradients.
+    """
+    survivors: Int64[Tensor, " S"] = torch.nonzero(keep)[:cap, 0]
+    parts = [gaussians.map(lambda tensor: tensor[survivors]), *newborn]
+    replaced = Gaussians.concatenated(parts).map(lambda tensor: tensor[:cap])
+    optimizer.follow(survivors, len(replaced) - len(survivors))
+    return replaced.trainable()

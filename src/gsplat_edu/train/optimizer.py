@@ -1,0 +1,78 @@
+"""Adam, one rate per parameter group, with moments that follow their Gaussians through density control."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+
+
+class Adam:
+    """Adam over the raw parameters of Gaussians.
+
+    m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g²,  p -= rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)
+
+    The step count t is shared by all and survives density control, as in Kerbl et al.'s code.
+
+    Args:
+        gaussians: The parameters to move.
+        learning_rates: Rate of every parameter by name; one that is not named does not move.
+        betas: Decay of the first and second moment.
+        eps: Floor under the root of the second moment.
+
+    Raises:
+        ArgumentError: a rate is given for something that is not a parameter.
+
+    Source: Kingma and Ba 2015, algorithm 1.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        learning_rates: Mapping[str, float],
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ) -> None:
+        tensors = gaussians.tensors()
+        if unknown := sorted(set(learning_rates) - set(tensors)):
+            raise ArgumentError(
+                f"learning_rates: {unknown[0]!r} is none of the parameters {', '.join(tensors)}"
+            )
+        self.learning_rates, self.betas, self.eps = dict(learning_rates), betas, eps
+        self.steps = 0
+        self.first = {name: torch.zeros_like(tensors[name]) for name in self.learning_rates}
+        self.second = {name: torch.zeros_like(tensors[name]) for name in self.learning_rates}
+
+    @torch.no_grad()
+    def step(self, gaussians: Gaussians) -> None:
+        """Move every parameter that has a gradient, in place, and drop the gradients."""
+        self.steps += 1
+        b1, b2 = self.betas
+        tensors = gaussians.tensors()
+        for name, rate in self.learning_rates.items():
+            parameter, m, v = tensors[name], self.first[name], self.second[name]
+            if parameter.grad is None:
+                continue
+            m.mul_(b1).add_(parameter.grad, alpha=1 - b1)
+            v.mul_(b2).addcmul_(parameter.grad, parameter.grad, value=1 - b2)
+            m_hat, v_hat = m / (1 - b1**self.steps), v / (1 - b2**self.steps)
+            parameter -= rate * m_hat / (v_hat.sqrt() + self.eps)
+        for parameter in tensors.values():
+            parameter.grad = None
+
+    @torch.no_grad()
+    def follow(self, survivors: Int64[Tensor, " S"], num_new: int) -> None:
+        """Carry the moments through a change of the Gaussians.
+
+        Args:
+            survivors: (S,) indices of the Gaussians that stay, in their new order; they keep their moments.
+            num_new: Gaussians added behind them, which start from zero moments.
+        """
+        for moments in (self.first, self.second):
+            for name, old in moments.items():
+                moments[name] = torch.cat([old[survivors], old.new_zeros(num_new, *old.shape[1:])])

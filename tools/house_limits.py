@@ -1,0 +1,69 @@
+"""Check the limits that keep the house small: lines a file, lines a function, parameters a function.
+
+    python tools/house_limits.py [FOLDER ...]
+
+Prints one line per breach and exits with 1 where there is one. An exception needs a reason in EXCEPTIONS.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+MAX_FILE_LINES = 500
+MAX_FUNCTION_LINES = 60
+MAX_PARAMETERS = 8
+
+FOLDERS = ("src", "native", "tests", "tools", "train", "benchmarks", "notebooks/source")
+SUFFIXES = {".py", ".cpp", ".h", ".js", ".sh"}
+
+EXCEPTIONS = {
+    "src/gsplat_edu/render/numpy_reference.py:render_gaussians": (
+        "the chapter's seven parameters stay as they are; extent and stop make it the kernels' oracle"
+    ),
+}
+"""Functions that may have more parameters, and why."""
+
+
+def breaches(path: Path, name: str) -> Iterator[str]:
+    """Yield a line for everything in one file that is over a limit.
+
+    Args:
+        path: The file.
+        name: What to call it, relative to the root.
+    """
+    text = path.read_text(encoding="utf-8")
+    lines = text.count("\n")
+    if lines > MAX_FILE_LINES:
+        yield f"{name}: {lines} lines, at most {MAX_FILE_LINES}; split it"
+    if path.suffix != ".py":
+        return
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        length = (node.end_lineno or node.lineno) - node.lineno + 1
+        if length > MAX_FUNCTION_LINES:
+            yield f"{name}:{node.lineno} {node.name}: {length} lines, at most {MAX_FUNCTION_LINES}; split it"
+        count = _parameters(node)
+        if count > MAX_PARAMETERS and f"{name}:{node.name}" not in EXCEPTIONS:
+            yield f"{name}:{node.lineno} {node.name}: {count} parameters, at most {MAX_PARAMETERS}"
+
+
+def _parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+    return len([n for i, n in enumerate(names) if not (i == 0 and n in ("self", "cls"))])
+
+
+def main(folders: list[str]) -> int:
+    """Check every file below the folders; print what is over a limit."""
+    root = Path(__file__).resolve().parent.parent
+    files = [f for folder in folders for f in sorted((root / folder).rglob("*")) if f.suffix in SUFFIXES]
+    found = [line for file in files for line in breaches(file, file.relative_to(root).as_posix())]
+    print("\n".join(found) if found else f"{len(files)} files are within the limits")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:] or list(FOLDERS)))
