@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from numpy.typing import ArrayLike
 
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import float64_array, in_range, whole_number
+from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
 
 WORLD_UP = (0.0, -1.0, 0.0)
 """The world's up direction: +y points down."""
@@ -170,7 +169,8 @@ class Camera:
         """
         x, y, z = np.moveaxis(float64_array("points_cam", points_cam, ("...", 3)), -1, 0)
         depth = np.where(z > 0, z, np.nan)
-        return self.fx * x / depth + self.cx, self.fy * y / depth + self.cy, np.array(z)
+        u, v = self.fx * x / depth + self.cx, self.fy * y / depth + self.cy
+        return np.asarray(u), np.asarray(v), np.array(z)  # one point: arrays of no axes, not bare numbers
 
 
 def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius: float = 3.0) -> Camera:

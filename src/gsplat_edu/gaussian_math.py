@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float64
-from numpy.typing import ArrayLike
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import check_shape, first_index, float64_array
+from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array
 
 
 def quat_to_R(quat: ArrayLike) -> Float64[np.ndarray, "3 3"]:

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-from numpy.typing import ArrayLike
 
 from gsplat_edu.constants import C0, C1, C2, C3, SH_MAX_DEGREE, SH_OFFSET
 from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.validation import first_index, float64_array
+from gsplat_edu.validation import ArrayLike, first_index, float64_array
 
 UNIT_TOLERANCE = 1e-3
 """How far from 1 the length of a viewing direction may be."""

@@ -7,13 +7,21 @@ checked here; what they return, and what they pass on inside, carries its shape 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
-from numpy.typing import ArrayLike
 
 from gsplat_edu.errors import ArgumentError, ShapeError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike as _NumPyArrayLike
+
+    ArrayLike: TypeAlias = _NumPyArrayLike
+else:
+    # NumPy's alias asks for methods that a tuple has in its stub file alone, so it cannot be checked at run
+    # time; float64_array does that.
+    ArrayLike = Any
 
 Shape = Sequence[int | str]
 """An expected shape: a number is that size; a letter is any size, the same wherever the letter stands;

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32
-from numpy.typing import ArrayLike
 
 from gsplat_edu.camera import Camera
-from gsplat_edu.validation import float64_array
+from gsplat_edu.validation import ArrayLike, float64_array
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -9,13 +9,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from numpy.typing import ArrayLike
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, LAMBDA_FLOOR, T_STOP, TILE, Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussian_math import project_cov3d
-from gsplat_edu.validation import first_index, float64_array, in_range, one_of
+from gsplat_edu.validation import ArrayLike, first_index, float64_array, in_range, one_of
 
 Extent = Literal["box3sigma", "exact"]
 Stop = Literal["box", "tile", "none"]

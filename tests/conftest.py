@@ -1,0 +1,40 @@
+"""Fixtures that many tests share."""
+
+from collections.abc import Iterator
+
+import jaxtyping
+import numpy as np
+import pytest
+
+from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
+
+
+@pytest.fixture
+def as_shipped() -> Iterator[None]:
+    """Switch the shape-checking hook off, so that errors are those a user gets."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def random_splats():
+    """Make n random splats in front of `random_camera`, every depth different."""
+
+    def make(n: int, seed: int = 0, scale: float = 0.1):
+        rng = np.random.default_rng(seed)
+        means = np.stack(
+            [rng.uniform(-0.6, 0.6, n), rng.uniform(-0.6, 0.6, n), rng.permutation(n) / max(n, 1)], axis=-1
+        )
+        cov3ds = build_cov3d_batch(
+            scale * rng.uniform(0.2, 1.5, (n, 3)), quat_to_R_batch(rng.normal(size=(n, 4)))
+        )
+        return means, cov3ds, rng.uniform(0, 1, (n, 3)), rng.uniform(0.02, 1.0, n)
+
+    return make
+
+
+@pytest.fixture
+def random_camera() -> Camera:
+    """A camera whose image is no multiple of a tile, not square, and off its centre."""
+    return Camera(np.eye(3), (0.1, -0.05, -3.0), fx=50.0, fy=45.0, cx=20.3, cy=16.8, H=35, W=41)
