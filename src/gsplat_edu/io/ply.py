@@ -29,7 +29,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
     """
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     count = len(gaussians)
-    sh_rest = np.swapaxes(tensors["sh_rest"], 1, 2).reshape(count, -1)  # channel-major
+    sh_rest = np.concatenate(np.moveaxis(tensors["sh_rest"], 2, 0), axis=1)  # channel-major
     columns: list[tuple[list[str], np.ndarray]] = [
         (["x", "y", "z"], tensors["means"]),
         (["nx", "ny", "nz"], np.zeros((count, 3))),

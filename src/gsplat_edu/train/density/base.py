@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import RenderOutput
@@ -10,6 +10,7 @@ from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.optimizer import Adam
 
 
+@runtime_checkable
 class DensityStrategy(Protocol):
     """Watches every step and, now and then, changes the Gaussians."""
 

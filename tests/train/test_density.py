@@ -1,0 +1,146 @@
+"""Clone, split, prune and the cap, on four Gaussians whose fate is set by hand."""
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu import Camera
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.train.config import DensityConfig
+from gsplat_edu.train.density.adc import AdaptiveDensityControl
+from gsplat_edu.train.density.surgery import replace, split_children
+from gsplat_edu.train.optimizer import Adam
+
+SMALL, LARGE = math.log(0.02), math.log(0.2)  # 1 % of the extent 3.0 is 0.03
+CONFIG = DensityConfig(start=100, stop=600, every=100)
+
+
+def four(dtype=torch.float64) -> Gaussians:
+    """Return Gaussians that are small, large, large, and small but too faint to live."""
+    n = 4
+    return Gaussians(
+        means=torch.arange(n * 3, dtype=dtype).reshape(n, 3),
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=dtype).repeat(n, 1),
+        log_scales=torch.tensor([SMALL, LARGE, LARGE, SMALL], dtype=dtype)[:, None].repeat(1, 3),
+        sh0=torch.arange(n, dtype=dtype)[:, None, None].repeat(1, 1, 3),
+        sh_rest=torch.zeros(n, 0, 3, dtype=dtype),
+        logit_opacities=torch.tensor([0.0, 0.0, 0.0, -6.0], dtype=dtype),
+    ).trainable()
+
+
+def controlled(hot, config=CONFIG):
+    """Set up density control that has seen the gradients `hot` asks for in two renders."""
+    gaussians = four()
+    optimizer = Adam(gaussians, {"means": 1e-3})
+    optimizer.first["means"] = torch.arange(12.0, dtype=torch.float64).reshape(4, 3) + 1
+    control = AdaptiveDensityControl(config, torch.Generator().manual_seed(0), gaussians)
+    control.norm_sums = torch.tensor(hot, dtype=torch.float64) * 2 * 1.01 * config.grad_threshold
+    control.times_visible = torch.full((4,), 2.0, dtype=torch.float64)
+    return control, gaussians, optimizer
+
+
+def test_small_offenders_are_cloned_large_ones_split_and_the_faint_pruned():
+    control, gaussians, optimizer = controlled(hot=[1, 1, 0, 1])
+    changed, event = control.update(100, gaussians, optimizer)
+    assert dataclasses.astuple(event) == (100, 1, 2, 1, 5)
+    # Survivors 0 and 2; the clone of 0; two children of 1.
+    assert changed.sh0[:, 0, 0].tolist() == [0, 2, 0, 1, 1]
+    torch.testing.assert_close(changed.means[:3], gaussians.means[[0, 2, 0]])
+    expected = torch.tensor([SMALL, LARGE, SMALL, LARGE - math.log(1.6), LARGE - math.log(1.6)])
+    torch.testing.assert_close(changed.log_scales[:, 0], expected.double())
+    offsets = changed.means[3:] - gaussians.means[1]
+    assert (offsets != 0).all() and (offsets.abs() < 5 * 0.2).all() and (offsets[0] != offsets[1]).all()
+    torch.testing.assert_close(optimizer.first["means"][:2], torch.tensor([[1.0, 2, 3], [7, 8, 9]]).double())
+    assert (optimizer.first["means"][2:] == 0).all()
+    assert all(t.requires_grad and t.is_leaf for t in changed.tensors().values())
+    assert len(control.norm_sums) == 5 and (control.norm_sums == 0).all(), "starts counting again"
+
+
+def test_the_threshold_is_on_the_mean_over_the_views_that_see_it():
+    control, gaussians, optimizer = controlled(hot=[1, 0, 0, 0])
+    control.times_visible[0] = 3
+    _, event = control.update(100, gaussians, optimizer)
+    assert event.num_cloned == 0
+
+
+@pytest.mark.parametrize(
+    ("iteration", "due"), [(0, False), (99, False), (100, True), (150, False), (500, True), (600, False)]
+)
+def test_the_window(iteration, due):
+    control, gaussians, optimizer = controlled(hot=[0, 0, 0, 0])
+    assert (control.update(iteration, gaussians, optimizer) is not None) == due
+
+
+@pytest.mark.parametrize("cap", [1, 2, 3, 4])
+def test_the_cap_cuts_from_the_end(cap):
+    control, gaussians, optimizer = controlled([1, 1, 0, 1], dataclasses.replace(CONFIG, max_gaussians=cap))
+    changed, event = control.update(100, gaussians, optimizer)
+    assert event.num_gaussians == len(changed) == cap
+    assert changed.sh0[:, 0, 0].tolist() == [0, 2, 0, 1, 1][:cap]
+    assert len(optimizer.first["means"]) == cap
+
+
+def test_all_may_be_pruned():
+    gaussians = four().map(lambda t: t.detach()[3:]).trainable()
+    optimizer = Adam(gaussians, {"means": 1e-3})
+    control = AdaptiveDensityControl(CONFIG, torch.Generator(), gaussians)
+    changed, event = control.update(100, gaussians, optimizer)
+    assert len(changed) == 0 and event.num_pruned == 1
+    assert control.update(200, changed, optimizer)[1].num_gaussians == 0
+
+
+def test_children_are_drawn_from_the_parents_distribution():
+    """20,000 children of one parent: their covariance is the parent's.
+
+    The sample covariance's relative error is about sqrt(2 / 20,000) = 1 %; five of those.
+    """
+    from gsplat_edu import build_cov3d, quat_to_R
+
+    quat, scale = np.array([0.9, 0.3, -0.2, 0.4]), np.array([0.3, 0.1, 0.02])
+    one = {
+        "means": torch.tensor([[1.0, 2.0, 3.0]]),
+        "quats": torch.tensor(quat)[None],
+        "log_scales": torch.tensor(np.log(scale))[None],
+    }
+    many = {name: t.double().repeat(20_000, 1) for name, t in one.items()}
+    rest = {
+        "sh0": torch.zeros(20_000, 1, 3).double(),
+        "sh_rest": torch.zeros(20_000, 0, 3).double(),
+        "logit_opacities": torch.zeros(20_000).double(),
+    }
+    children = split_children(Gaussians(**many, **rest), 1.6, torch.Generator().manual_seed(0))
+    cov = np.cov(children.means.numpy().T)
+    expected = build_cov3d(scale, quat_to_R(quat))
+    assert np.abs(cov - expected).max() < 0.05 * np.abs(expected).max()
+    np.testing.assert_allclose(children.scales[0].numpy(), scale / 1.6)
+
+
+def test_replace_without_change_is_the_identity():
+    gaussians = four()
+    optimizer = Adam(gaussians, {"means": 1e-3})
+    same = replace(gaussians, optimizer, torch.ones(4, dtype=torch.bool), [], cap=10)
+    for name, tensor in same.tensors().items():
+        torch.testing.assert_close(tensor, gaussians.tensors()[name], rtol=0, atol=0)
+
+
+def test_observed_norms_are_ndc_gradients_of_what_is_visible():
+    """The signal is |(gx W/2, gy H/2)|; on an image that is not square the two factors differ."""
+    camera = Camera.looking_at((0, 0, -3), (0, 0, 0), 20, 20, 12, 30)
+    gaussians = four().map(lambda t: t.detach().clone())
+    means = torch.tensor([[0.1, 0.1, 0], [-0.2, 0.1, 0.5], [0, 0, -9.0], [0.3, -0.1, 0]], dtype=torch.float64)
+    gaussians = dataclasses.replace(gaussians, means=means).trainable()
+    control = AdaptiveDensityControl(CONFIG, torch.Generator(), gaussians)
+    for _ in range(2):
+        out = functools.partial(render, backend="torch")(gaussians, camera)
+        (out.image**2).sum().backward()
+        control.observe(out)
+    expected = torch.zeros(4, dtype=torch.float64)
+    gradient = out.means2d.grad
+    expected[out.visible] = 2 * torch.sqrt((gradient[:, 0] * 15) ** 2 + (gradient[:, 1] * 6) ** 2)
+    torch.testing.assert_close(control.norm_sums, expected)
+    assert control.times_visible.tolist() == [2, 2, 0, 2], "the third is behind the camera"

@@ -1,0 +1,142 @@
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu import ArgumentError, ShapeError
+from gsplat_edu.data.synthetic import sphere_capture
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train.density.adc import AdaptiveDensityControl
+from gsplat_edu.train.events import DensifyEvent, StepEvent
+from gsplat_edu.train.initialize import random_ball
+from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.views import View
+
+RENDER = functools.partial(render, backend="torch")
+SHORT = TrainConfig(iterations=12, density=DensityConfig(start=4, stop=12, every=4, max_gaussians=80))
+
+
+@pytest.fixture(scope="module")
+def views():
+    return sphere_capture(24).train
+
+
+def trainer(views, callbacks=(), config=SHORT):
+    generator = torch.Generator().manual_seed(9)
+    start = random_ball(60, generator)
+    control = AdaptiveDensityControl(config.density, generator, start)
+    return Trainer(start, views, config, render=RENDER, density=control, callbacks=callbacks)
+
+
+def test_two_runs_give_the_same_bits(views):
+    runs = [trainer(views) for _ in range(2)]
+    losses = [run.run().losses for run in runs]
+    assert losses[0] == losses[1]
+    assert len(runs[0].gaussians) > 60, "density control took part"
+    for name, tensor in runs[0].gaussians.tensors().items():
+        assert torch.equal(tensor, runs[1].gaussians.tensors()[name]), name
+
+
+def test_callbacks_hear_of_every_step_and_densification_in_order(views):
+    heard = []
+    result = trainer(views, [lambda t, event: heard.append((event, len(t.gaussians)))]).run()
+    steps = [event for event, _ in heard if isinstance(event, StepEvent)]
+    changes = [(event, count) for event, count in heard if isinstance(event, DensifyEvent)]
+    assert [s.iteration for s in steps] == list(range(12))
+    assert [s.loss for s in steps] == result.losses and [s.num_gaussians for s in steps] == result.counts
+    assert [event.iteration for event, _ in changes] == [4, 8]
+    assert all(event.num_gaussians == count for event, count in changes)
+    assert result.counts[5] == changes[0][0].num_gaussians
+    assert result.seconds > 0
+
+
+def test_the_start_is_left_alone(views):
+    start = random_ball(20, torch.Generator().manual_seed(0))
+    before = start.map(torch.clone)
+    Trainer(start, views, TrainConfig(iterations=2), render=RENDER).run()
+    for name, tensor in start.tensors().items():
+        assert torch.equal(tensor, before.tensors()[name])
+
+
+def test_views_are_drawn_with_the_seed(views):
+    seen = []
+
+    def watching(gaussians, camera):
+        seen.append(next(i for i, view in enumerate(views) if view.camera is camera))
+        return RENDER(gaussians, camera)
+
+    config = TrainConfig(iterations=6, seed=3)
+    Trainer(random_ball(10, torch.Generator()), views, config, render=watching).run()
+    rng = np.random.default_rng(3)
+    assert seen == [int(rng.integers(24)) for _ in range(6)]
+
+
+def test_one_gaussian_finds_one_spot(views):
+    """Views of any origin will do: here a single blob, and the loop fits it."""
+    camera = views[0].camera
+    blob = Gaussians(
+        means=torch.tensor([[0.1, -0.1, 0.0]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        log_scales=torch.full((1, 3), -1.5),
+        sh0=torch.full((1, 1, 3), 1.0),
+        sh_rest=torch.zeros(1, 0, 3),
+        logit_opacities=torch.zeros(1),
+    )
+    target = View(camera, RENDER(blob, camera).image.numpy())
+    start = blob.map(lambda t: t + 0.05)
+    result = Trainer(start, [target], TrainConfig(iterations=150), render=RENDER).run()
+    assert result.losses[-1] < 0.1 * result.losses[0]
+
+
+def test_a_scene_that_vanishes_does_not_stop_the_run(views):
+    faint = random_ball(3, torch.Generator()).map(torch.clone)
+    faint.logit_opacities.fill_(-9.0)
+    config = TrainConfig(iterations=4, density=DensityConfig(start=1, stop=3, every=1))
+    control = AdaptiveDensityControl(config.density, torch.Generator(), faint)
+    run = Trainer(faint, views, config, render=RENDER, density=control)
+    assert run.run().counts == [3, 3, 0, 0]
+
+
+def test_nothing_to_learn_from_is_refused(views):
+    some = random_ball(3, torch.Generator())
+    with pytest.raises(ArgumentError, match="^views: "):
+        Trainer(some, [], SHORT, render=RENDER)
+    with pytest.raises(ArgumentError, match="^gaussians: "):
+        Trainer(random_ball(0, torch.Generator()), views, SHORT, render=RENDER)
+
+
+@pytest.mark.parametrize(
+    ("make", "names"),
+    [
+        (lambda: TrainConfig(iterations=0), "iterations"),
+        (lambda: TrainConfig(seed=-1), "seed"),
+        (lambda: TrainConfig(learning_rates={"means": -1.0}), r"learning_rates\['means'\]"),
+        (lambda: DensityConfig(every=0), "every"),
+        (lambda: DensityConfig(max_gaussians=0), "max_gaussians"),
+        (lambda: DensityConfig(extent=0.0), "extent"),
+        (lambda: DensityConfig(min_opacity=2.0), "min_opacity"),
+        (lambda: random_ball(-1, torch.Generator()), "count"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(make, names):
+    with pytest.raises(ArgumentError, match=f"^{names}: "):
+        make()
+
+
+def test_a_photo_of_another_size_is_refused(views):
+    with pytest.raises(ShapeError, match="^image: "):
+        View(views[0].camera, np.zeros((24, 25, 3)))
+
+
+def test_random_ball_is_the_documented_start():
+    gaussians = random_ball(5000, torch.Generator().manual_seed(0), torch.float64)
+    radii = gaussians.means.norm(dim=-1)
+    assert radii.max() <= 1
+    # Uniform by volume: the median radius is 0.5^(1/3) = 0.794; its standard error is below 0.006.
+    assert abs(float(radii.median()) - 0.5 ** (1 / 3)) < 0.02
+    torch.testing.assert_close(gaussians.scales, torch.full((5000, 3), 0.09, dtype=torch.float64))
+    assert gaussians.sh_degree == 0
+    assert abs(float(gaussians.sh0.std()) - 0.2) < 0.01
