@@ -20,8 +20,6 @@ images a tenth as wide, and that is the reason of nearly all that follows.
     structure-from-motion, sized by the distance to their neighbours.)
 12. Gradients are averaged over the renders in which a Gaussian is in front of the camera. (Paper's code: in
     which it also reaches the image.)
-13. Scales split at their largest axis against 1 % of the extent; the children of a split are drawn from one
-    generator shared with the start. (As the paper; the order of the draws is ours to keep.)
 """
 
 from __future__ import annotations

@@ -1,0 +1,89 @@
+import re
+from importlib.metadata import version
+
+import pytest
+
+from gsplat_edu.cli.main import COMMANDS, main
+
+TINY = ["demo", "--iters", "2", "--k0", "5", "--cap", "8", "--size", "8"]
+
+
+def test_demo_writes_figure_curves_and_scene(tmp_path, capsys):
+    assert main([*TINY, "--out", str(tmp_path / "a" / "s.png")]) == 0
+    printed = capsys.readouterr().out
+    assert "2/2" in printed, "the bar reached its end"
+    assert re.search(r"held-out L1: init 0\.\d{4} -> final 0\.\d{4}", printed)
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["s.ply", "s.png", "s_curves.png"]
+
+
+def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
+    arguments = ["demo", "--iters", "1", "--size", "8", "--k0", "5", "--out", str(tmp_path / "s.png")]
+    assert main(arguments) == 0
+    assert "reduced: --cap 800 (the chapter's: --cap 1600)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--iters", "0"], "--iters: is 0, but has to be a whole number of at least 1"),
+        (["--iters", "many"], "argument --iters: 'many' is not a whole number"),
+        (["--size", "-3"], "--size: is -3"),
+        (["--k0", "0"], "--k0: is 0"),
+        (["--k0", "900"], "--k0: is 900, more than --cap 800"),
+        (["--cap", "3"], "--k0: is 400, more than --cap 3"),
+        (["--seed", "-1"], "--seed: is -1"),
+        (
+            ["--backend", "cuda"],
+            "backend 'cuda': not in this version of gsplat_edu; use auto or one of: torch",
+        ),
+        (["--out", "sphere.jpg"], "--out: 'sphere.jpg' has to end in .png"),
+        (["--out", "taken/sphere.png"], "--out: cannot write taken/sphere.png"),
+        (["--out", "folder.png"], "--out: folder.png is a folder"),
+        (["--itres", "3"], "unrecognized arguments: --itres 3"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").write_text("a file where a folder is needed")
+    (tmp_path / "folder.png").mkdir()
+    try:
+        code = main(["demo", *arguments])
+    except SystemExit as exit_:
+        code = exit_.code
+    printed = capsys.readouterr()
+    assert code == 2
+    assert printed.err.count("\n") == 1 and says in printed.err
+    assert printed.err.startswith("gsplat-edu")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder.png", "taken"]
+
+
+def test_an_unknown_command_is_one_line(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["trian"])
+    assert exit_.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_debug_adds_the_traceback(capsys):
+    assert main(["demo", "--iters", "0", "--debug"]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" in error and error.splitlines()[-1].startswith("gsplat-edu demo: --iters")
+
+
+def test_without_a_command_the_help_is_shown(capsys):
+    assert main([]) == 2
+    assert "demo" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_an_example_that_parses(command, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main([command, "--help"])
+    assert exit_.value.code == 0
+    assert f"example: gsplat-edu {command} " in capsys.readouterr().out
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"gsplat-edu {version('gsplat-edu')}\n"

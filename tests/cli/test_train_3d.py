@@ -1,0 +1,76 @@
+"""The course's script, run as a user runs it."""
+
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from matplotlib.image import imread
+
+SCRIPT = Path(__file__).parents[2] / "train" / "train_3d.py"
+
+
+def run(*arguments, **options):
+    command = [sys.executable, str(SCRIPT), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+@pytest.mark.slow
+def test_the_default_budget_trains_end_to_end(tmp_path):
+    """The dense backend's reduced budget: at least threefold on the camera that was held out."""
+    out = tmp_path / "new" / "folder" / "sphere.png"
+    done = run("--out", out, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert (
+        "reduced: --iters 300 --cap 800 --size 64 (the chapter's: --iters 800 --cap 1600 --size 128)"
+        in lines[0]
+    )
+    assert re.fullmatch(r"iter    0  L1 0\.\d{4}  K 400", lines[1])
+    assert re.fullmatch(r"  densify: \+\d+ cloned, \+\d+ split children, -\d+ pruned -> K=\d+", lines[3])
+    assert re.fullmatch(r"300 iters in \d+\.\d s -> \d+\.\d{3} ms/iter at 64 px, K~800", lines[-3])
+    judged = re.fullmatch(r"held-out L1: init (0\.\d{4}) -> final (0\.\d{4})", lines[-2])
+    before, after = (float(number) for number in judged.groups())
+    assert before > 3 * after
+
+    written = {path.name for path in out.parent.iterdir()}
+    assert written == {"sphere.png", "sphere_curves.png", "sphere.ply"}
+    figure = imread(out)
+    assert figure.shape[1] > 3 * figure.shape[0], "four panels side by side"
+    ply = out.with_suffix(".ply").read_bytes()
+    assert b"element vertex 800\n" in ply and len(ply.split(b"end_header\n", 1)[1]) == 800 * 17 * 4
+
+
+def test_the_budget_on_the_command_line(tmp_path):
+    budget = ["--iters", 3, "--k0", 12, "--cap", 20, "--size", 9, "--seed", 4, "--backend", "torch"]
+    done = run(*budget, "--out", tmp_path / "x.png")
+    assert done.returncode == 0, done.stderr
+    assert "reduced" not in done.stdout, "nothing was chosen for the user"
+    assert "ms/iter at 9 px, K~12" in done.stdout
+    assert done.stdout.splitlines()[-1] == "wrote " + ", ".join(
+        str(tmp_path / name) for name in ("x.png", "x_curves.png", "x.ply")
+    )
+
+
+def test_an_interrupt_is_one_line_and_exit_code_130(tmp_path):
+    command = [
+        sys.executable,
+        "-u",
+        str(SCRIPT),
+        "--iters",
+        "100000",
+        "--size",
+        "16",
+        "--out",
+        tmp_path / "x.png",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not process.stdout.readline().startswith("iter "):
+            pass
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stderr == "train_3d.py: interrupted\n"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,23 @@
+import numpy as np
+from matplotlib.image import imread
+
+from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
+
+
+def test_panels_show_the_images_given_clipped(tmp_path):
+    bright, dark = np.full((8, 8, 3), 2.0), np.full((8, 8, 3), -1.0)
+    save_figure(tmp_path / "x.png", held_out_figure([("bright", bright), ("dark", dark)]))
+    pixels = imread(tmp_path / "x.png")[..., :3]
+    height, width, _ = pixels.shape
+    assert (pixels[height // 2, width // 4] == 1).all()
+    assert (pixels[height // 2, 3 * width // 4] == 0).all()
+
+
+def test_curves_are_labelled_and_hold_the_numbers():
+    figure = curves_figure([0.3, 0.2, 0.1], [4, 4, 7])
+    loss, count = figure.axes
+    np.testing.assert_array_equal(loss.lines[0].get_ydata(), [0.3, 0.2, 0.1])
+    np.testing.assert_array_equal(count.lines[0].get_ydata(), [4, 4, 7])
+    for axes in (loss, count):
+        assert axes.get_title() and axes.get_xlabel() and axes.get_ylabel()
+    assert loss.get_yscale() == "log"

@@ -1,0 +1,56 @@
+"""The limits of the house, and that the tool which checks them sees a breach."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def limits():
+    spec = importlib.util.spec_from_file_location("house_limits", ROOT / "tools" / "house_limits.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_repository_is_within_its_limits(limits, capsys):
+    assert limits.main(list(limits.FOLDERS)) == 0, capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("x = 1\n" * 501, "501 lines"),
+        ("def f():\n" + "    x = 1\n" * 60, "f: 61 lines"),
+        ("def f(a, b, c, d, e, f, g, h, i):\n    pass\n", "9 parameters"),
+        ("class A:\n    def f(self, a, b, c, d, e, f, *, g, h, i):\n        pass\n", "9 parameters"),
+    ],
+)
+def test_a_breach_is_named(limits, tmp_path, text, says):
+    path = tmp_path / "new.py"
+    path.write_text(text)
+    (line,) = limits.breaches(path, "new.py")
+    assert line.startswith("new.py") and says in line
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x = 1\n" * 500,
+        "def f():\n" + "    x = 1\n" * 59,
+        "class A:\n    def f(self, a, b, c, d, e, f, g, h):\n        pass\n",
+    ],
+)
+def test_the_limit_itself_is_allowed(limits, tmp_path, text):
+    path = tmp_path / "new.py"
+    path.write_text(text)
+    assert list(limits.breaches(path, "new.py")) == []
+
+
+def test_exceptions_name_functions_that_exist(limits):
+    for key in limits.EXCEPTIONS:
+        file, function = key.split(":")
+        assert f"def {function}(" in (ROOT / file).read_text()

@@ -1,0 +1,58 @@
+"""Who may import whom: the contracts of pyproject.toml, and that they would notice."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def lint(folder):
+    """Run the contracts on a copy of the package, so that a planted import is what is looked at."""
+    code = (
+        "import sys; sys.path.insert(0, 'src'); from importlinter.cli import lint_imports_command as c; c()"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture
+def copy(tmp_path):
+    shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    return tmp_path
+
+
+def test_the_contracts_hold(copy):
+    done = lint(copy)
+    assert done.returncode == 0, done.stdout
+    assert "0 broken" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("camera.py", "import gsplat_edu.scenes"),
+        ("train/trainer.py", "import gsplat_edu.data.synthetic"),
+        ("train/trainer.py", "import gsplat_edu.cli.main"),
+        ("train/density/surgery.py", "import gsplat_edu.render.torch_reference"),
+        ("render/torch_reference.py", "import gsplat_edu.render.numpy_reference"),
+        ("sh.py", "import torch"),
+        ("losses.py", "import gsplat_edu.data"),
+    ],
+)
+def test_a_planted_import_breaks_a_contract(copy, file, line):
+    path = copy / "src" / "gsplat_edu" / file
+    path.write_text(path.read_text() + f"\n{line}\n")
+    done = lint(copy)
+    assert done.returncode == 1, done.stdout
+    assert "1 broken" in done.stdout or "2 broken" in done.stdout
+
+
+def test_a_new_module_has_to_be_given_a_layer(copy):
+    (copy / "src" / "gsplat_edu" / "helpers.py").write_text("")
+    assert lint(copy).returncode == 1
