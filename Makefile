@@ -1,20 +1,21 @@
 # Everything here sets itself up in .venv first, and skips that when it is done.
-PYTHON ?= python3
-export PYTHON
+# PYTHON=python3.12 in front or behind chooses the interpreter; the default is python3.
 BIN := .venv/bin
 OUT ?= out/sphere.png
+export PYTHON
 
-.PHONY: help demo test check notebooks clean
+.PHONY: help demo test check bench notebooks clean
 
 help:
 	@echo "make demo        train the sphere on the embedded scene; writes $(OUT), curves and scene"
 	@echo "make test        all tests"
 	@echo "make check       lint, format, types, layering and the house's limits"
+	@echo "make bench       measure; prints tables and writes out/bench/*.json"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
 	@echo "make clean       remove .venv, out and caches"
 
 demo:
-	@tools/set_up.sh
+	@tools/set_up.sh demo
 	@echo "== demo: training the sphere from 24 of its own renders"
 	@$(BIN)/gsplat-edu demo --out $(OUT)
 
@@ -35,6 +36,10 @@ check:
 	@$(BIN)/lint-imports
 	@echo "== check: the house's limits"
 	@$(BIN)/python tools/house_limits.py
+
+bench:
+	@tools/set_up.sh demo
+	@$(BIN)/python benchmarks/dense.py --out out/bench/dense.json
 
 notebooks:
 	@tools/set_up.sh dev

@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
         TimeRemainingColumn(),
         console=console,
     )
+    closing: list[str] = []
     with bar:
         task = bar.add_task("sphere", total=options.budget.iters, loss=float("nan"), count=options.k0)
 
@@ -45,4 +46,5 @@ def run(arguments: argparse.Namespace) -> None:
             if isinstance(event, StepEvent):
                 bar.update(task, advance=1, loss=event.loss, count=event.num_gaussians)
 
-        run_sphere(options, [advance], say=lambda line: console.print(line, soft_wrap=True))
+        run_sphere(options, [advance], say=closing.append)
+    console.print(*closing, sep="\n", soft_wrap=True)
