@@ -53,6 +53,8 @@ REJECTED = [
     (look_at, {"eye": (0, -1, 0), "target": (0, 1, 0)}, ArgumentError, "up"),
     (look_at, {"eye": (0, 0, 0), "target": (0, 0, 1), "up": (0, 0, 0)}, ArgumentError, "up"),
     (look_at, {"eye": "here", "target": (0, 0, 1)}, ArgumentError, "eye"),
+    (look_at, {"eye": torch.ones(3, requires_grad=True), "target": (0, 0, 1)}, ArgumentError, "eye"),
+    (look_at, {"eye": [(0, 0), (1,)], "target": (0, 0, 1)}, ArgumentError, "eye"),
     (orbit_camera, {"azimuth": NAN, "elevation": 0, "size": 8, "fx": 1}, ArgumentError, "azimuth"),
     (orbit_camera, {"azimuth": 0, "elevation": INF, "size": 8, "fx": 1}, ArgumentError, "elevation"),
     (orbit_camera, {"azimuth": 0, "elevation": 0, "size": 0, "fx": 1}, ArgumentError, "H"),

@@ -48,7 +48,7 @@ def float64_array(
     """
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor that requires grad
         raise ArgumentError(f"{name}: cannot be read as an array of numbers ({error})") from None
     check_shape(name, array.shape, shape, {} if sizes is None else sizes)
     finite = np.isfinite(array)
