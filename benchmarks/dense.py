@@ -33,9 +33,7 @@ CAMERA = sphere_cameras(SIZE)[8]
 def seconds(gaussians: Gaussians, chunk: int) -> tuple[float, float]:
     """Time one forward and one backward pass."""
     start = time.perf_counter()
-    output = render(
-        gaussians, sphere_cameras(SIZE)[8], settings=RenderSettings(dense_chunk=chunk), backend="torch"
-    )
+    output = render(gaussians, CAMERA, settings=RenderSettings(dense_chunk=chunk), backend="torch")
     middle = time.perf_counter()
     output.image.mean().backward()
     return middle - start, time.perf_counter() - middle

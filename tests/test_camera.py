@@ -5,16 +5,18 @@ from gsplat_edu import ArgumentError, Camera, look_at, orbit_camera
 
 
 def test_look_at_along_z_is_the_identity():
-    np.testing.assert_allclose(look_at((0, 0, -3), (0, 0, 0)), np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(look_at((0, 0, -3), (0, 0, 0)), np.eye(3), rtol=0, atol=1e-15)
 
 
 def test_look_at_rows_are_right_down_forward():
     rng = np.random.default_rng(0)
     for eye, target in rng.normal(size=(50, 2, 3)):
         R = look_at(eye, target)
-        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(R @ R.T, np.eye(3), rtol=0, atol=1e-14)
         assert np.linalg.det(R) > 0
-        np.testing.assert_allclose(R @ (target - eye), [0, 0, np.linalg.norm(target - eye)], atol=1e-14)
+        np.testing.assert_allclose(
+            R @ (target - eye), [0, 0, np.linalg.norm(target - eye)], rtol=0, atol=1e-14
+        )
         assert abs(R[0] @ (0, -1, 0)) < 1e-14, "right is level"
         assert R[1] @ (0, -1, 0) < 0, "down points away from up"
 
@@ -22,7 +24,7 @@ def test_look_at_rows_are_right_down_forward():
 def test_looking_at_puts_the_target_in_the_middle_and_up_at_the_top():
     cam = Camera.looking_at(eye=(1, -2, -3), target=(0.5, 0, 1), fx=100, fy=90, H=60, W=80)
     u, v, z = cam.project(cam.world_to_cam([(0.5, 0, 1), (0.5, -0.1, 1)]))
-    np.testing.assert_allclose((u[0], v[0]), (40, 30), atol=1e-12)
+    np.testing.assert_allclose((u[0], v[0]), (40, 30), rtol=0, atol=1e-12)
     assert v[1] < v[0]
     np.testing.assert_allclose(z[0], np.linalg.norm([-0.5, 2, 4]))
 
@@ -67,7 +69,7 @@ def test_orbit_camera_stands_on_its_sphere_and_looks_at_the_centre():
     for azimuth in np.linspace(0, 6, 7):
         cam = orbit_camera(azimuth, 0.3, size=32, fx=40, radius=2.5)
         np.testing.assert_allclose(np.linalg.norm(cam.eye), 2.5)
-        np.testing.assert_allclose(cam.world_to_cam((0, 0, 0)), (0, 0, 2.5), atol=1e-14)
+        np.testing.assert_allclose(cam.world_to_cam((0, 0, 0)), (0, 0, 2.5), rtol=0, atol=1e-14)
     np.testing.assert_allclose(orbit_camera(0, 0, 32, 40).eye, (0, 0, -3))
     assert orbit_camera(0, 0.3, 32, 40).eye[1] > 0, "positive elevation is +y, which is down"
     with pytest.raises(ArgumentError, match="up"):

@@ -24,6 +24,8 @@ from gsplat_edu import (
     sphere_shell,
 )
 from gsplat_edu.gaussians import Gaussians, cov3d_t, quat_to_R_t
+from gsplat_edu.io.ply import save_ply
+from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import eval_sh_t, render_t
@@ -62,6 +64,8 @@ REJECTED = [
     (orbit_camera, {"azimuth": 0, "elevation": 0, "size": 8, "fx": 1, "radius": 0}, ArgumentError, "radius"),
     (Camera, camera(R=np.eye(4)), ShapeError, "R"),
     (Camera, camera(R=2 * I3), ArgumentError, "R"),
+    (Camera, camera(R=I3 + 1e-3), ArgumentError, "R"),
+    (Camera, camera(H=8.0), ArgumentError, "H"),
     (Camera, camera(R=np.diag([1, 1, -1])), ArgumentError, "R"),
     (Camera, camera(R=np.full((3, 3), NAN)), ArgumentError, "R[0, 0]"),
     (Camera, camera(eye=(0, 0, 0, 1)), ShapeError, "eye"),
@@ -100,6 +104,10 @@ REJECTED = [
     (render_gaussians, splat(cov3ds=I3), ShapeError, "cov3ds"),
     (render_gaussians, splat(cov3ds=[I3, I3]), ShapeError, "cov3ds"),
     (render_gaussians, splat(cov3ds=[-I3]), ArgumentError, "cov3ds[0]"),
+    (render_gaussians, splat(cov3ds=[-0.001 * I3]), ArgumentError, "cov3ds[0]"),
+    (render_gaussians, splat(cov3ds=[np.diag([1, 1, -9])]), ArgumentError, "cov3ds[0]"),
+    (render_gaussians, splat(cov3ds=[I3 + np.eye(3, k=1) / 2]), ArgumentError, "cov3ds[0]"),
+    (render_gaussians, splat(means=[[0, 1j, 1]]), ArgumentError, "means"),
     (render_gaussians, splat(colors=[1, 1, 1]), ShapeError, "colors"),
     (render_gaussians, splat(colors=[[1, INF, 1]]), ArgumentError, "colors[0, 1]"),
     (render_gaussians, splat(opacities=[[0.5]]), ShapeError, "opacities"),
@@ -121,6 +129,8 @@ REJECTED = [
     (sh_basis, {"dirs": (0, 1)}, ShapeError, "dirs"),
     (sh_basis, {"dirs": (0, NAN, 1)}, ArgumentError, "dirs[1]"),
     (eval_sh, {"degree": 4, "sh": np.zeros((1, 16, 3)), "dirs": [(0, 0, 1)]}, ArgumentError, "degree"),
+    (eval_sh, {"degree": 2.0, "sh": np.zeros((1, 16, 3)), "dirs": [(0, 0, 1)]}, ArgumentError, "degree"),
+    (eval_sh, {"degree": True, "sh": np.zeros((1, 16, 3)), "dirs": [(0, 0, 1)]}, ArgumentError, "degree"),
     (eval_sh, {"degree": -1, "sh": np.zeros((1, 16, 3)), "dirs": [(0, 0, 1)]}, ArgumentError, "degree"),
     (eval_sh, {"degree": 2, "sh": np.zeros((1, 4, 3)), "dirs": [(0, 0, 1)]}, ShapeError, "sh"),
     (eval_sh, {"degree": 0, "sh": np.zeros((2, 1, 3)), "dirs": [(0, 0, 1)]}, ShapeError, "dirs"),
@@ -227,7 +237,10 @@ REJECTED_TENSORS = [
     (render_t, T1 | {"cam": CAM, "cov3ds": torch.zeros(2, 3, 3)}, ShapeError, "cov3ds"),
     (render_t, T1 | {"cam": CAM, "colors": torch.full((1, 3), NAN)}, ArgumentError, "colors[0, 0]"),
     (render_t, T1 | {"cam": CAM, "opacities": torch.ones(1, 1)}, ShapeError, "opacities"),
+    (render_t, T1 | {"cam": CAM, "opacities": torch.tensor([-5.0])}, ArgumentError, "opacities[0]"),
+    (render_t, T1 | {"cam": CAM, "alpha_min": -1.0}, ArgumentError, "alpha_min"),
     (render_t, T1 | {"cam": CAM, "chunk": 0}, ArgumentError, "chunk"),
+    (RenderSettings, {"sh_degree": 9}, ArgumentError, "sh_degree"),
     (RenderSettings, {"background": (0, 0)}, ShapeError, "background"),
     (RenderSettings, {"sh_degree": -1}, ArgumentError, "sh_degree"),
     (RenderSettings, {"dense_chunk": 0}, ArgumentError, "dense_chunk"),
@@ -268,9 +281,44 @@ def test_nothing_visible_gives_the_background_and_zero_gradients(case):
     torch.testing.assert_close(out.image, torch.tensor([0.1, 0.2, 0.3]).expand(8, 9, 3))
     assert (out.transmittance == 1).all() and len(out.visible) == 0
     out.image.sum().backward()
-    for name, tensor in scene.tensors().items():
-        assert tensor.grad is None or (tensor.grad == 0).all(), name
+    for name in ("means", "quats", "log_scales", "sh0", "logit_opacities"):
+        assert (scene.tensors()[name].grad == 0).all(), name
     assert out.means2d_grad_norms().shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({"quats": np.ones((2, 4), np.float32)}, "quats"),
+        ({"sh0": torch.zeros(2, 1, 3, dtype=torch.float64)}, "sh0"),
+        ({"logit_opacities": torch.zeros(2, dtype=torch.int64)}, "logit_opacities"),
+    ],
+)
+def test_gaussians_of_other_types(changes, names):
+    with pytest.raises(ArgumentError, match=f"^{names}: "):
+        gaussians(2, **changes)
+
+
+def test_a_long_or_short_quaternion_is_the_rotation_it_was():
+    expected = quat_to_R_t(torch.tensor([[1.0, 1, 0, 0]]))
+    for factor in (1e20, 1e-30, -1.0):
+        torch.testing.assert_close(quat_to_R_t(factor * torch.tensor([[1.0, 1, 0, 0]])), expected)
+
+
+def test_a_needle_is_a_covariance():
+    """Its 2D determinant cancels, but it is symmetric and positive semi-definite, and so it is drawn."""
+    direction = np.array([0.6, 0.8, 0.0])
+    _, T = render_gaussians(**splat(cov3ds=[1e4 * np.outer(direction, direction)]))
+    assert T.min() < 0.6
+
+
+def test_losses_and_scene_files(tmp_path):
+    with pytest.raises(ShapeError, match="^target: "):
+        l1(torch.zeros(2, 2, 3), torch.zeros(1, 1, 3))
+    bad = gaussians(2, log_scales=torch.full((2, 3), NAN))
+    with pytest.raises(ArgumentError, match=r"^log_scales\[0, 0\]"):
+        save_ply(tmp_path / "x.ply", bad)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_gradient_norms_before_backward():

@@ -16,9 +16,11 @@ def test_sphere_shell_draws_azimuths_then_polar_angles():
 
 def test_disks_are_tangent_to_the_sphere():
     means, cov3ds, _, _ = sphere_shell(n=200, s_t=0.06, s_n=0.01)
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", cov3ds, means), 0.01**2 * means, atol=1e-17)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", cov3ds, means), 0.01**2 * means, rtol=0, atol=1e-17)
     eigenvalues = np.linalg.eigvalsh(cov3ds)
-    np.testing.assert_allclose(eigenvalues, np.broadcast_to([1e-4, 36e-4, 36e-4], (200, 3)), atol=1e-16)
+    np.testing.assert_allclose(
+        eigenvalues, np.broadcast_to([1e-4, 36e-4, 36e-4], (200, 3)), rtol=0, atol=1e-16
+    )
 
 
 def test_defaults():

@@ -13,19 +13,26 @@ fail() {
     exit 2
 }
 
-# The stamp is written last, so that an interrupted set-up is done again; a .venv that was moved does not match it.
-stamp="$(cat pyproject.toml constraints.txt | cksum) $PWD"
+# A stamp is written last, so that an interrupted set-up is done again.
+stamp=$(cat pyproject.toml constraints.txt | cksum)
 stands() { [ "$(cat ".venv/.set-up-$1" 2> /dev/null)" = "$stamp" ]; }
-same_python() { [ -z "${PYTHON:-}" ] || [ "$("$PYTHON" --version 2>&1)" = "$(.venv/bin/python --version 2>&1)" ]; }
 
-if { stands "$purpose" || stands dev; } && same_python; then
+# A .venv is used if it runs, was not moved here from elsewhere, and has the Python that was asked for.
+usable() {
+    .venv/bin/python -c 'pass' 2> /dev/null || return 1
+    grep -q "^VIRTUAL_ENV=.*$PWD/.venv" .venv/bin/activate || return 1
+    [ -z "${PYTHON:-}" ] || [ "$("$PYTHON" --version 2>&1)" = "$(.venv/bin/python --version 2>&1)" ]
+}
+
+if usable && { stands "$purpose" || stands dev; }; then
     echo "== set-up: already installed in .venv, skipped"
     exit 0
 fi
-if ! { stands demo && same_python; }; then
-    command -v "$python" > /dev/null || fail "there is no '$python'; name a Python from 3.11 on: make PYTHON=python3.12 ..."
-    "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
-        fail "$("$python" --version 2>&1) is too old; name a Python from 3.11 on: make PYTHON=python3.12 ..."
+if ! usable; then
+    hint="name a Python from 3.11 on: make PYTHON=python3.12 ..."
+    command -v "$python" > /dev/null || fail "there is no '$python'; $hint"
+    "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2> /dev/null ||
+        fail "'$python' does not run or is older than 3.11; $hint"
     echo "== set-up: making .venv with $("$python" --version)"
     "$python" -m venv --clear .venv ||
         fail "'$python -m venv' failed; on Debian and Ubuntu the package python3-venv is missing"

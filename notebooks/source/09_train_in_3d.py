@@ -12,7 +12,7 @@
 # ---
 
 # %% [markdown]
-# # 09 - Train in 3D, and let autograd hold the gradients
+# # 09 - A scene that is learned
 #
 # In two dimensions every gradient could be written down by hand and checked by hand. In three, a splat
 # reaches a pixel through a quaternion, a covariance, a perspective that is only linear up close, and a
@@ -169,7 +169,7 @@ SEED = 9
 generator = torch.Generator().manual_seed(SEED)
 cloud = random_ball(400, generator)
 density = DensityConfig(max_gaussians=CAP)
-config = TrainConfig(iterations=ITERATIONS, seed=SEED, density=density)
+config = TrainConfig(iterations=ITERATIONS, seed=SEED)
 print(f"{len(cloud)} splats at scale {float(cloud.scales[0, 0].detach()):.3f}")
 print(f"opacity {float(cloud.opacities[0]):.4f}, learning rates {dict(config.learning_rates)}")
 
@@ -255,12 +255,12 @@ count_ax.set(title="density control", xlabel="iteration", ylabel="number of spla
 plt.show()
 
 # %% [markdown]
-# A view that nobody trained on came out of a random cloud, a sum of absolute differences and a few rules
-# about when to copy. The count climbs in steps until it meets the cap. The loss answers each step with a
-# short spike, when raw children stand where their parent stood, and then falls below where it was: they
-# settle into what the parent could not explain.
+# Nobody trained on this view, and it is there: made of a random cloud, a sum of absolute differences and
+# a rule for making copies. In the right-hand plot each densification is a step up, until the cap. In the
+# left-hand one each step costs something first, since two children are a worse guess than the parent that
+# was fitted, and pays a little later.
 #
-# The same run is `python train/train_3d.py`, with the budget on the command line, or `gsplat-edu demo`.
+# To run this without a notebook: `python train/train_3d.py --help`, or `gsplat-edu demo`.
 
 # %% [markdown]
 # ## The next failure

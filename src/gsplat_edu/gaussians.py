@@ -27,6 +27,7 @@ class Gaussians:
 
     Raises:
         ShapeError: a shape differs, or the parameters have different N.
+        ArgumentError: a parameter is not a float tensor of the same dtype and device as the means.
     """
 
     means: Float[Tensor, "N 3"]
@@ -37,7 +38,14 @@ class Gaussians:
     logit_opacities: Float[Tensor, " N"]
 
     def __post_init__(self) -> None:
-        """Check that the shapes agree."""
+        """Check that shapes, dtypes and devices agree."""
+        given: dict[str, object] = dict(self.tensors())
+        for name, tensor in given.items():
+            if not (isinstance(tensor, Tensor) and tensor.is_floating_point()):
+                raise ArgumentError(f"{name}: has to be a float tensor, got {type(tensor).__name__}")
+            if (tensor.dtype, tensor.device) != (self.means.dtype, self.means.device):
+                wanted = f"{self.means.dtype} on {self.means.device}"
+                raise ArgumentError(f"{name}: is {tensor.dtype} on {tensor.device}, but means are {wanted}")
         sizes: dict[str, int] = {}
         for name, shape in {
             "means": ("N", 3),
@@ -81,6 +89,15 @@ class Gaussians:
         """Return the raw parameters by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    def check_finite(self) -> None:
+        """Check that no raw parameter is NaN or infinite.
+
+        Raises:
+            ArgumentError: one is; the message names the parameter and the entry.
+        """
+        for name, tensor in self.tensors().items():
+            check_tensor(name, tensor, ("...",), {})
+
     def map(self, change: Callable[[Tensor], Tensor]) -> Gaussians:
         """Return new Gaussians with the same change made to every raw parameter."""
         return Gaussians(**{name: change(tensor) for name, tensor in self.tensors().items()})
@@ -112,10 +129,13 @@ def quat_to_R_t(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     Differentiable in: quats.
     """
     check_tensor("quats", quats, ("N", 4), {})
-    length = quats.norm(dim=-1, keepdim=True)
-    if not bool((length > 0).all()):
-        raise ArgumentError(f"quats{first_index((length[:, 0] == 0).numpy(force=True))}: has zero length")
-    w, x, y, z = (quats / length).unbind(-1)
+    # The largest entry is divided out first, so that the norm neither overflows nor underflows. It may be a
+    # constant to autograd: a rotation does not depend on the quaternion's length.
+    largest = quats.detach().abs().amax(dim=-1, keepdim=True)
+    if not bool((largest > 0).all()):
+        raise ArgumentError(f"quats{first_index((largest[:, 0] == 0).numpy(force=True))}: has zero length")
+    scaled = quats / largest
+    w, x, y, z = (scaled / scaled.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

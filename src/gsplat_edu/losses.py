@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gsplat_edu.validation import check_shape
+
 
 def l1(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
     """Return the mean absolute difference of two images: mean |image - target|.
@@ -16,5 +18,9 @@ def l1(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[T
 
     Returns:
         () scalar, differentiable in both.
+
+    Raises:
+        ShapeError: the two are not of one size.
     """
+    check_shape("target", target.shape, image.shape, {})
     return torch.mean(torch.abs(image - target))

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.constants import C0, C1, C2, C3, SH_MAX_DEGREE, SH_OFFSET
 from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.validation import ArrayLike, first_index, float64_array
+from gsplat_edu.validation import ArrayLike, first_index, float64_array, whole_number
 
 UNIT_TOLERANCE = 1e-3
 """How far from 1 the length of a viewing direction may be."""
@@ -77,9 +77,7 @@ def num_coefficients(degree: int) -> int:
     Raises:
         ArgumentError: the degree is not 0, 1, 2 or 3.
     """
-    if degree not in range(SH_MAX_DEGREE + 1):
-        raise ArgumentError(f"degree: is {degree!r}, but has to be 0, 1, 2 or 3")
-    return (degree + 1) ** 2
+    return (whole_number("degree", degree, 0, SH_MAX_DEGREE) + 1) ** 2
 
 
 def basis_terms(degree: int, x: Any, y: Any, z: Any) -> list[Any]:  # noqa: ANN401

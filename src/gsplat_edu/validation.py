@@ -6,6 +6,7 @@ checked here; what they return, and what they pass on inside, carries its shape 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -47,7 +48,12 @@ def float64_array(
         ArgumentError: not numbers, or NaN or infinite somewhere.
     """
     try:
-        array = np.asarray(value, dtype=np.float64)
+        given = np.asarray(value)
+        if np.iscomplexobj(given):
+            raise ArgumentError(f"{name}: is complex, but has to be real")
+        array = given.astype(np.float64, copy=False)
+    except ArgumentError:
+        raise
     except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor that requires grad
         raise ArgumentError(f"{name}: cannot be read as an array of numbers ({error})") from None
     check_shape(name, array.shape, shape, {} if sizes is None else sizes)
@@ -97,16 +103,23 @@ def in_range(name: str, value: float, low: float, high: float = np.inf, *, open_
     return number
 
 
-def whole_number(name: str, value: object, low: int) -> int:
-    """Check that a value is a whole number of at least `low`.
+def whole_number(name: str, value: object, low: int, high: int | None = None) -> int:
+    """Check that a value is a whole number between `low` and `high`.
+
+    Returns:
+        The number as an int.
 
     Raises:
-        ArgumentError: it is not (True and 3.5 are not; 3.0 and NumPy integers are).
+        ArgumentError: it is not. True is not a number, and 3.0 is not a whole one.
     """
-    whole = isinstance(value, int | np.integer) or (isinstance(value, float) and value.is_integer())
-    if isinstance(value, bool) or not whole or int(value) < low:  # type: ignore[call-overload]
-        raise ArgumentError(f"{name}: is {value!r}, but has to be a whole number of at least {low}")
-    return int(value)  # type: ignore[call-overload, no-any-return]
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = None
+    if number is None or number < low or (high is not None and number > high):
+        bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
+        raise ArgumentError(f"{name}: is {value!r}, but has to be a whole number {bounds}")
+    return number
 
 
 def one_of(name: str, value: str, choices: Sequence[str]) -> None:

@@ -16,6 +16,20 @@ def test_demo_writes_figure_curves_and_scene(tmp_path, capsys):
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["s.ply", "s.png", "s_curves.png"]
 
 
+def test_a_name_in_brackets_is_printed_as_it_is(tmp_path, capsys):
+    out = tmp_path / "[red]x" / "s.png"
+    assert main([*TINY, "--out", str(out)]) == 0
+    assert str(out) in capsys.readouterr().out.replace("\n", "")
+
+
+def test_the_seed_decides_the_run(tmp_path, capsys):
+    scenes = []
+    for seed, name in (("4", "a"), ("4", "b"), ("5", "c")):
+        assert main([*TINY, "--seed", seed, "--out", str(tmp_path / f"{name}.png")]) == 0
+        scenes.append((tmp_path / f"{name}.ply").read_bytes())
+    assert scenes[0] == scenes[1] != scenes[2]
+
+
 def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
     arguments = ["demo", "--iters", "1", "--size", "8", "--k0", "5", "--out", str(tmp_path / "s.png")]
     assert main(arguments) == 0
@@ -32,6 +46,8 @@ def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
         (["--k0", "900"], "--k0: is 900, more than --cap 800"),
         (["--cap", "3"], "--k0: is 400, more than --cap 3"),
         (["--seed", "-1"], "--seed: is -1"),
+        (["--seed", "99999999999999999999999"], "--seed: is 99999999999999999999999"),
+        (["--iter", "3"], "unrecognized arguments: --iter 3"),
         (
             ["--backend", "cuda"],
             "backend 'cuda': not in this version of gsplat_edu; use auto or one of: torch",
@@ -54,6 +70,7 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, says, tmp_path, monkey
     assert code == 2
     assert printed.err.count("\n") == 1 and says in printed.err
     assert printed.err.startswith("gsplat-edu")
+    assert "0/" not in printed.out, "no bar was begun"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["folder.png", "taken"]
 
 

@@ -67,8 +67,11 @@ def test_an_interrupt_is_one_line_and_exit_code_130(tmp_path):
         tmp_path / "x.png",
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        while not process.stdout.readline().startswith("iter "):
-            pass
+        for line in process.stdout:  # ends by itself if the process dies
+            if line.startswith("iter "):
+                break
+        else:
+            pytest.fail(process.stderr.read())
         process.send_signal(signal.SIGINT)
         _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130

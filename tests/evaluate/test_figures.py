@@ -13,6 +13,15 @@ def test_panels_show_the_images_given_clipped(tmp_path):
     assert (pixels[height // 2, 3 * width // 4] == 0).all()
 
 
+def test_the_first_row_of_an_image_is_at_the_top(tmp_path):
+    image = np.zeros((8, 8, 3))
+    image[:4] = 1.0
+    save_figure(tmp_path / "x.png", held_out_figure([("half", image)]))
+    column = imread(tmp_path / "x.png")[:, :, 0]
+    height, width = column.shape
+    assert column[height * 2 // 5, width // 2] == 1 and column[height * 4 // 5, width // 2] == 0
+
+
 def test_curves_are_labelled_and_hold_the_numbers():
     figure = curves_figure([0.3, 0.2, 0.1], [4, 4, 7])
     loss, count = figure.axes

@@ -39,6 +39,13 @@ def test_every_make_target_is_in_the_readme_and_explained_by_make_help():
     assert targets == set(re.findall(r'"make ([a-z]+) ', makefile))
 
 
+def test_every_benchmark_has_its_results():
+    results = (ROOT / "benchmarks" / "RESULTS.md").read_text()
+    scripts = {path.name for path in (ROOT / "benchmarks").glob("*.py")} - {"hardware.py"}
+    assert scripts
+    assert [name for name in scripts if f"python benchmarks/{name}" not in results] == []
+
+
 def test_every_constant_is_in_the_decisions():
     decisions = (ROOT / "docs" / "DECISIONS.md").read_text()
     names = [name for name in vars(constants) if name.isupper()]

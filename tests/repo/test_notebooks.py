@@ -15,10 +15,10 @@ SOURCES = sorted((ROOT / "notebooks" / "source").glob("*.py"))
 CHAPTERS = pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
 
 
-def assigned(tree) -> set[str]:
-    """Collect the names a module defines at its top level."""
+def top_level_names(text: str) -> set[str]:
+    """Collect the functions, classes and constants that a module of the package defines."""
     names = set()
-    for node in tree.body:
+    for node in ast.parse(text).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             names.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
@@ -29,25 +29,22 @@ def assigned(tree) -> set[str]:
 
 def public_names() -> set[str]:
     modules = (ROOT / "src" / "gsplat_edu").rglob("*.py")
-    return {
-        name
-        for module in modules
-        for name in assigned(ast.parse(module.read_text()))
-        if not name.startswith("_")
-    }
+    names = {name for module in modules for name in top_level_names(module.read_text())}
+    return {name for name in names if not name.startswith("_")}
 
 
 def redefinitions(text: str) -> set[str]:
-    """Find names of the package that a chapter binds itself, at its top level or under another import."""
-    tree = ast.parse(text)
-    renamed = {
-        alias.asname
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        for alias in node.names
-        if alias.asname and not (isinstance(node, ast.ImportFrom) and alias.asname == alias.name)
-    }
-    return (assigned(tree) | renamed) & public_names()
+    """Find names of the package that a chapter binds itself, wherever and however it does."""
+    bound = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            bound.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del):
+            bound.add(node.id)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            ours = isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gsplat_edu")
+            bound |= {a.asname or a.name for a in node.names if not (ours and a.asname in (None, a.name))}
+    return bound & public_names()
 
 
 @CHAPTERS
@@ -65,6 +62,14 @@ def test_no_chapter_redefines_a_public_name(source):
         "from somewhere import mine as sphere_shell",
         "C0: float = 0.28",
         "def render_t(means): pass",
+        "from elsewhere import Camera",
+        "if True:\n    Z_NEAR = 1",
+        "def f():\n    def l1(a, b): pass",
+        "for Camera in range(3): pass",
+        "with open('x') as sphere_shell: pass",
+        "Z_NEAR += 1",
+        "print(T_STOP := 1)",
+        "from gsplat_edu import Camera as View",
     ],
 )
 def test_a_redefinition_would_be_found(text):
@@ -88,6 +93,7 @@ def test_what_ships_comes_from_the_source_and_was_executed(source):
     outputs = [output for cell in code for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error"]
     assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert not any("(reduced)" in output.get("text", "") for output in outputs), "ships on the full budget"
 
 
 @pytest.mark.slow
@@ -101,6 +107,7 @@ def test_chapters_execute_on_a_reduced_budget(source, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == [f"{source.stem}.ipynb"]
     notebook = nbformat.read(tmp_path / f"{source.stem}.ipynb", as_version=4)
     text = "".join(
         o.text for cell in notebook.cells for o in cell.get("outputs", []) if o.output_type == "stream"

@@ -66,6 +66,10 @@ def test_the_threshold_is_on_the_mean_over_the_views_that_see_it():
     control.times_visible[0] = 3
     _, event = control.update(100, gaussians, optimizer)
     assert event.num_cloned == 0
+    control, gaussians, optimizer = controlled(hot=[0.5, 0, 0, 0])
+    control.times_visible[0] = 1
+    _, event = control.update(100, gaussians, optimizer)
+    assert event.num_cloned == 1, "seen once, the sum is the mean"
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import View
 
 RENDER = functools.partial(render, backend="torch")
-SHORT = TrainConfig(iterations=12, density=DensityConfig(start=4, stop=12, every=4, max_gaussians=80))
+SHORT = TrainConfig(iterations=12)
+DENSITY = DensityConfig(start=4, stop=12, every=4, max_gaussians=80)
 
 
 @pytest.fixture(scope="module")
@@ -24,11 +25,11 @@ def views():
     return sphere_capture(24).train
 
 
-def trainer(views, callbacks=(), config=SHORT):
+def trainer(views, callbacks=()):
     generator = torch.Generator().manual_seed(9)
     start = random_ball(60, generator)
-    control = AdaptiveDensityControl(config.density, generator, start)
-    return Trainer(start, views, config, render=RENDER, density=control, callbacks=callbacks)
+    control = AdaptiveDensityControl(DENSITY, generator, start)
+    return Trainer(start, views, SHORT, render=RENDER, density=control, callbacks=callbacks)
 
 
 @pytest.fixture
@@ -38,16 +39,17 @@ def set_threads():
     torch.set_num_threads(before)
 
 
-def test_two_runs_give_the_same_bits_on_any_number_of_threads(views, set_threads):
-    runs = []
-    for threads in (2, 2, 1, 5):
-        set_threads(threads)
-        runs.append(trainer(views))
-        runs[-1].run()
+@pytest.mark.parametrize("threads", [1, 2])
+def test_two_runs_give_the_same_bits(set_threads, threads):
+    """64 px and chunks of 16 splats: 65,536 numbers per operation, twice what torch needs to go parallel."""
+    set_threads(threads)
+    views = sphere_capture(64).train
+    runs = [trainer(views) for _ in range(2)]
+    losses = [run.run().losses for run in runs]
+    assert losses[0] == losses[1]
     assert len(runs[0].gaussians) > 60, "density control took part"
-    for run in runs[1:]:
-        for name, tensor in runs[0].gaussians.tensors().items():
-            assert torch.equal(tensor, run.gaussians.tensors()[name]), name
+    for name, tensor in runs[0].gaussians.tensors().items():
+        assert torch.equal(tensor, runs[1].gaussians.tensors()[name]), name
 
 
 def test_callbacks_hear_of_every_step_and_densification_in_order(views):
@@ -85,7 +87,11 @@ def test_views_are_drawn_with_the_seed(views):
 
 
 def test_one_gaussian_finds_one_spot(views):
-    """Views of any origin will do: here a single blob, and the loop fits it."""
+    """Views of any origin will do: here a single blob, and the loop fits it.
+
+    Every raw parameter starts 0.05 off. Adam's slowest rate, 1e-3, covers that in 50 steps; a loop that
+    follows another gradient, or none, would not come down tenfold in 150.
+    """
     camera = views[0].camera
     blob = Gaussians(
         means=torch.tensor([[0.1, -0.1, 0.0]]),
@@ -104,9 +110,8 @@ def test_one_gaussian_finds_one_spot(views):
 def test_a_scene_that_vanishes_does_not_stop_the_run(views):
     faint = random_ball(3, torch.Generator()).map(torch.clone)
     faint.logit_opacities.fill_(-9.0)
-    config = TrainConfig(iterations=4, density=DensityConfig(start=1, stop=3, every=1))
-    control = AdaptiveDensityControl(config.density, torch.Generator(), faint)
-    run = Trainer(faint, views, config, render=RENDER, density=control)
+    control = AdaptiveDensityControl(DensityConfig(start=1, stop=3, every=1), torch.Generator(), faint)
+    run = Trainer(faint, views, TrainConfig(iterations=4), render=RENDER, density=control)
     assert run.run().counts == [3, 3, 0, 0]
 
 
@@ -125,12 +130,15 @@ def test_nothing_to_learn_from_is_refused(views):
         (lambda: TrainConfig(seed=-1), "seed"),
         (lambda: TrainConfig(learning_rates={"means": -1.0}), r"learning_rates\['means'\]"),
         (lambda: DensityConfig(every=0), "every"),
+        (lambda: DensityConfig(start=50, stop=49), "stop"),
+        (lambda: TrainConfig(iterations=2.0), "iterations"),
         (lambda: DensityConfig(max_gaussians=0), "max_gaussians"),
         (lambda: DensityConfig(extent=0.0), "extent"),
         (lambda: DensityConfig(min_opacity=2.0), "min_opacity"),
         (lambda: random_ball(-1, torch.Generator()), "count"),
     ],
 )
+@pytest.mark.usefixtures("as_shipped")
 def test_numbers_out_of_range_are_refused(make, names):
     with pytest.raises(ArgumentError, match=f"^{names}: "):
         make()
@@ -139,6 +147,15 @@ def test_numbers_out_of_range_are_refused(make, names):
 def test_a_photo_of_another_size_is_refused(views):
     with pytest.raises(ShapeError, match="^image: "):
         View(views[0].camera, np.zeros((24, 25, 3)))
+
+
+def test_photos_are_uint8_or_0_to_1(views):
+    camera = views[0].camera
+    photo = np.random.default_rng(0).integers(0, 256, (24, 24, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(View(camera, photo).image, (photo / 255).astype(np.float32))
+    for wrong in (photo.astype(float), photo / 255 - 1):
+        with pytest.raises(ArgumentError, match="^image\\[.*uint8"):
+            View(camera, wrong)
 
 
 def test_random_ball_is_the_documented_start():

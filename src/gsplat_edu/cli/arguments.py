@@ -6,7 +6,7 @@ import argparse
 import sys
 import traceback
 from collections.abc import Callable
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from gsplat_edu.errors import SplatError
 
@@ -15,7 +15,13 @@ EXIT_INTERRUPTED = 130
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser that answers a mistake with one line: what is wrong and where help is."""
+    """A parser that answers a mistake with one line: what is wrong and where help is.
+
+    Options are not abbreviated: what a script relies on keeps its meaning when options are added.
+    """
+
+    def __init__(self, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
         """Print the line and exit with 2."""

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Train, showing a bar with the loss and the number of Gaussians."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     options, notice = options_from(arguments)
     if notice:
         console.print(notice, soft_wrap=True)

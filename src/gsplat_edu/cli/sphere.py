@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float32
 
 from gsplat_edu.cli.arguments import whole_number_text
-from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
+from gsplat_edu.data.synthetic import ORBIT_RADIUS, SphereCapture, sphere_capture
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
 from gsplat_edu.files import check_writable
@@ -49,6 +49,10 @@ REDUCED = Budget(iters=300, cap=800, size=64)
 """What the dense torch backend trains by default: about a twentieth of the chapter's work."""
 
 
+MAX_SEED = 2**63 - 1
+"""What torch's generators take."""
+
+
 @dataclass(frozen=True)
 class SphereOptions:
     """Options of the run.
@@ -74,7 +78,7 @@ class SphereOptions:
         """Check the ranges."""
         for name, value in (*self.budget._asdict().items(), ("k0", self.k0)):
             whole_number(f"--{name}", value, 1)
-        whole_number("--seed", self.seed, 0)
+        whole_number("--seed", self.seed, 0, MAX_SEED)
         if self.k0 > self.budget.cap:
             raise ArgumentError(
                 f"--k0: is {self.k0}, more than --cap {self.budget.cap}; start with fewer or raise it"
@@ -128,11 +132,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def options_from(arguments: argparse.Namespace) -> tuple[SphereOptions, str | None]:
     """Turn what `add_options` parsed into options, with the budget of the backend that will run.
 
+    That the files can be written is found out here, before anything is trained. Their folder is made.
+
     Returns:
         The options, and a sentence where the budget is not the chapter's by default.
 
     Raises:
-        ArgumentError: an option is out of range.
+        ArgumentError: an option is out of range, or the files cannot be written.
         BackendUnavailableError: the backend does not run here.
     """
     backend = resolve_backend(arguments.backend)
@@ -141,6 +147,8 @@ def options_from(arguments: argparse.Namespace) -> tuple[SphereOptions, str | No
         name: getattr(arguments, name) for name in Budget._fields if getattr(arguments, name) is not None
     }
     options = SphereOptions(default._replace(**given), arguments.k0, arguments.seed, backend, arguments.out)
+    for path in options.files:
+        check_writable("--out", path)
     reduced = [name for name in Budget._fields if name not in given and default != CHAPTER]
     if not reduced:
         return options, None
@@ -160,12 +168,7 @@ def run_sphere(
         options: The options.
         callbacks: Told of every step and every densification.
         say: Prints the lines that close the run.
-
-    Raises:
-        ArgumentError: the files cannot be written; this is found out before the training.
     """
-    for path in options.files:
-        check_writable("--out", path)
     capture = sphere_capture(options.budget.size)
     renderer = functools.partial(render, backend=options.backend)
     iters = options.budget.iters
@@ -202,8 +205,8 @@ def run_sphere(
 def _trainer(
     options: SphereOptions, capture: SphereCapture, renderer: Renderer, callbacks: Sequence[Callback]
 ) -> Trainer:
-    density = DensityConfig(max_gaussians=options.budget.cap)
-    config = TrainConfig(iterations=options.budget.iters, seed=options.seed, density=density)
+    density = DensityConfig(extent=ORBIT_RADIUS, max_gaussians=options.budget.cap)
+    config = TrainConfig(iterations=options.budget.iters, seed=options.seed)
     generator = torch.Generator().manual_seed(options.seed)
     gaussians = random_ball(options.k0, generator)
     control = AdaptiveDensityControl(density, generator, gaussians)

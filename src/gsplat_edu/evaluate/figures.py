@@ -29,7 +29,7 @@ def held_out_figure(panels: Sequence[tuple[str, Float[np.ndarray, "H W 3"]]]) ->
         axes.imshow(np.clip(image, 0.0, 1.0), interpolation="nearest")
         axes.set_title(title)
         axes.axis("off")
-    figure.suptitle("held-out camera: never seen in training")
+    figure.suptitle("what the held-out camera sees")
     return figure
 
 

@@ -17,7 +17,7 @@ from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
 
 
-def save_ply(path: Path, gaussians: Gaussians) -> None:
+def save_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write Gaussians as a scene PLY.
 
     Args:
@@ -25,8 +25,10 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         gaussians: N Gaussians, raw parameters; written as float32.
 
     Raises:
+        ArgumentError: a parameter is NaN or infinite.
         OSError: the file cannot be written. What stood there before is untouched.
     """
+    gaussians.check_finite()
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     count = len(gaussians)
     sh_rest = np.concatenate(np.moveaxis(tensors["sh_rest"], 2, 0), axis=1)  # channel-major
@@ -43,5 +45,5 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
     table = np.concatenate([values for _, values in columns], axis=1).astype("<f4")
-    with written_aside(path) as aside:
+    with written_aside(Path(path)) as aside:
         aside.write_bytes("\n".join(header).encode("ascii") + table.tobytes())

@@ -1,1 +1,1 @@
-"""Gaussians and a camera in, an image out: the same stages by the same names in every backend."""
+"""Gaussians and a camera in, an image out: projection, sort and compositing, once per backend."""

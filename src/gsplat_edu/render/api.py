@@ -73,6 +73,7 @@ def render(
     """
     settings = settings or RenderSettings()
     resolve_backend(backend)  # the dense torch renderer is the only one so far
+    gaussians.check_finite()
     degree = min(settings.sh_degree, gaussians.sh_degree)
     dense = render_t(
         gaussians.means,

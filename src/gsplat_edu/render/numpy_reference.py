@@ -20,6 +20,9 @@ Extent = Literal["box3sigma", "exact"]
 Stop = Literal["box", "tile", "none"]
 Box = tuple[slice, slice]
 
+COV_TOLERANCE = 1e-6
+"""How far a covariance may be from symmetric and positive, as a fraction of its trace: room for float32."""
+
 
 class Projection(NamedTuple):
     """The visible splats in the image, near to far; ties keep the order of the input."""
@@ -106,6 +109,11 @@ def _checked(
     opacities = float64_array("opacities", opacities, ("N",), sizes)
     if np.any(outside := (opacities < 0) | (opacities > 1)):
         raise ArgumentError(f"opacities{first_index(outside)}: is outside 0 to 1")
+    trace = np.abs(np.trace(cov3ds, axis1=1, axis2=2))
+    skew = np.abs(cov3ds - np.swapaxes(cov3ds, 1, 2)).max(axis=(1, 2), initial=0.0)
+    smallest = np.linalg.eigvalsh(cov3ds)[:, 0]
+    if np.any(improper := (skew > COV_TOLERANCE * trace) | (smallest < -COV_TOLERANCE * trace)):
+        raise ArgumentError(f"cov3ds{first_index(improper)}: is not symmetric and positive semi-definite")
     return means, cov3ds, colors, opacities
 
 
@@ -115,20 +123,12 @@ def project(
     """Project what is in front of the camera to screen-space ellipses and sort it near to far.
 
     Sigma2d = J W Sigma W' J' + 0.3 I
-
-    Raises:
-        ArgumentError: a covariance projects to something that is not positive definite.
     """
     means_cam = cam.world_to_cam(means)
     index = np.flatnonzero(means_cam[:, 2] > z_near)
     index = index[np.argsort(means_cam[index, 2], kind="stable")]
     u, v, _ = cam.project(means_cam[index])
     cov2d = project_cov3d(cov3ds[index], means_cam[index], cam) + DILATION * np.eye(2)
-    improper = ~((np.linalg.det(cov2d) > 0) & (cov2d[:, 0, 0] > 0))
-    if np.any(improper):
-        raise ArgumentError(
-            f"cov3ds[{index[improper][0]}]: is not positive semi-definite, so it is no covariance"
-        )
     return Projection(index, np.stack([u, v], axis=-1), cov2d)
 
 
@@ -146,7 +146,7 @@ def _box(
     else:  # alpha = ALPHA_MIN on the ellipse d' Sigma^-1 d = 2 ln(o / ALPHA_MIN)
         level = 2.0 * np.log(max(opacity, ALPHA_MIN) / ALPHA_MIN)
         reach = np.sqrt(level * np.diag(cov2d))
-    low = np.clip(np.floor(mean2d) - np.floor(reach), 0, (cam.W, cam.H)).astype(int)
+    low = np.clip(np.floor(mean2d) - np.ceil(reach), 0, (cam.W, cam.H)).astype(int)
     high = np.clip(np.ceil(mean2d) + np.ceil(reach) + 1, 0, (cam.W, cam.H)).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])
 

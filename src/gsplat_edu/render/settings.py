@@ -30,5 +30,5 @@ class RenderSettings:
     def __post_init__(self) -> None:
         """Check the ranges."""
         float64_array("background", self.background, (3,))
-        whole_number("sh_degree", self.sh_degree, 0)
+        whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE)
         whole_number("dense_chunk", self.dense_chunk, 1)

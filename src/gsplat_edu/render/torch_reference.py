@@ -14,10 +14,10 @@ from torch import Tensor
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, SH_OFFSET, Z_NEAR
-from gsplat_edu.errors import ShapeError
+from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.gaussians import check_tensor
 from gsplat_edu.sh import basis_terms, num_coefficients
-from gsplat_edu.validation import whole_number
+from gsplat_edu.validation import first_index, in_range, whole_number
 
 
 class DenseRender(NamedTuple):
@@ -86,7 +86,7 @@ def render_t(
 
     Args:
         means: (N, 3) centres, world units.
-        cov3ds: (N, 3, 3) covariances, world units squared.
+        cov3ds: (N, 3, 3) covariances, world units squared; that they are is not checked here.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
         cam: The camera; means at depth 0.05 or nearer are culled.
@@ -100,17 +100,14 @@ def render_t(
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: an entry is NaN or infinite, or chunk is not a whole number of at least 1.
+        ArgumentError: an entry is NaN or infinite, an opacity is outside 0 to 1, alpha_min is negative, or
+            chunk is not a whole number of at least 1.
 
     Differentiable in: means, cov3ds, colors, opacities. Not in: the camera.
     Source: Kerbl et al. 2023, eq. 2-5.
     """
-    sizes: dict[str, int] = {}
-    check_tensor("means", means, ("N", 3), sizes)
-    check_tensor("cov3ds", cov3ds, ("N", 3, 3), sizes)
-    check_tensor("colors", colors, ("N", 3), sizes)
-    check_tensor("opacities", opacities, ("N",), sizes)
-    chunk = whole_number("chunk", chunk, 1)
+    _check(means, cov3ds, colors, opacities)
+    alpha_min, chunk = in_range("alpha_min", alpha_min, 0.0), whole_number("chunk", chunk, 1)
 
     screen = _project(means, cov3ds, cam)
     if track_means2d and screen.means2d.requires_grad:
@@ -125,9 +122,24 @@ def render_t(
         alpha = _alpha(screen.means2d[part], screen.conics[part], opacities[part], cam, alpha_min)
         T_after = T * torch.cumprod(1.0 - alpha, dim=0)
         T_before = torch.cat([T[None], T_after[:-1]], dim=0)
-        image = image + torch.einsum("khw,kc->hwc", T_before * alpha, colors[part])
+        image = image + torch.einsum("nyx,nc->yxc", T_before * alpha, colors[part])
         T = T_after[-1]
     return DenseRender(image, T, screen.means2d, screen.visible)
+
+
+def _check(
+    means: Float[Tensor, "N 3"],
+    cov3ds: Float[Tensor, "N 3 3"],
+    colors: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+) -> None:
+    sizes: dict[str, int] = {}
+    check_tensor("means", means, ("N", 3), sizes)
+    check_tensor("cov3ds", cov3ds, ("N", 3, 3), sizes)
+    check_tensor("colors", colors, ("N", 3), sizes)
+    check_tensor("opacities", opacities, ("N",), sizes)
+    if bool((outside := (opacities < 0) | (opacities > 1)).any()):
+        raise ArgumentError(f"opacities{first_index(outside.numpy(force=True))}: is outside 0 to 1")
 
 
 def _project(means: Float[Tensor, "N 3"], cov3ds: Float[Tensor, "N 3 3"], cam: Camera) -> _Screen:
@@ -158,5 +170,5 @@ def _alpha(
     dx = torch.arange(cam.W, dtype=means2d.dtype, device=means2d.device) - u
     dy = torch.arange(cam.H, dtype=means2d.dtype, device=means2d.device)[:, None] - v
     power = -0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy
-    alpha = torch.clamp(opacities[:, None, None] * torch.exp(power), max=ALPHA_MAX)
-    return torch.where(alpha < alpha_min, torch.zeros_like(alpha), alpha)
+    alpha = (opacities[:, None, None] * torch.exp(power)).clamp(max=ALPHA_MAX)
+    return alpha * (alpha >= alpha_min)

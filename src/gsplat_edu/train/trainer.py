@@ -86,7 +86,7 @@ class Trainer:
         self._view_order = np.random.default_rng(config.seed)
 
     def run(self) -> TrainResult:
-        """Take all the iterations of the budget."""
+        """Take all the iterations of the budget. A trainer runs once."""
         losses, counts = [], []
         start = time.perf_counter()
         for iteration in range(self.config.iterations):

@@ -18,8 +18,8 @@ from gsplat_edu.train.optimizer import Adam
 class AdaptiveDensityControl:
     """Clone the small, split the large, prune the faint.
 
-    A Gaussian whose image-space mean keeps receiving large gradients fails to explain its place. A small one
-    is copied, a large one gives way to two smaller ones drawn from it.
+    Where the loss pulls hard on a Gaussian's place in the image, one Gaussian is not enough: a small one is
+    copied, a large one gives way to two smaller ones drawn from it.
 
     Args:
         config: Window, thresholds and cap.
