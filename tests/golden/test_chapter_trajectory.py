@@ -1,9 +1,9 @@
 """The chapter's run with its seeds, up to the first densification: the same numbers, draw for draw.
 
 float32 on another machine adds in another order; 2e-4 leaves room for that and for the four printed digits,
-and is a hundredth of what the losses differ by from one view to the next. The count of the first densification
-is exact because no gradient norm is near the threshold of 2e-4: the nearest is 4.9e-7 away, a quarter of a per
-cent, and the faintest Gaussian has opacity 0.042 where 0.005 is pruned.
+and is a hundredth of what the losses differ by from one view to the next. The count of the first
+densification is exact because no gradient norm is near the threshold of 2e-4: the nearest is 4.9e-7 away, a
+quarter of a per cent, and the faintest Gaussian has opacity 0.042 where 0.005 is pruned.
 """
 
 import functools

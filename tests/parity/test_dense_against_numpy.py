@@ -87,8 +87,8 @@ def test_float32_stays_within_its_rounding(random_splats, random_camera):
     The conic carries a few eps times ac / det, the cancellation in its determinant, into the terms of the
     exponent, A dx²/2, C dy²/2 and B dx dy; u and v carry a few eps of their size, times the exponent's slope.
     Eight eps for "a few", and alpha errs by e = 8 eps (ac / det) (terms + slope max(|u|, |v|)) alpha. A pixel
-    mixes colours in [0, 1], so the errors of its splats at most add up. Where an alpha is within e of the floor
-    it may be dropped or kept: 1/255 more for each such splat.
+    mixes colours in [0, 1], so the errors of its splats at most add up. Where an alpha is within e of the
+    floor it may be dropped or kept: 1/255 more for each such splat.
     """
     splats = random_splats(80, scale=0.3)
     double = render_t(*tensors(*splats), random_camera).image
