@@ -4,12 +4,13 @@ BIN := .venv/bin
 OUT ?= out/sphere.png
 export PYTHON
 
-.PHONY: help demo test check bench notebooks clean
+.PHONY: help demo test check sanitize bench notebooks clean
 
 help:
 	@echo "make demo        train the sphere on the embedded scene; writes $(OUT), curves and scene"
 	@echo "make test        all tests"
 	@echo "make check       lint, format, types, layering and the house's limits"
+	@echo "make sanitize    native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
 	@echo "make bench       measure; prints tables and writes out/bench/*.json"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
 	@echo "make clean       remove .venv, out and caches"
@@ -37,8 +38,15 @@ check:
 	@echo "== check: the house's limits"
 	@$(BIN)/python tools/house_limits.py
 
+sanitize:
+	@tools/set_up.sh dev
+	@echo "== sanitize: building and testing the native module under sanitizers"
+	@tools/sanitize.sh
+
 bench:
 	@tools/set_up.sh demo
+	@$(BIN)/python benchmarks/raster.py --out out/bench/raster.json
+	@$(BIN)/python benchmarks/sphere.py --out out/bench/sphere.json
 	@$(BIN)/python benchmarks/dense.py --out out/bench/dense.json
 
 notebooks:

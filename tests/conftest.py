@@ -1,11 +1,21 @@
 """Fixtures that many tests share."""
 
+import importlib.util
+import os
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import settings
+
+if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: tools/sanitize.sh
+    (built,) = Path(os.environ["GSPLAT_TEST_NATIVE"]).glob("_native*.so")
+    spec = importlib.util.spec_from_file_location("gsplat_edu._native", built)
+    sys.modules["gsplat_edu._native"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sys.modules["gsplat_edu._native"])
 
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
 

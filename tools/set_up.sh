@@ -14,7 +14,7 @@ fail() {
 }
 
 # A stamp is written last, so that an interrupted set-up is done again.
-stamp=$(cat pyproject.toml constraints.txt | cksum)
+stamp=$(cat pyproject.toml constraints.txt CMakeLists.txt native/* | cksum)
 stands() { [ "$(cat ".venv/.set-up-$1" 2> /dev/null)" = "$stamp" ]; }
 
 # A .venv is used if it runs, was not moved here from elsewhere, and has the Python that was asked for.
@@ -37,6 +37,8 @@ if ! usable; then
     "$python" -m venv --clear .venv ||
         fail "'$python -m venv' failed; on Debian and Ubuntu the package python3-venv is missing"
 fi
+command -v c++ > /dev/null || command -v g++ > /dev/null || command -v clang++ > /dev/null ||
+    fail "there is no C++ compiler for the native kernels; on Debian and Ubuntu install the package g++"
 extra=
 [ "$purpose" = demo ] || extra="[$purpose]"
 echo "== set-up: installing gsplat_edu$extra with the versions in constraints.txt"

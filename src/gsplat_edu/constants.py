@@ -32,9 +32,25 @@ Source: Kerbl et al. 2023, appendix C."""
 TILE: Final = 16
 """px: edge of the square tiles in which kernels composite and stop. Source: Kerbl et al. 2023, section 6."""
 
+DET_FLOOR: Final = 1e-12
+"""px⁴: floor under the determinant of a screen-space covariance before its dilation, where antialiasing takes
+the root of its ratio to the one after. A Gaussian that is a line on the screen has determinant 0, where the
+root has no slope; below the floor the factor is constant. Source: ours."""
+
 LAMBDA_FLOOR: Final = 0.1
 """px⁴: floor under the discriminant when the larger eigenvalue of a screen-space covariance is taken for
 the 3-sigma box, so that rounding cannot make it negative. Source: Kerbl et al. 2023, its code."""
+
+SSIM_C1: Final = 0.01**2
+"""Keeps SSIM's ratio of means away from 0 / 0, for images of range 1. Source: Wang et al. 2004, K1 = 0.01."""
+
+SSIM_C2: Final = 0.03**2
+"""Keeps SSIM's ratio of variances away from 0 / 0, for images of range 1.
+Source: Wang et al. 2004, K2 = 0.03."""
+
+SSIM_SIGMA: Final = 1.5
+"""px: standard deviation of SSIM's window, 11 taps wide, zero outside the image.
+Source: Wang et al. 2004; the padding is that of Kerbl et al. 2023's code."""
 
 # Spherical harmonics: normalisations of the real basis, degree 0 to 3. Each is the number that makes its
 # polynomial's square integrate to 1 over the sphere. Source: Sloan 2008, "Stupid Spherical Harmonics Tricks".

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.camera import Camera
+from gsplat_edu.constants import DET_FLOOR, DILATION
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array
 
@@ -132,6 +133,28 @@ def project_cov3d(cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera) -> Float64
     JW = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2) @ cam.R
     cov2d: Float64[np.ndarray, "*batch 2 2"] = JW @ cov3d @ np.swapaxes(JW, -1, -2)
     return cov2d
+
+
+def opacity_compensation(cov2d: ArrayLike) -> Float64[np.ndarray, "*batch"]:
+    """Return the factor by which antialiasing lowers an opacity, so that the dilation adds no light.
+
+    sqrt(max(det Sigma2d, 1e-12) / det(Sigma2d + 0.3 I))
+
+    Args:
+        cov2d: (..., 2, 2) screen-space covariances before the dilation, px².
+
+    Returns:
+        (...) factors in (0, 1).
+
+    Raises:
+        ShapeError: the last two axes are not (2, 2).
+        ArgumentError: an entry is NaN or infinite.
+
+    Source: Yu et al. 2024, "Mip-Splatting", eq. 9 with the dilation of Kerbl et al.; the floor is ours.
+    """
+    cov2d = float64_array("cov2d", cov2d, ("...", 2, 2))
+    det, dilated = np.linalg.det(cov2d), np.linalg.det(cov2d + DILATION * np.eye(2))
+    return np.asarray(np.sqrt(np.maximum(det, DET_FLOOR) / dilated))
 
 
 def _rotations(name: str, quats: Float64[np.ndarray, "*batch 4"]) -> Float64[np.ndarray, "*batch 3 3"]:

@@ -32,8 +32,10 @@ def test_the_seed_decides_the_run(tmp_path, capsys):
 
 def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
     arguments = ["demo", "--iters", "1", "--size", "8", "--k0", "5", "--out", str(tmp_path / "s.png")]
-    assert main(arguments) == 0
+    assert main([*arguments, "--backend", "torch"]) == 0
     assert "reduced: --cap 800 (the chapter's: --cap 1600)" in capsys.readouterr().out
+    assert main(arguments) == 0
+    assert "reduced" not in capsys.readouterr().out, "the kernels take the chapter's budget"
 
 
 @pytest.mark.parametrize(
@@ -43,14 +45,14 @@ def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
         (["--iters", "many"], "argument --iters: 'many' is not a whole number"),
         (["--size", "-3"], "--size: is -3"),
         (["--k0", "0"], "--k0: is 0"),
-        (["--k0", "900"], "--k0: is 900, more than --cap 800"),
+        (["--k0", "1700"], "--k0: is 1700, more than --cap 1600"),
         (["--cap", "3"], "--k0: is 400, more than --cap 3"),
         (["--seed", "-1"], "--seed: is -1"),
         (["--seed", "99999999999999999999999"], "--seed: is 99999999999999999999999"),
         (["--iter", "3"], "unrecognized arguments: --iter 3"),
         (
             ["--backend", "cuda"],
-            "backend 'cuda': not in this version of gsplat_edu; use auto or one of: torch",
+            "backend 'cuda': not in this version of gsplat_edu; use auto or one of: cpu, torch",
         ),
         (["--out", "sphere.jpg"], "--out: 'sphere.jpg' has to end in .png"),
         (["--out", "taken/sphere.png"], "--out: cannot write taken/sphere.png"),

@@ -21,7 +21,7 @@ def run(*arguments, **options):
 def test_the_default_budget_trains_end_to_end(tmp_path):
     """The dense backend's reduced budget: at least threefold on the camera that was held out."""
     out = tmp_path / "new" / "folder" / "sphere.png"
-    done = run("--out", out, cwd=tmp_path)
+    done = run("--backend", "torch", "--out", out, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert (

@@ -4,13 +4,17 @@ float32 on another machine adds in another order; 2e-4 leaves room for that and 
 and is a hundredth of what the losses differ by from one view to the next. The count of the first
 densification is exact because no gradient norm is near the threshold of 2e-4: the nearest is 4.9e-7 away, a
 quarter of a per cent, and the faintest Gaussian has opacity 0.042 where 0.005 is pruned.
+
+The native kernels stop a tile below 1e-4 and stop nothing else; they get 1e-3, and the same first densification.
 """
 
 import functools
+import re
 
 import pytest
 import torch
 
+from gsplat_edu.cli.main import main
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
@@ -21,11 +25,12 @@ from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
 
 CHAPTER = {0: 0.2492, 20: 0.1827, 40: 0.1315, 60: 0.1152, 80: 0.1181, 100: 0.1346}
-TOLERANCE = 2e-4
+TOLERANCE = {"torch": 2e-4, "cpu": 1e-3}
 
 
 @pytest.mark.slow
-def test_the_first_hundred_iterations():
+@pytest.mark.parametrize("backend", ["torch", "cpu"])
+def test_the_first_hundred_iterations(backend):
     capture = sphere_capture(128)
     config = TrainConfig(iterations=101, seed=9)
     generator = torch.Generator().manual_seed(9)
@@ -35,17 +40,33 @@ def test_the_first_hundred_iterations():
         start,
         capture.train,
         config,
-        render=functools.partial(render, backend="torch"),
+        render=functools.partial(render, backend=backend),
         density=AdaptiveDensityControl(DensityConfig(), generator, start),
         callbacks=[lambda _, event: densified.append(event) if isinstance(event, DensifyEvent) else None],
     )
     with torch.no_grad():
-        held_out = render(trainer.gaussians, capture.held_out.camera, backend="torch").image
-    assert float(l1(held_out, torch.tensor(capture.held_out.image))) == pytest.approx(0.2360, abs=TOLERANCE)
+        held_out = render(trainer.gaussians, capture.held_out.camera, backend=backend).image
+    assert float(l1(held_out, torch.tensor(capture.held_out.image))) == pytest.approx(
+        0.2360, abs=TOLERANCE[backend]
+    )
 
     losses = trainer.run().losses
-    assert {i: losses[i] for i in CHAPTER} == pytest.approx(CHAPTER, abs=TOLERANCE)
+    assert {i: losses[i] for i in CHAPTER} == pytest.approx(CHAPTER, abs=TOLERANCE[backend])
     assert densified == [
         DensifyEvent(100, num_cloned=0, num_split_children=568, num_pruned=0, num_gaussians=684)
     ]
     assert len(trainer.gaussians) == 684
+
+
+def test_the_whole_run_on_the_kernels(tmp_path, capsys):
+    """800 iterations end at 1,600 Gaussians and a held-out L1 of at most 0.0100.
+
+    Five seeds gave 0.0076 to 0.0090, mean 0.0084, standard deviation 0.0005 (benchmarks/RESULTS.md); the chapter's
+    seed 0.0087. 0.0100 is three deviations above the mean.
+    """
+    assert main(["demo", "--backend", "cpu", "--out", str(tmp_path / "x.png")]) == 0
+    printed = capsys.readouterr().out
+    assert "K~1600" in printed and "800 iters" in printed
+    before, after = re.search(r"held-out L1: init (0\.\d{4}) -> final (0\.\d{4})", printed).groups()
+    assert float(before) == pytest.approx(0.2360, abs=2e-4)
+    assert float(after) <= 0.0100

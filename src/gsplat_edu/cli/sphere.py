@@ -25,7 +25,8 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.backends import BACKENDS, resolve_backend
+from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import DensityConfig, TrainConfig
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent, StepEvent
@@ -46,7 +47,7 @@ CHAPTER = Budget(iters=800, cap=1600, size=128)
 """The chapter's run."""
 
 REDUCED = Budget(iters=300, cap=800, size=64)
-"""What the dense torch backend trains by default: about a twentieth of the chapter's work."""
+"""What the dense backend torch trains by default: about a twentieth of the chapter's work."""
 
 
 MAX_SEED = 2**63 - 1
@@ -119,7 +120,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=whole_number_text, metavar="N", help=f"{text} {default}")
     number("--k0", 400, "Gaussians at the start")
     number("--seed", 9, "seed of the start, the splits and the view order")
-    parser.add_argument("--backend", default="auto", metavar="NAME", help="auto or torch (default: auto)")
+    names = ", ".join(("auto", *BACKENDS))
+    parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
     parser.add_argument(
         "--out",
         type=Path,
@@ -170,7 +172,8 @@ def run_sphere(
         say: Prints the lines that close the run.
     """
     capture = sphere_capture(options.budget.size)
-    renderer = functools.partial(render, backend=options.backend)
+    # depth is not looked at, and images are faster without
+    renderer = functools.partial(render, backend=options.backend, settings=RenderSettings(depth=False))
     iters = options.budget.iters
     middle = 3 * iters // 8  # the chapter shows 300 of its 800
 

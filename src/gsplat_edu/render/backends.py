@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from gsplat_edu import kernels
 from gsplat_edu.errors import BackendUnavailableError
 
-AVAILABLE = ("torch",)
-"""Backends that run on every machine: torch is the dense reference, every splat at every pixel."""
+BACKENDS = ("cpu", "torch")
+"""All backends, the fastest first: native SIMD kernels; the dense reference, every splat at every pixel."""
 
 
 def resolve_backend(name: str) -> str:
@@ -18,12 +19,20 @@ def resolve_backend(name: str) -> str:
         The name of an available backend.
 
     Raises:
-        BackendUnavailableError: no such backend here; the message lists those there are.
+        BackendUnavailableError: there is no such backend, or it does not run here; the message says why.
     """
     if name == "auto":
-        return AVAILABLE[0]
-    if name not in AVAILABLE:
+        name = BACKENDS[0]
+    if name not in BACKENDS:
         raise BackendUnavailableError(
-            f"backend {name!r}: not in this version of gsplat_edu; use auto or one of: {', '.join(AVAILABLE)}"
+            f"backend {name!r}: not in this version of gsplat_edu; use auto or one of: {', '.join(BACKENDS)}"
         )
+    reason = unavailable(name)
+    if reason:
+        raise BackendUnavailableError(f"backend {name!r}: {reason}")
     return name
+
+
+def unavailable(name: str) -> str | None:
+    """Say why a backend does not run on this machine; None where it does."""
+    return kernels.REASON if name == "cpu" else None

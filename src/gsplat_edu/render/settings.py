@@ -15,6 +15,9 @@ class RenderSettings:
     Args:
         background: Colour behind everything, RGB.
         sh_degree: Highest degree of spherical harmonics to use; less where the Gaussians store less.
+        antialiased: Lower each opacity by the light that the dilation adds (Mip-Splatting), see
+            `gsplat_edu.gaussian_math.opacity_compensation`.
+        depth: Render expected depth too. Training that does not look at depth is faster without.
         dense_chunk: Splats that the dense torch backend evaluates at once. It decides speed, not the image
             (beyond rounding); 16 keeps a chunk in a core's cache at 128 px (benchmarks/RESULTS.md).
 
@@ -25,6 +28,8 @@ class RenderSettings:
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sh_degree: int = SH_MAX_DEGREE
+    antialiased: bool = False
+    depth: bool = True
     dense_chunk: int = 16
 
     def __post_init__(self) -> None:

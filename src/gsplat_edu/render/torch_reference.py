@@ -13,9 +13,11 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.camera import Camera
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, SH_OFFSET, Z_NEAR
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, DILATION, SH_OFFSET, Z_NEAR
 from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.gaussians import check_tensor
+from gsplat_edu.gaussians import Gaussians, check_tensor, cov3d_t
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.sh import basis_terms, num_coefficients
 from gsplat_edu.validation import first_index, in_range, whole_number
 
@@ -35,6 +37,9 @@ class _Screen(NamedTuple):
     means2d: Float[Tensor, "M 2"]
     conics: Float[Tensor, "M 3"]  # inverse of the dilated 2D covariance: xx, xy, yy, px^-2
     visible: Int64[Tensor, " M"]
+    depths: Float[Tensor, " M"]
+    variances: Float[Tensor, "M 2"]  # xx and yy of the dilated 2D covariance, px^2
+    compensation: Float[Tensor, " M"]  # opacity factor of antialiasing
 
 
 def eval_sh_t(degree: int, sh: Float[Tensor, "N K 3"], dirs: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -113,10 +118,78 @@ def render_t(
     if track_means2d and screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     colors, opacities = colors[screen.visible], opacities[screen.visible]
+    image, T = _composite(screen, colors, opacities, cam, alpha_min, chunk)
+    return DenseRender(image, T, screen.means2d, screen.visible)
+
+
+def render_dense(
+    gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Float[Tensor, "3"]
+) -> RenderOutput:
+    """Render raw parameters: the backend torch of `gsplat_edu.render.api.render`.
+
+    Args:
+        gaussians: N Gaussians.
+        camera: The camera.
+        settings: The settings.
+        background: (3,) colour behind everything.
+
+    Returns:
+        The view. Differentiable in every raw parameter and the background.
+
+    Raises:
+        ArgumentError: a parameter is NaN or infinite, or a quaternion has zero length.
+    """
+    gaussians.check_finite()
+    degree = min(settings.sh_degree, gaussians.sh_degree)
+    colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
+    screen = _project(gaussians.means, cov3d_t(gaussians.log_scales, gaussians.quats), camera)
+    if screen.means2d.requires_grad:
+        screen.means2d.retain_grad()
+    opacities = gaussians.opacities[screen.visible]
+    if settings.antialiased:
+        opacities = opacities * screen.compensation
+    channels = [colors[screen.visible]] + ([screen.depths[:, None]] if settings.depth else [])
+    mixed, T = _composite(
+        screen, torch.cat(channels, dim=1), opacities, camera, ALPHA_MIN, settings.dense_chunk
+    )
+    level = 2.0 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1.0))
+    radii = torch.sqrt(level[:, None] * screen.variances.detach())
+
+    def norms() -> Tensor:
+        gradient = screen.means2d.grad
+        if gradient is None:
+            if len(screen.visible):
+                raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
+            gradient = torch.zeros_like(screen.means2d)
+        half_size = torch.tensor([camera.W / 2, camera.H / 2], dtype=gradient.dtype, device=gradient.device)
+        length: Tensor = torch.linalg.vector_norm(gradient * half_size, dim=-1)
+        return length
+
+    return RenderOutput(
+        image=mixed[..., :3] + T[..., None] * background,
+        transmittance=T,
+        depth=mixed[..., 3] if settings.depth else None,
+        visible=screen.visible,
+        radii=radii,
+        num_pairs=None,
+        grad_norms=norms,
+    )
+
+
+def _composite(
+    screen: _Screen,
+    colors: Float[Tensor, "M C"],
+    opacities: Float[Tensor, " M"],
+    cam: Camera,
+    alpha_min: float,
+    chunk: int,
+) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
+    """Mix C channels on zero, near to far; returns them and the final transmittance."""
     # Empty sums tie the image to the inputs, so that backward gives zeros when nothing is visible.
     tie = sum(tensor[:0].sum() for tensor in (screen.means2d, screen.conics, colors, opacities))
-    image = torch.zeros(cam.H, cam.W, 3, dtype=means.dtype, device=means.device) + tie
-    T = torch.ones(cam.H, cam.W, dtype=means.dtype, device=means.device)
+    dtype, device = colors.dtype, colors.device
+    image = torch.zeros(cam.H, cam.W, colors.shape[1], dtype=dtype, device=device) + tie
+    T = torch.ones(cam.H, cam.W, dtype=dtype, device=device)
     for start in range(0, len(screen.visible), chunk):
         part = slice(start, start + chunk)
         alpha = _alpha(screen.means2d[part], screen.conics[part], opacities[part], cam, alpha_min)
@@ -124,7 +197,15 @@ def render_t(
         T_before = torch.cat([T[None], T_after[:-1]], dim=0)
         image = image + torch.einsum("nyx,nc->yxc", T_before * alpha, colors[part])
         T = T_after[-1]
-    return DenseRender(image, T, screen.means2d, screen.visible)
+    return image, T
+
+
+def _viewing_directions(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 3"]:
+    """Point from the camera to each mean; a mean at the camera, which is culled, gets the zero vector."""
+    offset = means - torch.tensor(camera.eye, dtype=means.dtype, device=means.device)
+    squared = (offset * offset).sum(dim=-1, keepdim=True)
+    # where() twice, so that the square root's infinite slope at 0 never meets the chain rule.
+    return torch.where(squared > 0, offset / torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
 
 
 def _check(
@@ -154,8 +235,11 @@ def _project(means: Float[Tensor, "N 3"], cov3ds: Float[Tensor, "N 3 3"], cam: C
     JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
     cov2d = JW @ cov3ds[visible] @ JW.mT
     a, b, c = cov2d[:, 0, 0] + DILATION, cov2d[:, 0, 1], cov2d[:, 1, 1] + DILATION
-    conics = torch.stack([c, -b, a], dim=-1) / (a * c - b * b)[:, None]
-    return _Screen(means2d, conics, visible)
+    det = a * c - b * b
+    conics = torch.stack([c, -b, a], dim=-1) / det[:, None]
+    det_before = cov2d[:, 0, 0] * cov2d[:, 1, 1] - b * b
+    compensation = torch.sqrt(det_before.clamp(min=DET_FLOOR) / det)
+    return _Screen(means2d, conics, visible, z, torch.stack([a, c], dim=-1), compensation)
 
 
 def _alpha(

@@ -10,14 +10,18 @@ from torch import Tensor
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.kernels import kernel
 
 
 class Adam:
     """Adam over the raw parameters of Gaussians.
 
-    m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g²,  p -= rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)
+    m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g²
+    p -= rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)
 
-    The step count t is shared by all and survives density control, as in Kerbl et al.'s code.
+    The step count t is shared by all and survives density control, as in Kerbl et al.'s code. On the CPU a
+    step is one native pass over each parameter, the same to the bit on any number of threads; elsewhere it is
+    torch's.
 
     Args:
         gaussians: The parameters to move.
@@ -58,10 +62,13 @@ class Adam:
             parameter, m, v = tensors[name], self.first[name], self.second[name]
             if parameter.grad is None:
                 continue
-            m.mul_(b1).add_(parameter.grad, alpha=1 - b1)
-            v.mul_(b2).addcmul_(parameter.grad, parameter.grad, value=1 - b2)
-            m_hat, v_hat = m / (1 - b1**self.steps), v / (1 - b2**self.steps)
-            parameter -= rate * m_hat / (v_hat.sqrt() + self.eps)
+            numbers = (rate, b1, b2, self.eps, 1 - b1**self.steps, 1 - b2**self.steps)
+            if parameter.device.type == "cpu":
+                arrays = (parameter, m, v, parameter.grad.contiguous())
+                step = kernel("adam_f", parameter.dtype)
+                step([a.data_ptr() for a in arrays], parameter.numel(), numbers, torch.get_num_threads())
+            else:
+                _step_in_torch(parameter, m, v, numbers)
         for parameter in tensors.values():
             parameter.grad = None
 
@@ -76,3 +83,12 @@ class Adam:
         for moments in (self.first, self.second):
             for name, old in moments.items():
                 moments[name] = torch.cat([old[survivors], old.new_zeros(num_new, *old.shape[1:])])
+
+
+def _step_in_torch(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:
+    rate, b1, b2, eps, correction1, correction2 = numbers
+    gradient = parameter.grad
+    if gradient is not None:
+        m.mul_(b1).add_(gradient, alpha=1 - b1)
+        v.mul_(b2).addcmul_(gradient, gradient, value=1 - b2)
+        parameter -= rate * (m / correction1) / ((v / correction2).sqrt() + eps)

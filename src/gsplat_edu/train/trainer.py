@@ -13,7 +13,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import l1
-from gsplat_edu.render.api import RenderOutput
+from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import DensifyEvent, StepEvent

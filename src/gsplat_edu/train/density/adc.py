@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.render.api import RenderOutput
+from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.train.config import DensityConfig
 from gsplat_edu.train.density.surgery import replace, split_children
 from gsplat_edu.train.events import DensifyEvent

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol, runtime_checkable
 
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.render.api import RenderOutput
+from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.optimizer import Adam
 

@@ -1,0 +1,110 @@
+"""How long does an iteration of the course's training take, on the kernels and on the dense renderer?
+
+    python benchmarks/sphere.py [--out FILE.json]
+
+The chapter's run ends at 1,600 Gaussians at 128 px. From there, the number of Gaussians fixed, both backends take
+turns: the dense renderer with the chapter's chunk of 512 splats and with the 16 it trains with, the kernels in
+between. Then the kernels train all 800 iterations.
+"""
+
+from __future__ import annotations
+
+import functools
+import statistics
+import time
+
+import hardware
+import torch
+
+from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.losses import l1
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train.density.adc import AdaptiveDensityControl
+from gsplat_edu.train.initialize import random_ball
+from gsplat_edu.train.trainer import Trainer
+
+NATIVE = functools.partial(render, backend="cpu", settings=RenderSettings(depth=False))
+DENSE = {
+    chunk: functools.partial(render, backend="torch", settings=RenderSettings(depth=False, dense_chunk=chunk))
+    for chunk in (512, 16)
+}
+
+
+def whole_run() -> tuple[Gaussians, float]:
+    """Train the chapter's 800 iterations; return the scene and the milliseconds per iteration."""
+    capture = sphere_capture(128)
+    generator = torch.Generator().manual_seed(9)
+    start = random_ball(400, generator)
+    control = AdaptiveDensityControl(DensityConfig(), generator, start)
+    trainer = Trainer(start, capture.train, TrainConfig(), render=NATIVE, density=control)
+    result = trainer.run()
+    return trainer.gaussians, 1e3 * result.seconds / len(result.losses)
+
+
+def iteration_ms(scene: Gaussians, renderer: object, iterations: int) -> float:
+    """Time iterations of a fixed number of Gaussians."""
+    capture = sphere_capture_once()
+    trainer = Trainer(scene, capture.train, TrainConfig(iterations=iterations), render=renderer)
+    return 1e3 * trainer.run().seconds / iterations
+
+
+@functools.cache
+def sphere_capture_once() -> SphereCapture:
+    """Take the photos once."""
+    return sphere_capture(128)
+
+
+def stages(scene: Gaussians, rounds: int = 200) -> dict[str, float]:
+    """Split an iteration of the kernels into its stages, in milliseconds."""
+    view = sphere_capture_once().train[0]
+    target, leaves = torch.tensor(view.image), scene.trainable()
+    names = ("project", "sort", "intersect", "composite", "composite_backward", "project_backward")
+    found: dict[str, list[float]] = {name: [] for name in (*names, "render", "loss", "backward")}
+    for _ in range(rounds):
+        start = time.perf_counter()
+        output = NATIVE(leaves, view.camera)
+        frame = output.image.grad_fn.frame
+        rendered = time.perf_counter()
+        loss = l1(output.image, target)
+        compared = time.perf_counter()
+        loss.backward()
+        done = time.perf_counter()
+        for name, seconds in zip(names, frame.seconds, strict=True):
+            found[name].append(seconds)
+        found["render"].append(rendered - start)
+        found["loss"].append(compared - rendered)
+        found["backward"].append(done - compared)
+    return {name: 1e3 * statistics.median(times) for name, times in found.items()}
+
+
+def main() -> None:
+    """Measure, print the table, write the JSON."""
+    arguments = hardware.parser("The course's training: kernels against the dense renderer.").parse_args()
+    runs = [whole_run() for _ in range(3)]
+    scene = runs[0][0]
+    rounds = []
+    for _ in range(3):
+        rounds.append({"native": iteration_ms(scene, NATIVE, 200)})
+        rounds[-1] |= {f"dense {chunk}": iteration_ms(scene, DENSE[chunk], 3) for chunk in DENSE}
+    ratios = {name: statistics.median(r[name] / r["native"] for r in rounds) for name in rounds[0]}
+    medians = {name: statistics.median(r[name] for r in rounds) for name in rounds[0]}
+    split = stages(scene)
+    result = {
+        "run_ms": [ms for _, ms in runs],
+        "iteration_ms": medians,
+        "times_native": ratios,
+        "stages_ms": split,
+    }
+    hardware.report(result, arguments.out)
+    print(f"800 iterations, three runs: {', '.join(f'{ms:.3f}' for _, ms in runs)} ms per iteration")
+    print(f"one iteration at K = {len(scene)}:")
+    for name in medians:
+        print(f"  {name:10} {medians[name]:10.3f} ms   {ratios[name]:8.1f} x the kernels")
+    print("stages, ms: " + ", ".join(f"{name} {ms:.3f}" for name, ms in split.items()))
+
+
+if __name__ == "__main__":
+    main()

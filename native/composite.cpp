@@ -1,0 +1,100 @@
+// composite: one tile's splats, near to far, into its pixels.
+//
+//     alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
+//
+// The tile ends before the first splat that finds every pixel below 1e-4.
+#include "isa.h"
+#include "tile.h"
+
+namespace gsplat {
+namespace GSPLAT_ISA {
+
+template <class T>
+struct TileState {
+    alignas(64) T transmittance[TILE][TILE];
+    alignas(64) T red[TILE][TILE], green[TILE][TILE], blue[TILE][TILE], depth[TILE][TILE];
+};
+
+// Draws one splat; returns whether a pixel of the rows it touched still lets light through.
+template <class T, bool DEPTH>
+GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileState<T> &tile) {
+    using V = typename Vector<T>::V;
+    constexpr int LANES = Vector<T>::LANES;
+    V brightest = V{};
+    for (int column = 0; column < TILE; column += LANES) {
+        const V dx = iota<T>() + splat(T(column + box.x0) - s.u);
+        const V along = splat(s.log2_o) + splat(s.a) * dx * dx, cross = splat(s.b) * dx;
+        V dy = splat(T(first + box.y0) - s.v);
+        for (int row = first; row <= last; ++row, dy += splat(T(1))) {
+            const V p = along + dy * (cross + splat(s.c) * dy);
+            const V alpha = clamped(exp2_small(p), T(ALPHA_MAX), p, T(LOG2_ALPHA_MIN));
+            V t = load<V>(&tile.transmittance[row][column]);
+            const V w = t * alpha;
+            store(&tile.red[row][column], load<V>(&tile.red[row][column]) + w * splat(s.color[0]));
+            store(&tile.green[row][column], load<V>(&tile.green[row][column]) + w * splat(s.color[1]));
+            store(&tile.blue[row][column], load<V>(&tile.blue[row][column]) + w * splat(s.color[2]));
+            if (DEPTH) store(&tile.depth[row][column], load<V>(&tile.depth[row][column]) + w * splat(s.depth));
+            t -= w;
+            store(&tile.transmittance[row][column], t);
+            brightest = brightest > t ? brightest : t;
+        }
+    }
+    return any_at_least(brightest, T(T_STOP));
+}
+
+template <class T>
+GSPLAT_INLINE bool lets_light_through(const TileState<T> &tile) {
+    using V = typename Vector<T>::V;
+    V brightest = V{};
+    for (int row = 0; row < TILE; ++row)
+        for (int column = 0; column < TILE; column += Vector<T>::LANES) {
+            const V t = load<V>(&tile.transmittance[row][column]);
+            brightest = brightest > t ? brightest : t;
+        }
+    return any_at_least(brightest, T(T_STOP));
+}
+
+template <class T, bool DEPTH>
+void composite_tile(const CompositeArgs<T> &args, int32_t index) {
+    const TileBox box = tile_box(args.grid, args.camera, index);
+    TileState<T> tile;
+    memset(&tile, 0, sizeof tile);
+    for (int y = 0; y < box.height; ++y)
+        for (int x = 0; x < box.width; ++x) tile.transmittance[y][x] = 1;
+
+    const uint32_t begin = args.tile_begin[index], end = args.tile_begin[index + 1];
+    uint32_t k = begin;
+    Rows rows;
+    for (; k < end; ++k) {
+        const uint32_t i = (k - begin) % BATCH;
+        if (i == 0) rows_of(args.splats, args.pairs + k, vmin(BATCH, end - k), box, rows);
+        if (rows.first[i] > rows.last[i]) continue;
+        const Splat<T> &s = args.splats[args.pairs[k].gaussian];
+        if (!draw<T, DEPTH>(s, box, rows.first[i], rows.last[i], tile) && !lets_light_through(tile)) {
+            ++k;
+            break;
+        }
+    }
+    args.done[index] = k - begin;
+    for (int y = 0; y < box.height; ++y)
+        for (int x = 0; x < box.width; ++x) {
+            const int64_t pixel = int64_t(box.y0 + y) * args.camera.W + box.x0 + x;
+            const T t = tile.transmittance[y][x];
+            args.image[3 * pixel] = tile.red[y][x] + t * T(args.settings.background[0]);
+            args.image[3 * pixel + 1] = tile.green[y][x] + t * T(args.settings.background[1]);
+            args.image[3 * pixel + 2] = tile.blue[y][x] + t * T(args.settings.background[2]);
+            args.transmittance[pixel] = t;
+            if (DEPTH) args.depth[pixel] = tile.depth[y][x];
+        }
+}
+
+template <class T>
+void composite(const CompositeArgs<T> &args, int32_t tile) {
+    args.depth ? composite_tile<T, true>(args, tile) : composite_tile<T, false>(args, tile);
+}
+
+template void composite<float>(const CompositeArgs<float> &, int32_t);
+template void composite<double>(const CompositeArgs<double> &, int32_t);
+
+}  // namespace GSPLAT_ISA
+}  // namespace gsplat

@@ -1,0 +1,173 @@
+// What the kernels take and give: raw pointers and sizes, the same for every instruction set.
+//
+// A kernel works on a range of its items and writes only what belongs to them, so any number of threads may run
+// any ranges in any order and the result is the same to the bit.
+#pragma once
+
+#include <stdint.h>
+
+#include "constants.h"
+
+namespace gsplat {
+
+// Pinhole camera in OpenCV axes: x_cam = R (x - eye), u = fx x/z + cx.
+struct Camera {
+    double R[9];
+    double eye[3];
+    double fx, fy, cx, cy;
+    int32_t H, W;
+};
+
+// Choices of one render.
+struct Settings {
+    double z_near;
+    double background[3];
+    int32_t sh_degree;
+    int32_t antialiased;
+};
+
+// N Gaussians. Either raw parameters (quats is not null) or covariances, colours and opacities.
+template <class T>
+struct Scene {
+    int64_t n;
+    const T *means;                                    // N 3
+    const T *quats, *log_scales;                       // N 4, N 3
+    const T *sh0, *sh_rest, *logit_opacities;          // N 3, N rest 3, N
+    int32_t rest;                                      // coefficients per channel in sh_rest
+    const T *cov3ds, *colors, *opacities;              // N 3 3, N 3, N
+};
+
+// Gradients of the same; every entry of a range is written, zeros included.
+template <class T>
+struct SceneGrads {
+    T *means, *quats, *log_scales, *sh0, *sh_rest, *logit_opacities, *cov3ds, *colors, *opacities;
+    T *means2d_norm;                                   // N, |(gu W/2, gv H/2)|
+};
+
+// One visible Gaussian on the screen, in base 2: alpha = 2^(log2_o + a dx² + b dx dy + c dy²).
+template <class T>
+struct Splat {
+    T u, v;
+    T a, b, c;
+    T log2_o;
+    T color[3];
+    T depth;
+    T extent[2];                                       // half width and height of alpha >= 1/255, px
+};
+
+// One Gaussian in one tile: which, and where its partial gradients go.
+struct Pair {
+    uint32_t gaussian;
+    uint32_t slot;
+};
+
+// Partial sums of one pair, in this order: w g by colour channel, the moments of h, and w times the depth's gradient.
+enum Sum { RED, GREEN, BLUE, H, HX, HXX, HY, HXY, HYY, DEPTH, SLOT };
+
+struct Grid {
+    int32_t tiles_x, tiles_y;
+    int32_t tiles() const { return tiles_x * tiles_y; }
+};
+
+template <class T>
+struct ProjectArgs {
+    Scene<T> scene;
+    Camera camera;
+    Settings settings;
+    Splat<T> *splats;                                  // N, filled where visible
+    uint32_t *visible;                                 // ids, compact within each block
+    uint32_t *block_visible;                           // count per block of BLOCK Gaussians
+};
+
+template <class T>
+struct IntersectArgs {
+    const Splat<T> *splats;
+    const uint32_t *sorted;                            // ids, near to far
+    Grid grid;
+    Camera camera;
+    uint32_t *pairs_of;                                // N, tiles that each Gaussian touches
+    const uint32_t *slot_begin;                        // N, first slot of each Gaussian
+    Pair *pairs;
+};
+
+template <class T>
+struct CompositeArgs {
+    const Splat<T> *splats;
+    const Pair *pairs;
+    const uint32_t *tile_begin;                        // tiles + 1
+    Grid grid;
+    Camera camera;
+    Settings settings;
+    T *image, *transmittance, *depth;                  // H W 3, H W, H W (depth may be null)
+    uint32_t *done;                                    // tiles, pairs composited before the tile ended
+};
+
+template <class T>
+struct CompositeBackwardArgs {
+    CompositeArgs<T> forward;
+    const T *grad_image, *grad_transmittance, *grad_depth;  // H W 3; the others may be null
+    T *slots;                                          // pairs x SLOT
+    T *tile_background;                                // tiles x 3, sum of g T_final
+};
+
+template <class T>
+struct ProjectBackwardArgs {
+    Scene<T> scene;
+    Camera camera;
+    Settings settings;
+    const uint32_t *pairs_of, *slot_begin;
+    const T *slots;
+    SceneGrads<T> grads;
+};
+
+template <class T>
+struct AdamArgs {
+    T *parameter, *first, *second;
+    const T *gradient;
+    double rate, beta1, beta2, eps, correction1, correction2;
+};
+
+constexpr int SSIM_HALF = 5;                           // taps on either side of the middle one
+constexpr int64_t SSIM_BAND = 32;                      // image rows a thread takes at a time
+
+constexpr int64_t SSIM_STRIP = 384;                    // and numbers of each row; a multiple of every vector's width
+
+template <class T>
+struct LossArgs {
+    const T *image, *target;                           // H W 3
+    const uint8_t *target_bytes;                       // H W 3, used instead of target where not null
+    int32_t H, W;
+    double ssim_weight;
+    T *maps;                                           // 3 H W 3: derivatives of SSIM by mean, variance, covariance
+    T *grad;                                           // H W 3
+    double *sums;                                      // bands x 2: sums of |x - y| and of SSIM
+
+    int64_t bands() const { return (H + SSIM_BAND - 1) / SSIM_BAND; }
+    // Numbers of scratch that a band needs.
+    static constexpr int64_t SCRATCH = 4 * (SSIM_BAND + 2 * SSIM_HALF) * SSIM_STRIP;
+};
+
+constexpr int64_t BLOCK = 256;                         // Gaussians a thread takes at a time
+
+// The kernels of one instruction set and scalar type.
+template <class T>
+struct Kernels {
+    void (*project)(const ProjectArgs<T> &, int64_t block);
+    void (*count)(const IntersectArgs<T> &, int64_t begin, int64_t end, uint32_t *per_tile);
+    void (*scatter)(const IntersectArgs<T> &, int64_t begin, int64_t end, uint32_t *next);
+    void (*composite)(const CompositeArgs<T> &, int32_t tile);
+    void (*composite_backward)(const CompositeBackwardArgs<T> &, int32_t tile);
+    void (*project_backward)(const ProjectBackwardArgs<T> &, int64_t block);
+    void (*adam)(const AdamArgs<T> &, int64_t begin, int64_t end);
+    void (*loss_forward)(const LossArgs<T> &, int64_t band, T *scratch);
+    void (*loss_backward)(const LossArgs<T> &, int64_t band, T *scratch);
+};
+
+struct Isa {
+    const char *name;
+    Kernels<float> f32;
+    Kernels<double> f64;
+    int (*fma_benchmark)(int64_t rounds, float *sink); // independent vector FMAs, returns FMAs per round
+};
+
+}  // namespace gsplat

@@ -1,0 +1,102 @@
+#include "threads.h"
+
+#include <unistd.h>
+
+#include <atomic>
+#include <condition_variable>
+#include <memory>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace gsplat {
+namespace {
+
+// Work is announced by a new round number. Workers spin for it a little while, because the next stage of a frame
+// comes within microseconds, and then sleep.
+class Pool {
+  public:
+    ~Pool() {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            quit_ = true;
+            round_.fetch_add(1);
+        }
+        wake_.notify_all();
+        for (auto &worker : workers_) worker.join();
+    }
+
+    void run(int threads, int64_t count, const Task &task) {
+        while (int(workers_.size()) < threads - 1) workers_.emplace_back([this, id = int(workers_.size())] { work(id); });
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            task_ = &task;
+            count_ = count;
+            next_.store(0);
+            helpers_ = threads - 1;
+            open_ = true;
+            round_.fetch_add(1);
+        }
+        wake_.notify_all();
+        drain(0);
+        {  // whoever has not come by now is not waited for: its core may be busy with something else
+            std::lock_guard<std::mutex> lock(mutex_);
+            open_ = false;
+        }
+        while (active_.load() > 0) std::this_thread::yield();
+    }
+
+  private:
+    void drain(int worker) {
+        for (int64_t i = next_.fetch_add(1); i < count_; i = next_.fetch_add(1)) (*task_)(i, worker);
+    }
+
+    void work(int id) {
+        uint64_t seen = 0;
+        for (;;) {
+            for (int spin = 0; spin < 2000 && round_.load() == seen; ++spin) std::this_thread::yield();
+            {
+                std::unique_lock<std::mutex> lock(mutex_);
+                wake_.wait(lock, [&] { return round_.load() != seen; });
+                seen = round_.load();
+                if (quit_) return;
+                if (!open_ || id >= helpers_) continue;
+                active_.fetch_add(1);
+            }
+            drain(id + 1);
+            active_.fetch_sub(1);
+        }
+    }
+
+    std::vector<std::thread> workers_;
+    std::mutex mutex_;
+    std::condition_variable wake_;
+    std::atomic<uint64_t> round_{0};
+    std::atomic<int64_t> next_{0};
+    std::atomic<int> active_{0};
+    const Task *task_ = nullptr;
+    int64_t count_ = 0;
+    int helpers_ = 0;
+    bool open_ = false, quit_ = false;
+};
+
+std::mutex pool_mutex;
+
+}  // namespace
+
+void parallel(int threads, int64_t count, const Task &task) {
+    if (threads <= 1 || count <= 1) {
+        for (int64_t i = 0; i < count; ++i) task(i, 0);
+        return;
+    }
+    static Pool *pool = nullptr;
+    static pid_t owner = 0;
+    std::lock_guard<std::mutex> lock(pool_mutex);
+    if (owner != getpid()) {  // a forked child has none of its parent's threads
+        pool = new Pool;
+        owner = getpid();
+    }
+    pool->run(threads, count, task);
+}
+
+}  // namespace gsplat

@@ -1,0 +1,54 @@
+// What compositing a tile and going back through it share.
+#pragma once
+
+#include "gaussian_math.h"
+
+namespace gsplat {
+namespace GSPLAT_ISA {
+
+// Pixels of one tile inside the image.
+struct TileBox {
+    int32_t x0, y0, width, height;
+};
+
+GSPLAT_INLINE TileBox tile_box(const Grid &grid, const gsplat::Camera &cam, int32_t tile) {
+    TileBox box;
+    box.x0 = tile % grid.tiles_x * TILE, box.y0 = tile / grid.tiles_x * TILE;
+    box.width = vmin(TILE, cam.W - box.x0), box.height = vmin(TILE, cam.H - box.y0);
+    return box;
+}
+
+// The rows of a tile that each of its next few splats can touch; first > last where it touches none.
+constexpr uint32_t BATCH = 16;
+
+struct Rows {
+    int32_t first[BATCH], last[BATCH];
+};
+
+// Over the tile's columns [low, high] (relative to the mean) the ellipse reaches from its highest to its lowest point, or
+// to where the band ends nearest to that point. At width dx it spans dy = tangent dx +- half sqrt(1 - (dx / ex)²).
+// Plain loops over BATCH lanes, which the compiler turns into vectors.
+template <class T>
+GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, Rows &rows) {
+    T u[BATCH], v[BATCH], a[BATCH], b[BATCH], c[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
+    for (uint32_t i = 0; i < BATCH; ++i) {
+        const Splat<T> &s = splats[pairs[i < count ? i : 0].gaussian];
+        u[i] = s.u, v[i] = s.v, a[i] = s.a, b[i] = s.b, c[i] = s.c, ex[i] = s.extent[0], ey[i] = s.extent[1];
+        drop[i] = s.log2_o - T(LOG2_ALPHA_MIN);
+    }
+    const T x0 = T(box.x0), y0 = T(box.y0), lowest = T(box.height - 1), slack = T(1e-3);
+    for (uint32_t i = 0; i < BATCH; ++i) {
+        const T low = x0 - u[i], high = low + T(TILE - 1);
+        const T tangent = -b[i] / (2 * c[i]), half = sqrt_(vmax(drop[i] / -c[i], T(0)));
+        const T foot = -b[i] / (2 * a[i]) * ey[i];
+        const T xb = vmin(vmax(foot, low), high), xt = vmin(vmax(-foot, low), high);
+        const T qb = vmax(1 - (xb / ex[i]) * (xb / ex[i]), T(0)), qt = vmax(1 - (xt / ex[i]) * (xt / ex[i]), T(0));
+        const T bottom = v[i] - y0 + tangent * xb + half * sqrt_(qb) + slack;
+        const T top = v[i] - y0 + tangent * xt - half * sqrt_(qt) - slack;
+        rows.first[i] = int32_t(ceil_(vmin(vmax(top, T(0)), T(TILE))));
+        rows.last[i] = int32_t(floor_(vmin(vmax(bottom, T(-1)), lowest)));
+    }
+}
+
+}  // namespace GSPLAT_ISA
+}  // namespace gsplat

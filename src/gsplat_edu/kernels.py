@@ -1,0 +1,38 @@
+"""The native module, or the reason why it is not there. Every call of a native kernel goes through here."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+import torch
+
+from gsplat_edu.errors import BackendUnavailableError
+
+_native: ModuleType | None
+REASON: str | None
+"""Why the native module does not load, and what to do; None where it does."""
+
+try:
+    _native = importlib.import_module("gsplat_edu._native")
+except ImportError as error:
+    _native = None
+    mend = "unset it" if "GSPLAT_EDU_ISA" in str(error) else "install gsplat_edu again"
+    REASON = f"the native module does not load ({error}); {mend}, or use the backend torch"
+else:
+    REASON = None
+
+SUFFIXES = {torch.float32: "32", torch.float64: "64"}
+"""How native names end by scalar type: float for speed, double for proof."""
+
+
+def kernel(name: str, dtype: torch.dtype) -> Any:  # noqa: ANN401
+    """Look up a native function or class by its name without the scalar type, "adam_f" for example.
+
+    Raises:
+        BackendUnavailableError: the native module is not there.
+    """
+    if _native is None:
+        raise BackendUnavailableError(f"native kernels: {REASON}")
+    return getattr(_native, name + SUFFIXES[dtype])

@@ -1,0 +1,209 @@
+"""What must not happen: crashes, hangs, leaks, and one bad Gaussian spoiling the others."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu import ArgumentError, Camera, _native
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.settings import RenderSettings
+from native_scenes import camera, random
+
+POISONS = (float("nan"), float("inf"), -float("inf"), 1e-42, 3e38, -3e38, 1e20, -1e20, 0.0)
+
+
+def poisoned(gaussians: Gaussians, victims: torch.Tensor, rng: np.random.Generator) -> Gaussians:
+    """Put a poison into one random number of one parameter of every victim."""
+    changed = gaussians.map(torch.clone)
+    names = list(changed.tensors())
+    for victim in victims.tolist():
+        numbers = changed.tensors()[names[rng.integers(len(names))]][victim].view(-1)
+        numbers[rng.integers(len(numbers))] = POISONS[rng.integers(len(POISONS))]
+    return changed
+
+
+@pytest.mark.parametrize("block", range(8))
+def test_poison_stays_where_it_is(block):
+    """25 seeds a block, 200 in all: where no victim is drawn, image and gradients are those without the victims.
+
+    A victim is still drawn where its numbers can be (a scale of 0, a huge but finite colour): then it is part of
+    the image, and the others' gradients have to stay finite.
+    """
+    for seed in range(25 * block, 25 * block + 25):
+        rng = np.random.default_rng(seed)
+        scene = random(40, seed=seed)
+        victims = torch.tensor(rng.choice(40, 5, replace=False))
+        changed = poisoned(scene.gaussians(torch.float32), victims, rng).trainable()
+        out = render(changed, scene.camera, backend="cpu")
+        assert torch.isfinite(out.transmittance).all(), seed
+        weights = torch.tensor(rng.normal(size=out.image.shape), dtype=torch.float32)
+        (out.image * weights).sum().backward()
+        others = torch.ones(40, dtype=torch.bool)
+        others[victims] = False
+        drawn = set(out.visible.tolist())
+        if not drawn & set(victims.tolist()):
+            clean = scene.gaussians(torch.float32).map(lambda t, others=others: t[others].clone()).trainable()
+            expected = render(clean, scene.camera, backend="cpu")
+            assert torch.equal(out.image, expected.image), seed
+            (expected.image * weights).sum().backward()
+            for name, tensor in changed.tensors().items():
+                assert torch.equal(tensor.grad[others], clean.tensors()[name].grad), (seed, name)
+        sane = all(float(changed.tensors()["sh0"][v].detach().abs().max()) < 1e6 for v in drawn)
+        sane = sane and all(float(changed.sh_rest[v].detach().abs().max()) < 1e6 for v in drawn)
+        if sane:
+            assert torch.isfinite(out.image).all(), seed
+            for name, tensor in changed.tensors().items():
+                assert torch.isfinite(tensor.grad[others]).all(), (seed, name)
+
+
+def test_a_gaussian_that_is_not_finite_is_left_out_with_zero_gradient():
+    scene = random(10)
+    gaussians = scene.gaussians()
+    gaussians.quats[3] = 0.0
+    gaussians.means[5, 1] = float("nan")
+    gaussians.sh_rest[7, 2, 1] = float("inf")
+    gaussians = gaussians.trainable()
+    out = render(gaussians, scene.camera, backend="cpu")
+    assert not {3, 5, 7} & set(out.visible.tolist())
+    out.image.sum().backward()
+    for name, tensor in gaussians.tensors().items():
+        assert (tensor.grad[[3, 5, 7]] == 0).all(), name
+
+
+@pytest.mark.parametrize("case", ["none", "all culled"])
+def test_nothing_to_draw(case):
+    scene = random(0 if case == "none" else 20)
+    gaussians = scene.gaussians(torch.float32)
+    gaussians.means[:, 2] -= 100.0
+    gaussians = gaussians.trainable()
+    settings = RenderSettings(background=(0.1, 0.2, 0.3))
+    out = render(gaussians, scene.camera, settings=settings, backend="cpu")
+    torch.testing.assert_close(out.image, torch.tensor([0.1, 0.2, 0.3]).expand_as(out.image))
+    assert (out.transmittance == 1).all() and (out.depth == 0).all()
+    assert out.num_pairs == 0 and len(out.visible) == 0
+    out.image.sum().backward()
+    assert all((tensor.grad == 0).all() for tensor in gaussians.tensors().values())
+    assert out.means2d_grad_norms().shape == (0,)
+
+
+def test_gradients_may_be_asked_for_in_part():
+    scene = random(20)
+    full, part = (scene.gaussians().trainable() for _ in range(2))
+    render(full, scene.camera, backend="cpu").depth.sum().backward()
+    out = render(part, scene.camera, backend="cpu")
+    out.transmittance.sum().backward()
+    assert (part.sh0.grad == 0).all() and part.logit_opacities.grad.abs().max() > 0
+    assert full.means.grad.abs().max() > 0 and (full.sh_rest.grad == 0).all()
+
+
+def test_parameters_need_not_be_contiguous():
+    scene = random(20)
+    plain = scene.gaussians()
+    strided = plain.map(lambda t: torch.stack([t, t], dim=-1)[..., 0])
+    assert not strided.means.is_contiguous()
+    assert torch.equal(*(render(g, scene.camera, backend="cpu").image for g in (plain, strided)))
+
+
+def test_other_dtypes_are_refused():
+    with pytest.raises(ArgumentError, match="float32 or float64"):
+        render(random(3).gaussians(torch.float16), camera(9, 9), backend="cpu")
+    with pytest.raises(ArgumentError, match="float32 or float64"):
+        render_covariances(
+            torch.zeros(1, 3),
+            torch.eye(3)[None].double(),
+            torch.zeros(1, 3),
+            torch.zeros(1),
+            camera(9, 9),
+        )
+
+
+def test_several_cameras_give_their_views_stacked():
+    scene = random(30)
+    cameras = [camera(41, 35), Camera.looking_at((2, 0, -2), (0, 0, 0), 40, 40, 35, 41)]
+    gaussians = scene.gaussians().trainable()
+    stack = render(gaussians, cameras, backend="cpu")
+    assert stack.image.shape == (2, 35, 41, 3) and stack.depth.shape == stack.transmittance.shape == (
+        2,
+        35,
+        41,
+    )
+    for i, one in enumerate(cameras):
+        assert torch.equal(stack.image[i], render(gaussians, one, backend="cpu").image)
+    stack.image.sum().backward()
+    assert [view.means2d_grad_norms().shape == view.visible.shape for view in stack.views] == [True, True]
+    with pytest.raises(ArgumentError, match="sizes"):
+        render(gaussians, [camera(8, 8), camera(9, 8)], backend="cpu")
+
+
+@pytest.mark.own_process
+def test_memory_stays_flat():
+    """Renders of changing size, in a process of their own: 100 to warm up, then 300 that may not grow by 16 MiB.
+
+    The largest, which the warm-up begins with, needs about 30 MiB; kept once per render that would be gigabytes.
+    """
+    code = """
+import resource, numpy as np, torch
+from native_scenes import random, camera
+from gsplat_edu.render.api import render
+rng = np.random.default_rng(0)
+scenes = [random(n).gaussians(torch.float32) for n in (50, 500, 5000, 20000)]
+def rss():
+    return int(open('/proc/self/statm').read().split()[1]) * resource.getpagesize() / 2**20
+def turn(scene=None, size=None):
+    g = scenes[rng.integers(4) if scene is None else scene].trainable()
+    size = rng.integers(1, 400, 2) if size is None else size
+    render(g, camera(int(size[0]), int(size[1])), backend='cpu').image.sum().backward()
+for _ in range(5):
+    turn(3, (399, 399))
+for _ in range(95):
+    turn()
+before = rss()
+for _ in range(300):
+    turn()
+print(rss() - before)
+"""
+    here = str(Path(__file__).parents[1])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": here},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 16.0
+
+
+@pytest.mark.own_process
+@pytest.mark.parametrize("name", _native.isas())
+def test_the_environment_forces_an_instruction_set(name):
+    code = "from gsplat_edu import _native; print(_native.isa())"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"GSPLAT_EDU_ISA": name},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.strip() == name
+
+
+@pytest.mark.own_process
+def test_an_instruction_set_that_is_not_there_is_said_so():
+    code = "from gsplat_edu.cli.main import main; import sys; sys.exit(main(['demo', '--backend', 'cpu']))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"GSPLAT_EDU_ISA": "v9"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and "GSPLAT_EDU_ISA=v9" in done.stderr and "v2" in done.stderr

@@ -1,0 +1,56 @@
+"""Write native/constants.h from src/gsplat_edu/constants.py, so that each constant stands in one place.
+
+    python tools/generate_constants.py
+
+A test compares the file with what this writes.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from gsplat_edu import constants as c
+
+HEADER = Path(__file__).resolve().parent.parent / "native" / "constants.h"
+NAMES = (
+    "DILATION",
+    "ALPHA_MIN",
+    "ALPHA_MAX",
+    "T_STOP",
+    "DET_FLOOR",
+    "C0",
+    "C1",
+    "C2",
+    "C3",
+    "SH_OFFSET",
+    "SSIM_C1",
+    "SSIM_C2",
+)
+SSIM_TAPS = 6
+"""The middle tap of SSIM's window and the five on one side of it."""
+
+
+def header() -> str:
+    """Return the text of the header."""
+    lines = [
+        "// Made by tools/generate_constants.py from src/gsplat_edu/constants.py. Do not edit.",
+        "#pragma once",
+    ]
+    lines += ["", "namespace gsplat {", "", f"constexpr int TILE = {c.TILE};"]
+    lines += [_line(name, getattr(c, name)) for name in NAMES]
+    lines.append(_line("LOG2_ALPHA_MIN", math.log2(c.ALPHA_MIN)))
+    window = [math.exp(-(k**2) / (2 * c.SSIM_SIGMA**2)) for k in range(SSIM_TAPS)]
+    total = window[0] + 2 * sum(window[1:])
+    lines.append(_line("SSIM_TAP", tuple(tap / total for tap in window)))
+    return "\n".join([*lines, "", "}  // namespace gsplat", ""])
+
+
+def _line(name: str, value: float | tuple[float, ...]) -> str:
+    if isinstance(value, tuple):
+        return f"constexpr double {name}[{len(value)}] = {{{', '.join(repr(v) for v in value)}}};"
+    return f"constexpr double {name} = {value!r};"
+
+
+if __name__ == "__main__":
+    HEADER.write_text(header(), encoding="ascii")

@@ -1,0 +1,16 @@
+#!/bin/sh
+# Build the native module with AddressSanitizer and UndefinedBehaviorSanitizer and run its tests on that build.
+set -eu
+cd "$(dirname "$0")/.."
+python=$PWD/.venv/bin/python
+build=$PWD/build/sanitize
+export PATH="$PWD/.venv/bin:$PATH"
+cmake -S . -B "$build" -G Ninja -DGSPLAT_SANITIZE=ON -DPython_EXECUTABLE="$python" > "$build.log" 2>&1 ||
+    { cat "$build.log" >&2; exit 1; }
+cmake --build "$build"
+"$python" tools/check_objects.py "$build"
+# Python itself is not instrumented, so the runtime comes in by preload; its own leaks, and torch's, are not ours.
+preload="$(g++ -print-file-name=libasan.so) $(g++ -print-file-name=libubsan.so)"
+LD_PRELOAD="$preload" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
+    GSPLAT_TEST_NATIVE="$build" "$python" -m pytest -q tests/native tests/test_losses.py tests/train/test_optimizer.py \
+    -m "not own_process" -p no:cacheprovider --capture=sys
