@@ -2,6 +2,7 @@
 # PYTHON=python3.12 in front or behind chooses the interpreter; the default is python3.
 BIN := .venv/bin
 OUT ?= out/sphere.png
+DATA := $(or $(GSPLAT_EDU_DATA),../shared/data)
 export PYTHON
 
 .PHONY: help demo test check sanitize bench notebooks clean
@@ -48,6 +49,8 @@ bench:
 	@$(BIN)/python benchmarks/raster.py --out out/bench/raster.json
 	@$(BIN)/python benchmarks/sphere.py --out out/bench/sphere.json
 	@$(BIN)/python benchmarks/dense.py --out out/bench/dense.json
+	@if test -d "$(DATA)/snowmiku97"; then $(BIN)/python benchmarks/train_step.py --out out/bench/train_step.json; \
+	    else echo "benchmarks/train_step.py: no snowmiku97 in $(DATA), skipped; set GSPLAT_EDU_DATA"; fi
 
 notebooks:
 	@tools/set_up.sh dev

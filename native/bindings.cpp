@@ -93,7 +93,7 @@ void adam(const std::array<Address, 4> &arrays, int64_t size, const std::array<d
 template <class T>
 std::array<double, 2> loss_of(const std::array<Address, 4> &p, int32_t H, int32_t W, double ssim_weight, int threads) {
     nb::gil_scoped_release release;
-    LossArgs<T> args{at<T>(p[0]), at<T>(p[1]), at<uint8_t>(p[2]), H, W, ssim_weight, nullptr, at<T>(p[3]), nullptr};
+    LossArgs<T> args{at<T>(p[0]), at<T>(p[1]), at<uint8_t>(p[2]), H, W, ssim_weight, at<T>(p[3]), nullptr};
     std::array<double, 2> means;
     loss<T>(args, &means[0], &means[1], threads);
     return means;

@@ -207,13 +207,11 @@ void Frame<T>::backward(const ImageGrads<T> &in, const SceneGrads<T> &out, T *ba
 
 template <class T>
 void loss(LossArgs<T> args, double *l1, double *ssim, int threads) {
-    Buffer maps, sums, scratch;
+    Buffer sums, scratch;
     const size_t size = size_t(args.H) * size_t(args.W) * 3;
-    if (args.ssim_weight != 0) args.maps = static_cast<T *>(maps.reserve((3 * size + 1) * sizeof(T)));
     args.sums = static_cast<double *>(sums.reserve(size_t(args.bands() + 1) * 2 * sizeof(double)));
     auto *room = static_cast<T *>(scratch.reserve(size_t(threads * args.SCRATCH) * sizeof(T)));
-    parallel(threads, args.bands(), [&](int64_t band, int w) { kernels<T>().loss_forward(args, band, room + w * args.SCRATCH); });
-    parallel(threads, args.bands(), [&](int64_t band, int w) { kernels<T>().loss_backward(args, band, room + w * args.SCRATCH); });
+    parallel(threads, args.bands(), [&](int64_t band, int w) { kernels<T>().loss(args, band, room + w * args.SCRATCH); });
     *l1 = *ssim = 0;
     for (int64_t band = 0; band < args.bands(); ++band) *l1 += args.sums[2 * band], *ssim += args.sums[2 * band + 1];
     *l1 /= double(size), *ssim /= double(size);

@@ -76,7 +76,7 @@ class Frame {
     Buffer splats_, visible_, sorted_, pairs_of_, slot_begin_, pairs_, tile_begin_, done_;
 };
 
-// (1 - k) L1 + k (1 - SSIM): the two means, and the gradient to args.grad. Maps, sums and scratch are provided.
+// (1 - k) L1 + k (1 - SSIM): the two means, and the gradient to args.grad. Sums and scratch are provided.
 template <class T>
 void loss(LossArgs<T> args, double *l1, double *ssim, int threads);
 

@@ -128,9 +128,9 @@ struct AdamArgs {
 };
 
 constexpr int SSIM_HALF = 5;                           // taps on either side of the middle one
-constexpr int64_t SSIM_BAND = 32;                      // image rows a thread takes at a time
-
-constexpr int64_t SSIM_STRIP = 384;                    // and numbers of each row; a multiple of every vector's width
+constexpr int64_t SSIM_BAND = 64;                      // image rows a thread takes at a time
+constexpr int64_t SSIM_STRIP = 192;                    // and numbers of each row; multiples of every vector's width,
+constexpr int64_t SSIM_MAP = 224;                      // as is this: a strip and a window's half on either side
 
 template <class T>
 struct LossArgs {
@@ -138,13 +138,13 @@ struct LossArgs {
     const uint8_t *target_bytes;                       // H W 3, used instead of target where not null
     int32_t H, W;
     double ssim_weight;
-    T *maps;                                           // 3 H W 3: derivatives of SSIM by mean, variance, covariance
     T *grad;                                           // H W 3
     double *sums;                                      // bands x 2: sums of |x - y| and of SSIM
 
     int64_t bands() const { return (H + SSIM_BAND - 1) / SSIM_BAND; }
-    // Numbers of scratch that a band needs.
-    static constexpr int64_t SCRATCH = 4 * (SSIM_BAND + 2 * SSIM_HALF) * SSIM_STRIP;
+    // Numbers of scratch that a thread needs.
+    static constexpr int64_t SCRATCH =
+        4 * (SSIM_BAND + 4 * SSIM_HALF) * SSIM_MAP + 3 * (SSIM_BAND + 2 * SSIM_HALF) * SSIM_STRIP;
 };
 
 constexpr int64_t BLOCK = 256;                         // Gaussians a thread takes at a time
@@ -159,8 +159,7 @@ struct Kernels {
     void (*composite_backward)(const CompositeBackwardArgs<T> &, int32_t tile);
     void (*project_backward)(const ProjectBackwardArgs<T> &, int64_t block);
     void (*adam)(const AdamArgs<T> &, int64_t begin, int64_t end);
-    void (*loss_forward)(const LossArgs<T> &, int64_t band, T *scratch);
-    void (*loss_backward)(const LossArgs<T> &, int64_t band, T *scratch);
+    void (*loss)(const LossArgs<T> &, int64_t band, T *scratch);
 };
 
 struct Isa {

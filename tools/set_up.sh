@@ -28,6 +28,8 @@ if usable && { stands "$purpose" || stands dev; }; then
     echo "== set-up: already installed in .venv, skipped"
     exit 0
 fi
+command -v c++ > /dev/null || command -v g++ > /dev/null || command -v clang++ > /dev/null ||
+    fail "there is no C++ compiler for the native kernels; on Debian and Ubuntu install the package g++"
 if ! usable; then
     hint="name a Python from 3.11 on: make PYTHON=python3.12 ..."
     command -v "$python" > /dev/null || fail "there is no '$python'; $hint"
@@ -37,8 +39,6 @@ if ! usable; then
     "$python" -m venv --clear .venv ||
         fail "'$python -m venv' failed; on Debian and Ubuntu the package python3-venv is missing"
 fi
-command -v c++ > /dev/null || command -v g++ > /dev/null || command -v clang++ > /dev/null ||
-    fail "there is no C++ compiler for the native kernels; on Debian and Ubuntu install the package g++"
 extra=
 [ "$purpose" = demo ] || extra="[$purpose]"
 echo "== set-up: installing gsplat_edu$extra with the versions in constraints.txt"
