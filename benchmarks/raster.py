@@ -45,7 +45,9 @@ def frame_seconds(parameters: list[torch.Tensor], threads: int) -> tuple[tuple[f
     out = [torch.empty_like(p) for p in parameters]
     norms, background = torch.empty(len(parameters[0])), torch.empty(3)
     outgoing = [out[0].data_ptr(), 0, 0, 0, 0, 0, *(o.data_ptr() for o in out[1:]), norms.data_ptr()]
-    frame.backward([gradient.data_ptr(), 0, 0], outgoing, background.data_ptr())
+    forward = [image.data_ptr(), transmittance.data_ptr(), 0]
+    incoming = [gradient.data_ptr(), 0, 0]
+    frame.backward(len(norms), 0, addresses, forward, incoming, outgoing, background.data_ptr())
     return frame.seconds, frame.num_pairs
 
 

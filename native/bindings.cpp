@@ -5,6 +5,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <array>
 #include <chrono>
 #include <cstdlib>
@@ -59,11 +60,13 @@ void bind_frame(nb::module_ &m, const char *name) {
                  self.composite({at<T>(image), at<T>(transmittance), at<T>(depth)});
              })
         .def("backward",
-             [](F &self, const std::array<Address, 3> &in, const std::array<Address, 10> &out, Address background) {
+             [](F &self, int64_t n, int32_t rest, const std::array<Address, 9> &scene, const std::array<Address, 3> &forward,
+                const std::array<Address, 3> &in, const std::array<Address, 10> &out, Address background) {
                  nb::gil_scoped_release release;
                  SceneGrads<T> grads{at<T>(out[0]), at<T>(out[1]), at<T>(out[2]), at<T>(out[3]), at<T>(out[4]),
                                      at<T>(out[5]), at<T>(out[6]), at<T>(out[7]), at<T>(out[8]), at<T>(out[9])};
-                 self.backward({at<T>(in[0]), at<T>(in[1]), at<T>(in[2])}, grads, at<T>(background));
+                 self.backward(scene_of<T>(n, rest, scene), {at<T>(forward[0]), at<T>(forward[1]), at<T>(forward[2])},
+                               {at<T>(in[0]), at<T>(in[1]), at<T>(in[2])}, grads, at<T>(background));
              })
         .def("visible",
              [](const F &self, Address ids, Address radii) {

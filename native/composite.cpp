@@ -20,6 +20,7 @@ template <class T, bool DEPTH>
 GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileState<T> &tile) {
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
+    const T most = vmin(s.log2_o, T(LOG2_ALPHA_MAX));
     V brightest = V{};
     for (int column = 0; column < TILE; column += LANES) {
         const V dx = iota<T>() + splat(T(column + box.x0) - s.u);
@@ -27,7 +28,7 @@ GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, in
         V dy = splat(T(first + box.y0) - s.v);
         for (int row = first; row <= last; ++row, dy += splat(T(1))) {
             const V p = along + dy * (cross + splat(s.c) * dy);
-            const V alpha = clamped(exp2_small(p), T(ALPHA_MAX), p, T(LOG2_ALPHA_MIN));
+            const V alpha = exp2_between(p, T(LOG2_ALPHA_MIN), most);
             V t = load<V>(&tile.transmittance[row][column]);
             const V w = t * alpha;
             store(&tile.red[row][column], load<V>(&tile.red[row][column]) + w * splat(s.color[0]));

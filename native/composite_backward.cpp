@@ -24,6 +24,7 @@ GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, 
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
     // w g (3), and the moments of h: 1, x, xx, y, xy in the order in which they are summed; then yy and w z.
+    const T most = vmin(s.log2_o, T(LOG2_ALPHA_MAX));
     V sums[8] = {}, hyy = V{}, wz = V{};
     for (int column = 0; column < TILE; column += LANES) {
         const V dx = iota<T>() + splat(T(column + box.x0) - s.u);
@@ -33,8 +34,7 @@ GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, 
         V dy = splat(T(first + box.y0) - s.v);
         for (int row = first; row <= last; ++row, dy += splat(T(1))) {
             const V p = along + dy * (cross + splat(s.c) * dy);
-            const V raw = exp2_small(p);
-            const V alpha = clamped(raw, T(ALPHA_MAX), p, T(LOG2_ALPHA_MIN));
+            const V alpha = exp2_between(p, T(LOG2_ALPHA_MIN), most);
             const V r = load<V>(&tile.red[row][column]), g = load<V>(&tile.green[row][column]);
             const V b = load<V>(&tile.blue[row][column]);
             V cg = r * splat(s.color[0]) + g * splat(s.color[1]) + b * splat(s.color[2]);
@@ -46,7 +46,7 @@ GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, 
                 wz += w * z;
             }
             const V rest = load<V>(&tile.rest[row][column]) - w * cg;
-            const V h = where_below(raw, T(ALPHA_MAX), alpha * (t * cg - rest * reciprocal(splat(T(1)) - alpha)));
+            const V h = where_below(p, T(LOG2_ALPHA_MAX), alpha * (t * cg - rest * reciprocal(splat(T(1)) - alpha)));
             store(&tile.rest[row][column], rest);
             store(&tile.transmittance[row][column], t - w);
             wr += w * r, wg += w * g, wb += w * b;

@@ -9,6 +9,7 @@ constexpr double ALPHA_MIN = 0.00392156862745098;
 constexpr double ALPHA_MAX = 0.99;
 constexpr double T_STOP = 0.0001;
 constexpr double DET_FLOOR = 1e-12;
+constexpr double COLOR_LIMIT = 1000000.0;
 constexpr double C0 = 0.28209479177387814;
 constexpr double C1 = 0.4886025119029199;
 constexpr double C2[3] = {1.0925484305920792, 0.31539156525252005, 0.5462742152960396};
@@ -17,6 +18,7 @@ constexpr double SH_OFFSET = 0.5;
 constexpr double SSIM_C1 = 0.0001;
 constexpr double SSIM_C2 = 0.0009;
 constexpr double LOG2_ALPHA_MIN = -7.994353436858858;
+constexpr double LOG2_ALPHA_MAX = -0.014499569695115089;
 constexpr double SSIM_TAP[6] = {0.2660117248617943, 0.21300553771125366, 0.1093606895097, 0.03600077212843082, 0.007598758135239184, 0.0010283800844791099};
 
 }  // namespace gsplat

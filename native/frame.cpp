@@ -1,5 +1,7 @@
 #include "frame.h"
 
+#include <pthread.h>
+
 #include <algorithm>
 #include <chrono>
 #include <cstdlib>
@@ -16,19 +18,24 @@
 namespace gsplat {
 namespace {
 
+constexpr size_t MAX_SPARES = 32;
+
 struct Spare {
     void *data;
     size_t capacity;
 };
 
 // Spares live as long as the process: frames may still be freed while it ends.
-std::mutex &spares_mutex() {
-    static auto *mutex = new std::mutex;
-    return *mutex;
-}
+// A forked child gets a new mutex: the thread that held it may not exist there.
+std::mutex *spares_lock = new std::mutex;
+[[maybe_unused]] const int registered = pthread_atfork(nullptr, nullptr, [] { spares_lock = new std::mutex; });
 
 std::vector<Spare> &spares() {
-    static auto *list = new std::vector<Spare>;
+    static auto *list = [] {
+        auto *made = new std::vector<Spare>;
+        made->reserve(MAX_SPARES + 2);  // a destructor adds to it and must not throw
+        return made;
+    }();
     return *list;
 }
 
@@ -43,13 +50,23 @@ class Timer {
     std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
 };
 
-constexpr size_t MAX_SPARES = 32;
-
 }  // namespace
 
+#ifdef GSPLAT_SANITIZE
+// Exact sizes and real frees, so that the sanitizer sees every overrun; filled with what no kernel may rely on.
+Buffer::~Buffer() { std::free(data_); }
+
+void *Buffer::reserve(size_t bytes) {
+    std::free(data_);
+    data_ = std::malloc(bytes);
+    if (!data_) throw std::bad_alloc();
+    std::memset(data_, 0xFF, bytes);
+    return data_;
+}
+#else
 Buffer::~Buffer() {
     if (!data_) return;
-    std::lock_guard<std::mutex> lock(spares_mutex());
+    std::lock_guard<std::mutex> lock(*spares_lock);
     spares().push_back({data_, capacity_});
     if (spares().size() > MAX_SPARES) {
         auto smallest = std::min_element(spares().begin(), spares().end(),
@@ -61,7 +78,7 @@ Buffer::~Buffer() {
 
 void *Buffer::reserve(size_t bytes) {
     if (data_ && capacity_ >= bytes) return data_;
-    std::lock_guard<std::mutex> lock(spares_mutex());
+    std::lock_guard<std::mutex> lock(*spares_lock);
     if (data_) spares().push_back({std::exchange(data_, nullptr), capacity_});
     auto best = spares().end();
     for (auto it = spares().begin(); it != spares().end(); ++it)
@@ -85,23 +102,24 @@ void *Buffer::reserve(size_t bytes) {
     capacity_ = rounded;
     return data_;
 }
+#endif
 
 template <class T>
 Frame<T>::Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, int threads)
-    : scene_(scene), camera_(camera), settings_(settings), threads_(threads) {
+    : n_(scene.n), camera_(camera), settings_(settings), threads_(threads) {
     grid_.tiles_x = (camera.W + TILE - 1) / TILE, grid_.tiles_y = (camera.H + TILE - 1) / TILE;
     if (scene.n >= (int64_t(1) << 32)) throw std::length_error("more than 4,294,967,295 Gaussians");
-    project();
+    project(scene);
     sort();
     intersect();
 }
 
 template <class T>
-void Frame<T>::project() {
+void Frame<T>::project(const Scene<T> &scene) {
     Timer timer(seconds_[0]);
-    const size_t n = size_t(std::max<int64_t>(scene_.n, 1));
+    const size_t n = size_t(std::max<int64_t>(n_, 1));
     Buffer block_visible;
-    ProjectArgs<T> args{scene_, camera_, settings_, static_cast<Splat<T> *>(splats_.reserve(n * sizeof(Splat<T>))),
+    ProjectArgs<T> args{scene, camera_, settings_, static_cast<Splat<T> *>(splats_.reserve(n * sizeof(Splat<T>))),
                         static_cast<uint32_t *>(visible_.reserve(n * 4)),
                         static_cast<uint32_t *>(block_visible.reserve(size_t(blocks() + 1) * 4))};
     parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project(args, block); });
@@ -147,11 +165,11 @@ template <class T>
 void Frame<T>::intersect() {
     Timer timer(seconds_[2]);
     const int64_t tiles = grid_.tiles();
-    const int64_t chunks = std::clamp<int64_t>(visible_count_ / 512, 1, 16 * int64_t(threads_));
+    const int64_t chunks = std::clamp<int64_t>(visible_count_ / 512, 1, std::min<int64_t>(16 * int64_t(threads_), 1 + 8 * visible_count_ / tiles));
     Buffer next_buffer;
     auto *next = static_cast<uint32_t *>(next_buffer.reserve(size_t(chunks * tiles) * 4));
     std::memset(next, 0, size_t(chunks * tiles) * 4);
-    const size_t n = size_t(std::max<int64_t>(scene_.n, 1));
+    const size_t n = size_t(std::max<int64_t>(n_, 1));
     auto *pairs_of = static_cast<uint32_t *>(pairs_of_.reserve(n * 4));
     auto *slot_begin = static_cast<uint32_t *>(slot_begin_.reserve(n * 4));
     std::memset(pairs_of, 0, n * 4);
@@ -160,7 +178,7 @@ void Frame<T>::intersect() {
     parallel(threads_, chunks, [&](int64_t c, int) { kernels<T>().count(args, begin(c), begin(c + 1), next + c * tiles); });
 
     uint64_t total = 0;
-    for (int64_t i = 0; i < scene_.n; ++i) slot_begin[i] = uint32_t(total), total += pairs_of[i];
+    for (int64_t i = 0; i < n_; ++i) slot_begin[i] = uint32_t(total), total += pairs_of[i];
     if (total >= (uint64_t(1) << 32)) throw std::length_error("more than 4,294,967,295 pairs of Gaussian and tile");
     pairs_count_ = int64_t(total);
     auto *tile_begin = static_cast<uint32_t *>(tile_begin_.reserve(size_t(tiles + 1) * 4));
@@ -177,7 +195,6 @@ void Frame<T>::intersect() {
 template <class T>
 void Frame<T>::composite(const Outputs<T> &out) {
     Timer timer(seconds_[3]);
-    out_ = out;
     CompositeArgs<T> args{splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_,
                           out.image, out.transmittance, out.depth,
                           static_cast<uint32_t *>(done_.reserve(size_t(grid_.tiles()) * 4))};
@@ -185,11 +202,12 @@ void Frame<T>::composite(const Outputs<T> &out) {
 }
 
 template <class T>
-void Frame<T>::backward(const ImageGrads<T> &in, const SceneGrads<T> &out, T *background) {
+void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out,
+                        T *background) {
     Buffer slots, tile_background;
     CompositeBackwardArgs<T> args{
-        {splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, out_.image,
-         out_.transmittance, out_.depth, done_.as<uint32_t>()},
+        {splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, forward.image,
+         forward.transmittance, forward.depth, done_.as<uint32_t>()},
         in.image, in.transmittance, in.depth,
         static_cast<T *>(slots.reserve((size_t(pairs_count_) + 1) * SLOT * sizeof(T))),
         static_cast<T *>(tile_background.reserve(size_t(grid_.tiles()) * 3 * sizeof(T)))};
@@ -201,7 +219,7 @@ void Frame<T>::backward(const ImageGrads<T> &in, const SceneGrads<T> &out, T *ba
     background[0] = background[1] = background[2] = 0;
     for (int32_t tile = 0; tile < grid_.tiles(); ++tile)
         for (int k = 0; k < 3; ++k) background[k] += args.tile_background[3 * tile + k];
-    ProjectBackwardArgs<T> last{scene_, camera_, settings_, pairs_of_.as<uint32_t>(), slot_begin_.as<uint32_t>(), args.slots, out};
+    ProjectBackwardArgs<T> last{scene, camera_, settings_, pairs_of_.as<uint32_t>(), slot_begin_.as<uint32_t>(), args.slots, out};
     parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project_backward(last, block); });
 }
 

@@ -50,7 +50,8 @@ class Frame {
   public:
     Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, int threads);
     void composite(const Outputs<T> &out);
-    void backward(const ImageGrads<T> &in, const SceneGrads<T> &out, T *background);
+    // The scene and the outputs are given again: between the passes they may have moved.
+    void backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background);
 
     int64_t num_visible() const { return visible_count_; }
     int64_t num_pairs() const { return pairs_count_; }
@@ -60,18 +61,17 @@ class Frame {
     const Splat<T> *splats() const { return splats_.as<Splat<T>>(); }
 
   private:
-    void project();
+    void project(const Scene<T> &scene);
     void sort();
     void intersect();
-    int64_t blocks() const { return (scene_.n + BLOCK - 1) / BLOCK; }
+    int64_t blocks() const { return (n_ + BLOCK - 1) / BLOCK; }
 
-    Scene<T> scene_;
+    int64_t n_;
     Camera camera_;
     Settings settings_;
     Grid grid_;
     int threads_;
     int64_t visible_count_ = 0, pairs_count_ = 0;
-    Outputs<T> out_{};
     std::array<double, 6> seconds_{};
     Buffer splats_, visible_, sorted_, pairs_of_, slot_begin_, pairs_, tile_begin_, done_;
 };

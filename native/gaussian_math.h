@@ -26,6 +26,13 @@ GSPLAT_INLINE bool finite(T x) {
     return x - x == T(0);
 }
 
+// Finite, and no larger than any photo could ask for.
+template <class T>
+GSPLAT_INLINE bool is_color(const T *c) {
+    const T limit = T(COLOR_LIMIT);
+    return c[0] <= limit && c[1] <= limit && c[2] <= limit && c[0] >= -limit && c[1] >= -limit && c[2] >= -limit;
+}
+
 template <class T>
 GSPLAT_INLINE T dot3(const T *a, const T *b) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -151,7 +158,8 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
     g.a = g.a0 + d, g.b = g.b0, g.c = g.c0 + d;
     g.det = g.det0 + d * (g.a0 + g.c0) + d * d;
     g.compensation = set.antialiased ? sqrt_(vmax(g.det0, T(DET_FLOOR)) / g.det) : T(1);
-    const T check = g.a * g.c + g.det + g.p[0] + g.p[1] + g.opacity * g.compensation;
+    // z squared, so that depths can still be weighted and added.
+    const T check = g.a * g.c + g.det + g.p[0] + g.p[1] + z * z + g.opacity * g.compensation;
     return finite(check) && g.det > 0 && g.opacity * g.compensation >= T(ALPHA_MIN);
 }
 
@@ -160,7 +168,7 @@ template <class T>
 GSPLAT_INLINE bool project_color(const Scene<T> &scene, const Settings &set, int64_t i, Projected<T> &g) {
     if (!scene.quats) {
         for (int k = 0; k < 3; ++k) g.color[k] = scene.colors[3 * i + k];
-        return finite(g.color[0] + g.color[1] + g.color[2]);
+        return is_color(g.color);
     }
     g.distance = sqrt_(dot3(g.offset, g.offset));
     for (int k = 0; k < 3; ++k) g.dir[k] = g.offset[k] / g.distance;
@@ -170,7 +178,7 @@ GSPLAT_INLINE bool project_color(const Scene<T> &scene, const Settings &set, int
     for (int k = 0; k < 3; ++k) g.color[k] = g.basis[0] * scene.sh0[3 * i + k] + T(SH_OFFSET);
     for (int j = 0; j < rest; ++j)
         for (int k = 0; k < 3; ++k) g.color[k] += g.basis[j + 1] * sh[3 * j + k];
-    return finite(g.color[0] + g.color[1] + g.color[2]);
+    return is_color(g.color);
 }
 
 }  // namespace GSPLAT_ISA

@@ -121,15 +121,21 @@ GSPLAT_INLINE bool any_at_least(VD v, double x) {
     return any != 0;
 }
 
-// 2^p for p up to 126; below -126 any number near 0. n = round(p) by adding and subtracting 1.5 * 2^23 (which
-// -ffast-math would fold away), then a polynomial of degree 5 on [-1/2, 1/2] fitted for its relative error, 2.4e-7.
-GSPLAT_INLINE VF exp2_small(VF p) {
+// 2^min(p, most), 0 where p < least; most <= 0 and -126 <= least. A p above `most` is rounding: in a long thin splat the
+// terms of p cancel. n = round(p) (by adding and subtracting 1.5 * 2^23, which -ffast-math would fold away), then a
+// polynomial of degree 5 on [-1/2, 1/2] fitted for its relative error, 2.4e-7.
+GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
+    const VF top = splat(most);
 #if GSPLAT_VECTOR_BYTES == 64
+    const __mmask16 keep = _mm512_cmp_ps_mask((__m512)p, _mm512_set1_ps(least), _CMP_GE_OQ);
+    p = p < top ? p : top;
     const __m512 n = _mm512_roundscale_ps((__m512)p, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
     const VF f = p - (VF)n;
 #else
-    const VF magic = splat(12582912.0f), least = splat(-126.0f);
-    p = p > least ? p : least;  // a smaller one would shift out of the exponent
+    const VF magic = splat(12582912.0f), bottom = splat(least);
+    const auto keep = p >= bottom;
+    p = p < top ? p : top;
+    p = p > bottom ? p : bottom;  // a smaller one would shift out of the exponent
     const VF n = (p + magic) - magic;
     const VF f = p - n;
 #endif
@@ -140,32 +146,16 @@ GSPLAT_INLINE VF exp2_small(VF p) {
     y = y * f + splat(6.93147182e-1f);
     y = y * f + splat(1.0f);
 #if GSPLAT_VECTOR_BYTES == 64
-    return (VF)_mm512_scalef_ps((__m512)y, n);
+    return (VF)_mm512_maskz_scalef_ps(keep, (__m512)y, n);
 #else
     const Vector<float>::M e = __builtin_convertvector(n, Vector<float>::M);
-    return (VF)((Vector<float>::M)y + (e << 23));
+    return keep ? (VF)((Vector<float>::M)y + (e << 23)) : VF{};
 #endif
 }
 
-GSPLAT_INLINE VD exp2_small(VD p) {
-    for (int i = 0; i < Vector<double>::LANES; ++i) p[i] = exp2(p[i]);
+GSPLAT_INLINE VD exp2_between(VD p, double least, double most) {
+    for (int i = 0; i < Vector<double>::LANES; ++i) p[i] = p[i] >= least ? exp2(p[i] < most ? p[i] : most) : 0.0;
     return p;
-}
-
-// min(x, most), 0 where p < least.
-GSPLAT_INLINE VF clamped(VF x, float most, VF p, float least) {
-#if GSPLAT_VECTOR_BYTES == 64
-    const __mmask16 keep = _mm512_cmp_ps_mask((__m512)p, _mm512_set1_ps(least), _CMP_GE_OQ);
-    return (VF)_mm512_maskz_min_ps(keep, (__m512)x, _mm512_set1_ps(most));
-#else
-    const VF low = x < splat(most) ? x : splat(most);
-    return p >= splat(least) ? low : VF{};
-#endif
-}
-
-GSPLAT_INLINE VD clamped(VD x, double most, VD p, double least) {
-    const VD low = x < splat(most) ? x : splat(most);
-    return p >= splat(least) ? low : VD{};
 }
 
 // x, 0 where key is not below the limit.

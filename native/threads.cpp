@@ -1,5 +1,6 @@
 #include "threads.h"
 
+#include <pthread.h>
 #include <unistd.h>
 
 #include <atomic>
@@ -13,19 +14,9 @@ namespace gsplat {
 namespace {
 
 // Work is announced by a new round number. Workers spin for it a little while, because the next stage of a frame
-// comes within microseconds, and then sleep.
+// comes within microseconds, and then sleep. The pool lives as long as the process; tasks do not throw.
 class Pool {
   public:
-    ~Pool() {
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            quit_ = true;
-            round_.fetch_add(1);
-        }
-        wake_.notify_all();
-        for (auto &worker : workers_) worker.join();
-    }
-
     void run(int threads, int64_t count, const Task &task) {
         while (int(workers_.size()) < threads - 1) workers_.emplace_back([this, id = int(workers_.size())] { work(id); });
         {
@@ -59,7 +50,6 @@ class Pool {
                 std::unique_lock<std::mutex> lock(mutex_);
                 wake_.wait(lock, [&] { return round_.load() != seen; });
                 seen = round_.load();
-                if (quit_) return;
                 if (!open_ || id >= helpers_) continue;
                 active_.fetch_add(1);
             }
@@ -77,10 +67,12 @@ class Pool {
     const Task *task_ = nullptr;
     int64_t count_ = 0;
     int helpers_ = 0;
-    bool open_ = false, quit_ = false;
+    bool open_ = false;
 };
 
-std::mutex pool_mutex;
+// Held while a round runs. A forked child gets a new one: the thread that held it may not exist there.
+std::mutex *pool_mutex = new std::mutex;
+[[maybe_unused]] const int registered = pthread_atfork(nullptr, nullptr, [] { pool_mutex = new std::mutex; });
 
 }  // namespace
 
@@ -91,7 +83,7 @@ void parallel(int threads, int64_t count, const Task &task) {
     }
     static Pool *pool = nullptr;
     static pid_t owner = 0;
-    std::lock_guard<std::mutex> lock(pool_mutex);
+    std::lock_guard<std::mutex> lock(*pool_mutex);
     if (owner != getpid()) {  // a forked child has none of its parent's threads
         pool = new Pool;
         owner = getpid();

@@ -7,7 +7,7 @@
 namespace gsplat {
 
 // Runs task(0, worker) .. task(count - 1, worker) on up to `threads` threads, the caller among them, and waits for all.
-// `worker` is below `threads`, and no two tasks run at once on the same one.
+// Tasks do not throw. `worker` is below `threads`, and no two tasks run at once on the same one.
 using Task = std::function<void(int64_t, int)>;
 void parallel(int threads, int64_t count, const Task &task);
 

@@ -19,6 +19,7 @@ NAMES = (
     "ALPHA_MAX",
     "T_STOP",
     "DET_FLOOR",
+    "COLOR_LIMIT",
     "C0",
     "C1",
     "C2",
@@ -39,7 +40,7 @@ def header() -> str:
     ]
     lines += ["", "namespace gsplat {", "", f"constexpr int TILE = {c.TILE};"]
     lines += [_line(name, getattr(c, name)) for name in NAMES]
-    lines.append(_line("LOG2_ALPHA_MIN", math.log2(c.ALPHA_MIN)))
+    lines += [_line(f"LOG2_{name}", math.log2(getattr(c, name))) for name in ("ALPHA_MIN", "ALPHA_MAX")]
     window = [math.exp(-(k**2) / (2 * c.SSIM_SIGMA**2)) for k in range(SSIM_TAPS)]
     total = window[0] + 2 * sum(window[1:])
     lines.append(_line("SSIM_TAP", tuple(tap / total for tap in window)))

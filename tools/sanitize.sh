@@ -5,6 +5,7 @@ cd "$(dirname "$0")/.."
 python=$PWD/.venv/bin/python
 build=$PWD/build/sanitize
 export PATH="$PWD/.venv/bin:$PATH"
+mkdir -p build
 cmake -S . -B "$build" -G Ninja -DGSPLAT_SANITIZE=ON -DPython_EXECUTABLE="$python" > "$build.log" 2>&1 ||
     { cat "$build.log" >&2; exit 1; }
 cmake --build "$build"

@@ -32,6 +32,10 @@ Source: Kerbl et al. 2023, appendix C."""
 TILE: Final = 16
 """px: edge of the square tiles in which kernels composite and stop. Source: Kerbl et al. 2023, section 6."""
 
+COLOR_LIMIT: Final = 1e6
+"""The kernels take a colour beyond this for one that is not finite and leave its Gaussian out. No photo comes near, and
+the gradients of the Gaussians around it would lose all their digits to it. Source: ours."""
+
 DET_FLOOR: Final = 1e-12
 """px⁴: floor under the determinant of a screen-space covariance before its dilation, where antialiasing takes
 the root of its ratio to the one after. A Gaussian that is a line on the screen has determinant 0, where the

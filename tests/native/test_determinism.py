@@ -11,6 +11,7 @@ from gsplat_edu.train.config import DensityConfig, TrainConfig
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
+from native_scenes import random
 
 
 def test_300_iterations_of_training(set_threads):
@@ -30,3 +31,19 @@ def test_300_iterations_of_training(set_threads):
     for run in runs[1:]:
         for name, tensor in run.items():
             assert torch.equal(tensor, runs[0][name]), name
+
+
+def test_a_scene_of_many_blocks_and_chunks(set_threads):
+    """12,000 Gaussians at 400 x 260: dozens of blocks to project, a dozen chunks to sort into 425 tiles."""
+    scene = random(12_000, (400, 260), seed=1)
+    results = []
+    for threads in (1, 2, 5):
+        set_threads(threads)
+        gaussians = scene.gaussians(torch.float32).trainable()
+        out = render(gaussians, scene.camera, backend="cpu")
+        (out.image.square().sum() + out.depth.sum()).backward()
+        found = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
+        results.append(found | {"image": out.image.detach(), "T": out.transmittance.detach()})
+    for other in results[1:]:
+        for name, tensor in results[0].items():
+            assert torch.equal(tensor, other[name]), name

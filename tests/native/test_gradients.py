@@ -85,7 +85,8 @@ def test_gradcheck_of_lower_degrees(degree):
     assert torch.autograd.gradcheck(forward, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
-def test_gradcheck_of_the_lower_door(isa):
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradcheck_of_the_lower_door(isa, antialiased):
     """Covariances are moved along symmetric directions: S = B B' + 0.1 I."""
     generator = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
@@ -94,12 +95,16 @@ def test_gradcheck_of_the_lower_door(isa):
     )
     roots, colors, logits = 0.4 * draw(4, 3, 3), draw(4, 3), 0.5 * draw(4)
 
-    def forward(means, roots, colors, logits):
+    settings = RenderSettings(antialiased=antialiased)
+
+    def forward(background, means, roots, colors, logits):
         covs = roots @ roots.mT + 0.3 * torch.eye(3, dtype=torch.float64)
-        out = render_covariances(means, covs, colors, torch.sigmoid(logits), camera(11, 9))
+        opacities = torch.sigmoid(logits)
+        out = render_covariances(means, covs, colors, opacities, camera(11, 9), settings, background)
         return out.image, out.transmittance, out.depth
 
-    inputs = [t.requires_grad_() for t in (means, roots, colors, logits)]
+    background = torch.tensor(BACKGROUND, dtype=torch.float64)
+    inputs = [t.requires_grad_() for t in (background, means, roots, colors, logits)]
     assert torch.autograd.gradcheck(forward, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 

@@ -1,5 +1,6 @@
 """What must not happen: crashes, hangs, leaks, and one bad Gaussian spoiling the others."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -33,8 +34,8 @@ def poisoned(gaussians: Gaussians, victims: torch.Tensor, rng: np.random.Generat
 def test_poison_stays_where_it_is(block):
     """25 seeds a block, 200 in all: where no victim is drawn, image and gradients are those without the victims.
 
-    A victim is still drawn where its numbers can be (a scale of 0, a huge but finite colour): then it is part of
-    the image, and the others' gradients have to stay finite.
+    A victim is still drawn where its numbers can be (a scale of 0, an opacity of 1): then it is part of the image,
+    and image and gradients have to stay finite.
     """
     for seed in range(25 * block, 25 * block + 25):
         rng = np.random.default_rng(seed)
@@ -44,23 +45,19 @@ def test_poison_stays_where_it_is(block):
         out = render(changed, scene.camera, backend="cpu")
         assert torch.isfinite(out.transmittance).all(), seed
         weights = torch.tensor(rng.normal(size=out.image.shape), dtype=torch.float32)
-        (out.image * weights).sum().backward()
+        ((out.image * weights).sum() + out.depth.sum()).backward()
         others = torch.ones(40, dtype=torch.bool)
         others[victims] = False
-        drawn = set(out.visible.tolist())
-        if not drawn & set(victims.tolist()):
+        assert torch.isfinite(out.image).all() and torch.isfinite(out.depth).all(), seed
+        for name, tensor in changed.tensors().items():
+            assert torch.isfinite(tensor.grad[others]).all(), (seed, name)
+        if not set(out.visible.tolist()) & set(victims.tolist()):
             clean = scene.gaussians(torch.float32).map(lambda t, others=others: t[others].clone()).trainable()
             expected = render(clean, scene.camera, backend="cpu")
             assert torch.equal(out.image, expected.image), seed
-            (expected.image * weights).sum().backward()
+            ((expected.image * weights).sum() + expected.depth.sum()).backward()
             for name, tensor in changed.tensors().items():
                 assert torch.equal(tensor.grad[others], clean.tensors()[name].grad), (seed, name)
-        sane = all(float(changed.tensors()["sh0"][v].detach().abs().max()) < 1e6 for v in drawn)
-        sane = sane and all(float(changed.sh_rest[v].detach().abs().max()) < 1e6 for v in drawn)
-        if sane:
-            assert torch.isfinite(out.image).all(), seed
-            for name, tensor in changed.tensors().items():
-                assert torch.isfinite(tensor.grad[others]).all(), (seed, name)
 
 
 def test_a_gaussian_that_is_not_finite_is_left_out_with_zero_gradient():
@@ -75,6 +72,70 @@ def test_a_gaussian_that_is_not_finite_is_left_out_with_zero_gradient():
     out.image.sum().backward()
     for name, tensor in gaussians.tensors().items():
         assert (tensor.grad[[3, 5, 7]] == 0).all(), name
+
+
+def test_a_mean_at_the_end_of_all_numbers_does_not_reach_the_depth():
+    scene = random(10)
+    gaussians = scene.gaussians(torch.float32)
+    R = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
+    gaussians.means[4] = 3e38
+    out = render(gaussians, Camera(R, (-2.0, -2.0, -2.0), 30, 30, 15, 15, 30, 30), backend="cpu")
+    assert torch.isfinite(out.depth).all() and 4 not in out.visible.tolist()
+
+
+def test_thin_splats_far_off_stay_between_nothing_and_everything(isa):
+    """The terms of their exponents cancel to more than the opacity allows; alpha may not follow."""
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        direction = rng.normal(size=3)
+        means = torch.tensor(
+            500.0 * direction / np.linalg.norm(direction) + (0, 0, 5.0), dtype=torch.float32
+        )[None]
+        means[:, 2] = means[:, 2].abs() + 1
+        one = Gaussians(
+            means=means,
+            quats=torch.tensor(rng.normal(size=(1, 4)), dtype=torch.float32),
+            log_scales=torch.tensor([[np.log(1000.0), -6.0, -6.0]], dtype=torch.float32),
+            sh0=torch.ones(1, 1, 3),
+            sh_rest=torch.zeros(1, 0, 3),
+            logit_opacities=torch.tensor([1.0]),
+        ).trainable()
+        out = render(one, Camera(np.eye(3), (0, 0, 0), 100, 100, 50, 50, 100, 100), backend="cpu")
+        lowest = 1 - torch.sigmoid(torch.tensor(1.0))
+        assert out.transmittance.min() >= lowest - 1e-6 and out.transmittance.max() <= 1
+        out.image.sum().backward()
+        assert all(torch.isfinite(t.grad).all() for t in one.tensors().values())
+
+
+def test_backward_finds_the_tensors_where_they_are_then():
+    """Checkpointing throws the forward pass's tensors away and makes them again elsewhere."""
+    scene = random(60)
+    found = []
+    for wrap in (False, True):
+        gaussians = scene.gaussians(torch.float32).trainable()
+
+        def image(means, gaussians=gaussians):
+            moved = dataclasses.replace(gaussians, means=means * 1.0)
+            return render(moved, scene.camera, backend="cpu").image
+
+        if wrap:
+            result = torch.utils.checkpoint.checkpoint(image, gaussians.means, use_reentrant=False)
+        else:
+            result = image(gaussians.means)
+        torch.rand(200_000)  # takes what was freed
+        result.square().sum().backward()
+        found.append({name: t.grad for name, t in gaussians.tensors().items()})
+    for name, gradient in found[0].items():
+        assert torch.equal(gradient, found[1][name]), name
+
+
+def test_a_second_backward_adds_to_the_norms():
+    scene = random(20)
+    out = render(scene.gaussians().trainable(), scene.camera, backend="cpu")
+    out.image.sum().backward(retain_graph=True)
+    once = out.means2d_grad_norms().clone()
+    out.image.sum().backward()
+    torch.testing.assert_close(out.means2d_grad_norms(), 2 * once)
 
 
 @pytest.mark.parametrize("case", ["none", "all culled"])
@@ -207,3 +268,29 @@ def test_an_instruction_set_that_is_not_there_is_said_so():
     )
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "GSPLAT_EDU_ISA=v9" in done.stderr and "v2" in done.stderr
+
+
+@pytest.mark.own_process
+def test_the_dense_backend_trains_without_the_native_module(tmp_path):
+    code = "from gsplat_edu.cli.main import main; import sys; sys.exit(main(sys.argv[1:]))"
+    arguments = [
+        "demo",
+        "--backend",
+        "torch",
+        "--iters",
+        "2",
+        "--size",
+        "8",
+        "--k0",
+        "5",
+        "--out",
+        str(tmp_path / "x.png"),
+    ]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env=os.environ | {"GSPLAT_EDU_ISA": "v9"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 import torch
 
@@ -57,3 +59,25 @@ def test_moments_follow_survivors_and_start_at_zero_for_the_newborn():
     assert adam.steps == 1
     torch.testing.assert_close(adam.first["means"], torch.cat([m[[0, 3]], torch.zeros(2, 3).double()]))
     torch.testing.assert_close(adam.second["means"], torch.cat([v[[0, 3]], torch.zeros(2, 3).double()]))
+
+
+def test_parameters_need_not_be_contiguous_and_autograd_hears_of_the_step():
+    gaussians = start()
+    strided = dataclasses.replace(gaussians, means=gaussians.means.detach().T.contiguous().T.requires_grad_())
+    plain = start()
+    for scene in (strided, plain):
+        before = scene.means._version
+        set_gradients(scene, torch.Generator().manual_seed(5))
+        Adam(scene, RATES).step(scene)
+        assert scene.means._version > before
+    assert not strided.means.is_contiguous()
+    torch.testing.assert_close(strided.means, plain.means, rtol=0, atol=1e-15)
+
+
+def test_moments_that_did_not_follow_are_refused():
+    gaussians = start()
+    adam = Adam(gaussians, RATES)
+    fewer = gaussians.map(lambda tensor: tensor[:3]).trainable()
+    set_gradients(fewer, torch.Generator().manual_seed(5))
+    with pytest.raises(ArgumentError, match="follow"):
+        adam.step(fewer)

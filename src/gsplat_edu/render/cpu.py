@@ -65,6 +65,7 @@ def render_covariances(
     opacities: Tensor,
     camera: Camera,
     settings: RenderSettings | None = None,
+    background: Tensor | None = None,
 ) -> RenderOutput:
     """Render Gaussians given as covariances and colours: what the chapter's dense `render_t` takes.
 
@@ -75,6 +76,7 @@ def render_covariances(
         opacities: (N,) 0 to 1.
         camera: The camera.
         settings: Background, antialiasing and depth; the defaults where None.
+        background: (3,) background as a tensor, to differentiate in; that of the settings where None.
 
     Returns:
         The view.
@@ -83,7 +85,7 @@ def render_covariances(
         ShapeError: a shape differs, or the arguments have different N.
         ArgumentError: an entry is NaN or infinite, or dtypes are not one of float32 and float64.
 
-    Differentiable in: means, cov3ds, colors, opacities. Not in: the camera.
+    Differentiable in: means, cov3ds, colors, opacities, background. Not in: the camera.
     """
     settings = settings or RenderSettings()
     sizes: dict[str, int] = {}
@@ -91,7 +93,9 @@ def render_covariances(
     check_tensor("cov3ds", cov3ds, ("N", 3, 3), sizes)
     check_tensor("colors", colors, ("N", 3), sizes)
     check_tensor("opacities", opacities, ("N",), sizes)
-    background = torch.tensor(settings.background, dtype=means.dtype)
+    if background is None:
+        background = torch.tensor(settings.background, dtype=means.dtype)
+    check_tensor("background", background, (3,), {})
     call = _Call(camera, settings, 0, direct=True)
     return _output(call, background, means, cov3ds, colors, opacities)
 
@@ -167,20 +171,25 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        *kept, image, _, _ = ctx.saved_tensors
+        *kept, image, transmittance, depth = ctx.saved_tensors
         call: _Call = ctx.call
         incoming = [None if g is None else g.contiguous() for g in grads]
         if incoming[0] is None:
             incoming[0] = torch.zeros_like(image)
         outgoing = [torch.empty_like(p) for p in kept]
-        call.norms = kept[0].new_empty(len(kept[0]))
+        norms = kept[0].new_empty(len(kept[0]))
         background = kept[0].new_empty(3)
-        addresses = _scene(outgoing, call.direct)
+        # Saved tensors may have been moved since the forward pass: the kernels are told where they are now.
         ctx.frame.backward(
+            len(norms),
+            0 if call.direct else kept[4].shape[1],
+            _scene(kept, call.direct),
+            [image.data_ptr(), transmittance.data_ptr(), depth.data_ptr() if call.settings.depth else 0],
             [0 if g is None else g.data_ptr() for g in incoming],
-            [*addresses, call.norms.data_ptr()],
+            [*_scene(outgoing, call.direct), norms.data_ptr()],
             background.data_ptr(),
         )
+        call.norms = norms if call.norms is None else call.norms + norms
         return None, background, *outgoing
 
 

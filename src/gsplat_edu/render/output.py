@@ -37,7 +37,8 @@ class RenderOutput:
         """Return the signal of density control: |(gx W/2, gy H/2)|, g = d loss / d mean in the image, px.
 
         The factors turn pixels into normalised device coordinates, so that one threshold serves every image
-        size. Zero for Gaussians the loss does not reach.
+        size. Zero for Gaussians the loss does not reach. A second backward through the same image adds to it, as it
+        does to gradients.
 
         Raises:
             ArgumentError: backward has not run through this image.

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
+from gsplat_edu import kernels
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.kernels import kernel
 
 
 class Adam:
@@ -21,7 +21,7 @@ class Adam:
 
     The step count t is shared by all and survives density control, as in Kerbl et al.'s code. On the CPU a
     step is one native pass over each parameter, the same to the bit on any number of threads; elsewhere it is
-    torch's.
+    torch's, as it is where the native module is not there.
 
     Args:
         gaussians: The parameters to move.
@@ -49,8 +49,14 @@ class Adam:
             )
         self.learning_rates, self.betas, self.eps = dict(learning_rates), betas, eps
         self.steps = 0
-        self.first = {name: torch.zeros_like(tensors[name]) for name in self.learning_rates}
-        self.second = {name: torch.zeros_like(tensors[name]) for name in self.learning_rates}
+        self.first = {
+            name: torch.zeros_like(tensors[name], memory_format=torch.contiguous_format)
+            for name in self.learning_rates
+        }
+        self.second = {
+            name: torch.zeros_like(tensors[name], memory_format=torch.contiguous_format)
+            for name in self.learning_rates
+        }
 
     @torch.no_grad()
     def step(self, gaussians: Gaussians) -> None:
@@ -63,12 +69,12 @@ class Adam:
             if parameter.grad is None:
                 continue
             numbers = (rate, b1, b2, self.eps, 1 - b1**self.steps, 1 - b2**self.steps)
-            if parameter.device.type == "cpu":
-                arrays = (parameter, m, v, parameter.grad.contiguous())
-                step = kernel("adam_f", parameter.dtype)
-                step([a.data_ptr() for a in arrays], parameter.numel(), numbers, torch.get_num_threads())
-            else:
-                _step_in_torch(parameter, m, v, numbers)
+            if m.shape != parameter.shape:
+                raise ArgumentError(
+                    f"{name}: has shape {tuple(parameter.shape)}, its moments {tuple(m.shape)}; call follow"
+                )
+            step = _step_natively if _native_takes(parameter) else _step_in_torch
+            step(parameter, m, v, numbers)
         for parameter in tensors.values():
             parameter.grad = None
 
@@ -83,6 +89,22 @@ class Adam:
         for moments in (self.first, self.second):
             for name, old in moments.items():
                 moments[name] = torch.cat([old[survivors], old.new_zeros(num_new, *old.shape[1:])])
+
+
+def _native_takes(parameter: Tensor) -> bool:
+    here = (
+        parameter.device.type == "cpu" and parameter.dtype in kernels.SUFFIXES and parameter.is_contiguous()
+    )
+    return here and kernels.REASON is None
+
+
+def _step_natively(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:
+    gradient = parameter.grad
+    if gradient is not None:
+        arrays = (parameter, m, v, gradient.to(parameter.dtype).contiguous())
+        step = kernels.kernel("adam_f", parameter.dtype)
+        step([a.data_ptr() for a in arrays], parameter.numel(), numbers, torch.get_num_threads())
+        torch.autograd.graph.increment_version(parameter)  # so that autograd knows of the change
 
 
 def _step_in_torch(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:
