@@ -11,6 +11,7 @@ thread: machines drift, and that drifts with them.
 from __future__ import annotations
 
 import statistics
+from typing import NamedTuple
 
 import hardware
 import numpy as np
@@ -32,22 +33,36 @@ def scene(count: int) -> list[torch.Tensor]:
     return [torch.tensor(array, dtype=torch.float32) for array in arrays]
 
 
-def frame_seconds(parameters: list[torch.Tensor], threads: int) -> tuple[tuple[float, ...], int]:
+class Room(NamedTuple):
+    """Where results go, made once: the system's handing out of pages is not the raster's cost."""
+
+    image: torch.Tensor
+    transmittance: torch.Tensor
+    gradient: torch.Tensor
+    out: list[torch.Tensor]
+    norms: torch.Tensor
+    background: torch.Tensor
+
+
+def room(parameters: list[torch.Tensor]) -> Room:
+    """Make room for the results of a scene."""
+    gradient = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
+    norms, out = torch.zeros(len(parameters[0])), [torch.zeros_like(p) for p in parameters]
+    return Room(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE), gradient, out, norms, torch.zeros(3))
+
+
+def frame_seconds(parameters: list[torch.Tensor], to: Room, threads: int) -> tuple[tuple[float, ...], int]:
     """Render once and go back once; return the seconds of each stage and the number of pairs."""
     camera = Camera(np.eye(3), (0, 0, 0), FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE)
     means, covs, colors, opacities = (p.data_ptr() for p in parameters)
     view = [*camera.R.ravel(), *camera.eye, camera.fx, camera.fy, camera.cx, camera.cy, 0.05, 0, 0, 0]
     addresses = [means, 0, 0, 0, 0, 0, covs, colors, opacities]
     frame = _native.FrameF32(len(parameters[0]), 0, addresses, view, SIZE, SIZE, 0, False, threads)
-    image, transmittance = torch.empty(SIZE, SIZE, 3), torch.empty(SIZE, SIZE)
-    frame.composite(image.data_ptr(), transmittance.data_ptr(), 0)
-    gradient = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
-    out = [torch.empty_like(p) for p in parameters]
-    norms, background = torch.empty(len(parameters[0])), torch.empty(3)
-    outgoing = [out[0].data_ptr(), 0, 0, 0, 0, 0, *(o.data_ptr() for o in out[1:]), norms.data_ptr()]
-    forward = [image.data_ptr(), transmittance.data_ptr(), 0]
-    incoming = [gradient.data_ptr(), 0, 0]
-    frame.backward(len(norms), 0, addresses, forward, incoming, outgoing, background.data_ptr())
+    forward = [to.image.data_ptr(), to.transmittance.data_ptr(), 0]
+    frame.composite(*forward)
+    outgoing = [to.out[0].data_ptr(), 0, 0, 0, 0, 0, *(o.data_ptr() for o in to.out[1:]), to.norms.data_ptr()]
+    incoming = [to.gradient.data_ptr(), 0, 0]
+    frame.backward(len(to.norms), 0, addresses, forward, incoming, outgoing, to.background.data_ptr())
     return frame.seconds, frame.num_pairs
 
 
@@ -55,8 +70,9 @@ def measure(count: int, isa: str, threads: int) -> dict[str, float | str]:
     """Measure one line of the table."""
     _native.choose_isa(isa)
     parameters = scene(count)
-    frame_seconds(parameters, threads)
-    rounds = [frame_seconds(parameters, threads) for _ in range(ROUNDS)]
+    to = room(parameters)
+    frame_seconds(parameters, to, threads)
+    rounds = [frame_seconds(parameters, to, threads) for _ in range(ROUNDS)]
     rate = statistics.median(_native.fma_rate() for _ in range(3))
     pairs = rounds[0][1]
     row: dict[str, float | str] = {

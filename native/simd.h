@@ -125,14 +125,13 @@ GSPLAT_INLINE bool any_at_least(VD v, double x) {
 // terms of p cancel. n = round(p) (by adding and subtracting 1.5 * 2^23, which -ffast-math would fold away), then a
 // polynomial of degree 5 on [-1/2, 1/2] fitted for its relative error, 2.4e-7.
 GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
-    const VF top = splat(most);
 #if GSPLAT_VECTOR_BYTES == 64
     const __mmask16 keep = _mm512_cmp_ps_mask((__m512)p, _mm512_set1_ps(least), _CMP_GE_OQ);
-    p = p < top ? p : top;
+    p = (VF)_mm512_min_ps((__m512)p, _mm512_set1_ps(most));
     const __m512 n = _mm512_roundscale_ps((__m512)p, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
     const VF f = p - (VF)n;
 #else
-    const VF magic = splat(12582912.0f), bottom = splat(least);
+    const VF magic = splat(12582912.0f), bottom = splat(least), top = splat(most);
     const auto keep = p >= bottom;
     p = p < top ? p : top;
     p = p > bottom ? p : bottom;  // a smaller one would shift out of the exponent

@@ -140,17 +140,20 @@ def test_double_agrees_with_autograd_through_the_dense_renderer(name, antialiase
         )
 
 
-@pytest.mark.parametrize("name", ["random", "17 x 33", "one Gaussian", "larger than the image"])
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "ties in depth"])
 def test_float_agrees_with_double(isa, name):
-    """Absolute: 2e-3 of the largest gradient of the parameter.
+    """Absolute: 3e-4 of the parameter's largest gradient. Ties are left out: rounding decides who is nearer.
 
-    eps |R0| / (1 - alpha) is at most 1.2e-7 x 100 |R0| with alphas up to 0.99, 1.2e-5 of R0 for each layer; a
-    hundred layers over a pixel add up to 1.2e-3 at the very worst.
+    R loses eps |R0| / (1 - alpha) at a layer, 1.2e-7 x 100 = 1.2e-5 of R0 behind the clamp of 0.99; a pixel lets two
+    such layers through before its tile stops, and some twenty fainter ones with a tenth of that each. Needles, and
+    what passes close by the camera, have conics with ac / det up to some 200: 8 eps times that times exponents of
+    up to 20 is 4e-3, which is what they get.
     """
+    bound = 4e-3 if name in ("needles 100:1", "partly behind") else 3e-4
     single, double = (gradients(SCENES[name], "cpu", dtype) for dtype in (torch.float32, torch.float64))
     for key, gradient in double.items():
-        scale = float(gradient.abs().max()) + 1e-9
-        assert float((single[key].double() - gradient).abs().max()) < 2e-3 * scale, key
+        error = float((single[key].double() - gradient).abs().max())
+        assert error < bound * float(gradient.abs().max()), key
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

@@ -2,11 +2,12 @@
 
 float64: sums of at most a few thousand terms of order 1 in another order: 1e-12.
 
-float32: a weight w = T alpha carries the relative errors of its alpha and of those in front of it. An alpha's
-exponent carries a few eps times its conditioning, K = cond (terms + slope |p|) as in
-tests/parity/test_dense_against_numpy.py; here it is bounded by what the scene's double render says when its
-parameters are perturbed by 4 float32 eps: errors of the arithmetic are of the size of those of its input. Ten
-times the largest such change, plus 1/255 where an alpha may fall on either side of the floor.
+float32: the kernels compute with a few roundings per step what the double render computes without; to a rounding
+each step is exact for parameters that are a few eps away (backward stability: projections, exponents and products
+are sums and products without cancellation beyond that of their input). So the error of a pixel is bounded by how much
+it moves when the parameters move by 4 eps, times 4 for what eight random moves may have missed, plus the rounding of
+the sum over its layers, eps times the largest colour times their number in sequence (a hundred). A pixel where an
+alpha is within that of the floor may gain or lose 1/255 of a colour: two such pixels a scene are allowed.
 """
 
 import numpy as np
@@ -86,10 +87,8 @@ def test_float_stays_within_its_rounding(isa, name):
     scene = SCENES[name]
     image, T, _ = rendered(scene, torch.float32)
     truth, truth_T, _ = scene.truth()
-    bright = max(1.0, np.abs(scene.sh).max())
-    error = np.abs(image - truth).max(axis=-1)
-    bound = 10 * sensitivity(scene) + bright * 1e-5
-    over = error > bound
-    assert over.mean() < 0.01, "only where an alpha is on the floor"
-    assert error.max() < 10 * bright / 255
-    assert np.abs(T - truth_T).max() < 10 / 255
+    bright = max(1.0, np.abs(image).max())
+    error = np.maximum(np.abs(image - truth).max(axis=-1), np.abs(T - truth_T))
+    over = error > 4 * sensitivity(scene) + 100 * np.finfo(np.float32).eps * bright
+    assert over.sum() <= 2
+    assert error.max() < 1.1 * bright / 255
