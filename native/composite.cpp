@@ -68,7 +68,10 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     Rows rows;
     for (; k < end; ++k) {
         const uint32_t i = (k - begin) % BATCH;
-        if (i == 0) rows_of(args.splats, args.pairs + k, vmin(BATCH, end - k), box, rows);
+        if (i == 0) {
+            fetch_next(args.splats, args.pairs + k, end - k);
+            rows_of(args.splats, args.pairs + k, vmin(BATCH, end - k), box, rows);
+        }
         if (rows.first[i] > rows.last[i]) continue;
         const Splat<T> &s = args.splats[args.pairs[k].gaussian];
         if (!draw<T, DEPTH>(s, box, rows.first[i], rows.last[i], tile) && !lets_light_through(tile)) {

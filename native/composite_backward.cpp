@@ -99,7 +99,10 @@ void undo_tile(const CompositeBackwardArgs<T> &args, int32_t index) {
         T *slot = args.slots + int64_t(SLOT) * forward.pairs[k].slot;
         const uint32_t i = (k - begin) % BATCH;
         if (k + 4 < end) __builtin_prefetch(args.slots + int64_t(SLOT) * forward.pairs[k + 4].slot, 1);
-        if (i == 0 && k < stop) rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
+        if (i == 0 && k < stop) {
+            fetch_next(forward.splats, forward.pairs + k, stop - k);
+            rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
+        }
         if (k >= stop || rows.first[i] > rows.last[i])
             for (int j = 0; j < SLOT; ++j) slot[j] = 0;
         else

@@ -25,6 +25,16 @@ struct Rows {
     int32_t first[BATCH], last[BATCH];
 };
 
+// Asks for the records of the batch after the one that begins at `pairs`; a record may lie across two lines of cache.
+template <class T>
+GSPLAT_INLINE void fetch_next(const Splat<T> *splats, const Pair *pairs, uint32_t left) {
+    for (uint32_t i = BATCH; i < 2 * BATCH && i < left; ++i) {
+        const char *record = reinterpret_cast<const char *>(splats + pairs[i].gaussian);
+        __builtin_prefetch(record);
+        __builtin_prefetch(record + sizeof(Splat<T>) - 1);
+    }
+}
+
 // Over the tile's columns [low, high] (relative to the mean) the ellipse reaches from its highest to its lowest point, or
 // to where the band ends nearest to that point. At width dx it spans dy = tangent dx +- half sqrt(1 - (dx / ex)²).
 // Plain loops over BATCH lanes, which the compiler turns into vectors.
