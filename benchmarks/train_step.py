@@ -64,7 +64,7 @@ class Reader:
 
 
 def read_cameras(model: Path) -> list[tuple[str, Camera]]:
-    """Read names and cameras; the principal point moves by half a pixel, as our pixels are sampled at their corner."""
+    """Read names and cameras; COLMAP puts the centre of the first pixel at (0.5, 0.5), we put it at (0, 0)."""
     file, intrinsics = Reader(model / "cameras.bin"), {}
     for _ in range(file.take("Q")[0]):
         identity, kind, W, H = file.take("IiQQ")

@@ -23,8 +23,8 @@ template <class T, bool WITH_DEPTH>
 GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileGradient<T> &tile, T *slot) {
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
-    // w g (3), and the moments of h: 1, x, xx, y, xy in the order in which they are summed; then yy and w z.
     const T most = vmin(s.log2_o, T(LOG2_ALPHA_MAX));
+    // w g (3) and the moments of h, 1, x, xx, y, xy, in the order of a slot; then yy and w z.
     V sums[8] = {}, hyy = V{}, wz = V{};
     for (int column = 0; column < TILE; column += LANES) {
         const V dx = iota<T>() + splat(T(column + box.x0) - s.u);

@@ -36,7 +36,7 @@ GSPLAT_INLINE Ellipse<T> ellipse(const Splat<T> &s) {
 // Calls visit(tile_y, first tile_x, last tile_x) for every row of tiles that the ellipse meets.
 template <class T, class F>
 GSPLAT_INLINE void rows_of_tiles(const Ellipse<T> &e, const Camera &cam, F visit) {
-    const T slack = T(1e-3);  // px: rounding must not lose a pixel on the rim; what it adds is below the floor
+    const T slack = T(RIM_SLACK);
     const int32_t first = int32_t(vmax(ceil_(e.v - e.ey - slack), T(0)));
     const int32_t last = int32_t(vmin(floor_(e.v + e.ey + slack), T(cam.H - 1)));
     if (first > last) return;

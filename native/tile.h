@@ -46,7 +46,7 @@ GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t c
         u[i] = s.u, v[i] = s.v, a[i] = s.a, b[i] = s.b, c[i] = s.c, ex[i] = s.extent[0], ey[i] = s.extent[1];
         drop[i] = s.log2_o - T(LOG2_ALPHA_MIN);
     }
-    const T x0 = T(box.x0), y0 = T(box.y0), lowest = T(box.height - 1), slack = T(1e-3);
+    const T x0 = T(box.x0), y0 = T(box.y0), lowest = T(box.height - 1), slack = T(RIM_SLACK);
     for (uint32_t i = 0; i < BATCH; ++i) {
         const T low = x0 - u[i], high = low + T(TILE - 1);
         const T tangent = -b[i] / (2 * c[i]), half = sqrt_(vmax(drop[i] / -c[i], T(0)));

@@ -20,6 +20,12 @@ from native_scenes import camera, random
 POISONS = (float("nan"), float("inf"), -float("inf"), 1e-42, 3e38, -3e38, 1e20, -1e20, 0.0)
 
 
+def python(code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
+    """Run Python once more, with additions to the environment."""
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
+
+
 def poisoned(gaussians: Gaussians, victims: torch.Tensor, rng: np.random.Generator) -> Gaussians:
     """Put a poison into one random number of one parameter of every victim."""
     changed = gaussians.map(torch.clone)
@@ -230,67 +236,30 @@ for _ in range(300):
     turn()
 print(rss() - before)
 """
-    here = str(Path(__file__).parents[1])
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"PYTHONPATH": here},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python(code, PYTHONPATH=str(Path(__file__).parents[1]))
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) < 16.0
+
+
+MAIN = "from gsplat_edu.cli.main import main; import sys; sys.exit(main(sys.argv[1:]))"
 
 
 @pytest.mark.own_process
 @pytest.mark.parametrize("name", _native.isas())
 def test_the_environment_forces_an_instruction_set(name):
-    code = "from gsplat_edu import _native; print(_native.isa())"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"GSPLAT_EDU_ISA": name},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python("from gsplat_edu import _native; print(_native.isa())", GSPLAT_EDU_ISA=name)
     assert done.stdout.strip() == name
 
 
 @pytest.mark.own_process
 def test_an_instruction_set_that_is_not_there_is_said_so():
-    code = "from gsplat_edu.cli.main import main; import sys; sys.exit(main(['demo', '--backend', 'cpu']))"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"GSPLAT_EDU_ISA": "v9"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python(MAIN, "demo", "--backend", "cpu", GSPLAT_EDU_ISA="v9")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "GSPLAT_EDU_ISA=v9" in done.stderr and "v2" in done.stderr
 
 
 @pytest.mark.own_process
 def test_the_dense_backend_trains_without_the_native_module(tmp_path):
-    code = "from gsplat_edu.cli.main import main; import sys; sys.exit(main(sys.argv[1:]))"
-    arguments = [
-        "demo",
-        "--backend",
-        "torch",
-        "--iters",
-        "2",
-        "--size",
-        "8",
-        "--k0",
-        "5",
-        "--out",
-        str(tmp_path / "x.png"),
-    ]
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        env=os.environ | {"GSPLAT_EDU_ISA": "v9"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    budget = ["--iters", "2", "--size", "8", "--k0", "5", "--out", str(tmp_path / "x.png")]
+    done = python(MAIN, "demo", "--backend", "torch", *budget, GSPLAT_EDU_ISA="v9")
     assert done.returncode == 0, done.stderr
