@@ -9,6 +9,7 @@ between. Then the kernels train all 800 iterations.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import statistics
 import time
@@ -16,30 +17,38 @@ import time
 import hardware
 import torch
 
+from gsplat_edu import Camera
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
+from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
 
-NATIVE = functools.partial(render, backend="cpu", settings=RenderSettings(depth=False))
-DENSE = {
-    chunk: functools.partial(render, backend="torch", settings=RenderSettings(depth=False, dense_chunk=chunk))
-    for chunk in (512, 16)
-}
+SETTINGS = RenderSettings(depth=False)
+NATIVE = functools.partial(render, backend="cpu")
+
+
+def dense(gaussians: Gaussians, camera: Camera, *, settings: RenderSettings, chunk: int) -> RenderOutput:
+    """Render on the dense backend, so many splats at a time."""
+    settings = dataclasses.replace(settings, dense_chunk=chunk)
+    return render(gaussians, camera, settings=settings, backend="torch")
+
+
+DENSE = {chunk: functools.partial(dense, chunk=chunk) for chunk in (512, 16)}
 
 
 def whole_run() -> tuple[Gaussians, float]:
     """Train the chapter's 800 iterations; return the scene and the milliseconds per iteration."""
-    capture = sphere_capture(128)
+    capture, config = sphere_capture(128), course_config()
     generator = torch.Generator().manual_seed(9)
     start = random_ball(400, generator)
-    control = AdaptiveDensityControl(DensityConfig(), generator, start)
-    trainer = Trainer(start, capture.train, TrainConfig(), render=NATIVE, density=control)
+    control = AdaptiveDensityControl(config, EXTENT, generator, start)
+    trainer = Trainer(start, capture.train, config, render=NATIVE, extent=EXTENT, density=control)
     result = trainer.run()
     return trainer.gaussians, 1e3 * result.seconds / len(result.losses)
 
@@ -47,7 +56,8 @@ def whole_run() -> tuple[Gaussians, float]:
 def iteration_ms(scene: Gaussians, renderer: object, iterations: int) -> float:
     """Time iterations of a fixed number of Gaussians."""
     capture = sphere_capture_once()
-    trainer = Trainer(scene, capture.train, TrainConfig(iterations=iterations), render=renderer)
+    config = course_config(iterations=iterations)
+    trainer = Trainer(scene, capture.train, config, render=renderer, extent=EXTENT)
     return 1e3 * trainer.run().seconds / iterations
 
 
@@ -65,7 +75,7 @@ def stages(scene: Gaussians, rounds: int = 200) -> dict[str, float]:
     found: dict[str, list[float]] = {name: [] for name in (*names, "render", "loss", "backward")}
     for _ in range(rounds):
         start = time.perf_counter()
-        output = NATIVE(leaves, view.camera)
+        output = NATIVE(leaves, view.camera, settings=SETTINGS)
         frame = output.image.grad_fn.frame
         rendered = time.perf_counter()
         loss = l1(output.image, target)

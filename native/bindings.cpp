@@ -27,14 +27,15 @@ T *at(Address address) {
     return reinterpret_cast<T *>(address);
 }
 
-// View: R (9), eye (3), fx, fy, cx, cy, z_near, background (3).
-using View = std::array<double, 20>;
+// View: R (9), eye (3), fx, fy, cx, cy, z_near, background (3), bounds of x/z (2) and y/z (2) inside the Jacobian.
+using View = std::array<double, 24>;
 
 Camera camera_of(const View &v, int32_t H, int32_t W) {
     Camera cam{};
     for (int k = 0; k < 9; ++k) cam.R[k] = v[k];
     for (int k = 0; k < 3; ++k) cam.eye[k] = v[9 + k];
-    cam.fx = v[12], cam.fy = v[13], cam.cx = v[14], cam.cy = v[15], cam.H = H, cam.W = W;
+    cam.fx = v[12], cam.fy = v[13], cam.cx = v[14], cam.cy = v[15];
+    cam.x_low = v[20], cam.x_high = v[21], cam.y_low = v[22], cam.y_high = v[23], cam.H = H, cam.W = W;
     return cam;
 }
 

@@ -100,6 +100,7 @@ GSPLAT_INLINE void harmonics_backward(int degree, T x, T y, T z, const T *g, T *
 template <class T>
 struct Projected {
     T offset[3], p[3];              // mean - eye in world axes; mean in camera axes
+    T ratio[2];                     // x/z and y/z, clamped, as the Jacobian takes them
     T t0[3], t1[3];                 // rows of J W
     T q[4], q_norm, R[9], s[3];     // unit quaternion, its length before, rotation, scales
     T r0[3], r1[3];                 // rows of J W M, M = R S
@@ -119,9 +120,11 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
     const T x = g.p[0], y = g.p[1], z = g.p[2];
     if (!(z > T(set.z_near))) return false;
     const T iz = 1 / z;
+    g.ratio[0] = vmin(vmax(x * iz, T(cam.x_low)), T(cam.x_high));
+    g.ratio[1] = vmin(vmax(y * iz, T(cam.y_low)), T(cam.y_high));
     for (int k = 0; k < 3; ++k) {
-        g.t0[k] = T(cam.fx) * iz * (T(cam.R[k]) - x * iz * T(cam.R[6 + k]));
-        g.t1[k] = T(cam.fy) * iz * (T(cam.R[3 + k]) - y * iz * T(cam.R[6 + k]));
+        g.t0[k] = T(cam.fx) * iz * (T(cam.R[k]) - g.ratio[0] * T(cam.R[6 + k]));
+        g.t1[k] = T(cam.fy) * iz * (T(cam.R[3 + k]) - g.ratio[1] * T(cam.R[6 + k]));
     }
     if (scene.quats) {
         const T *q = scene.quats + 4 * i;

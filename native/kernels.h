@@ -15,6 +15,7 @@ struct Camera {
     double R[9];
     double eye[3];
     double fx, fy, cx, cy;
+    double x_low, x_high, y_low, y_high;               // bounds of x/z and y/z inside the Jacobian; may be infinite
     int32_t H, W;
 };
 

@@ -39,7 +39,9 @@ GSPLAT_INLINE void mean_gradient(const Projected<T> &g, const Camera &cam, const
         w0 += d0[k] * T(cam.R[6 + k]), w1 += d1[k] * T(cam.R[6 + k]);
         s0 += d0[k] * g.t0[k], s1 += d1[k] * g.t1[k];
     }
-    // J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³ W_2.
+    // J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³ W_2. A clamped x/z is a constant.
+    if (g.ratio[0] != x) w0 = 0;
+    if (g.ratio[1] != y) w1 = 0;
     const T fx = T(cam.fx) * iz, fy = T(cam.fy) * iz;
     dp[0] = fx * uv[0] - fx * iz * w0;
     dp[1] = fy * uv[1] - fy * iz * w1;

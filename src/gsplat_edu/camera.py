@@ -132,6 +132,27 @@ class Camera:
         H, W = whole_number("H", H, 1), whole_number("W", W, 1)
         return cls(look_at(eye, target, up), eye, fx, fy, W / 2, H / 2, H, W)
 
+    def jacobian_bounds(self, limit: float | None) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Bound x/z and y/z where the projection's Jacobian is taken.
+
+        Far outside the image the first-order ellipse of a Gaussian grows without bound and paints across it.
+        The bounds are the viewing directions of the image rectangle, enlarged by `limit` around its middle.
+
+        Args:
+            limit: Factor, 1.3 in Kerbl et al.'s code; None for no bounds.
+
+        Returns:
+            (low, high) of x/z and of y/z.
+        """
+        if limit is None:
+            return (-np.inf, np.inf), (-np.inf, np.inf)
+        edges = [
+            [(0.5 * (size - 1) + side * 0.5 * limit * size - middle) / focal for side in (-1, 1)]
+            for size, middle, focal in ((self.W, self.cx, self.fx), (self.H, self.cy, self.fy))
+        ]
+        (x_low, x_high), (y_low, y_high) = edges
+        return (x_low, x_high), (y_low, y_high)
+
     def world_to_cam(self, points: ArrayLike) -> Float64[np.ndarray, "*batch 3"]:
         """Move points from world to camera coordinates: x_cam = R (x - eye).
 

@@ -3,7 +3,10 @@
     SplatError
     ├── ArgumentError (also a ValueError)    an argument's value cannot be used
     │   └── ShapeError                       an argument's shape is not the documented one
-    └── BackendUnavailableError              this machine cannot run the backend that was asked for
+    ├── BackendUnavailableError              this machine cannot run the backend that was asked for
+    ├── DatasetError                         a capture cannot be read, or not as it stands
+    ├── SceneFormatError                     a scene file is not what it says it is
+    └── CheckpointError                      a run cannot be continued, or its state not be written
 
 Every message is one line that says what is wrong, where, and what to do next. The command line prints that
 line and exits with 2.
@@ -26,3 +29,15 @@ class ShapeError(ArgumentError):
 
 class BackendUnavailableError(SplatError):
     """The rendering backend that was asked for does not run here; the message says why and what does."""
+
+
+class DatasetError(SplatError):
+    """A capture cannot be read; the message names the file, and the line or image where there is one."""
+
+
+class SceneFormatError(SplatError):
+    """A scene file cannot be read; the message names the file and what it lacks."""
+
+
+class CheckpointError(SplatError):
+    """A run cannot be saved or continued; the message names the file and what stands unharmed."""

@@ -99,7 +99,9 @@ def build_cov3d_batch(scales: ArrayLike, Rs: ArrayLike) -> Float64[np.ndarray, "
     return cov3ds
 
 
-def project_cov3d(cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera) -> Float64[np.ndarray, "*batch 2 2"]:
+def project_cov3d(
+    cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera, jacobian_limit: float | None = None
+) -> Float64[np.ndarray, "*batch 2 2"]:
     """Project 3D covariances to the image, to first order around their means.
 
     Sigma2d = J W Sigma W' J',  W = cam.R,  J = [[fx/z, 0, -fx x/z²], [0, fy/z, -fy y/z²]]
@@ -110,6 +112,8 @@ def project_cov3d(cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera) -> Float64
         cov3d: (..., 3, 3) covariances in world axes, world units squared.
         mean_cam: (..., 3) means in camera coordinates, world units; the same leading axes.
         cam: The camera.
+        jacobian_limit: x/z and y/z inside J are clamped to this many half fields of view, see
+            `Camera.jacobian_bounds`; None clamps nothing.
 
     Returns:
         (..., 2, 2) screen-space covariances, px².
@@ -129,7 +133,9 @@ def project_cov3d(cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera) -> Float64
             f"mean_cam{first_index(z <= 0)}: z <= 0 is not in front of the camera; cull it first"
         )
     zero = np.zeros_like(z)
-    rows = [[cam.fx / z, zero, -cam.fx * x / z**2], [zero, cam.fy / z, -cam.fy * y / z**2]]
+    (x_low, x_high), (y_low, y_high) = cam.jacobian_bounds(jacobian_limit)
+    x_z, y_z = np.clip(x / z, x_low, x_high), np.clip(y / z, y_low, y_high)
+    rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
     JW = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2) @ cam.R
     cov2d: Float64[np.ndarray, "*batch 2 2"] = JW @ cov3d @ np.swapaxes(JW, -1, -2)
     return cov2d

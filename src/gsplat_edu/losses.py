@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -14,7 +15,40 @@ from gsplat_edu.kernels import REASON, SUFFIXES, kernel
 from gsplat_edu.validation import check_shape, in_range
 
 
-def l1(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+def photo_loss(
+    image: Float[Tensor, "H W 3"],
+    target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
+    mask: Bool[np.ndarray, "H W"] | None = None,
+    ssim_weight: float = 0.2,
+) -> Float[Tensor, ""]:
+    """Return the loss a trainer steps down: `l1_ssim`, or `l1` where SSIM has no weight, of what a mask leaves.
+
+    Where a pixel does not count, image and photo are both black; the mean is over all pixels all the same.
+
+    Args:
+        image: (H, W, 3) rendered.
+        target: (H, W, 3) photo, uint8 or float from 0 to 1.
+        mask: (H, W) true where a pixel counts; None where all do.
+        ssim_weight: k, 0 to 1.
+
+    Returns:
+        () scalar, differentiable in the image.
+
+    Raises:
+        ShapeError: the sizes differ.
+    """
+    if target.dtype != torch.uint8:
+        target = target.to(image.dtype)
+    if mask is not None:
+        counts = torch.from_numpy(mask)[..., None]
+        check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
+        image, target = image * counts, target * counts
+    return l1_ssim(image, target, ssim_weight) if ssim_weight else l1(image, target)
+
+
+def l1(
+    image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"]
+) -> Float[Tensor, ""]:
     """Return the mean absolute difference of two images: mean |image - target|.
 
     On the CPU it is one native pass (where the native module is there): torch would wake its own threads for it,
@@ -22,7 +56,7 @@ def l1(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[T
 
     Args:
         image: (H, W, 3) rendered.
-        target: (H, W, 3) photo; no gradient reaches it.
+        target: (H, W, 3) photo, 0 to 1, or uint8, 0 to 255; no gradient reaches it.
 
     Returns:
         () scalar, differentiable in the image.
@@ -32,8 +66,10 @@ def l1(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[T
     """
     check_shape("target", target.shape, image.shape, {})
     native = REASON is None and image.device.type == "cpu" and image.dtype in SUFFIXES
-    if native and image.dtype == target.dtype:
+    if native and target.dtype in (image.dtype, torch.uint8):
         return l1_ssim(image, target, ssim_weight=0.0)
+    if target.dtype == torch.uint8:
+        target = target.to(image.dtype) / 255.0
     return torch.mean(torch.abs(image - target.detach()))
 
 
@@ -94,4 +130,5 @@ class _L1Ssim(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        return gradient * grad, None, None
+        # Almost always 1: a pass over the image would wake torch's threads for nothing.
+        return (gradient if float(grad) == 1.0 else gradient * grad), None, None

@@ -2,40 +2,141 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, UInt8
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import ArrayLike, first_index, float64_array
+from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array
+
+Pixels = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Photo:
+    """The pixels of a view.
+
+    Args:
+        image: (H, W, 3) RGB: uint8, not copied; or float from 0 to 1, kept as float32.
+        alpha: (H, W) uint8, 255 where the photo is opaque; None where it is everywhere.
+        mask: (H, W) true where a pixel counts; None where all do.
+
+    Raises:
+        ShapeError: the three are not of one size.
+        ArgumentError: a pixel is NaN or outside 0 to 1, or alpha or mask is of another type.
+    """
+
+    image: Pixels
+    alpha: UInt8[np.ndarray, "H W"] | None
+    mask: Bool[np.ndarray, "H W"] | None
+
+    def __init__(
+        self,
+        image: ArrayLike,
+        alpha: UInt8[np.ndarray, "H W"] | None = None,
+        mask: Bool[np.ndarray, "H W"] | None = None,
+    ) -> None:
+        pixels = np.asarray(image)
+        if pixels.dtype != np.uint8:
+            values = float64_array("image", image, ("H", "W", 3))
+            if np.any(outside := (values < 0) | (values > 1)):
+                where = first_index(outside)
+                raise ArgumentError(
+                    f"image{where}: is outside 0 to 1; divide by the largest value or give uint8"
+                )
+            pixels = values.astype(np.float32)
+        check_shape("image", pixels.shape, ("H", "W", 3), {})
+        for name, plane, dtype in (("alpha", alpha, np.uint8), ("mask", mask, np.bool_)):
+            if plane is not None:
+                check_shape(name, plane.shape, pixels.shape[:2], {})
+                if plane.dtype != dtype:
+                    raise ArgumentError(f"{name}: is {plane.dtype}, but has to be {np.dtype(dtype)}")
+        for name, value in {"image": pixels, "alpha": alpha, "mask": mask}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes the pixels take."""
+        return sum(a.nbytes for a in (self.image, self.alpha, self.mask) if a is not None)
+
+    def over(self, background: ArrayLike) -> Pixels:
+        """Put the photo over a background: rgb alpha + background (1 - alpha).
+
+        Args:
+            background: (3,) colour, 0 to 1.
+
+        Returns:
+            (H, W, 3) the photo itself where it is opaque; else uint8, rounded.
+        """
+        if self.alpha is None:
+            return self.image
+        share = self.alpha[..., None].astype(np.float32) / 255.0
+        image = self.image.astype(np.float32) / (255.0 if self.image.dtype == np.uint8 else 1.0)
+        behind = np.asarray(background, dtype=np.float32)
+        mixed = np.clip(image * share + behind * (1.0 - share), 0.0, 1.0)
+        flat: UInt8[np.ndarray, "H W 3"] = np.round(255.0 * mixed).astype(np.uint8)
+        return flat
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class View:
-    """A camera and its photo.
+    """A camera and its photo, in memory or still on disk.
 
     Args:
         camera: The camera.
-        image: (H, W, 3) the photo, of the camera's size: uint8, or float from 0 to 1; kept as float32.
+        image: (H, W, 3) the photo, of the camera's size; see `Photo`.
+        alpha: (H, W) opacity of the photo, uint8; None where it is opaque.
+        mask: (H, W) true where a pixel counts; None where all do.
+        name: What the capture calls it.
 
     Raises:
-        ShapeError: the image is not of the camera's size.
-        ArgumentError: a pixel is NaN or outside 0 to 1.
+        ShapeError: the photo is not of the camera's size.
+        ArgumentError: as for `Photo`.
+
+    Attributes:
+        read: Gives the photo, from memory or from disk; it may be called from another thread.
+        on_disk: Reading may take time, so that it pays to begin early.
     """
 
     camera: Camera
-    image: Float32[np.ndarray, "H W 3"]
+    name: str
+    read: Callable[[], Photo]
+    on_disk: bool
 
-    def __init__(self, camera: Camera, image: ArrayLike) -> None:
-        values = float64_array("image", image, (camera.H, camera.W, 3))
-        if np.asarray(image).dtype == np.uint8:
-            values = values / 255.0
-        if np.any(outside := (values < 0) | (values > 1)):
-            where = first_index(outside)
-            raise ArgumentError(f"image{where}: is outside 0 to 1; divide by the largest value or give uint8")
-        pixels = values.astype(np.float32)
-        pixels.flags.writeable = False
-        object.__setattr__(self, "camera", camera)
-        object.__setattr__(self, "image", pixels)
+    def __init__(
+        self,
+        camera: Camera,
+        image: ArrayLike,
+        *,
+        alpha: UInt8[np.ndarray, "H W"] | None = None,
+        mask: Bool[np.ndarray, "H W"] | None = None,
+        name: str = "",
+    ) -> None:
+        photo = Photo(image, alpha, mask)
+        check_shape("image", photo.image.shape, (camera.H, camera.W, 3), {})
+        self._set(camera, name, lambda: photo, on_disk=False)
+
+    @classmethod
+    def stored(cls, camera: Camera, read: Callable[[], Photo], name: str = "") -> View:
+        """Make a view whose photo is read when it is asked for.
+
+        Args:
+            camera: The camera.
+            read: Gives the photo, of the camera's size.
+            name: What the capture calls it.
+        """
+        view = cls.__new__(cls)
+        view._set(camera, name, read, on_disk=True)
+        return view
+
+    def _set(self, camera: Camera, name: str, read: Callable[[], Photo], on_disk: bool) -> None:
+        for key, value in {"camera": camera, "name": name, "read": read, "on_disk": on_disk}.items():
+            object.__setattr__(self, key, value)
+
+    @property
+    def image(self) -> Pixels:
+        """(H, W, 3) the photo's RGB."""
+        return self.read().image

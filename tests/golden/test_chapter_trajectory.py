@@ -18,7 +18,7 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
-from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.initialize import random_ball
@@ -32,7 +32,7 @@ TOLERANCE = {"torch": 2e-4, "cpu": 1e-3}
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
 def test_the_first_hundred_iterations(backend):
     capture = sphere_capture(128)
-    config = TrainConfig(iterations=101, seed=9)
+    config = course_config(iterations=101)
     generator = torch.Generator().manual_seed(9)
     start = random_ball(400, generator)
     densified = []
@@ -41,7 +41,8 @@ def test_the_first_hundred_iterations(backend):
         capture.train,
         config,
         render=functools.partial(render, backend=backend),
-        density=AdaptiveDensityControl(DensityConfig(), generator, start),
+        extent=EXTENT,
+        density=AdaptiveDensityControl(config, EXTENT, generator, start),
         callbacks=[lambda _, event: densified.append(event) if isinstance(event, DensifyEvent) else None],
     )
     with torch.no_grad():

@@ -6,8 +6,7 @@ import torch
 
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.render.api import render
-from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
@@ -16,15 +15,15 @@ from native_scenes import random
 
 def test_300_iterations_of_training(set_threads):
     """Two densifications included; 1, 2 and 5 threads, and the first of them twice."""
-    views = sphere_capture(64).train
+    views, config = sphere_capture(64).train, course_config(iterations=300, max_gaussians=800)
     runs = []
     for threads in (1, 1, 2, 5):
         set_threads(threads)
         generator = torch.Generator().manual_seed(9)
         start = random_ball(400, generator)
-        control = AdaptiveDensityControl(DensityConfig(max_gaussians=800), generator, start)
-        renderer = functools.partial(render, backend="cpu", settings=RenderSettings(depth=False))
-        trainer = Trainer(start, views, TrainConfig(iterations=300), render=renderer, density=control)
+        control = AdaptiveDensityControl(config, EXTENT, generator, start)
+        renderer = functools.partial(render, backend="cpu")
+        trainer = Trainer(start, views, config, render=renderer, extent=EXTENT, density=control)
         trainer.run()
         runs.append(trainer.gaussians.tensors())
     assert len(runs[0]["means"]) == 800

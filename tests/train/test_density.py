@@ -11,13 +11,14 @@ from gsplat_edu import Camera
 from gsplat_edu.gaussians import Gaussians, cov3d_t
 from gsplat_edu.render.api import render
 from gsplat_edu.render.torch_reference import eval_sh_t, render_t
-from gsplat_edu.train.config import DensityConfig
+from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.surgery import replace, split_children
 from gsplat_edu.train.optimizer import Adam
 
 SMALL, LARGE = math.log(0.02), math.log(0.2)  # 1 % of the extent 3.0 is 0.03
-CONFIG = DensityConfig(start=100, stop=600, every=100)
+CONFIG = TrainConfig(densify_start=99, densify_stop=600, reset_every=0, over_cap="cut")
+EXTENT = 3.0
 
 
 def four(dtype=torch.float64) -> Gaussians:
@@ -38,7 +39,7 @@ def controlled(hot, config=CONFIG):
     gaussians = four()
     optimizer = Adam(gaussians, {"means": 1e-3})
     optimizer.first["means"] = torch.arange(12.0, dtype=torch.float64).reshape(4, 3) + 1
-    control = AdaptiveDensityControl(config, torch.Generator().manual_seed(0), gaussians)
+    control = AdaptiveDensityControl(config, EXTENT, torch.Generator().manual_seed(0), gaussians)
     control.norm_sums = torch.tensor(hot, dtype=torch.float64) * 2 * 1.01 * config.grad_threshold
     control.times_visible = torch.full((4,), 2.0, dtype=torch.float64)
     return control, gaussians, optimizer
@@ -46,7 +47,7 @@ def controlled(hot, config=CONFIG):
 
 def test_small_offenders_are_cloned_large_ones_split_and_the_faint_pruned():
     control, gaussians, optimizer = controlled(hot=[1, 1, 0, 1])
-    changed, event = control.update(100, gaussians, optimizer)
+    changed, (event,) = control.update(100, gaussians, optimizer)
     assert dataclasses.astuple(event) == (100, 1, 2, 1, 5)
     # Survivors 0 and 2; the clone of 0; two children of 1.
     assert changed.sh0[:, 0, 0].tolist() == [0, 2, 0, 1, 1]
@@ -64,11 +65,11 @@ def test_small_offenders_are_cloned_large_ones_split_and_the_faint_pruned():
 def test_the_threshold_is_on_the_mean_over_the_views_that_see_it():
     control, gaussians, optimizer = controlled(hot=[1, 0, 0, 0])
     control.times_visible[0] = 3
-    _, event = control.update(100, gaussians, optimizer)
+    _, (event,) = control.update(100, gaussians, optimizer)
     assert event.num_cloned == 0
     control, gaussians, optimizer = controlled(hot=[0.5, 0, 0, 0])
     control.times_visible[0] = 1
-    _, event = control.update(100, gaussians, optimizer)
+    _, (event,) = control.update(100, gaussians, optimizer)
     assert event.num_cloned == 1, "seen once, the sum is the mean"
 
 
@@ -77,13 +78,13 @@ def test_the_threshold_is_on_the_mean_over_the_views_that_see_it():
 )
 def test_the_window(iteration, due):
     control, gaussians, optimizer = controlled(hot=[0, 0, 0, 0])
-    assert (control.update(iteration, gaussians, optimizer) is not None) == due
+    assert bool(control.update(iteration, gaussians, optimizer)[1]) == due
 
 
 @pytest.mark.parametrize("cap", [1, 2, 3, 4])
 def test_the_cap_cuts_from_the_end(cap):
     control, gaussians, optimizer = controlled([1, 1, 0, 1], dataclasses.replace(CONFIG, max_gaussians=cap))
-    changed, event = control.update(100, gaussians, optimizer)
+    changed, (event,) = control.update(100, gaussians, optimizer)
     assert event.num_gaussians == len(changed) == cap
     assert changed.sh0[:, 0, 0].tolist() == [0, 2, 0, 1, 1][:cap]
     assert len(optimizer.first["means"]) == cap
@@ -92,10 +93,10 @@ def test_the_cap_cuts_from_the_end(cap):
 def test_all_may_be_pruned():
     gaussians = four().map(lambda t: t.detach()[3:]).trainable()
     optimizer = Adam(gaussians, {"means": 1e-3})
-    control = AdaptiveDensityControl(CONFIG, torch.Generator(), gaussians)
-    changed, event = control.update(100, gaussians, optimizer)
+    control = AdaptiveDensityControl(CONFIG, EXTENT, torch.Generator(), gaussians)
+    changed, (event,) = control.update(100, gaussians, optimizer)
     assert len(changed) == 0 and event.num_pruned == 1
-    assert control.update(200, changed, optimizer)[1].num_gaussians == 0
+    assert control.update(200, changed, optimizer)[1][0].num_gaussians == 0
 
 
 def test_children_are_drawn_from_the_parents_distribution():
@@ -139,11 +140,11 @@ def test_observed_norms_are_ndc_gradients_of_what_is_visible(backend):
     gaussians = four().map(lambda t: t.detach().clone())
     means = torch.tensor([[0.1, 0.1, 0], [-0.2, 0.1, 0.5], [0, 0, -9.0], [0.3, -0.1, 0]], dtype=torch.float64)
     gaussians = dataclasses.replace(gaussians, means=means).trainable()
-    control = AdaptiveDensityControl(CONFIG, torch.Generator(), gaussians)
+    control = AdaptiveDensityControl(CONFIG, EXTENT, torch.Generator(), gaussians)
     for _ in range(2):
         out = render(gaussians, camera, backend=backend)
         (out.image**2).sum().backward()
-        control.observe(out)
+        control.observe(gaussians, out)
     covs, colors = (
         cov3d_t(gaussians.log_scales, gaussians.quats),
         eval_sh_t(0, gaussians.sh0, gaussians.means),

@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import numpy as np
@@ -8,7 +9,8 @@ from gsplat_edu import ArgumentError, ShapeError
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
-from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train.config import TrainConfig, recipe
+from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent, StepEvent
 from gsplat_edu.train.initialize import random_ball
@@ -16,8 +18,7 @@ from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import View
 
 RENDER = functools.partial(render, backend="torch")
-SHORT = TrainConfig(iterations=12)
-DENSITY = DensityConfig(start=4, stop=12, every=4, max_gaussians=80)
+SHORT = dataclasses.replace(course_config(iterations=12, max_gaussians=80), densify_stop=12, densify_every=4)
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +29,8 @@ def views():
 def trainer(views, callbacks=()):
     generator = torch.Generator().manual_seed(9)
     start = random_ball(60, generator)
-    control = AdaptiveDensityControl(DENSITY, generator, start)
-    return Trainer(start, views, SHORT, render=RENDER, density=control, callbacks=callbacks)
+    control = AdaptiveDensityControl(SHORT, EXTENT, generator, start)
+    return Trainer(start, views, SHORT, render=RENDER, extent=EXTENT, density=control, callbacks=callbacks)
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_callbacks_hear_of_every_step_and_densification_in_order(views):
 def test_the_start_is_left_alone(views):
     start = random_ball(20, torch.Generator().manual_seed(0))
     before = start.map(torch.clone)
-    Trainer(start, views, TrainConfig(iterations=2), render=RENDER).run()
+    Trainer(start, views, course_config(iterations=2), render=RENDER).run()
     for name, tensor in start.tensors().items():
         assert torch.equal(tensor, before.tensors()[name])
 
@@ -76,11 +77,11 @@ def test_the_start_is_left_alone(views):
 def test_views_are_drawn_with_the_seed(views):
     seen = []
 
-    def watching(gaussians, camera):
+    def watching(gaussians, camera, *, settings):
         seen.append(next(i for i, view in enumerate(views) if view.camera is camera))
-        return RENDER(gaussians, camera)
+        return RENDER(gaussians, camera, settings=settings)
 
-    config = TrainConfig(iterations=6, seed=3)
+    config = course_config(iterations=6, seed=3)
     Trainer(random_ball(10, torch.Generator()), views, config, render=watching).run()
     rng = np.random.default_rng(3)
     assert seen == [int(rng.integers(24)) for _ in range(6)]
@@ -103,15 +104,16 @@ def test_one_gaussian_finds_one_spot(views):
     )
     target = View(camera, RENDER(blob, camera).image.numpy())
     start = blob.map(lambda t: t + 0.05)
-    result = Trainer(start, [target], TrainConfig(iterations=150), render=RENDER).run()
+    result = Trainer(start, [target], course_config(iterations=150), render=RENDER, extent=EXTENT).run()
     assert result.losses[-1] < 0.1 * result.losses[0]
 
 
 def test_a_scene_that_vanishes_does_not_stop_the_run(views):
     faint = random_ball(3, torch.Generator()).map(torch.clone)
     faint.logit_opacities.fill_(-9.0)
-    control = AdaptiveDensityControl(DensityConfig(start=1, stop=3, every=1), torch.Generator(), faint)
-    run = Trainer(faint, views, TrainConfig(iterations=4), render=RENDER, density=control)
+    config = dataclasses.replace(course_config(iterations=4), densify_stop=3, densify_every=1)
+    control = AdaptiveDensityControl(config, EXTENT, torch.Generator(), faint)
+    run = Trainer(faint, views, config, render=RENDER, density=control)
     assert run.run().counts == [3, 3, 0, 0]
 
 
@@ -128,13 +130,17 @@ def test_nothing_to_learn_from_is_refused(views):
     [
         (lambda: TrainConfig(iterations=0), "iterations"),
         (lambda: TrainConfig(seed=-1), "seed"),
-        (lambda: TrainConfig(learning_rates={"means": -1.0}), r"learning_rates\['means'\]"),
-        (lambda: DensityConfig(every=0), "every"),
-        (lambda: DensityConfig(start=50, stop=49), "stop"),
+        (lambda: TrainConfig(means_rate=-1.0), "means_rate"),
+        (lambda: TrainConfig(densify_every=0), "densify_every"),
+        (lambda: TrainConfig(densify_start=50, densify_stop=49), "densify_stop"),
+        (lambda: TrainConfig(strategy="best"), "strategy"),
+        (lambda: TrainConfig(view_order="sorted"), "view_order"),
+        (lambda: TrainConfig(background=(1.0, 1.0)), "background"),
+        (lambda: recipe(0), "iterations"),
+        (lambda: recipe(100, densify_end=5), "field"),
         (lambda: TrainConfig(iterations=2.0), "iterations"),
-        (lambda: DensityConfig(max_gaussians=0), "max_gaussians"),
-        (lambda: DensityConfig(extent=0.0), "extent"),
-        (lambda: DensityConfig(min_opacity=2.0), "min_opacity"),
+        (lambda: TrainConfig(max_gaussians=0), "max_gaussians"),
+        (lambda: TrainConfig(min_opacity=2.0), "min_opacity"),
         (lambda: random_ball(-1, torch.Generator()), "count"),
     ],
 )
@@ -152,7 +158,8 @@ def test_a_photo_of_another_size_is_refused(views):
 def test_photos_are_uint8_or_0_to_1(views):
     camera = views[0].camera
     photo = np.random.default_rng(0).integers(0, 256, (24, 24, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(View(camera, photo).image, (photo / 255).astype(np.float32))
+    np.testing.assert_array_equal(View(camera, photo).image, photo)
+    np.testing.assert_array_equal(View(camera, photo / 255).image, (photo / 255).astype(np.float32))
     for wrong in (photo.astype(float), photo / 255 - 1):
         with pytest.raises(ArgumentError, match="^image\\[.*uint8"):
             View(camera, wrong)

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsplat_edu.cli.sphere import add_options, options_from, run_sphere
-from gsplat_edu.train.events import DensifyEvent, StepEvent
+from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
 SUMMARY = "learn a sphere from 24 renders of it and judge the result with a held-out camera"
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
     with bar:
         task = bar.add_task("sphere", total=options.budget.iters, loss=float("nan"), count=options.k0)
 
-        def advance(trainer: Trainer, event: StepEvent | DensifyEvent) -> None:
+        def advance(trainer: Trainer, event: Event) -> None:
             if isinstance(event, StepEvent):
                 bar.update(task, advance=1, loss=event.loss, count=event.num_gaussians)
 

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float32
 
 from gsplat_edu.cli.arguments import whole_number_text
-from gsplat_edu.data.synthetic import ORBIT_RADIUS, SphereCapture, sphere_capture
+from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
 from gsplat_edu.files import check_writable
@@ -27,9 +27,9 @@ from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import BACKENDS, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
-from gsplat_edu.train.events import DensifyEvent, StepEvent
+from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Callback, Renderer, Trainer, TrainResult
 from gsplat_edu.validation import whole_number
@@ -172,18 +172,17 @@ def run_sphere(
         say: Prints the lines that close the run.
     """
     capture = sphere_capture(options.budget.size)
-    # depth is not looked at, and images are faster without
-    renderer = functools.partial(render, backend=options.backend, settings=RenderSettings(depth=False))
-    iters = options.budget.iters
+    renderer = functools.partial(render, backend=options.backend)
+    settings, iters = RenderSettings(depth=False), options.budget.iters
     middle = 3 * iters // 8  # the chapter shows 300 of its 800
 
     def held_out(gaussians: Gaussians) -> Float32[np.ndarray, "H W 3"]:
         with torch.no_grad():
-            return renderer(gaussians, capture.held_out.camera).image.numpy(force=True)
+            return renderer(gaussians, capture.held_out.camera, settings=settings).image.numpy(force=True)
 
     snapshots = {}
 
-    def take_snapshot(trainer: Trainer, event: StepEvent | DensifyEvent) -> None:
+    def take_snapshot(trainer: Trainer, event: Event) -> None:
         if event.iteration == middle:  # told of the step first, then of its densification, which shows
             snapshots["middle"] = held_out(trainer.gaussians)
 
@@ -208,12 +207,13 @@ def run_sphere(
 def _trainer(
     options: SphereOptions, capture: SphereCapture, renderer: Renderer, callbacks: Sequence[Callback]
 ) -> Trainer:
-    density = DensityConfig(extent=ORBIT_RADIUS, max_gaussians=options.budget.cap)
-    config = TrainConfig(iterations=options.budget.iters, seed=options.seed)
+    config = course_config(options.budget.iters, options.seed, options.budget.cap)
     generator = torch.Generator().manual_seed(options.seed)
     gaussians = random_ball(options.k0, generator)
-    control = AdaptiveDensityControl(density, generator, gaussians)
-    return Trainer(gaussians, capture.train, config, render=renderer, density=control, callbacks=callbacks)
+    control = AdaptiveDensityControl(config, EXTENT, generator, gaussians)
+    return Trainer(
+        gaussians, capture.train, config, render=renderer, extent=EXTENT, density=control, callbacks=callbacks
+    )
 
 
 def _l1(image: Float32[np.ndarray, "H W 3"], truth: Float32[np.ndarray, "H W 3"]) -> float:

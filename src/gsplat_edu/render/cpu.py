@@ -132,6 +132,7 @@ class _Rasterize(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         camera, means = call.camera, parameters[0]
+        x_bounds, y_bounds = camera.jacobian_bounds(call.settings.jacobian_limit)
         kept = [p.detach().contiguous() for p in parameters]
         frame = kernel("FrameF", means.dtype)(
             len(means),
@@ -146,6 +147,8 @@ class _Rasterize(torch.autograd.Function):
                 camera.cy,
                 Z_NEAR,
                 *background.tolist(),
+                *x_bounds,
+                *y_bounds,
             ],
             camera.H,
             camera.W,

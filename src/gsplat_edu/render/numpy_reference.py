@@ -43,6 +43,7 @@ def render_gaussians(
     *,
     extent: Extent = "box3sigma",
     stop: Stop = "box",
+    jacobian_limit: float | None = None,
 ) -> tuple[Float64[np.ndarray, "H W 3"], Float64[np.ndarray, "H W"]]:
     """Render Gaussians as seen by a camera.
 
@@ -61,6 +62,7 @@ def render_gaussians(
             ceil(3 sqrt(lambda_max)), which cuts faint tails. "exact": every pixel with alpha >= 1/255.
         stop: When nothing more is drawn. "box": a splat is skipped when its whole box is below 1e-4
             transmittance. "tile": a 16x16 tile ends when all its pixels are. "none": never.
+        jacobian_limit: As for `project_cov3d`: the course clamps nothing, captures are trained with 1.3.
 
     Returns:
         image: (H, W, 3) float64, not clipped; an empty scene is the background.
@@ -76,7 +78,7 @@ def render_gaussians(
     bg, z_near = float64_array("bg", bg, (3,)), in_range("z_near", z_near, 0.0)
     one_of("extent", extent, ("box3sigma", "exact"))
     one_of("stop", stop, ("box", "tile", "none"))
-    splats = project(cam, means, cov3ds, z_near)
+    splats = project(cam, means, cov3ds, z_near, jacobian_limit)
     image = np.zeros((cam.H, cam.W, 3))
     # Whole tiles are kept; pixels outside the image have no transmittance and keep no tile alive.
     padded = np.pad(np.ones((cam.H, cam.W)), ((0, -cam.H % TILE), (0, -cam.W % TILE)))
@@ -118,7 +120,11 @@ def _checked(
 
 
 def project(
-    cam: Camera, means: Float64[np.ndarray, "N 3"], cov3ds: Float64[np.ndarray, "N 3 3"], z_near: float
+    cam: Camera,
+    means: Float64[np.ndarray, "N 3"],
+    cov3ds: Float64[np.ndarray, "N 3 3"],
+    z_near: float,
+    jacobian_limit: float | None,
 ) -> Projection:
     """Project what is in front of the camera to screen-space ellipses and sort it near to far.
 
@@ -128,7 +134,7 @@ def project(
     index = np.flatnonzero(means_cam[:, 2] > z_near)
     index = index[np.argsort(means_cam[index, 2], kind="stable")]
     u, v, _ = cam.project(means_cam[index])
-    cov2d = project_cov3d(cov3ds[index], means_cam[index], cam) + DILATION * np.eye(2)
+    cov2d = project_cov3d(cov3ds[index], means_cam[index], cam, jacobian_limit) + DILATION * np.eye(2)
     return Projection(index, np.stack([u, v], axis=-1), cov2d)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gsplat_edu.constants import SH_MAX_DEGREE
-from gsplat_edu.validation import float64_array, whole_number
+from gsplat_edu.validation import float64_array, in_range, whole_number
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,8 @@ class RenderSettings:
         antialiased: Lower each opacity by the light that the dilation adds (Mip-Splatting), see
             `gsplat_edu.gaussian_math.opacity_compensation`.
         depth: Render expected depth too. Training that does not look at depth is faster without.
+        jacobian_limit: x/z and y/z inside the projection's Jacobian are clamped to this many half fields of view
+            (`Camera.jacobian_bounds`); 1.3 for captures, as in Kerbl et al.'s code; None clamps nothing.
         dense_chunk: Splats that the dense torch backend evaluates at once. It decides speed, not the image
             (beyond rounding); 16 keeps a chunk in a core's cache at 128 px (benchmarks/RESULTS.md).
 
@@ -30,10 +32,13 @@ class RenderSettings:
     sh_degree: int = SH_MAX_DEGREE
     antialiased: bool = False
     depth: bool = True
+    jacobian_limit: float | None = None
     dense_chunk: int = 16
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         float64_array("background", self.background, (3,))
         whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE)
+        if self.jacobian_limit is not None:
+            in_range("jacobian_limit", self.jacobian_limit, 1.0)
         whole_number("dense_chunk", self.dense_chunk, 1)

@@ -142,7 +142,8 @@ def render_dense(
     gaussians.check_finite()
     degree = min(settings.sh_degree, gaussians.sh_degree)
     colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
-    screen = _project(gaussians.means, cov3d_t(gaussians.log_scales, gaussians.quats), camera)
+    cov3ds = cov3d_t(gaussians.log_scales, gaussians.quats)
+    screen = _project(gaussians.means, cov3ds, camera, settings.jacobian_limit)
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     opacities = gaussians.opacities[screen.visible]
@@ -223,7 +224,12 @@ def _check(
         raise ArgumentError(f"opacities{first_index(outside.numpy(force=True))}: is outside 0 to 1")
 
 
-def _project(means: Float[Tensor, "N 3"], cov3ds: Float[Tensor, "N 3 3"], cam: Camera) -> _Screen:
+def _project(
+    means: Float[Tensor, "N 3"],
+    cov3ds: Float[Tensor, "N 3 3"],
+    cam: Camera,
+    jacobian_limit: float | None = None,
+) -> _Screen:
     R = torch.tensor(cam.R, dtype=means.dtype, device=means.device)
     means_cam = (means - torch.tensor(cam.eye, dtype=means.dtype, device=means.device)) @ R.T
     visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]
@@ -231,7 +237,9 @@ def _project(means: Float[Tensor, "N 3"], cov3ds: Float[Tensor, "N 3 3"], cam: C
     x, y, z = means_cam[visible].unbind(-1)
     means2d = torch.stack([cam.fx * x / z + cam.cx, cam.fy * y / z + cam.cy], dim=-1)
     zero = torch.zeros_like(z)
-    rows = [[cam.fx / z, zero, -cam.fx * x / z**2], [zero, cam.fy / z, -cam.fy * y / z**2]]
+    (x_low, x_high), (y_low, y_high) = cam.jacobian_bounds(jacobian_limit)
+    x_z, y_z = (x / z).clamp(x_low, x_high), (y / z).clamp(y_low, y_high)
+    rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
     JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
     cov2d = JW @ cov3ds[visible] @ JW.mT
     a, b, c = cov2d[:, 0, 0] + DILATION, cov2d[:, 0, 1], cov2d[:, 1, 1] + DILATION

@@ -1,102 +1,226 @@
-"""The numbers of the course's training, named, and every way in which it differs from the paper.
+"""Every number of a training, named, with its source.
 
-The paper is Kerbl et al. 2023. The sphere is learned in 800 iterations where the paper takes 30,000, on
-images of 128 px where the paper's have a thousand and more; most of what follows comes from that. Each
-item names what is done here and, in brackets, what the paper or its code does.
-
-1.  The means' learning rate is 1e-3 throughout. (1.6e-4 times the scene's extent, falling a
-    hundredfold.) The cloud has a long way to go and few steps to go it in.
-2.  The loss is L1. (0.8 L1 + 0.2 (1 - SSIM).)
-3.  Colour is spherical harmonics of degree 0, as the sphere looks alike from everywhere. (Degree 3, one
-    more every 1,000 iterations.)
-4.  Opacity is never reset. (Every 3,000 iterations, which this run does not reach.)
-5.  Nothing is pruned for its size, neither in the image nor in the world. (Both.)
-6.  There is a cap on the number of Gaussians: survivors come first, then clones, then split children,
-    and what is over the cap is cut from the end; a parent whose children are cut is gone all the same.
-    (No cap.)
-7.  Densification runs every 100 iterations from 100 to before 600. (Every 100 from 500 to 15,000.)
-8.  The scene's extent is the radius of the camera orbit. (1.1 times the largest distance of a camera
-    from the cameras' centre.)
-9.  Views are drawn with replacement. (Each view once before any comes again.)
-10. Adam's eps is 1e-8. (1e-15.)
-11. The start is a random cloud in the unit ball, all of one size (`gsplat_edu.train.initialize`). (The
-    points of structure-from-motion, sized by the distance to their neighbours.)
-12. Gradients are averaged over the renders in which a Gaussian is in front of the camera. (In which it
-    also reaches the image.)
-13. Means nearer than 0.05 are culled (0.2), and the Jacobian of the projection is not clamped at the
-    edge of the field of view (at 1.3 times it).
-14. Images have one size throughout. (The first iterations run at a lower resolution.)
+The defaults are the recipe of Kerbl et al. 2023 ("2023" below) as its code runs it, and of Kheradmand et al. 2024
+for the strategy mcmc. Iterations count from 0: what happens "at iteration i" happens with or after step i + 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
+from dataclasses import dataclass, fields
+from typing import Any
 
-from gsplat_edu.validation import in_range, whole_number
+from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
 
+RECIPE_ITERATIONS = 30_000
+"""Length of the run that the recipe's milestones are made for."""
 
-@dataclass(frozen=True)
-class DensityConfig:
-    """When and where the number of Gaussians changes.
+SHORT_RUN = 3_000
+"""Runs shorter than this do not reset opacities: there would be no time to recover."""
 
-    Args:
-        start: No iteration before this one densifies.
-        stop: Neither this iteration nor a later one does.
-        every: Iterations that are a multiple of this densify.
-        grad_threshold: A Gaussian whose mean gradient norm (in normalised device coordinates) is above
-            this fails to explain its place and is cloned or split.
-        percent_dense: Fraction of the extent: offenders with a larger scale are split, the others cloned.
-        extent: Size of the scene, world units.
-        min_opacity: Gaussians below this opacity are pruned.
-        split_shrink: Children of a split have their parent's scales divided by this.
-        max_gaussians: Cap on the number of Gaussians.
-    """
-
-    start: int = 100
-    stop: int = 600
-    every: int = 100
-    grad_threshold: float = 2e-4
-    percent_dense: float = 0.01
-    extent: float = 3.0
-    min_opacity: float = 0.005
-    split_shrink: float = 1.6
-    max_gaussians: int = 1600
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        whole_number("stop", self.stop, whole_number("start", self.start, 0))
-        for name in ("every", "max_gaussians"):
-            whole_number(name, getattr(self, name), 1)
-        for name in ("grad_threshold", "percent_dense"):
-            in_range(name, getattr(self, name), 0.0)
-        for name in ("extent", "split_shrink"):
-            in_range(name, getattr(self, name), 0.0, open_low=True)
-        in_range("min_opacity", self.min_opacity, 0.0, 1.0)
+STRATEGIES = ("adc", "mcmc", "none")
+OVER_CAP = ("strongest", "cut")
+VIEW_ORDERS = ("shuffled", "random")
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run.
+    """One training run; see `recipe` for runs of other lengths than 30,000 iterations.
 
     Args:
         iterations: Number of steps; each renders one view.
-        seed: Seed of the view order.
-        learning_rates: Adam's rate of every raw parameter by name; one that is not named does not move.
+        seed: Seed of the start, the view order, splits, relocations and noise.
+        means_rate: Adam's rate of the means at the start, times the scene's extent. (2023)
+        means_rate_final: The same at `means_rate_iterations`; log-linear between, constant afterwards. (2023)
+        means_rate_iterations: Where the means' rate has come down.
+        quats_rate: Rate of the quaternions. (2023)
+        scales_rate: Rate of the log scales. (2023)
+        sh0_rate: Rate of the constant harmonic. (2023)
+        sh_rest_rate: Rate of the higher harmonics: a twentieth of it. (2023)
+        opacities_rate: Rate of the logit opacities. (2023; newer forks use 2.5e-2.)
+        adam_eps: Floor under the root of Adam's second moment. (2023)
+        ssim_weight: k of the loss (1 - k) L1 + k (1 - SSIM). (2023, eq. 7)
+        sh_degree: Highest degree of spherical harmonics.
+        sh_every: Iterations after which the degree in use goes up by one; 0 uses all from the start. (2023)
+        view_order: "shuffled": each view once before any comes again (2023); "random": drawn with replacement.
+        background: Colour behind everything, RGB.
+        random_background: Draw another background for every iteration instead.
+        antialiased: Train for antialiased rendering, see `gsplat_edu.render.settings.RenderSettings`.
+        jacobian_limit: Clamp of the projection's Jacobian, half fields of view (2023); None clamps nothing.
+        start_opacity: Opacity of the start cloud. (2023)
+        start_scale: Factor on the start cloud's scales, which are the root mean squared distance to 3 neighbours.
+        strategy: "adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "none".
+        max_gaussians: Cap on the number of Gaussians; None for none, which mcmc does not take.
+        over_cap: adc: what is done where more are due than there is room for. "strongest": only those are cloned or
+            split that are pulled hardest; "cut": survivors come first, then clones, then children, and what is over
+            the cap is cut from the end; a parent whose children are cut is gone all the same (the course).
+        densify_start: Neither this iteration nor an earlier one densifies. (2023; both strategies)
+        densify_stop: Neither this iteration nor a later one does. (2023)
+        densify_every: Iterations that are a multiple of this densify. (2023; 2024)
+        grad_threshold: adc: Gaussians whose mean gradient norm, in normalised device coordinates, is above this
+            fail to explain their place and are cloned or split. (2023)
+        percent_dense: adc: fraction of the extent; offenders of a larger scale are split, others cloned. (2023)
+        split_shrink: adc: the two children of a split have their parent's scales divided by this. (2023)
+        min_opacity: Gaussians below this opacity are pruned (2023), or relocated (2024).
+        prune_scale: adc: fraction of the extent; Gaussians of a larger scale are pruned once opacities have been
+            reset; 0 prunes none. (2023)
+        prune_screen_size: adc: Gaussians whose ellipse had a larger half axis in the image, px, are pruned once
+            opacities have been reset; 0 prunes none. (2023 has 20, but it never took effect there.)
+        reset_every: adc: iterations between resets of the opacities while densifying; 0 for never. (2023)
+        reset_opacity: adc: what opacities are lowered to. (2023)
+        mcmc_stop: mcmc: as densify_stop. (2024's code)
+        mcmc_start_opacity: mcmc: as start_opacity. (2024's code)
+        mcmc_start_scale: mcmc: as start_scale. (2024's code)
+        mcmc_growth: mcmc: the number of Gaussians grows by this factor, up to the cap. (2024, section 4.3)
+        mcmc_noise: mcmc: noise on the means, times their rate. (2024, section 4.1: lambda_noise)
+        mcmc_opacity_weight: mcmc: weight of the mean opacity in the loss. (2024, eq. 10: lambda_o)
+        mcmc_scale_weight: mcmc: weight of the mean scale in the loss. (2024, eq. 10: lambda_Sigma)
+
+    Raises:
+        ArgumentError: a value is outside its range; the message names it.
     """
 
-    iterations: int = 800
-    seed: int = 9
-    learning_rates: Mapping[str, float] = field(
-        default_factory=lambda: MappingProxyType(
-            {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "sh0": 2.5e-3, "logit_opacities": 5e-2}
-        )
-    )
+    iterations: int = RECIPE_ITERATIONS
+    seed: int = 0
+    means_rate: float = 1.6e-4
+    means_rate_final: float = 1.6e-6
+    means_rate_iterations: int = 30_000
+    quats_rate: float = 1e-3
+    scales_rate: float = 5e-3
+    sh0_rate: float = 2.5e-3
+    sh_rest_rate: float = 2.5e-3 / 20
+    opacities_rate: float = 5e-2
+    adam_eps: float = 1e-15
+    ssim_weight: float = 0.2
+    sh_degree: int = SH_MAX_DEGREE
+    sh_every: int = 1_000
+    view_order: str = "shuffled"
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    random_background: bool = False
+    antialiased: bool = False
+    jacobian_limit: float | None = 1.3
+    start_opacity: float = 0.1
+    start_scale: float = 1.0
+    strategy: str = "adc"
+    max_gaussians: int | None = None
+    over_cap: str = "strongest"
+    densify_start: int = 500
+    densify_stop: int = 15_000
+    densify_every: int = 100
+    grad_threshold: float = 2e-4
+    percent_dense: float = 0.01
+    split_shrink: float = 1.6
+    min_opacity: float = 0.005
+    prune_scale: float = 0.1
+    prune_screen_size: float = 0.0
+    reset_every: int = 3_000
+    reset_opacity: float = 0.01
+    mcmc_stop: int = 25_000
+    mcmc_start_opacity: float = 0.5
+    mcmc_start_scale: float = 0.1
+    mcmc_growth: float = 1.05
+    mcmc_noise: float = 5e5
+    mcmc_opacity_weight: float = 0.01
+    mcmc_scale_weight: float = 0.01
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        whole_number("iterations", self.iterations, 1)
-        whole_number("seed", self.seed, 0)
-        for name, rate in self.learning_rates.items():
-            in_range(f"learning_rates[{name!r}]", rate, 0.0)
+        for name in ("iterations", "means_rate_iterations", "densify_every"):
+            whole_number(name, getattr(self, name), 1)
+        for name in ("sh_every", "reset_every", "densify_start"):
+            whole_number(name, getattr(self, name), 0)
+        whole_number("seed", self.seed, 0, 2**63 - 1)
+        whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE)
+        whole_number("densify_stop", self.densify_stop, self.densify_start)
+        whole_number("mcmc_stop", self.mcmc_stop, self.densify_start)
+        if self.max_gaussians is not None:
+            whole_number("max_gaussians", self.max_gaussians, 1)
+        for name in _NOT_NEGATIVE:
+            in_range(name, getattr(self, name), 0.0)
+        for name in ("ssim_weight", "min_opacity"):
+            in_range(name, getattr(self, name), 0.0, 1.0)
+        for name in ("start_opacity", "mcmc_start_opacity", "reset_opacity"):
+            in_range(name, getattr(self, name), 0.0, 1.0 - 1e-6, open_low=True)
+        for name in ("start_scale", "mcmc_start_scale", "split_shrink", "adam_eps"):
+            in_range(name, getattr(self, name), 0.0, open_low=True)
+        in_range("mcmc_growth", self.mcmc_growth, 1.0)
+        if self.jacobian_limit is not None:
+            in_range("jacobian_limit", self.jacobian_limit, 1.0)
+        float64_array("background", self.background, (3,))
+        one_of("view_order", self.view_order, VIEW_ORDERS)
+        one_of("strategy", self.strategy, STRATEGIES)
+        one_of("over_cap", self.over_cap, OVER_CAP)
+
+    @property
+    def start(self) -> tuple[float, float]:
+        """Opacity and scale factor of the start cloud, by strategy."""
+        if self.strategy == "mcmc":
+            return self.mcmc_start_opacity, self.mcmc_start_scale
+        return self.start_opacity, self.start_scale
+
+    @property
+    def learning_rates(self) -> dict[str, float]:
+        """Adam's rate of every raw parameter by name; that of the means before the extent and its schedule."""
+        return {
+            "means": self.means_rate,
+            "quats": self.quats_rate,
+            "log_scales": self.scales_rate,
+            "sh0": self.sh0_rate,
+            "sh_rest": self.sh_rest_rate,
+            "logit_opacities": self.opacities_rate,
+        }
+
+
+_NOT_NEGATIVE = (
+    "means_rate",
+    "means_rate_final",
+    "quats_rate",
+    "scales_rate",
+    "sh0_rate",
+    "sh_rest_rate",
+    "opacities_rate",
+    "grad_threshold",
+    "percent_dense",
+    "prune_scale",
+    "prune_screen_size",
+    "mcmc_noise",
+    "mcmc_opacity_weight",
+    "mcmc_scale_weight",
+)
+
+MILESTONES = (
+    "means_rate_iterations",
+    "sh_every",
+    "densify_start",
+    "densify_stop",
+    "mcmc_stop",
+    "reset_every",
+)
+"""Fields that `recipe` stretches with the run; the interval of densification is not among them."""
+
+
+def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **changes: Any) -> TrainConfig:  # noqa: ANN401
+    """Make the configuration of a run of any length.
+
+    Milestones keep their place relative to the length of the run: with 7,000 iterations densification ends at
+    3,500 instead of 15,000. Runs under 3,000 iterations do not reset opacities.
+
+    Args:
+        iterations: Number of steps.
+        rescale: Stretch the milestones; False keeps the plain numbers of 30,000 iterations.
+        changes: Fields of `TrainConfig` that are set as they are.
+
+    Raises:
+        ArgumentError: a value is outside its range, or there is no such field.
+    """
+    whole_number("iterations", iterations, 1)
+    for name in changes:
+        one_of("field", name, [field.name for field in fields(TrainConfig)])
+    plain = TrainConfig()
+    stretched: dict[str, Any] = {}
+    if rescale:
+        for name in MILESTONES:
+            stretched[name] = max(1, round(getattr(plain, name) * iterations / RECIPE_ITERATIONS))
+    if iterations < SHORT_RUN:
+        stretched["reset_every"] = 0
+    return TrainConfig(**{"iterations": iterations, **stretched, **changes})

@@ -22,14 +22,14 @@ class StepEvent:
 
 @dataclass(frozen=True)
 class DensifyEvent:
-    """Density control changed the Gaussians, after the step of the same iteration.
+    """Adaptive density control changed the Gaussians, after the step of the same iteration.
 
     Args:
         iteration: Counted from 0.
-        num_cloned: Gaussians added as clones, before the cap.
-        num_split_children: Gaussians added as children of splits, before the cap.
-        num_pruned: Gaussians removed for their opacity.
-        num_gaussians: Gaussians after the cap.
+        num_cloned: Gaussians added as clones.
+        num_split_children: Gaussians added as children of splits; their parents are gone.
+        num_pruned: Gaussians removed for their opacity or size.
+        num_gaussians: Gaussians afterwards.
     """
 
     iteration: int
@@ -37,3 +37,37 @@ class DensifyEvent:
     num_split_children: int
     num_pruned: int
     num_gaussians: int
+
+
+@dataclass(frozen=True)
+class ResetEvent:
+    """Opacities were lowered, after the step (and the densification) of the same iteration.
+
+    Args:
+        iteration: Counted from 0.
+        opacity: What they were lowered to where they were above it.
+    """
+
+    iteration: int
+    opacity: float
+
+
+@dataclass(frozen=True)
+class RelocateEvent:
+    """MCMC moved dead Gaussians to living ones and added others, after the step of the same iteration.
+
+    Args:
+        iteration: Counted from 0.
+        num_relocated: Gaussians too faint to be seen that were moved.
+        num_added: Gaussians added.
+        num_gaussians: Gaussians afterwards.
+    """
+
+    iteration: int
+    num_relocated: int
+    num_added: int
+    num_gaussians: int
+
+
+Change = DensifyEvent | ResetEvent | RelocateEvent
+Event = StepEvent | Change

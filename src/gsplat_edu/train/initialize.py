@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
+from gsplat_edu.constants import C0, SH_OFFSET
+from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.validation import whole_number
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.density.adc import AdaptiveDensityControl
+from gsplat_edu.train.density.base import DensityStrategy
+from gsplat_edu.train.density.mcmc import MCMC
+from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
 START_SCALE = 0.09
 """World units: standard deviation of every start Gaussian; a few hundred of them fill the unit ball."""
@@ -20,6 +28,74 @@ QUAT_JITTER = 0.01
 
 SH0_JITTER = 0.2
 """Standard deviation of the start coefficients around 0, which is mid-grey."""
+
+NEIGHBOURS = 3
+"""Start scales come from the distances to this many nearest points. (Kerbl et al. 2023's code)"""
+
+SMALLEST_DISTANCE = 1e-7**0.5
+"""World units: floor under the start scales, for points that coincide. (Kerbl et al. 2023's code)"""
+
+
+def from_points(points: ArrayLike, colors: ArrayLike, config: TrainConfig) -> Gaussians:
+    """Put a Gaussian on every point: a ball as wide as the gap to its neighbours, of the point's colour.
+
+    scale = factor * sqrt(mean squared distance to the 3 nearest points),  sh0 = (colour - 0.5) / C0
+
+    Args:
+        points: (N, 3) positions, world units.
+        colors: (N, 3) colours, 0 to 1.
+        config: Start opacity, scale factor, SH degree, seed; and the cap: of more points a random part is taken.
+
+    Returns:
+        Gaussians of the configuration's SH degree, float32; min(N, cap) of them.
+
+    Raises:
+        ShapeError: a shape differs, or the two have different N.
+        ArgumentError: there are no points, or a number is NaN or infinite.
+
+    Source: Kerbl et al. 2023, section 5.1 and its code.
+    """
+    sizes: dict[str, int] = {}
+    points = float64_array("points", points, ("N", 3), sizes)
+    colors = float64_array("colors", colors, ("N", 3), sizes)
+    if not len(points):
+        raise ArgumentError("points: are none; give at least one to start from")
+    if config.max_gaussians is not None and len(points) > config.max_gaussians:
+        chosen = np.random.default_rng(config.seed).permutation(len(points))[: config.max_gaussians]
+        points, colors = points[np.sort(chosen)], colors[np.sort(chosen)]
+    count = len(points)
+    scales = np.full(count, START_SCALE)
+    if count > 1:
+        distances, _ = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, count))
+        scales = np.sqrt(np.square(distances[:, 1:]).mean(axis=1))
+    opacity, factor = config.start
+    scales = factor * np.maximum(scales, SMALLEST_DISTANCE)
+    num_rest = (config.sh_degree + 1) ** 2 - 1
+    return Gaussians(
+        means=torch.tensor(points, dtype=torch.float32),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=torch.tensor(np.log(scales), dtype=torch.float32)[:, None].repeat(1, 3),
+        sh0=torch.tensor((colors - SH_OFFSET) / C0, dtype=torch.float32)[:, None],
+        sh_rest=torch.zeros(count, num_rest, 3),
+        logit_opacities=torch.full((count,), math.log(opacity / (1 - opacity))),
+    )
+
+
+def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> DensityStrategy | None:
+    """Make the density strategy that a configuration names; None for none.
+
+    Args:
+        config: The configuration; its seed is that of the strategy's draws.
+        extent: Size of the scene, world units.
+        gaussians: What training starts from.
+
+    Raises:
+        ArgumentError: the strategy is mcmc and there is no cap.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    if config.strategy == "adc":
+        return AdaptiveDensityControl(config, extent, generator, gaussians)
+    return MCMC(config, generator) if config.strategy == "mcmc" else None
 
 
 def random_ball(count: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Gaussians:

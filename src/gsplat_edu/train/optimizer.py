@@ -79,6 +79,20 @@ class Adam:
             parameter.grad = None
 
     @torch.no_grad()
+    def forget(self, name: str) -> None:
+        """Set a parameter's moments to zero, where it was changed by hand."""
+        for moments in (self.first, self.second):
+            if name in moments:
+                moments[name].zero_()
+
+    @torch.no_grad()
+    def forget_rows(self, indices: Int64[Tensor, " S"]) -> None:
+        """Set all moments of some Gaussians to zero, where those were changed by hand."""
+        for moments in (self.first, self.second):
+            for moment in moments.values():
+                moment[indices] = 0.0
+
+    @torch.no_grad()
     def follow(self, survivors: Int64[Tensor, " S"], num_new: int) -> None:
         """Carry the moments through a change of the Gaussians.
 

@@ -2,38 +2,55 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import l1
+from gsplat_edu.losses import photo_loss
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
-from gsplat_edu.train.events import DensifyEvent, StepEvent
+from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.feed import ViewFeed
 from gsplat_edu.train.optimizer import Adam
+from gsplat_edu.train.schedule import means_rate, sh_degree
+from gsplat_edu.train.threads import one_thread
 from gsplat_edu.views import View
 
-Renderer = Callable[[Gaussians, Camera], RenderOutput]
-"""Renders Gaussians from a camera, differentiably. Which backend does it is not the trainer's business."""
 
-Callback = Callable[["Trainer", StepEvent | DensifyEvent], None]
-"""Is told of every step and every densification, with the trainer as it stands after it."""
+@runtime_checkable
+class Renderer(Protocol):
+    """Renders Gaussians from a camera, differentiably. Which backend does it is not the trainer's business."""
+
+    def __call__(self, gaussians: Gaussians, camera: Camera, *, settings: RenderSettings) -> RenderOutput:
+        """Render; see `gsplat_edu.render.api.render`."""
+        ...
+
+
+Callback = Callable[["Trainer", Event], None]
+"""Is told of every step and every change of the Gaussians, with the trainer as it stands after it."""
+
+BACKGROUND_STREAM = 1
+"""Second word of the seed of the random backgrounds, so that they do not follow the view order."""
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """A finished run.
+    """What `Trainer.run` has done.
 
     Args:
-        losses: Loss of every iteration.
-        counts: Gaussians rendered in every iteration.
+        losses: Loss of every iteration of this call.
+        counts: Gaussians rendered in every iteration of this call.
         seconds: Wall time of the loop, callbacks included.
     """
 
@@ -45,22 +62,25 @@ class TrainResult:
 class Trainer:
     """Moves Gaussians until they look like the views.
 
-    Each iteration draws a view, renders it, takes a step of Adam down the L1 loss and lets the density
-    strategy change the Gaussians.
+    Each iteration draws a view, renders it, takes a step of Adam down the loss and lets the density strategy
+    change the Gaussians.
 
     Args:
         gaussians: Where to start; not changed.
         views: What to learn from, at least one.
-        config: Budget, rates and seed.
+        config: Budget, rates, schedule and seed.
         render: The renderer.
+        extent: Size of the scene, world units: the means' learning rate is a fraction of it.
         density: The density strategy; None keeps the number of Gaussians.
-        callbacks: Told of every step and every densification, in this order.
+        callbacks: Told of every step and every change, in this order.
 
     Raises:
-        ArgumentError: there are no views, or no Gaussians.
+        ArgumentError: there are no views, no Gaussians, or more Gaussians than the cap.
 
     Attributes:
         gaussians: The Gaussians as they stand.
+        iteration: Steps taken so far.
+        last: The last rendered image, its photo and its mask, for whoever wants to look.
     """
 
     def __init__(
@@ -70,6 +90,7 @@ class Trainer:
         config: TrainConfig,
         *,
         render: Renderer,
+        extent: float = 1.0,
         density: DensityStrategy | None = None,
         callbacks: Sequence[Callback] = (),
     ) -> None:
@@ -77,40 +98,109 @@ class Trainer:
             raise ArgumentError("views: is empty; give at least one view to learn from")
         if not len(gaussians):
             raise ArgumentError("gaussians: is empty; give at least one Gaussian to start from")
+        if config.max_gaussians is not None and len(gaussians) > config.max_gaussians:
+            raise ArgumentError(
+                f"gaussians: are {len(gaussians)}, more than max_gaussians = {config.max_gaussians}; start with fewer"
+            )
         self.gaussians = gaussians.trainable()
-        self.config, self.density = config, density
+        self.config, self.extent, self.density = config, extent, density
+        self.iteration = 0
+        self.last: tuple[Tensor, Tensor, np.ndarray[Any, Any] | None] | None = None
         self._render, self._callbacks = render, tuple(callbacks)
-        self._cameras = [view.camera for view in views]
-        self._targets = [torch.tensor(view.image, dtype=gaussians.means.dtype) for view in views]
-        self._optimizer = Adam(self.gaussians, config.learning_rates)
-        self._view_order = np.random.default_rng(config.seed)
+        self._feed = ViewFeed(views, config.view_order, config.seed)
+        self._optimizer = Adam(self.gaussians, config.learning_rates, eps=config.adam_eps)
+        self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
-    def run(self) -> TrainResult:
-        """Take all the iterations of the budget. A trainer runs once."""
+    def run(self, stop: Callable[[], bool] = lambda: False) -> TrainResult:
+        """Take the iterations that are left of the budget.
+
+        Args:
+            stop: Asked after every iteration; the run ends when it says so, and can be taken up again.
+        """
         losses, counts = [], []
         start = time.perf_counter()
-        for iteration in range(self.config.iterations):
-            step = self._step(iteration)
+        while self.iteration < self.config.iterations:
+            step = self._step()
             losses.append(step.loss)
             counts.append(step.num_gaussians)
             self._tell(step)
             if self.density is not None:
-                changed = self.density.update(iteration, self.gaussians, self._optimizer)
-                if changed is not None:
-                    self.gaussians, event = changed
+                with one_thread():
+                    changed = self.density.update(step.iteration, self.gaussians, self._optimizer)
+                self.gaussians, events = changed
+                for event in events:
                     self._tell(event)
+            if stop():
+                break
         return TrainResult(losses, counts, time.perf_counter() - start)
 
-    def _step(self, iteration: int) -> StepEvent:
-        view = int(self._view_order.integers(len(self._cameras)))
-        output = self._render(self.gaussians, self._cameras[view])
-        loss = l1(output.image, self._targets[view])
+    def _step(self) -> StepEvent:
+        iteration, config = self.iteration, self.config
+        view, photo = self._feed.next()
+        background = config.background
+        if config.random_background:
+            background = tuple(self._backgrounds.uniform(size=3).tolist())
+        settings = RenderSettings(
+            background=background,
+            sh_degree=sh_degree(config, iteration),
+            antialiased=config.antialiased,
+            jacobian_limit=config.jacobian_limit,
+            depth=False,
+        )
+        output = self._render(self.gaussians, view.camera, settings=settings)
+        target = torch.from_numpy(photo.over(background))
+        loss = photo_loss(output.image, target, photo.mask, config.ssim_weight)
         loss.backward()  # type: ignore[no-untyped-call]
         if self.density is not None:
-            self.density.observe(output)
+            with one_thread():
+                self.density.observe(self.gaussians, output)
+        self._optimizer.learning_rates["means"] = means_rate(config, self.extent, iteration)
         self._optimizer.step(self.gaussians)
+        self.last = output.image.detach(), target, photo.mask
+        self.iteration += 1
         return StepEvent(iteration, float(loss.detach()), len(self.gaussians))
 
-    def _tell(self, event: StepEvent | DensifyEvent) -> None:
+    def _tell(self, event: Event) -> None:
         for callback in self._callbacks:
             callback(self, event)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Return all that a run needs to go on later as if nothing had happened: tensors, and what JSON holds."""
+        parts = {"gaussians": self.gaussians.tensors(), "first": self._optimizer.first}
+        parts["second"] = self._optimizer.second
+        numbers: dict[str, Any] = {
+            "iteration": self.iteration,
+            "steps": self._optimizer.steps,
+            "feed": self._feed.state(),
+            "backgrounds": self._backgrounds.bit_generator.state,
+        }
+        if self.density is not None:
+            parts["density"], numbers["density"] = self.density.state()
+        flat = {
+            f"{part}.{name}": t.detach() for part, tensors in parts.items() for name, t in tensors.items()
+        }
+        return flat, numbers
+
+    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
+        """Go on from what `state` returned, in a trainer made with the same arguments."""
+
+        def part(name: str) -> dict[str, Tensor]:
+            return {key.split(".", 1)[1]: t for key, t in tensors.items() if key.startswith(f"{name}.")}
+
+        self.gaussians = Gaussians(**part("gaussians")).trainable()
+        self._optimizer.first, self._optimizer.second = part("first"), part("second")
+        self._optimizer.steps, self.iteration = numbers["steps"], numbers["iteration"]
+        self._feed.load_state(numbers["feed"])
+        self._backgrounds.bit_generator.state = numbers["backgrounds"]
+        if self.density is not None:
+            self.density.load_state(part("density"), numbers["density"])
+
+    def last_psnr(self) -> float:
+        """Return the PSNR of the last image that was rendered for a step, dB; NaN before the first."""
+        if self.last is None:
+            return math.nan
+        image, target, mask = self.last
+        truth = target.numpy().astype(np.float32) / (255.0 if target.dtype == torch.uint8 else 1.0)
+        error = np.square(np.clip(image.numpy(force=True), 0.0, 1.0) - truth)
+        mean = float(error[mask].mean() if mask is not None else error.mean())
+        return -10.0 * math.log10(max(mean, 1e-10))

@@ -1,17 +1,23 @@
-"""Adaptive density control: clone, split and prune by the gradient of the means in the image.
+"""Adaptive density control: clone, split and prune by the gradient of the means in the image; reset opacities.
 
-Its differences from the paper are listed in `gsplat_edu.train.config`.
+`gsplat_edu.train.config` holds its numbers.
 """
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.train.config import DensityConfig
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import replace, split_children
-from gsplat_edu.train.events import DensifyEvent
+from gsplat_edu.train.events import Change, DensifyEvent, ResetEvent
 from gsplat_edu.train.optimizer import Adam
 
 
@@ -19,48 +25,109 @@ class AdaptiveDensityControl:
     """Clone the small, split the large, prune the faint.
 
     Where the loss pulls hard on a Gaussian's place in the image, one Gaussian is not enough: a small one is
-    copied, a large one gives way to two smaller ones drawn from it.
+    copied, a large one gives way to two smaller ones drawn from it. Now and then all opacities are lowered, and
+    what nobody needs stays faint and is pruned.
 
     Args:
         config: Window, thresholds and cap.
+        extent: Size of the scene, world units.
         generator: Source of the split children's positions.
         gaussians: What training starts from.
 
     Source: Kerbl et al. 2023, section 5.2.
     """
 
-    def __init__(self, config: DensityConfig, generator: torch.Generator, gaussians: Gaussians) -> None:
-        self.config, self.generator = config, generator
+    def __init__(
+        self, config: TrainConfig, extent: float, generator: torch.Generator, gaussians: Gaussians
+    ) -> None:
+        self.config, self.extent, self.generator = config, extent, generator
         self._forget(gaussians)
 
-    def observe(self, output: RenderOutput) -> None:
+    def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
         """Add this view's gradient norms to those of the Gaussians it shows."""
         self.norm_sums[output.visible] += output.means2d_grad_norms()
         self.times_visible[output.visible] += 1
+        if self.config.prune_screen_size:
+            seen = self.largest_radii[output.visible]
+            self.largest_radii[output.visible] = torch.maximum(seen, output.radii.amax(dim=-1))
 
     @torch.no_grad()
-    def update(
+    def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
+        """Clone, split, prune and reset where the schedule has it."""
+        config, events = self.config, list[Change]()
+        if not config.densify_start < iteration < config.densify_stop:
+            return gaussians, events
+        if iteration % config.densify_every == 0:
+            gaussians, densified = self._densify(iteration, gaussians, optimizer)
+            events.append(densified)
+        if self._reset_is_due(iteration):
+            ceiling = math.log(config.reset_opacity / (1 - config.reset_opacity))
+            gaussians.logit_opacities.clamp_(max=ceiling)
+            optimizer.forget("logit_opacities")
+            events.append(ResetEvent(iteration, config.reset_opacity))
+        return gaussians, events
+
+    def _densify(
         self, iteration: int, gaussians: Gaussians, optimizer: Adam
-    ) -> tuple[Gaussians, DensifyEvent] | None:
-        """Clone, split and prune where the schedule has it."""
+    ) -> tuple[Gaussians, DensifyEvent]:
         config = self.config
-        if not config.start <= iteration < config.stop or iteration % config.every:
-            return None
-        hot = self.norm_sums / self.times_visible.clamp(min=1) > config.grad_threshold
-        large = gaussians.scales.amax(dim=-1) > config.percent_dense * config.extent
+        pull = self.norm_sums / self.times_visible.clamp(min=1)
+        size = gaussians.scales.amax(dim=-1)
         keep = gaussians.opacities >= config.min_opacity
-        clone, split = keep & hot & ~large, keep & hot & large
+        if config.reset_every and iteration > config.reset_every:
+            if config.prune_scale:
+                keep &= size <= config.prune_scale * self.extent
+            if config.prune_screen_size:
+                keep &= self.largest_radii <= config.prune_screen_size
+        hot = keep & (pull > config.grad_threshold)
+        if config.over_cap == "strongest":
+            hot = self._within_cap(pull, hot, int(keep.sum()))
+        large = size > config.percent_dense * self.extent
+        clone, split = hot & ~large, hot & large
 
         clones = gaussians.map(lambda tensor: tensor[clone])
         parents = gaussians.map(lambda tensor: tensor[split])
         children = [split_children(parents, config.split_shrink, self.generator) for _ in range(2)]
         replaced = replace(gaussians, optimizer, keep & ~split, [clones, *children], config.max_gaussians)
         self._forget(replaced)
-        event = DensifyEvent(
-            iteration, len(clones), 2 * len(parents), int((~keep).sum()), num_gaussians=len(replaced)
+        counts = len(clones), 2 * len(parents), int((~keep).sum())
+        return replaced, DensifyEvent(iteration, *counts, num_gaussians=len(replaced))
+
+    def _within_cap(self, pull: Tensor, hot: Bool[Tensor, " N"], num_kept: int) -> Bool[Tensor, " N"]:
+        """Leave as many as there is room for, those pulled hardest; a clone and a split each add one Gaussian."""
+        room = (
+            len(pull) if self.config.max_gaussians is None else max(self.config.max_gaussians - num_kept, 0)
         )
-        return replaced, event
+        candidates = torch.nonzero(hot)[:, 0]
+        if len(candidates) <= room:
+            return hot
+        order = torch.argsort(pull[candidates], descending=True, stable=True)
+        chosen = torch.zeros_like(hot)
+        chosen[candidates[order[:room]]] = True
+        return chosen
+
+    def _reset_is_due(self, iteration: int) -> bool:
+        every = self.config.reset_every
+        on_white = min(self.config.background) >= 1.0 and iteration == self.config.densify_start + 1
+        return bool(every) and (iteration % every == 0 or on_white)
 
     def _forget(self, gaussians: Gaussians) -> None:
         self.norm_sums = torch.zeros_like(gaussians.logit_opacities, requires_grad=False)
         self.times_visible = torch.zeros_like(self.norm_sums)
+        self.largest_radii = torch.zeros_like(self.norm_sums)
+
+    def state(self) -> State:
+        """Return the statistics since the last densification, and the generator."""
+        tensors = {
+            "norm_sums": self.norm_sums,
+            "times_visible": self.times_visible,
+            "largest_radii": self.largest_radii,
+            "generator": self.generator.get_state(),
+        }
+        return tensors, {}
+
+    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.norm_sums, self.times_visible = tensors["norm_sums"], tensors["times_visible"]
+        self.largest_radii = tensors["largest_radii"]
+        self.generator.set_state(tensors["generator"])

@@ -36,7 +36,11 @@ def split_children(parents: Gaussians, shrink: float, generator: torch.Generator
 
 @torch.no_grad()
 def replace(
-    gaussians: Gaussians, optimizer: Adam, keep: Bool[Tensor, " N"], newborn: list[Gaussians], cap: int
+    gaussians: Gaussians,
+    optimizer: Adam,
+    keep: Bool[Tensor, " N"],
+    newborn: list[Gaussians],
+    cap: int | None = None,
 ) -> Gaussians:
     """Keep some Gaussians, add others behind them, and cut from the end what is over the cap.
 
@@ -45,13 +49,13 @@ def replace(
         optimizer: Its moments follow: survivors keep theirs, the newborn start from zero.
         keep: (N,) true for those that stay.
         newborn: What is added, in this order.
-        cap: Largest number of Gaussians afterwards.
+        cap: Largest number of Gaussians afterwards; None for none.
 
     Returns:
         The new Gaussians, leaves that collect gradients.
     """
     survivors: Int64[Tensor, " S"] = torch.nonzero(keep)[:cap, 0]
     parts = [gaussians.map(lambda tensor: tensor[survivors]), *newborn]
-    replaced = Gaussians.concatenated(parts).map(lambda tensor: tensor[:cap])
+    replaced = Gaussians.concatenated(parts).map(lambda tensor: tensor[:cap].contiguous())
     optimizer.follow(survivors, len(replaced) - len(survivors))
-    return replaced.trainable()
+    return replaced.map(lambda tensor: tensor.requires_grad_())

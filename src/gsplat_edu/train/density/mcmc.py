@@ -1,0 +1,168 @@
+"""Density control as Markov chain Monte Carlo: Gaussians are samples, and none is ever thrown away.
+
+A Gaussian too faint to be seen is moved onto a living one, drawn by opacity, and the two share its place so that
+the image stays (nearly) as it was. The number grows by a few percent at a time up to a cap. Noise lets those that
+are not yet opaque wander; opacity and scale are kept small, so that superfluous ones die and are moved.
+
+Source: Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo".
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians, quat_to_R_t
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.density.base import State
+from gsplat_edu.train.density.surgery import replace
+from gsplat_edu.train.events import Change, RelocateEvent
+from gsplat_edu.train.optimizer import Adam
+
+MOST_SHARERS = 51
+"""Most Gaussians that may share one place at a time; the sum below loses its digits beyond. (2024's code)"""
+
+NOISE_SHARPNESS = 100.0
+"""k of the noise's gate sigmoid(k (t - opacity)). (2024, eq. 9)"""
+
+NOISE_THRESHOLD = 0.005
+"""t of the gate: only Gaussians about as faint as the dead get all of the noise. (2024: 1 - 0.995)"""
+
+
+class MCMC:
+    """Relocate the dead, grow up to the cap, add noise, regularise.
+
+    Args:
+        config: Window, growth, noise and weights; `max_gaussians` has to be set.
+        generator: Source of the places and of the noise.
+
+    Raises:
+        ArgumentError: there is no cap.
+    """
+
+    def __init__(self, config: TrainConfig, generator: torch.Generator) -> None:
+        if config.max_gaussians is None:
+            raise ArgumentError("max_gaussians: mcmc grows up to a cap and needs one, for example 200000")
+        self.config, self.generator, self.cap = config, generator, config.max_gaussians
+
+    @torch.no_grad()
+    def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
+        """Add the gradients of the regularisers: weight_o mean(opacity) + weight_s mean(scale)."""
+        config, opacities, scales = self.config, gaussians.opacities, gaussians.scales
+        pulls = (
+            (gaussians.logit_opacities, config.mcmc_opacity_weight * opacities * (1 - opacities)),
+            (gaussians.log_scales, config.mcmc_scale_weight * scales),
+        )
+        for parameter, pull in pulls:
+            if parameter.grad is not None and parameter.numel():
+                parameter.grad += pull / parameter.numel()
+
+    @torch.no_grad()
+    def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
+        """Relocate and grow where the schedule has it; add noise after every step."""
+        config, events = self.config, list[Change]()
+        due = config.densify_start < iteration < config.mcmc_stop and iteration % config.densify_every == 0
+        if due and len(gaussians):
+            dead = gaussians.opacities <= config.min_opacity
+            num_relocated = self._relocate(gaussians, optimizer, torch.nonzero(dead)[:, 0])
+            gaussians, num_added = self._grow(gaussians, optimizer)
+            events.append(RelocateEvent(iteration, num_relocated, num_added, len(gaussians)))
+        self._add_noise(gaussians, optimizer.learning_rates["means"])
+        return gaussians, events
+
+    def _relocate(self, gaussians: Gaussians, optimizer: Adam, dead: Int64[Tensor, " D"]) -> int:
+        """Move the dead onto living ones, in place. Where all are dead there is nowhere to go."""
+        weights = gaussians.opacities.double()
+        weights[dead] = 0.0
+        if not len(dead) or not bool((weights > 0).any()):
+            return 0
+        places = self._draw(weights, len(dead))
+        self._share(gaussians, optimizer, places)
+        for tensor in gaussians.tensors().values():
+            tensor[dead] = tensor[places]
+        optimizer.forget_rows(dead)
+        return len(dead)
+
+    def _grow(self, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, int]:
+        count = len(gaussians)
+        num_added = max(min(self.cap, int(self.config.mcmc_growth * count)) - count, 0)
+        if not num_added:
+            return gaussians, 0
+        places = self._draw(gaussians.opacities.double(), num_added)
+        self._share(gaussians, optimizer, places)
+        newborn = gaussians.map(lambda tensor: tensor[places])
+        keep = torch.ones(count, dtype=torch.bool, device=gaussians.means.device)
+        return replace(gaussians, optimizer, keep, [newborn]), num_added
+
+    def _draw(self, weights: Float[Tensor, " N"], count: int) -> Int64[Tensor, " count"]:
+        """Draw indices with replacement, each as probable as its weight."""
+        cumulated = torch.cumsum(weights, dim=0)
+        uniform = torch.rand(count, generator=self.generator, dtype=torch.float64).to(weights.device)
+        places = torch.searchsorted(cumulated, uniform * cumulated[-1], right=True)
+        return places.clamp(max=len(weights) - 1)
+
+    def _share(self, gaussians: Gaussians, optimizer: Adam, places: Int64[Tensor, " D"]) -> None:
+        """Make room at places for those that come: fainter and of another size, in place."""
+        arrivals = torch.bincount(places, minlength=len(gaussians))
+        hosts = torch.nonzero(arrivals)[:, 0]
+        sharers = (arrivals[hosts] + 1).clamp(max=MOST_SHARERS)
+        opacities, factor = shared_shape(gaussians.opacities[hosts].double(), sharers)
+        opacities = opacities.clamp(min=self.config.min_opacity, max=1 - 1e-6)
+        gaussians.logit_opacities[hosts] = torch.logit(opacities).to(gaussians.logit_opacities)
+        gaussians.log_scales[hosts] += factor.log()[:, None].to(gaussians.log_scales)
+        optimizer.forget_rows(hosts)
+
+    def _add_noise(self, gaussians: Gaussians, rate: float) -> None:
+        """Means += rate noise sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I)."""
+        means = gaussians.means
+        draw = torch.randn(len(means), 3, generator=self.generator, dtype=means.dtype).to(means.device)
+        R, scales = quat_to_R_t(gaussians.quats.detach()), gaussians.scales
+        wander = (R @ (scales.square() * (R.mT @ draw[..., None])[..., 0])[..., None])[..., 0]
+        gate = torch.sigmoid(NOISE_SHARPNESS * (NOISE_THRESHOLD - gaussians.opacities))
+        means += (rate * self.config.mcmc_noise) * gate[:, None] * wander
+
+    def state(self) -> State:
+        """Return the generator."""
+        return {"generator": self.generator.get_state()}, {}
+
+    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.generator.set_state(tensors["generator"])
+
+
+def shared_shape(
+    opacities: Float[Tensor, " N"], sharers: Int64[Tensor, " N"]
+) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+    """Work out what n Gaussians in one place have to be so that together they look like the one before.
+
+    o' = 1 - (1 - o)^(1/n),   scale' = scale o / (sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1))
+
+    Args:
+        opacities: (N,) of the one, in (0, 1), float64.
+        sharers: (N,) n, 1 to 51.
+
+    Returns:
+        (N,) opacity of each of the n, and (N,) factor of its scales.
+
+    Source: Kheradmand et al. 2024, eq. 8 and 9.
+    """
+    each = 1 - (1 - opacities) ** (1 / sharers)
+    total = torch.zeros_like(opacities)
+    for k in range(MOST_SHARERS):
+        # sum_{i=k+1..n} C(i-1, k) = C(n, k+1), by the hockey stick of Pascal's triangle.
+        log_binomial = _log_choose(sharers, k + 1)
+        term = torch.exp(log_binomial + (k + 1) * torch.log(each)) / math.sqrt(k + 1)
+        total += torch.where(sharers > k, term * (-1) ** k, 0.0)
+    return each, opacities / total
+
+
+def _log_choose(n: Int64[Tensor, " N"], k: int) -> Float[Tensor, " N"]:
+    """Log C(n, k); where n < k the value is not used."""
+    real = n.double().clamp(min=k)
+    return torch.lgamma(real + 1) - math.lgamma(k + 1) - torch.lgamma(real - k + 1)
