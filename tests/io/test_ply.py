@@ -1,9 +1,15 @@
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.errors import SceneFormatError, ShapeError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.ply import save_ply
+from gsplat_edu.io.ply import load_ply, save_ply
+
+DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
 def random_gaussians(count, rest):
@@ -76,3 +82,219 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         save_ply(path, random_gaussians(5, 0))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path], "and nothing beside it"
+
+
+def assert_equal(a, b):
+    for name, tensor in a.tensors().items():
+        other = b.tensors()[name]
+        assert other.dtype == torch.float32 and other.is_contiguous(), name
+        np.testing.assert_array_equal(
+            tensor.numpy().view(np.uint32), other.numpy().view(np.uint32), err_msg=name
+        )
+
+
+@pytest.mark.parametrize("count", [0, 1, 9])
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+def test_what_is_saved_is_loaded_to_the_bit(tmp_path, rest, count):
+    gaussians = random_gaussians(count, rest)
+    if count:
+        gaussians.means[0, 1] = -0.0
+    save_ply(tmp_path / "a.ply", gaussians)
+    assert_equal(gaussians, load_ply(str(tmp_path / "a.ply")))
+
+
+def test_an_origin_moves_the_means_in_float64(tmp_path):
+    gaussians = random_gaussians(5, 0)
+    save_ply(tmp_path / "plain.ply", gaussians)
+    save_ply(tmp_path / "zero.ply", gaussians, (0, 0, 0))
+    assert (tmp_path / "plain.ply").read_bytes() == (tmp_path / "zero.ply").read_bytes()
+
+    origin = np.array([1234.5678, -0.1, 3e5])
+    save_ply(tmp_path / "moved.ply", gaussians, origin)
+    moved = load_ply(tmp_path / "moved.ply")
+    exact = gaussians.means.numpy().astype(np.float64) + origin
+    np.testing.assert_array_equal(moved.means.numpy(), exact.astype(np.float32))
+    back = load_ply(tmp_path / "moved.ply", origin)
+    # the file holds float32: half a unit in the last place of 3e5 is 2^-6; the subtraction adds nothing of its size
+    np.testing.assert_allclose(back.means.numpy(), gaussians.means.numpy(), atol=2**-6 + 1e-6)
+    with pytest.raises(ShapeError, match="origin"):
+        load_ply(tmp_path / "moved.ply", (1, 2))
+
+
+def written(path, table, form="binary_little_endian", newline="\n", before=b"", extra_header=()):
+    """Write a structured table as a PLY in any of its forms."""
+    kinds = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int32"}
+    lines = ["ply", f"format {form} 1.0", "comment made by hand", "obj_info none", *extra_header]
+    lines += [f"element vertex {len(table)}"]
+    lines += [f"property {kinds[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
+    if form == "ascii":
+        rows = "".join(" ".join(repr(v.item()) for v in row) + newline for row in table)
+        body = rows.encode() + b"3 0 0 0\n"
+    else:
+        order = ">" if form == "binary_big_endian" else "<"
+        body = before + table.astype(table.dtype.newbyteorder(order)).tobytes() + b"\x03" + bytes(12)
+    path.write_bytes(newline.join(lines).encode() + body)
+
+
+def shuffled_table(gaussians, kind="f4", more=()):
+    """The columns of a scene without normals, in an order nobody expects, between columns nobody knows."""
+    columns = {
+        **{n: gaussians.means[:, i] for i, n in enumerate("xyz")},
+        **{f"rot_{i}": gaussians.quats[:, i] for i in range(4)},
+        **{f"scale_{i}": gaussians.log_scales[:, i] for i in range(3)},
+        **{f"f_dc_{i}": gaussians.sh0[:, 0, i] for i in range(3)},
+        "opacity": gaussians.logit_opacities,
+    }
+    rest = gaussians.sh_rest.shape[1]
+    columns |= {f"f_rest_{c * rest + k}": gaussians.sh_rest[:, k, c] for c in range(3) for k in range(rest)}
+    names = [str(name) for name in np.random.default_rng(1).permutation(list(columns))]
+    fields = [("red", "u1"), *((name, kind) for name in names), *((name, "f8") for name in more)]
+    table = np.zeros(len(gaussians), dtype=fields)
+    table["red"] = 200
+    for name in names:
+        table[name] = columns[name].numpy()
+    return table
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_any_order_any_byte_order_and_what_is_not_ours(tmp_path, form, kind, newline):
+    """ASCII holds the shortest decimal that reads back as the same number, so it loses nothing either."""
+    gaussians = random_gaussians(6, 8)
+    written(tmp_path / "a.ply", shuffled_table(gaussians, kind, more=("segment",)), form, newline)
+    assert_equal(gaussians, load_ply(tmp_path / "a.ply"))
+
+
+def test_an_element_before_the_vertices_is_skipped(tmp_path):
+    gaussians = random_gaussians(3, 0)
+    header = ("element camera 2", "property double f", "property uchar id")
+    written(tmp_path / "b.ply", shuffled_table(gaussians), before=bytes(18), extra_header=header)
+    assert_equal(gaussians, load_ply(tmp_path / "b.ply"))
+
+
+def refused(path):
+    with pytest.raises(SceneFormatError) as caught:
+        load_ply(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_every_cut_is_told(tmp_path, form):
+    path = tmp_path / "a.ply"
+    written(path, shuffled_table(random_gaussians(4, 0)), form)
+    whole = path.read_bytes()
+    end = whole.index(b"end_header\n") + 11
+    row = (len(whole) - end - 13) // 4
+    for length in [*range(0, end, 7), *range(end, end + 3 * row, 11)]:
+        path.write_bytes(whole[:length])
+        refused(path)
+    if form == "binary_little_endian":
+        path.write_bytes(whole[: end + 2 * row + 5])
+        assert "is truncated: 2 of 4 rows of vertex are there; get the file again" in refused(path)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_absurd_counts_allocate_nothing(tmp_path, form):
+    path = tmp_path / "a.ply"
+    written(path, shuffled_table(random_gaussians(3, 0)), form)
+    whole = path.read_bytes()
+    for count in (10**10, 10**30):
+        path.write_bytes(whole.replace(b"element vertex 3", b"element vertex %d" % count))
+        said = refused(path)
+        assert "truncated" in said or "rows of vertex" in said
+    chunk = b"element chunk %d\nproperty int a\nelement vertex 3" % 10**30
+    path.write_bytes(whole.replace(b"element vertex 3", chunk))
+    assert "is truncated: 0 of 3 rows" in refused(path)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_big_endian"])
+@pytest.mark.parametrize(("value", "text"), [(np.nan, "nan"), (-np.inf, "-inf"), (1e300, "inf")])
+def test_what_is_not_finite_is_named(tmp_path, form, value, text):
+    table = shuffled_table(random_gaussians(5, 3), "f8", more=("unused",))
+    table["unused"] = np.nan  # nobody reads it
+    table["scale_1"][3] = value
+    written(tmp_path / "a.ply", table, form)
+    assert f"vertex 3: scale_1 is {text} (1 such vertices in all)" in refused(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ((b"ply\n", b"PK\x03\x04\n"), "is not a PLY: its first line is not 'ply'"),
+        ((b"ply\n", b"version https://git-lfs.github.com/spec/v1\n"), "is a Git LFS pointer"),
+        (
+            (b"format binary_little_endian", b"format text"),
+            "line 2: 'format text 1.0' is no line of a PLY header",
+        ),
+        ((b"format binary_little_endian 1.0", b"comment"), "its header names no format"),
+        ((b"element vertex 3", b"element vertex -3"), "'element vertex -3' is no line"),
+        ((b"element vertex 3", b"element point 3"), "is a PLY without vertices"),
+        ((b"element vertex 3", b"comment"), "belongs to no element"),
+        ((b"property float x\n", b"property real x\n"), "'property real x' is no line"),
+        ((b"property float x\n", b"property float y\n"), "property y stands twice"),
+        ((b"property float x\n", b"property list uchar int x\n"), "has the list x"),
+        (
+            (b"property float opacity", b"property float transparency"),
+            "is not a splat scene: lacks opacity; export",
+        ),
+        (
+            (b"property float f_rest_8", b"property float f_rest_9"),
+            "has 9 properties f_rest_*, but SH degrees",
+        ),
+        (
+            (b"property float f_rest_8", b"property float rest"),
+            "has 8 properties f_rest_*, but SH",
+        ),
+        ((b"end_header", b"comment" + b" long" * 2000), "is no line of a PLY header"),
+        ((b"end_header\n", b"comment\n" * 11000), "no end_header in 10000 lines"),
+    ],
+)
+def test_damage_is_named(tmp_path, change, says):
+    path = tmp_path / "a.ply"
+    written(path, shuffled_table(random_gaussians(3, 3)))
+    whole = path.read_bytes()
+    assert change[0] in whole
+    path.write_bytes(whole.replace(*change, 1))
+    assert says in refused(path)
+
+
+@pytest.mark.parametrize(("old", "new"), [(b" 200", b" two"), (b"200 ", b""), (b"200 ", b"1 200 ")])
+def test_ascii_rows_that_do_not_fit_are_told(tmp_path, old, new):
+    path = tmp_path / "a.ply"
+    written(path, shuffled_table(random_gaussians(3, 0)), "ascii")
+    header, body = path.read_bytes().split(b"end_header\n")
+    body = body.replace(b"200 ", b"1.0 200 ", 1) if old == b" 200" else body
+    path.write_bytes(header + b"end_header\n" + body.replace(old, new, 1))
+    assert "rows of vertex" in refused(path)
+
+
+def shared(name):
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    return path
+
+
+def test_a_trained_scene_of_somebody_else():
+    gaussians = load_ply(shared("plush_dog/point_cloud_29999_clean.ply"))
+    assert (len(gaussians), gaussians.sh_degree) == (15_105, 3)
+    assert float(gaussians.quats.norm(dim=1).min()) >= 0.36 and float(gaussians.logit_opacities.max()) == 400
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("odd/lfs_pointer_point_cloud.ply", "is a Git LFS pointer"),
+        ("odd/no_colour_value_weight.ply", "is not a splat scene: lacks f_dc_0, f_dc_1, f_dc_2, opacity;"),
+        ("formats/ply_beetle/beetle.ascii.ply", "is a mesh, not a splat scene: lacks f_dc_0"),
+        ("formats/ply_beetle/beetle.binary.ply", "is a mesh, not a splat scene: lacks f_dc_0"),
+        ("fox/points3D_aligned_derived.ply", "is a point cloud, not a splat scene: lacks f_dc_0"),
+        ("formats/biker.compressed.ply", "is a compressed splat PLY"),
+    ],
+)
+def test_files_of_the_world_that_are_no_scene(name, says):
+    assert says in refused(shared(name))

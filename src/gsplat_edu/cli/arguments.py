@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import traceback
 from collections.abc import Callable
@@ -36,6 +37,31 @@ def whole_number_text(text: str) -> int:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
 
 
+def seconds_text(text: str) -> float:
+    """Read a duration from the command line: 90, 90s, 1.5m, 2h, 1h30m; in seconds."""
+    match = re.fullmatch(r"(?:([\d.]+)h)?(?:([\d.]+)m)?(?:([\d.]+)s?)?", text.strip())
+    try:
+        hours, minutes, seconds = (float(part or 0) for part in match.groups()) if match else (0.0, 0.0, 0.0)
+    except ValueError:
+        hours = minutes = seconds = 0.0
+    total = 3600 * hours + 60 * minutes + seconds
+    if total <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no duration; give, for example, 90s, 20m or 1h30m")
+    return total
+
+
+def bytes_text(text: str) -> int:
+    """Read a size from the command line: 4GiB, 500MB, 1e9; in bytes."""
+    match = re.fullmatch(r"([\d.]+(?:e\d+)?)\s*([kmgt]?)(i?)b?", text.strip().lower())
+    try:
+        number = float(match[1]) if match else -1.0
+    except ValueError:
+        number = -1.0
+    if match is None or number < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no size; give, for example, 4GiB or 500MB")
+    return int(number * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " "))
+
+
 def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
     """Run a command and turn what can go wrong into one line on stderr.
 
@@ -49,8 +75,8 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
     """
     try:
         command()
-    except KeyboardInterrupt:
-        print(f"{program}: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        print(f"{program}: {str(interruption) or 'interrupted'}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (SplatError, OSError) as error:
         if debug:

@@ -9,7 +9,7 @@ from importlib.metadata import version
 
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, OneLineParser, run_command
 
-COMMANDS = ("demo",)
+COMMANDS = ("demo", "train", "eval", "render", "info")
 """Commands, each a module `gsplat_edu.cli.NAME` with SUMMARY, EXAMPLE, add_arguments and run."""
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -13,6 +17,20 @@ from matplotlib.figure import Figure
 from gsplat_edu.files import written_aside
 
 DPI = 150
+
+CURVE_POINTS = 400
+"""Points of a curve of a report; of a longer one the means of equal stretches are drawn."""
+
+SVG_FACTS = ("Creator", "Date", "Format", "Type")
+"""What matplotlib says of a drawing unless told not to: dates and addresses."""
+
+RUN_CURVES = (
+    ("loss", "training loss", "loss of the iteration's view"),
+    ("psnr", "evaluations", "PSNR of the test views (dB)"),
+    ("num_gaussians", "density control", "number of Gaussians"),
+    ("ms", "speed", "ms per iteration"),
+)
+"""Curves of a run: key in its log, title and label."""
 
 
 def held_out_figure(panels: Sequence[tuple[str, Float[np.ndarray, "H W 3"]]]) -> Figure:
@@ -49,6 +67,58 @@ def curves_figure(losses: Sequence[float], counts: Sequence[int]) -> Figure:
     for axes in (loss_axes, count_axes):
         axes.grid(alpha=0.3)
     return figure
+
+
+def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
+    """Plot a run's log: loss, PSNR of evaluations, number of Gaussians, ms per iteration.
+
+    Args:
+        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, ms. A key that no line has gets
+            no curve.
+
+    Returns:
+        The figure; None where there is nothing to draw.
+    """
+    curves = []
+    for key, title, label in RUN_CURVES:
+        pairs = [(line["iteration"], line[key]) for line in log if _drawable(line, key)]
+        if pairs:
+            curves.append((key, title, label, _thinned(np.array(pairs, dtype=np.float64))))
+    if not curves:
+        return None
+    rows = math.ceil(len(curves) / 2)
+    figure = Figure(figsize=(10, 2.9 * rows), layout="constrained")
+    grid = figure.subplots(rows, 2, squeeze=False).ravel()
+    for axes, (key, title, label, points) in zip(grid, curves, strict=False):
+        axes.plot(*points.T, linewidth=1.0, marker="o" if len(points) < 40 else "", markersize=3)
+        axes.set(title=title, xlabel="iteration", ylabel=label)
+        axes.grid(alpha=0.3)
+        if key == "loss" and points[:, 1].min() > 0:
+            axes.set_yscale("log")
+        if key in ("num_gaussians", "ms"):
+            axes.set_ylim(0, None)
+    for axes in grid[len(curves) :]:
+        axes.axis("off")
+    return figure
+
+
+def svg_element(figure: Figure) -> str:
+    """Return a figure as an <svg> element to stand in a page, the same to the byte for the same figure."""
+    text = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": "gsplat_edu", "svg.fonttype": "path"}):
+        FigureCanvasAgg(figure).figure.savefig(text, format="svg", metadata=dict.fromkeys(SVG_FACTS))
+    drawing = text.getvalue()
+    return drawing[drawing.index("<svg") :]  # without the XML and DOCTYPE lines, which a page has of its own
+
+
+def _drawable(line: Mapping[str, Any], key: str) -> bool:
+    pair = (line.get("iteration"), line.get(key))
+    return all(isinstance(value, int | float) and math.isfinite(value) for value in pair)
+
+
+def _thinned(points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "Q 2"]:
+    pieces = np.array_split(points, min(len(points), CURVE_POINTS))
+    return np.stack([piece.mean(axis=0) for piece in pieces])
 
 
 def save_figure(path: Path, figure: Figure) -> None:

@@ -1,10 +1,13 @@
 """Inria's scene PLY: the file that viewers of Gaussian splats read.
 
-Binary little-endian float32, one vertex per Gaussian, raw values (logarithms of scales, logits of opacities):
-x y z, nx ny nz (zero), f_dc_0..2, f_rest_* channel by channel, opacity, scale_0..2, rot_0..3 as (w, x, y, z).
-A scene of SH degree 0 has no f_rest. Axes are those of the scene: nothing is flipped.
+Written as binary little-endian float32, one vertex per Gaussian, raw values (logarithms of scales, logits of
+opacities): x y z, nx ny nz (zero), f_dc_0..2, f_rest_* channel by channel, opacity, scale_0..2, rot_0..3 as
+(w, x, y, z). A scene of SH degree 0 has no f_rest. Axes are those of the scene: nothing is flipped.
 
-Source: the point_cloud.ply of Kerbl et al. 2023's code.
+Read by the names of the properties: in any order, of any number type, with properties and elements that are not ours
+left aside, binary of either byte order or ASCII.
+
+Source: the point_cloud.ply of Kerbl et al. 2023's code; Turk 1994, "The PLY Polygon File Format".
 """
 
 from __future__ import annotations
@@ -12,38 +15,151 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
+from jaxtyping import Float32
+from numpy.lib.recfunctions import structured_to_unstructured
+from torch import Tensor
 
+from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply_table import Element, read_elements, read_rows
+from gsplat_edu.validation import ArrayLike, float64_array
+
+MEANS = ("x", "y", "z")
+SH0 = tuple(f"f_dc_{i}" for i in range(3))
+OPACITY = ("opacity",)
+SCALES = tuple(f"scale_{i}" for i in range(3))
+QUATS = tuple(f"rot_{i}" for i in range(4))
+
+SH_REST_COUNTS = (0, 9, 24, 45)
+"""Numbers of f_rest properties: three channels of the coefficients of degrees 0 to 3."""
+
+ORIGIN = (0.0, 0.0, 0.0)
 
 
-def save_ply(path: str | Path, gaussians: Gaussians) -> None:
+def save_ply(path: str | Path, gaussians: Gaussians, origin: ArrayLike = ORIGIN) -> None:
     """Write Gaussians as a scene PLY.
 
     Args:
         path: The file; parent folders are made.
         gaussians: N Gaussians, raw parameters; written as float32.
+        origin: (3,) added to the means in float64: where the scene's zero lies in the capture's own frame.
 
     Raises:
+        ShapeError: the origin is not of shape (3,).
         ArgumentError: a parameter is NaN or infinite.
         OSError: the file cannot be written. What stood there before is untouched.
     """
     gaussians.check_finite()
+    shift = float64_array("origin", origin, (3,))
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     count = len(gaussians)
+    means = tensors["means"]
+    if shift.any():  # not for zero: -0.0 + 0.0 is 0.0
+        means = means.astype(np.float64) + shift
     sh_rest = np.concatenate(np.moveaxis(tensors["sh_rest"], 2, 0), axis=1)  # channel-major
-    columns: list[tuple[list[str], np.ndarray]] = [
-        (["x", "y", "z"], tensors["means"]),
-        (["nx", "ny", "nz"], np.zeros((count, 3))),
-        ([f"f_dc_{i}" for i in range(3)], tensors["sh0"][:, 0]),
-        ([f"f_rest_{i}" for i in range(sh_rest.shape[1])], sh_rest),
-        (["opacity"], tensors["logit_opacities"][:, None]),
-        ([f"scale_{i}" for i in range(3)], tensors["log_scales"]),
-        ([f"rot_{i}" for i in range(4)], tensors["quats"]),
+    columns: list[tuple[tuple[str, ...], np.ndarray]] = [
+        (MEANS, means),
+        (("nx", "ny", "nz"), np.zeros((count, 3))),
+        (SH0, tensors["sh0"][:, 0]),
+        (_rest_names(sh_rest.shape[1]), sh_rest),
+        (OPACITY, tensors["logit_opacities"][:, None]),
+        (SCALES, tensors["log_scales"]),
+        (QUATS, tensors["quats"]),
     ]
     names = [name for group, _ in columns for name in group]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
-    table = np.concatenate([values for _, values in columns], axis=1).astype("<f4")
+    table = np.concatenate([values for _, values in columns], axis=1, dtype="<f4", casting="same_kind")
     with written_aside(Path(path)) as aside:
         aside.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
+
+
+def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
+    """Read a scene PLY.
+
+    Args:
+        path: The file.
+        origin: (3,) subtracted from the means in float64; what `save_ply` was given.
+
+    Returns:
+        N Gaussians, raw parameters, float32, of the SH degree that the file holds. What `save_ply` wrote comes
+        back to the bit where the origin is zero.
+
+    Raises:
+        SceneFormatError: not a PLY, or a PLY of something else, or damaged: truncated, NaN, infinite.
+        ShapeError: the origin is not of shape (3,).
+        OSError: the file cannot be read.
+    """
+    path = Path(path)
+    shift = float64_array("origin", origin, (3,))
+    with path.open("rb") as file:
+        header = read_elements(path, file)
+        vertex = _splat_vertex(path, header.elements)
+        rest = sum(name.startswith("f_rest_") for name in vertex.names)
+        groups = (MEANS, SH0, _rest_names(rest), OPACITY, SCALES, QUATS)
+        columns = [name for group in groups for name in group]
+        table = read_rows(path, file, header, vertex)
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # a double beyond float32 becomes infinite, told of below
+        values = structured_to_unstructured(table[columns], dtype=np.float32)
+    _check_finite(path, values, columns)
+    ends = np.cumsum([len(group) for group in groups])[:-1]
+    means, sh0, sh_rest, opacity, scales, quats = np.split(values, ends, axis=1)
+    if shift.any():
+        means = (means.astype(np.float64) - shift).astype(np.float32)
+    return Gaussians(
+        means=_tensor(means),
+        quats=_tensor(quats),
+        log_scales=_tensor(scales),
+        sh0=_tensor(sh0[:, None, :]),
+        sh_rest=_tensor(np.moveaxis(sh_rest.reshape(len(values), 3, rest // 3), 1, 2)),
+        logit_opacities=_tensor(opacity[:, 0]),
+    )
+
+
+def _rest_names(count: int) -> tuple[str, ...]:
+    return tuple(f"f_rest_{i}" for i in range(count))
+
+
+def _tensor(values: Float32[np.ndarray, "..."]) -> Tensor:
+    return torch.from_numpy(values.copy())  # its own memory: the columns of the file's table are interleaved
+
+
+def _splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
+    """Return the element `vertex` if it has what a splat has."""
+    by_name = {element.name: element for element in elements}
+    vertex = by_name.get("vertex")
+    if vertex is None:
+        raise SceneFormatError(f"{path}: is a PLY without vertices, not a splat scene; give a scene PLY")
+    if "packed_position" in vertex.names:
+        raise SceneFormatError(
+            f"{path}: is a compressed splat PLY (packed_position ...); export it as an uncompressed PLY"
+        )
+    missing = [name for name in (*MEANS, *SH0, *OPACITY, *SCALES, *QUATS) if name not in vertex.names]
+    if missing:
+        kind, advice = "not a splat scene", "export it again"
+        if not {*SH0, *OPACITY, *SCALES, *QUATS} & set(vertex.names):
+            kind = f"a {'mesh' if 'face' in by_name else 'point cloud'}, {kind}"
+            advice = "give a scene PLY"
+        raise SceneFormatError(f"{path}: is {kind}: lacks {', '.join(missing)}; {advice}")
+    rest = [name for name in vertex.names if name.startswith("f_rest_")]
+    if len(rest) not in SH_REST_COUNTS or set(rest) != set(_rest_names(len(rest))):
+        counts = ", ".join(str(count) for count in SH_REST_COUNTS)
+        raise SceneFormatError(
+            f"{path}: has {len(rest)} properties f_rest_*, but SH degrees 0-3 have {counts}, counted from 0"
+        )
+    return vertex
+
+
+def _check_finite(path: Path, values: Float32[np.ndarray, "N P"], columns: list[str]) -> None:
+    finite = np.isfinite(values)
+    if not finite.all():
+        row, column = np.argwhere(~finite)[0]
+        bad = int((~finite.all(axis=1)).sum())
+        raise SceneFormatError(
+            f"{path}: vertex {row}: {columns[column]} is {values[row, column]}"
+            f" ({bad} such vertices in all); remove them or export the scene again"
+        )

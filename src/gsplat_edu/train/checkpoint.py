@@ -88,9 +88,9 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
         raise _damaged(path, str(error)) from None
 
 
-def _opened(path: Path) -> Any:  # noqa: ANN401
+def _opened(path: Path) -> Any:  # noqa: ANN401 - safetensors has no annotations
     try:
-        file = safe_open(path, framework="pt")
+        file: Any = safe_open(path, framework="pt")
         if (file.metadata() or {}).get("format") != FORMAT:
             raise CheckpointError(
                 f"{path}: is no checkpoint of this version of gsplat_edu; start the run again"

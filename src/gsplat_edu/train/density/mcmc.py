@@ -152,7 +152,7 @@ def shared_shape(
 
     Source: Kheradmand et al. 2024, eq. 8 and 9.
     """
-    each = 1 - (1 - opacities) ** (1 / sharers)
+    each = 1 - (1 - opacities) ** (1 / sharers.double())
     total = torch.zeros_like(opacities)
     for k in range(MOST_SHARERS):
         # sum_{i=k+1..n} C(i-1, k) = C(n, k+1), by the hockey stick of Pascal's triangle.

@@ -1,0 +1,171 @@
+"""`gsplat-edu info`: what a dataset, a run or a scene file holds, on one screen."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+
+from gsplat_edu.constants import ALPHA_MIN
+from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply import load_ply
+from gsplat_edu.runs.folder import RunFolder
+
+SUMMARY = "say what a dataset folder, a run folder or a scene PLY holds"
+EXAMPLE = "example: gsplat-edu info captures/plush"
+
+PERCENTILES = (1, 25, 50, 75, 99)
+
+HIGHLIGHTS = {
+    "data": ("path", "resolution", "test_every", "points"),
+    "train": ("strategy", "max_gaussians", "ssim_weight", "seed"),
+    "render": ("sh_degree", "background", "antialiased", "jacobian_limit"),
+}
+"""Settings of a run that are shown, by the section of config.json; what is None is not. report.html has them all."""
+
+Fact = tuple[str, str]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's argument."""
+    parser.add_argument("path", type=Path, metavar="PATH", help="dataset folder, run folder or scene PLY")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Print one line per fact."""
+    path: Path = arguments.path
+    if not path.exists():
+        raise ArgumentError(f"{path}: is not there; give a dataset folder, a run folder or a scene PLY")
+    if path.is_file() and path.suffix.lower() != ".json":  # a transforms.json is a dataset
+        facts = _scene_facts(path)
+    elif RunFolder(path).exists():
+        facts = _run_facts(RunFolder(path))
+    else:
+        facts = _dataset_facts(path)
+    console = Console(highlight=False, markup=False)
+    console.print(*(f"{name:<10} {value}".rstrip() for name, value in facts), sep="\n", soft_wrap=True)
+
+
+def _scene_facts(path: Path) -> list[Fact]:
+    gaussians = load_ply(path)
+    count, size = len(gaussians), path.stat().st_size
+    facts = [
+        ("scene", str(path)),
+        ("splats", f"{count:,}, SH degree {gaussians.sh_degree}"),
+        ("file", f"{size:,} bytes" + (f", {size / count:.0f} per splat" if count else "")),
+    ]
+    return facts + _splat_facts(gaussians) if count else facts
+
+
+def _splat_facts(gaussians: Gaussians) -> list[Fact]:
+    means, scales = gaussians.means.double().numpy(force=True), gaussians.scales.double().numpy(force=True)
+    opacities = gaussians.opacities.double().numpy(force=True)
+    inner = np.percentile(means, (1, 99), axis=0)
+    header = "percentiles " + ", ".join(str(p) for p in PERCENTILES)
+    facts = [
+        ("bounds", _bounds(means)),
+        ("", f"of the middle 98 %: {_bounds(inner)}"),
+        ("opacity", f"{_percentiles(opacities)}   ({header})"),
+        ("scale", f"{_percentiles(scales)}   world units"),
+    ]
+    diagonal = float(np.linalg.norm(inner[1] - inner[0]))
+    for number, what in (
+        (int((gaussians.quats.detach() == 0).all(dim=1).sum()), "a quaternion of length zero: never drawn"),
+        (
+            int((scales > diagonal).any(axis=1).sum()) if diagonal else 0,
+            "a scale beyond the middle 98 %'s diagonal",
+        ),
+        (int((opacities < ALPHA_MIN).sum()), "an opacity below 1/255: cannot be seen"),
+    ):
+        if number:
+            facts.append(("warning", f"{number:,} of {len(gaussians):,} splats have {what}"))
+    return facts
+
+
+def _run_facts(folder: RunFolder) -> list[Fact]:
+    config, metrics, log = folder.read_config(), folder.read_metrics(), folder.log()
+    planned = _section(config, "train").get("iterations")
+    reached = f"iteration {log[-1].get('iteration')}" if log else "nothing yet"
+    facts = [
+        ("run", f"{folder.path}, by gsplat_edu {config.get('version', '?')}"),
+        ("progress", f"{reached}" + (f" of {planned:,}" if isinstance(planned, int) else "")),
+    ]
+    for split in ("test", "train"):
+        scores = _section(metrics, split)
+        if scores.get("psnr") is not None:
+            facts.append(
+                (
+                    split,
+                    f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}, {scores['num_images']} images",
+                )
+            )
+    if not metrics:
+        facts.append(("test", f"not judged yet: gsplat-edu eval {folder.path}"))
+    if isinstance(seconds := metrics.get("seconds"), int | float):
+        facts.append(("time", f"{seconds:.1f} s"))
+    for key, names in HIGHLIGHTS.items():
+        section = _section(config, key)
+        said = [f"{name} {section[name]}" for name in names if section.get(name) is not None]
+        if said:
+            facts.append((key, ", ".join(said)))
+    facts.append(("backend", str(config.get("backend", "?"))))
+    try:
+        scene, iteration = folder.latest_scene()
+    except CheckpointError as error:
+        return [*facts, ("scene", str(error))]
+    return [*facts, ("", f"after {iteration:,} iterations:"), *_scene_facts(scene)]
+
+
+def _dataset_facts(path: Path) -> list[Fact]:
+    dataset = load_dataset(path, DataSettings())
+    views = (*dataset.train, *dataset.test)
+    cameras = [view.camera for view in views]
+    sizes = Counter(f"{camera.W}x{camera.H}" for camera in cameras)
+    lenses = Counter(f"fx {c.fx:.1f}, fy {c.fy:.1f}, cx {c.cx:.1f}, cy {c.cy:.1f}" for c in cameras)
+    eyes = np.stack([camera.eye for camera in cameras])
+    facts = [
+        ("dataset", str(dataset.path)),
+        ("layout", str(dataset.layout)),
+        ("photos", f"{len(views)}: {_counted(sizes)}"),
+        ("cameras", _counted(lenses)),
+        ("split", f"{len(dataset.train)} for training, {len(dataset.test)} held out"),
+        ("extent", f"{scene_extent(cameras):.4g} world units"),
+        ("positions", _bounds(eyes)),
+        ("points", f"{len(dataset.points):,}"),
+    ]
+    if len(dataset.points):
+        inner = np.percentile(dataset.points, (1, 99), axis=0)
+        facts.append(("", f"of the middle 98 %: {_bounds(inner)}"))
+    if np.any(dataset.origin):
+        facts.append(("origin", f"moved to {', '.join(f'{x:.6g}' for x in dataset.origin)}"))
+    return facts + [("note", note) for note in dataset.notes]
+
+
+def _section(values: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    section = values.get(key)
+    return section if isinstance(section, Mapping) else {}
+
+
+def _counted(counter: Counter[str], most: int = 3) -> str:
+    if len(counter) == 1:
+        return next(iter(counter))
+    parts = [f"{number} of {what}" for what, number in counter.most_common(most)]
+    return "; ".join(parts) + (f"; {len(counter) - most} more kinds" if len(counter) > most else "")
+
+
+def _bounds(points: Float[np.ndarray, "N 3"]) -> str:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return ", ".join(f"{n} {a:.4g} to {b:.4g}" for n, a, b in zip("xyz", low, high, strict=True))
+
+
+def _percentiles(values: Float[np.ndarray, "..."]) -> str:
+    quantiles: Sequence[float] = np.percentile(values, PERCENTILES).tolist()
+    return ", ".join(f"{value:.4g}" for value in quantiles)

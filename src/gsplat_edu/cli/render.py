@@ -1,0 +1,202 @@
+"""`gsplat-edu render`: pictures or a video of a trained scene."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import track
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.images import write_frames
+from gsplat_edu.evaluate.paths import orbit_of_scene, orbit_path, resized
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply import ORIGIN, load_ply
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import BACKENDS, resolve_backend
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.dataset import data_settings
+from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
+from gsplat_edu.validation import whole_number
+
+SUMMARY = "render a run or a scene PLY: an orbit as a video, or what the dataset's cameras see"
+EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"
+
+SCENE_SIZE = 512
+"""px: images of a PLY that came without cameras."""
+
+RUNS_CAMERAS = ""
+"""What --dataset is without a path."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What is rendered.
+
+    Args:
+        gaussians: The scene.
+        cameras: One per image.
+        names: File names of the images in a folder; None numbers them.
+        settings: How to render.
+    """
+
+    gaussians: Gaussians
+    cameras: Sequence[Camera]
+    names: Sequence[str] | None
+    settings: RenderSettings
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.add_argument("source", type=Path, metavar="RUN|PLY", help="folder of a run, or a scene PLY")
+    parser.add_argument(
+        "--dataset",
+        nargs="?",
+        const=RUNS_CAMERAS,
+        metavar="PATH",
+        help="render from the run's cameras, or from those of the dataset PATH",
+    )
+    parser.add_argument(
+        "--orbit", action="store_true", help="render an orbit around what the cameras look at (default)"
+    )
+
+    def number(flag: str, default: int | None, text: str) -> None:
+        parser.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
+
+    number("--frames", 120, "frames of the orbit (default: 120)")
+    number("--size", None, f"longer side of the images in px (default: the cameras'; {SCENE_SIZE} for a PLY)")
+    number("--fps", 30, "frames per second of a video (default: 30)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR|X.mp4",
+        help="folder of PNGs, or a video (default: renders/ in the run, out/ for a PLY)",
+    )
+    parser.add_argument(
+        "--white-background", action="store_true", help="render over white (default: the run's background)"
+    )
+    names = ", ".join(("auto", *BACKENDS))
+    parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Render and say what was written."""
+    backend = resolve_backend(arguments.backend)
+    for name in ("frames", "fps"):
+        whole_number(f"--{name}", getattr(arguments, name), 1)
+    if arguments.size is not None:
+        whole_number("--size", arguments.size, 1)
+    folder = RunFolder(arguments.source)
+    orbit = arguments.orbit or arguments.dataset is None
+    if folder.exists():
+        shot = _run_shot(arguments, folder, orbit)
+        out = arguments.out or folder.renders / ("orbit.mp4" if orbit else "views")
+    elif arguments.source.is_file():
+        shot = _ply_shot(arguments, orbit)
+        out = arguments.out or Path("out") / f"{arguments.source.stem}_{'orbit.mp4' if orbit else 'views'}"
+    elif arguments.source.exists():
+        raise ArgumentError(
+            f"{arguments.source}: is no run (it has no config.json); give a run or a scene PLY"
+        )
+    else:
+        raise ArgumentError(f"{arguments.source}: is not there; give the folder of a run, or a scene PLY")
+    console = Console(highlight=False, markup=False)
+    started = time.perf_counter()
+    frames = track(
+        _frames(shot, backend),
+        "rendering",
+        total=len(shot.cameras),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    written = write_frames(out, frames, fps=arguments.fps, names=shot.names)
+    each = 1e3 * (time.perf_counter() - started) / len(shot.cameras)
+    first = shot.cameras[0]
+    what = f"{len(shot.cameras)} images of {len(shot.gaussians):,} Gaussians, {first.W}x{first.H}, {each:.0f} ms each"
+    console.print(f"wrote {out}{'' if written == [out] else '/'}: {what}", soft_wrap=True)
+
+
+def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> Shot:
+    config = folder.read_config()
+    settings = _settings(render_settings(config), arguments)
+    scene, _ = folder.latest_scene()
+    if arguments.dataset not in (None, RUNS_CAMERAS):
+        return _dataset_shot(arguments, scene, settings, data_settings(config), orbit)
+    origin = config.get("origin", ORIGIN)
+    gaussians = load_ply(scene, origin)
+    cameras = folder.read_cameras(origin)
+    named = [(name, camera) for name, _, camera in cameras]
+    if not named:
+        raise ArgumentError(f"{folder.cameras}: lists no camera; name a dataset's folder with --dataset PATH")
+    return _shot(arguments, gaussians, named, settings, orbit)
+
+
+def _ply_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
+    settings = _settings(RenderSettings(), arguments)
+    if arguments.dataset == RUNS_CAMERAS:
+        raise ArgumentError(
+            "--dataset: a PLY comes without cameras; give the dataset's folder: --dataset PATH"
+        )
+    if arguments.dataset is not None:
+        return _dataset_shot(arguments, arguments.source, settings, DataSettings(), orbit)
+    gaussians = load_ply(arguments.source)
+    cameras = orbit_of_scene(gaussians, arguments.frames, arguments.size or SCENE_SIZE)
+    return Shot(gaussians, cameras, None, settings)
+
+
+def _dataset_shot(
+    arguments: argparse.Namespace, scene: Path, settings: RenderSettings, data: DataSettings, orbit: bool
+) -> Shot:
+    dataset = load_dataset(arguments.dataset, data)
+    gaussians = load_ply(scene, dataset.origin)  # the frame its cameras stand in
+    named = [(view.name, view.camera) for view in (*dataset.train, *dataset.test)]
+    return _shot(arguments, gaussians, named, settings, orbit)
+
+
+def _shot(
+    arguments: argparse.Namespace,
+    gaussians: Gaussians,
+    named: Sequence[tuple[str, Camera]],
+    settings: RenderSettings,
+    orbit: bool,
+) -> Shot:
+    cameras = [camera for _, camera in named]
+    names = None
+    if orbit:
+        cameras = orbit_path(cameras, arguments.frames, _depth(gaussians, cameras[0]))
+    else:
+        names = image_file_names([name for name, _ in named])
+    if arguments.size is not None:
+        cameras = [resized(camera, arguments.size) for camera in cameras]
+    return Shot(gaussians, cameras, names, settings)
+
+
+def _settings(settings: RenderSettings, arguments: argparse.Namespace) -> RenderSettings:
+    changes: dict[str, Any] = {"background": (1.0, 1.0, 1.0)} if arguments.white_background else {}
+    return replace(settings, depth=False, **changes)
+
+
+def _depth(gaussians: Gaussians, camera: Camera) -> float:
+    """Return the median depth of the Gaussians in front of a camera: where a single photo's subject may be."""
+    depths = camera.world_to_cam(gaussians.means.numpy(force=True))[:, 2]
+    ahead = depths[depths > 0]
+    return float(np.median(ahead)) if ahead.size else 1.0
+
+
+def _frames(shot: Shot, backend: str) -> Iterator[Float[np.ndarray, "H W 3"]]:
+    for camera in shot.cameras:
+        with torch.no_grad():
+            output = render(shot.gaussians, camera, settings=shot.settings, backend=backend)
+        yield output.image.numpy(force=True)

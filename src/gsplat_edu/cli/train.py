@@ -1,0 +1,260 @@
+"""`gsplat-edu train`: a capture becomes a scene."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gsplat_edu.cli.arguments import bytes_text, seconds_text, whole_number_text
+from gsplat_edu.cli.eval import score_lines
+from gsplat_edu.data.dataset import DataSettings
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.metrics import ImageScore
+from gsplat_edu.render.backends import BACKENDS, resolve_backend
+from gsplat_edu.runs.training import CaptureRun, RunOptions
+from gsplat_edu.train.config import RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
+from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.trainer import Trainer
+
+SUMMARY = "turn a folder of posed photos into a scene"
+EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
+
+NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background")
+"""Fields of the recipe that have their options spelled out below; the others are made from `TrainConfig`."""
+
+PSNR_EVERY = 20
+"""Iterations between two looks at the last view's PSNR, which cost a few milliseconds each."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.add_argument(
+        "data", type=Path, metavar="DATA", help="a capture: COLMAP, transforms.json or Blender"
+    )
+    parser.add_argument("--out", type=Path, metavar="RUN", required=True, help="folder of the run")
+    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint in RUN")
+    _add_budget(parser.add_argument_group("budget"))
+    _add_data(parser.add_argument_group("photos"))
+    group = parser.add_argument_group("recipe, see docs/RECIPE.md")
+    group.add_argument(
+        "--white-background", action="store_true", help="white behind everything (default: black)"
+    )
+    group.add_argument(
+        "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
+    )
+    for field in fields(TrainConfig):
+        if field.name not in NAMED:
+            _add_field(group, field.name, field.default)
+
+
+def _add_budget(group: argparse._ArgumentGroup) -> None:
+    def number(flag: str, text: str, default: int | None = None) -> None:
+        group.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
+
+    number("--iterations", f"steps of training (default: {RECIPE_ITERATIONS})", RECIPE_ITERATIONS)
+    group.add_argument(
+        "--no-rescale",
+        action="store_true",
+        help="keep the schedule of 30,000 iterations whatever --iterations is",
+    )
+    names = ", ".join(STRATEGIES)
+    group.add_argument("--strategy", metavar="NAME", default="adc", help=f"one of {names} (default: adc)")
+    number("--max-gaussians", "cap on the number of Gaussians (default: none; mcmc needs one)")
+    number("--seed", "seed of all that is drawn at random (default: 0)", 0)
+    number(
+        "--eval-every", "iterations between judgements by the test views, 0 for none (default: 1000)", 1000
+    )
+    number("--save-every", "iterations between checkpoints, 0 for none (default: 500)", 500)
+    group.add_argument(
+        "--time-limit",
+        type=seconds_text,
+        metavar="TIME",
+        help="end training after, for example, 90s, 20m or 2h",
+    )
+    names = ", ".join(("auto", *BACKENDS))
+    group.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+
+
+def _add_data(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--resolution",
+        type=float,
+        metavar="R",
+        help="below 32: divide sizes by it; from 32 on: longest side in px (default: as they are)",
+    )
+    group.add_argument(
+        "--test-every",
+        type=whole_number_text,
+        metavar="N",
+        help="every n-th view by name is for testing, 0 for none (default: the capture's own split, or 8)",
+    )
+    group.add_argument(
+        "--image-memory",
+        type=bytes_text,
+        metavar="SIZE",
+        default=DataSettings.image_memory,
+        help="decoded photos kept in memory, for example 500MB; others are read again (default: 4GiB)",
+    )
+    group.add_argument(
+        "--points", type=Path, metavar="X.ply", help="start from these points, not the capture's"
+    )
+
+
+def _add_field(group: argparse._ArgumentGroup, name: str, default: object) -> None:
+    flag, text = f"--{name.replace('_', '-')}", f"(default: {default})"
+    if isinstance(default, bool):
+        group.add_argument(flag, action="store_true", default=None, help=text)
+    elif isinstance(default, str):
+        group.add_argument(flag, metavar="NAME", help=text)
+    elif isinstance(default, int):
+        group.add_argument(flag, type=whole_number_text, metavar="N", help=text)
+    else:
+        group.add_argument(flag, type=_number_or_none, metavar="X", help=text)
+
+
+def _number_or_none(text: str) -> float | str:
+    if text == "none":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def options_from(arguments: argparse.Namespace) -> RunOptions:
+    """Turn what `add_arguments` parsed into the options of a run.
+
+    Raises:
+        ArgumentError: an option is out of range.
+        BackendUnavailableError: the backend does not run here.
+    """
+    changes: dict[str, Any] = {}
+    for field in fields(TrainConfig):
+        given = getattr(arguments, field.name, None)
+        if given is not None and field.name not in ("iterations", "background"):
+            changes[field.name] = None if given == "none" else given
+    if arguments.white_background:
+        changes["background"] = (1.0, 1.0, 1.0)
+    config = recipe(arguments.iterations, rescale=not arguments.no_rescale, **changes)
+    if config.strategy == "mcmc" and config.max_gaussians is None:
+        raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
+    settings = DataSettings(
+        resolution=arguments.resolution,
+        test_every=arguments.test_every,
+        background=None if config.random_background else config.background,
+        image_memory=arguments.image_memory,
+    )
+    return RunOptions(
+        data=arguments.data,
+        out=arguments.out,
+        config=config,
+        data_settings=settings,
+        points=arguments.points,
+        backend=resolve_backend(arguments.backend),
+        eval_every=arguments.eval_every,
+        save_every=arguments.save_every,
+        time_limit=arguments.time_limit,
+        resume=arguments.resume,
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train, showing how it goes; write the scene, the metrics and the report."""
+    console = Console(highlight=False, markup=False)
+
+    def say(sentence: str) -> None:
+        console.print(sentence, soft_wrap=True)
+
+    with interruptible() as interrupted:
+        capture = CaptureRun(options_from(arguments), say)
+        if capture.finished:
+            return
+        with _bar(console, "{task.fields[state]}") as bar:
+            _train(capture, bar, interrupted)
+        trainer, folder = capture.trainer, capture.folder.path
+        if interrupted():
+            raise KeyboardInterrupt(
+                f"interrupted after {trainer.iteration} iterations; the same command with --resume goes on from there"
+            )
+        with _bar(console, "") as bar:
+            task = bar.add_task("judging", total=len(capture.dataset.test) + len(capture.dataset.train))
+
+            def scored(split: str, score: ImageScore) -> None:
+                if interrupted():
+                    raise KeyboardInterrupt(
+                        "interrupted while judging; the scene is written, --resume judges it again"
+                    )
+                bar.advance(task)
+
+            result = capture.finish(scored)
+    rate = f"{1e3 * capture.seconds / max(trainer.iteration, 1):.1f} ms/iter"
+    say(
+        f"{trainer.iteration} iterations in {capture.seconds:.1f} s -> {rate}, {len(trainer.gaussians)} Gaussians"
+    )
+    for line in score_lines(result.test, result.train):
+        say(line)
+    say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
+    if trainer.iteration < trainer.config.iterations:
+        say(
+            f"the time limit ended it before {trainer.config.iterations}; --resume with a longer one goes on: {folder}"
+        )
+
+
+def _train(capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool]) -> None:
+    iterations = capture.options.config.iterations
+    photos = bar.add_task("photos", total=None, state="")
+    task = bar.add_task("training", total=iterations, state="", visible=False)
+    psnr = float("nan")
+
+    def show(trainer: Trainer, event: Event) -> None:
+        nonlocal psnr
+        if not isinstance(event, StepEvent):
+            return
+        if event.iteration % PSNR_EVERY == 0:
+            psnr = trainer.last_psnr()
+        speed = bar.tasks[-1].speed or 0.0
+        state = f"loss {event.loss:.3f} PSNR {psnr:.1f} K {event.num_gaussians} {speed:.0f} it/s"
+        bar.update(task, completed=trainer.iteration, state=state)
+
+    trainer = capture.start(lambda done, total: bar.update(photos, completed=done, total=total), [show])
+    bar.remove_task(photos)
+    bar.reset(task, total=iterations, completed=trainer.iteration, visible=True)
+    capture.train(interrupted)
+
+
+def _bar(console: Console, state: str) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn())
+    return Progress(*columns, TextColumn(state), TimeRemainingColumn(), console=console, transient=not state)
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C and SIGTERM end a training between two iterations; a second one ends it at once.
+
+    Yields:
+        Says whether one came. A loop that asks it is expected to end soon.
+    """
+    came = False
+
+    def note(number: int, frame: object) -> None:
+        nonlocal came
+        if came:
+            raise KeyboardInterrupt(
+                "interrupted; what was saved before is unharmed, --resume goes on from it"
+            )
+        came = True
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,251 @@
+"""How close renders come to photos, as numbers.
+
+Every number is taken in float64 with NumPy's sums, or by the native SSIM: it is the same to the bit on any number
+of threads. Renders are clamped to 0..1 first, as a screen would. Three names say exactly what was measured:
+
+    psnr        10 log10(1 / MSE), the render in floating point against the photo's bytes / 255
+    psnr_8bit   the same, with the render rounded to bytes as in a PNG
+    ssim        mean of SSIM over pixels and channels: Gaussian window of 11 taps, sigma 1.5, zero outside the image
+
+A mean over images is the mean of the images' values. PSNR of a mean error is another number; nothing here is that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, UInt8
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.losses import l1_ssim
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.validation import ArrayLike, check_shape, float64_array
+from gsplat_edu.views import Photo, View
+
+MSE_FLOOR = 1e-10
+"""Smallest mean squared error: identical images have 100 dB, a number that can be averaged, plotted and written."""
+
+Renderer = Callable[[Gaussians, Camera], RenderOutput]
+"""Renders Gaussians from a camera."""
+
+
+@dataclass(frozen=True)
+class ImageScore:
+    """How close one render comes to its photo.
+
+    Args:
+        name: What the capture calls the view.
+        psnr: dB, the render in floating point.
+        psnr_8bit: dB, the render rounded to bytes.
+        ssim: -1 to 1; 1 for equal images.
+        l1: Mean absolute difference, 0 to 1.
+    """
+
+    name: str
+    psnr: float
+    psnr_8bit: float
+    ssim: float
+    l1: float
+
+
+OnImage = Callable[[View, ImageScore, UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"]], None]
+"""Is told of every scored view: the view, its score, the render and the photo, both rounded to bytes."""
+
+
+def psnr(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
+    """Return the peak signal-to-noise ratio: 10 log10(1 / max(MSE, 1e-10)), the render in floating point.
+
+    Args:
+        image: (H, W, 3) rendered, 0 to 1, clamped to it; array or tensor.
+        truth: (H, W, 3) photo: uint8, divided by 255; or float, 0 to 1.
+        mask: (H, W) true where a pixel counts; None where all do.
+
+    Returns:
+        dB; 100 for equal images.
+
+    Raises:
+        ShapeError: the arguments are not of one size.
+        ArgumentError: a value is NaN or infinite, or no pixel counts.
+    """
+    return _Pair(image, truth, mask).psnr()
+
+
+def psnr_8bit(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
+    """Return the peak signal-to-noise ratio of the render rounded to bytes, as it would be read from a PNG.
+
+    Arguments, result and errors are those of `psnr`.
+    """
+    return _Pair(image, truth, mask).psnr_8bit()
+
+
+def mean_absolute_error(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
+    """Return mean |image - truth| over the pixels that count and the channels, 0 to 1.
+
+    Arguments and errors are those of `psnr`.
+    """
+    return _Pair(image, truth, mask).l1()
+
+
+def ssim(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
+    """Return the structural similarity: mean over pixels and channels, 11 taps, sigma 1.5, zero outside the image.
+
+    With a mask both images are zero where a pixel does not count, and the mean is still over all pixels.
+
+    Arguments and errors are those of `psnr`.
+
+    Raises:
+        BackendUnavailableError: the native module is not there.
+
+    Source: Wang et al. 2004.
+    """
+    return _Pair(image, truth, mask).ssim()
+
+
+def to_bytes(image: ArrayLike) -> UInt8[np.ndarray, "H W 3"]:
+    """Round an image to bytes: floor(255 x + 0.5), x clamped to 0..1. What is uint8 already stays as it is.
+
+    Args:
+        image: (H, W, 3) array or tensor.
+
+    Raises:
+        ShapeError: not (H, W, 3).
+        ArgumentError: a value is NaN or infinite.
+    """
+    given = _as_array(image)
+    if given.dtype == np.uint8:
+        check_shape("image", given.shape, ("H", "W", 3), {})
+        return given
+    values = np.clip(float64_array("image", given, ("H", "W", 3)), 0.0, 1.0)
+    rounded: UInt8[np.ndarray, "H W 3"] = np.floor(255.0 * values + 0.5).astype(np.uint8)
+    return rounded
+
+
+def score_image(name: str, image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> ImageScore:
+    """Take all the numbers of one image.
+
+    Args:
+        name: What the capture calls it.
+        image: As for `psnr`.
+        truth: As for `psnr`.
+        mask: As for `psnr`.
+
+    Raises:
+        ShapeError, ArgumentError: as for `psnr`.
+        BackendUnavailableError: as for `ssim`.
+    """
+    pair = _Pair(image, truth, mask)
+    return ImageScore(name, pair.psnr(), pair.psnr_8bit(), pair.ssim(), pair.l1())
+
+
+def score_views(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    render: Renderer,
+    background: ArrayLike,
+    on_image: OnImage | None = None,
+) -> list[ImageScore]:
+    """Render views and compare them with their photos.
+
+    Args:
+        gaussians: N Gaussians.
+        views: Cameras and photos. A view in which no pixel counts is left out.
+        render: Renders Gaussians from a camera, over `background`.
+        background: (3,) what photos that are not opaque are put over.
+        on_image: Is told of every scored view.
+
+    Returns:
+        The scores, in the order of the views.
+    """
+    scores = []
+    for view in views:
+        photo: Photo = view.read()
+        if photo.mask is not None and not photo.mask.any():
+            continue
+        with torch.no_grad():
+            image = render(gaussians, view.camera).image
+        truth = photo.over(background)
+        score = score_image(view.name, image, truth, photo.mask)
+        scores.append(score)
+        if on_image is not None:
+            on_image(view, score, to_bytes(image), to_bytes(truth))
+    return scores
+
+
+def summarize(scores: Sequence[ImageScore]) -> dict[str, float | int | None]:
+    """Return the means of scores over images: psnr, psnr_8bit, ssim, l1 (None for no images), and num_images."""
+    keys = ("psnr", "psnr_8bit", "ssim", "l1")
+    means = {key: float(np.mean([getattr(s, key) for s in scores])) if scores else None for key in keys}
+    return {**means, "num_images": len(scores)}
+
+
+def worst(scores: Sequence[ImageScore]) -> ImageScore:
+    """Return the score of the lowest PSNR, the first of equal ones.
+
+    Raises:
+        ArgumentError: there are no scores.
+    """
+    if not scores:
+        raise ArgumentError("scores: is empty; score at least one view")
+    return min(scores, key=lambda score: score.psnr)
+
+
+def best(scores: Sequence[ImageScore]) -> ImageScore:
+    """Return the score of the highest PSNR, the first of equal ones.
+
+    Raises:
+        ArgumentError: there are no scores.
+    """
+    if not scores:
+        raise ArgumentError("scores: is empty; score at least one view")
+    return max(scores, key=lambda score: score.psnr)
+
+
+def _as_array(image: ArrayLike) -> np.ndarray:
+    return image.numpy(force=True) if isinstance(image, torch.Tensor) else np.asarray(image)
+
+
+class _Pair:
+    """A render and its photo, checked once: float64, 0 to 1, and which pixels count (None: all)."""
+
+    def __init__(self, image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None) -> None:
+        sizes: dict[str, int] = {}
+        self.render = np.clip(float64_array("image", _as_array(image), ("H", "W", 3), sizes), 0.0, 1.0)
+        given = _as_array(truth)
+        self.photo = float64_array("truth", given, ("H", "W", 3), sizes)
+        if given.dtype == np.uint8:
+            self.photo = self.photo / 255.0
+        self.counts: Bool[np.ndarray, "H W"] | None = None
+        if mask is not None:
+            self.counts = _as_array(mask).astype(bool)
+            check_shape("mask", self.counts.shape, ("H", "W"), sizes)
+            if not self.counts.any():
+                raise ArgumentError("mask: no pixel counts; leave the image out")
+
+    def psnr(self) -> float:
+        return self._decibels(self.render)
+
+    def psnr_8bit(self) -> float:
+        return self._decibels(to_bytes(self.render) / 255.0)
+
+    def ssim(self) -> float:
+        planes = (self.render, self.photo)
+        if self.counts is not None:
+            inside = self.counts[..., None]
+            planes = (np.where(inside, self.render, 0.0), np.where(inside, self.photo, 0.0))
+        x, y = (torch.from_numpy(np.array(plane)) for plane in planes)
+        return 1.0 - float(l1_ssim(x, y, ssim_weight=1.0))
+
+    def l1(self) -> float:
+        return self._mean(np.abs(self.render - self.photo))
+
+    def _mean(self, errors: Float64[np.ndarray, "H W 3"]) -> float:
+        return float((errors if self.counts is None else errors[self.counts]).mean())
+
+    def _decibels(self, render: Float64[np.ndarray, "H W 3"]) -> float:
+        error = self._mean(np.square(render - self.photo))
+        return float(-10.0 * np.log10(max(error, MSE_FLOOR)))

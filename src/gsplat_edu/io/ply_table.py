@@ -1,0 +1,220 @@
+"""PLY as tables: the header's elements, and the rows of one of them. It knows nothing of splats."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from gsplat_edu.errors import SceneFormatError
+
+FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+"""Formats and their byte order as NumPy writes it."""
+
+NUMBERS = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+"""Number types of PLY, in both spellings, as NumPy's."""
+
+LINE_LIMIT = 4096
+"""Bytes of a header line: longer ones are not a header's."""
+
+HEADER_LIMIT = 10_000
+"""Lines of a header: a file that goes on longer is not a PLY, whatever its first line says."""
+
+LFS_POINTER = b"version https://git-lfs"
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of a PLY.
+
+    Args:
+        name: Its name, "vertex" for example.
+        count: Rows that the header promises.
+        properties: Name and NumPy type without byte order of each; the type is None for a list.
+    """
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, str | None], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the properties, in the order of the file."""
+        return tuple(name for name, _ in self.properties)
+
+    def dtype(self, path: Path, order: str) -> np.dtype[Any]:
+        """Return the type of a row.
+
+        Raises:
+            SceneFormatError: a property is a list, so that rows have no one size.
+        """
+        fields = []
+        for name, kind in self.properties:
+            if kind is None:
+                raise SceneFormatError(
+                    f"{path}: element {self.name} has the list {name}, so its rows cannot be read as a table;"
+                    " export it without"
+                )
+            fields.append((name, order + kind))
+        return np.dtype(fields)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the lines up to end_header say.
+
+    Args:
+        format: "ascii", "binary_little_endian" or "binary_big_endian".
+        elements: In the order of the file.
+    """
+
+    format: str
+    elements: tuple[Element, ...]
+
+
+def read_elements(path: Path, file: BinaryIO) -> Header:
+    """Read the header and leave the file at the first byte after it.
+
+    Raises:
+        SceneFormatError: not a PLY, or its header is damaged; the message names the line.
+    """
+    first = file.readline(LINE_LIMIT)
+    if first.startswith(LFS_POINTER):
+        raise SceneFormatError(f"{path}: is a Git LFS pointer, not the scene; fetch it with: git lfs pull")
+    if first.strip() != b"ply":
+        raise SceneFormatError(f"{path}: is not a PLY: its first line is not 'ply'; give a scene PLY")
+    header = _HeaderLines()
+    for number in range(2, HEADER_LIMIT):
+        line = file.readline(LINE_LIMIT)
+        words = line.decode("ascii", "replace").split()
+        if words == ["end_header"]:
+            break
+        mistake = "the header ends here" if not line else header.add(words)
+        if mistake:
+            raise SceneFormatError(f"{path}: line {number}: {mistake}; the file is damaged, get it again")
+    else:
+        raise SceneFormatError(f"{path}: no end_header in {HEADER_LIMIT} lines; the file is damaged")
+    if header.format is None:
+        raise SceneFormatError(f"{path}: its header names no format; the file is damaged, get it again")
+    return Header(header.format, tuple(Element(n, c, tuple(p)) for n, c, p in header.elements))
+
+
+class _HeaderLines:
+    """Collects the lines of a header; each answer is what is wrong with the line, or None."""
+
+    def __init__(self) -> None:
+        self.format: str | None = None
+        self.elements: list[tuple[str, int, list[tuple[str, str | None]]]] = []
+
+    def add(self, words: list[str]) -> str | None:
+        match words:
+            case [] | ["comment" | "obj_info", *_]:
+                return None
+            case ["format", name, _] if name in FORMATS and self.format is None:
+                self.format = name
+            case ["element", name, count] if count.isdecimal() and name not in [e[0] for e in self.elements]:
+                self.elements.append((name, int(count), []))
+            case ["property", "list", size, number, name] if size in NUMBERS and number in NUMBERS:
+                return self._property(name, None)
+            case ["property", number, name] if number in NUMBERS:
+                return self._property(name, NUMBERS[number])
+            case _:
+                return f"{' '.join(words)[:60]!r} is no line of a PLY header"
+        return None
+
+    def _property(self, name: str, kind: str | None) -> str | None:
+        if not self.elements:
+            return f"property {name} belongs to no element"
+        properties = self.elements[-1][2]
+        if name in [other for other, _ in properties]:
+            return f"property {name} stands twice"
+        properties.append((name, kind))
+        return None
+
+
+def read_rows(path: Path, file: BinaryIO, header: Header, wanted: Element) -> np.ndarray[Any, np.dtype[Any]]:
+    """Read the rows of one element.
+
+    Nothing is allocated for rows that the file is too small to hold.
+
+    Args:
+        path: The file's name, for messages.
+        file: The open file, just after its header.
+        header: What the header says.
+        wanted: The element, one of the header's.
+
+    Returns:
+        (count,) structured array with the element's properties by name; every one float64 where the file is ASCII.
+
+    Raises:
+        SceneFormatError: rows are missing or cannot be read; the message says how many are there.
+    """
+    order = FORMATS[header.format]
+    before = header.elements[: header.elements.index(wanted)]
+    dtype = wanted.dtype(path, order)
+    if header.format == "ascii":
+        return _ascii_rows(path, file, sum(element.count for element in before), wanted)
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    skipped = sum(element.count * element.dtype(path, order).itemsize for element in before)
+    there = max(0, left - skipped) // dtype.itemsize if dtype.itemsize else 0
+    if there < wanted.count:
+        raise _truncated(path, wanted, there)
+    file.seek(skipped, os.SEEK_CUR)
+    return np.fromfile(file, dtype=dtype, count=wanted.count)
+
+
+def _ascii_rows(path: Path, file: BinaryIO, skipped: int, wanted: Element) -> np.ndarray[Any, np.dtype[Any]]:
+    names = wanted.names
+    lines = itertools.islice(
+        (line for line in file if line.strip()),  # blank lines are no rows
+        min(skipped, sys.maxsize),
+        min(skipped + wanted.count, sys.maxsize),
+    )
+    rows = np.empty((0, len(names)))
+    if wanted.count:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # no line at all: told of below
+                rows = np.loadtxt(lines, comments=None, ndmin=2, encoding="latin-1")
+        except ValueError as error:
+            reason = str(error).split(";")[0].rstrip(".")
+            raise SceneFormatError(
+                f"{path}: rows of {wanted.name} cannot be read ({reason}); the file is damaged, get it again"
+            ) from None
+    if len(rows) < wanted.count:
+        raise _truncated(path, wanted, len(rows))
+    if rows.shape[1] != len(names):
+        raise SceneFormatError(
+            f"{path}: rows of {wanted.name} have {rows.shape[1]} numbers, but the header names {len(names)};"
+            " the file is damaged, get it again"
+        )
+    return np.ascontiguousarray(rows).view([(name, "f8") for name in names])[:, 0]
+
+
+def _truncated(path: Path, element: Element, there: int) -> SceneFormatError:
+    return SceneFormatError(
+        f"{path}: is truncated: {there} of {element.count} rows of {element.name} are there; get the file again"
+    )

@@ -1,0 +1,1 @@
+"""Runs: a folder per training, what is in it, and how it is judged."""

@@ -1,0 +1,128 @@
+"""Judging a run: scores, pictures and the report, written into its folder."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from gsplat_edu.evaluate.images import save_png, side_by_side
+from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
+from gsplat_edu.evaluate.report import Picture, Report, write_report
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.runs.folder import RunFolder, image_file_names
+from gsplat_edu.validation import ArrayLike
+from gsplat_edu.views import View
+
+Image = UInt8[np.ndarray, "H W 3"]
+
+Progress = Callable[[str, ImageScore], None]
+"""Is told of every scored view: its split and its score."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a scene is judged by.
+
+    Args:
+        test: Views that were held out.
+        train: Views it was trained on; none to leave them out.
+        background: (3,) what renders have behind them, and photos that are not opaque are put over.
+        notes: Sentences a reader of the report should know.
+    """
+
+    test: Sequence[View]
+    train: Sequence[View] = ()
+    background: ArrayLike = (0.0, 0.0, 0.0)
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What the judgement is.
+
+    Args:
+        test: Scores of the views that were held out.
+        train: Scores of the views of training.
+        metrics: What metrics.json holds.
+    """
+
+    test: list[ImageScore]
+    train: list[ImageScore]
+    metrics: dict[str, Any]
+
+
+def evaluate_run(
+    folder: RunFolder,
+    judged: Judged,
+    gaussians: Gaussians,
+    render: Renderer,
+    facts: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Score a scene and write metrics.json, renders/test/NAME.png (render | photo) and report.html.
+
+    Keys of an older metrics.json that are not scored here stay.
+
+    Args:
+        folder: The run's folder; its config and log go into the report.
+        judged: The views.
+        gaussians: The scene, in the frame of the views' cameras.
+        render: Renders Gaussians from a camera, over the background of `judged`.
+        facts: Single numbers for metrics.json: "iterations", "seconds".
+        progress: Is told of every scored view.
+
+    Returns:
+        The scores and the metrics.
+
+    Raises:
+        CheckpointError: a file of the folder is damaged.
+        DatasetError: a photo cannot be read.
+        OSError: a file cannot be written.
+    """
+    earlier, config, log = folder.read_metrics(), folder.read_config(), folder.log()
+    gallery = _Gallery(folder, judged.test, progress)
+
+    def tell(view: View, score: ImageScore, image: Image, truth: Image) -> None:
+        if progress is not None:
+            progress("train", score)
+
+    test = score_views(gaussians, judged.test, render, judged.background, gallery.add)
+    train = score_views(gaussians, judged.train, render, judged.background, tell)
+    metrics = {
+        **earlier,
+        "test": summarize(test),
+        "train": summarize(train),
+        "num_gaussians": len(gaussians),
+        **(facts or {}),
+        "test_views": [dataclasses.asdict(score) for score in test],
+    }
+    folder.write_metrics(metrics)
+    title = f"{folder.path.resolve().name}: 3D Gaussian Splatting"
+    write_report(
+        folder.report,
+        Report(title, metrics, log, config, scores=test, pictures=gallery.pictures, notes=judged.notes),
+    )
+    return Evaluation(test, train, metrics)
+
+
+class _Gallery:
+    """Writes each test view beside its photo, and keeps a small picture of it for the report."""
+
+    def __init__(self, folder: RunFolder, views: Sequence[View], progress: Progress | None) -> None:
+        names = image_file_names([view.name for view in views])
+        self._files = {
+            id(view): folder.renders / "test" / name for view, name in zip(views, names, strict=True)
+        }
+        self._progress = progress
+        self.pictures: list[Picture] = []
+
+    def add(self, view: View, score: ImageScore, image: Image, truth: Image) -> None:
+        save_png(self._files[id(view)], side_by_side([image, truth]))
+        self.pictures.append(Picture.of(view.name, image, truth))
+        if self._progress is not None:
+            self._progress("test", score)

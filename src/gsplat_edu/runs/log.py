@@ -1,0 +1,88 @@
+"""The log of a run: log.jsonl, one JSON object a line, each with the number of steps taken as `iteration`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, TextIO
+
+from gsplat_edu.files import written_aside
+from gsplat_edu.train.events import Event, StepEvent
+
+STEPS_PER_LINE = 10
+"""Steps that a line sums up: loss and time are means over them."""
+
+
+class LogWriter:
+    """Writes what the trainer reports.
+
+    Args:
+        path: The file; lines are added to what it holds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file: TextIO | None = None
+        self._losses: list[float] = []
+        self._last = 0.0
+
+    def record(self, event: Event, seconds: float) -> None:
+        """Write a change of the Gaussians as it comes, and steps ten at a time.
+
+        Args:
+            event: What happened.
+            seconds: Wall time of the training so far.
+        """
+        iteration = event.iteration + 1
+        if not isinstance(event, StepEvent):
+            kind = type(event).__name__.removesuffix("Event").lower()
+            self.write({**dataclasses.asdict(event), "iteration": iteration, "event": kind})
+            return
+        self._losses.append(event.loss)
+        if iteration % STEPS_PER_LINE == 0:
+            count = len(self._losses)
+            line = {
+                "iteration": iteration,
+                "loss": sum(self._losses) / count,
+                "num_gaussians": event.num_gaussians,
+                "ms": round(1e3 * (seconds - self._last) / count, 3),
+                "seconds": round(seconds, 3),
+            }
+            self.write(line)
+            self._losses, self._last = [], seconds
+
+    def write(self, line: dict[str, Any]) -> None:
+        """Add a line; it is on its way to the disk when this returns."""
+        if self._file is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self.path.open("a", encoding="utf-8")
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
+
+    def cut(self, iteration: int, seconds: float = 0.0) -> None:
+        """Drop the lines of steps beyond a checkpoint, which will be taken again.
+
+        Args:
+            iteration: Steps taken at the checkpoint.
+            seconds: Wall time of the training up to there.
+        """
+        self.close()
+        self._losses, self._last = [], seconds
+        if not self.path.exists():
+            return
+        kept = []
+        for line in self.path.read_text(encoding="utf-8").splitlines(keepends=True):
+            try:
+                if line.endswith("\n") and json.loads(line)["iteration"] <= iteration:
+                    kept.append(line)
+            except (ValueError, KeyError, TypeError):
+                continue  # torn by a kill
+        with written_aside(self.path) as aside:
+            aside.write_text("".join(kept), encoding="utf-8")
+
+    def close(self) -> None:
+        """Close the file; the next line opens it again."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None

@@ -1,0 +1,291 @@
+"""A capture becomes a scene, in a run folder that can be taken up again wherever it was left.
+
+The trainer knows neither files nor datasets; this module gives it both, and writes what comes out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.evaluate.metrics import ImageScore, score_views, summarize
+from gsplat_edu.evaluate.report import machine_facts
+from gsplat_edu.io.ply import save_ply
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.log import LogWriter
+from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_extra, save_checkpoint
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.events import Event
+from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.trainer import Callback, Trainer
+from gsplat_edu.validation import whole_number
+
+SAME = ("train", "render", "data")
+"""Sections of config.json that a resumed run has to share with the one it goes on from."""
+
+MAY_DIFFER = {"data": ("path", "image_memory")}
+"""What in them may be another all the same: the capture may have been moved."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """One run of training.
+
+    Args:
+        data: The capture.
+        out: The run's folder.
+        config: The recipe.
+        data_settings: How the capture is read.
+        points: A PLY to start from; the capture's own points where None.
+        backend: Rendering backend, by its own name.
+        eval_every: Iterations between judgements by the test views; 0 judges at the end only.
+        save_every: Iterations between checkpoints; 0 writes one at the end only, or when the run is stopped.
+        time_limit: Seconds of training after which the run ends; None for none.
+        resume: Go on from the folder's last checkpoint.
+
+    Raises:
+        ArgumentError: a number is out of range.
+    """
+
+    data: Path
+    out: Path
+    config: TrainConfig
+    data_settings: DataSettings
+    points: Path | None = None
+    backend: str = "cpu"
+    eval_every: int = 1_000
+    save_every: int = 500
+    time_limit: float | None = None
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("eval_every", "save_every"):
+            whole_number(name, getattr(self, name), 0)
+        if self.time_limit is not None and self.time_limit <= 0:
+            raise ArgumentError("time_limit: has to be above 0 seconds")
+
+    @property
+    def folder(self) -> RunFolder:
+        """The run's folder."""
+        return RunFolder(self.out)
+
+    @property
+    def render_settings(self) -> RenderSettings:
+        """How the scene is rendered once it is trained."""
+        config = self.config
+        return RenderSettings(
+            background=config.background,
+            sh_degree=config.sh_degree,
+            antialiased=config.antialiased,
+            jacobian_limit=config.jacobian_limit,
+            depth=False,
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return what config.json holds."""
+        data = dataclasses.asdict(self.data_settings)
+        return {
+            "version": version("gsplat-edu"),
+            "data": {
+                "path": str(self.data.resolve()),
+                **data,
+                "points": None if self.points is None else str(self.points.resolve()),
+            },
+            "train": dataclasses.asdict(self.config),
+            "render": dataclasses.asdict(self.render_settings),
+            "backend": self.backend,
+            "machine": machine_facts(),
+        }
+
+
+class CaptureRun:
+    """A run of training on a capture.
+
+    Args:
+        options: The run.
+        say: Told, in sentences, what the user wants to know.
+
+    Raises:
+        CheckpointError: the folder holds a run that is not to be resumed, or another one.
+        DatasetError: the capture cannot be read.
+        ArgumentError: options do not fit together.
+        OSError: the folder cannot be written to.
+
+    Attributes:
+        finished: The run was complete already; there is nothing to do.
+        trainer: The training; None where the run is finished.
+        dataset: The capture.
+    """
+
+    def __init__(self, options: RunOptions, say: Callable[[str], None] = lambda sentence: None) -> None:
+        self.options, self.folder, self._say = options, options.folder, say
+        self.seconds = 0.0
+        self.finished = self._prepare_folder()
+        if self.finished:
+            return
+        self.dataset = load_dataset(options.data, options.data_settings, points=options.points)
+        for note in self.dataset.notes:
+            say(note)
+
+    def _prepare_folder(self) -> bool:
+        """Check the folder against what is asked for; say whether its run is finished."""
+        options, folder = self.options, self.folder
+        if folder.exists():
+            if not options.resume:
+                raise CheckpointError(
+                    f"--out: {folder.path} holds a run already; add --resume to go on with it, or name another folder"
+                )
+            _check_same(folder.read_config(), options.document(), folder.path)
+            done = folder.read_metrics().get("iterations", 0)
+            if done >= options.config.iterations:
+                self._say(f"{folder.path}: is finished, {done} iterations; nothing to do")
+                return True
+            return False
+        if folder.path.exists() and not folder.path.is_dir():
+            raise ArgumentError(f"--out: {folder.path} is a file; name a folder")
+        if options.resume:
+            self._say(f"{folder.path}: holds no run to resume; starting at the beginning")
+        return False
+
+    def start(
+        self, progress: Callable[[int, int], None] | None = None, callbacks: Sequence[Callback] = ()
+    ) -> Trainer:
+        """Read the photos, make the trainer, and bring it to where the run was left.
+
+        Args:
+            progress: Told how many photos of how many have been read.
+            callbacks: Told of every step and every change.
+        """
+        options, dataset, folder = self.options, self.dataset, self.folder
+        dataset.preload(progress)
+        if not folder.exists():
+            folder.write_config(options.document() | {"origin": dataset.origin.tolist()})
+            folder.write_cameras(dataset.train, dataset.test, dataset.origin)
+        extent = scene_extent([view.camera for view in dataset.train])
+        gaussians = from_points(dataset.points, dataset.colors, options.config)
+        if len(gaussians) < len(dataset.points):
+            self._say(
+                f"the start cloud has {len(dataset.points)} points; {len(gaussians)} of them are taken, the cap"
+            )
+        self._log = LogWriter(folder.log_file)
+        self.trainer = Trainer(
+            gaussians,
+            dataset.train,
+            options.config,
+            render=functools.partial(render, backend=options.backend),
+            extent=extent,
+            density=make_strategy(options.config, extent, gaussians),
+            callbacks=[self._record, *callbacks],
+        )
+        self._take_up()
+        return self.trainer
+
+    def _take_up(self) -> None:
+        checkpoints = list_checkpoints(self.folder.checkpoints)
+        if checkpoints:
+            load_checkpoint(checkpoints[-1], self.trainer)
+            self.seconds = float(read_extra(checkpoints[-1])["seconds"])
+            self._say(f"resuming after {self.trainer.iteration} iterations")
+        elif self.options.resume and self.folder.log_file.exists():
+            self._say(f"{self.folder.path}: holds no checkpoint; starting at the beginning")
+        self._log.cut(self.trainer.iteration, self.seconds)
+
+    def train(self, stop: Callable[[], bool] = lambda: False) -> bool:
+        """Take the iterations that are left, and save where they ended.
+
+        Args:
+            stop: Asked after every iteration; the run is saved and can be resumed when it says so.
+
+        Returns:
+            Whether `stop` ended it.
+        """
+        limit, asked = self.options.time_limit, False
+        self._began = time.perf_counter() - self.seconds
+
+        def ends() -> bool:
+            nonlocal asked
+            self._judge_and_save_where_due()
+            asked = stop()
+            return asked or (limit is not None and self._elapsed() >= limit)
+
+        if limit is None or self.seconds < limit:
+            self.trainer.run(ends)
+        self.seconds = self._elapsed()
+        self.save()
+        return asked
+
+    def _judge_and_save_where_due(self) -> None:
+        done, options = self.trainer.iteration, self.options
+        if done == options.config.iterations:
+            return  # both are done at the end
+        if options.save_every and done % options.save_every == 0:
+            self.save()
+        if options.eval_every and done % options.eval_every == 0 and self.dataset.test:
+            means = summarize(self.scores())
+            self._log.write({"iteration": done, "psnr": means["psnr"], "ssim": means["ssim"]})
+            count = len(self.trainer.gaussians)
+            self._say(
+                f"iteration {done}: test PSNR {means['psnr']:.2f} dB, SSIM {means['ssim']:.4f}, {count} Gaussians"
+            )
+
+    def save(self) -> Path:
+        """Write a checkpoint; see `gsplat_edu.train.checkpoint.save_checkpoint`."""
+        return save_checkpoint(self.folder.checkpoints, self.trainer, {"seconds": self._elapsed()})
+
+    def finish(self, progress: Progress | None = None) -> Evaluation:
+        """Write the scene, and judge it by test and training views.
+
+        Args:
+            progress: Told of every view that was scored.
+        """
+        trainer, dataset = self.trainer, self.dataset
+        self._log.close()
+        save_ply(self.folder.scene(trainer.iteration), trainer.gaussians, dataset.origin)
+        settings = self.options.render_settings
+        return evaluate_run(
+            self.folder,
+            Judged(dataset.test, dataset.train, settings.background, dataset.notes),
+            trainer.gaussians,
+            functools.partial(render, settings=settings, backend=self.options.backend),
+            {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)},
+            progress,
+        )
+
+    def scores(self) -> list[ImageScore]:
+        """Score the test views as the scene stands."""
+        settings = self.options.render_settings
+        renderer = functools.partial(render, settings=settings, backend=self.options.backend)
+        return score_views(self.trainer.gaussians, self.dataset.test, renderer, settings.background)
+
+    def _elapsed(self) -> float:
+        return time.perf_counter() - self._began
+
+    def _record(self, trainer: Trainer, event: Event) -> None:
+        self._log.record(event, self._elapsed())
+
+
+def _check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
+    for section in SAME:
+        before, now = (dict(config.get(section, {})) for config in (old, new))
+        for key in sorted({*before, *now} - set(MAY_DIFFER.get(section, ()))):
+            a, b = (_plain(values.get(key)) for values in (before, now))
+            if a != b:
+                raise CheckpointError(
+                    f"--resume: {path} was begun with {key} = {a}, not {b}; give the same options, or another --out"
+                )
+
+
+def _plain(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value

@@ -1,0 +1,109 @@
+import json
+
+import pytest
+import torch
+
+import gsplat_edu.cli.main as command_line
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply import save_ply
+from gsplat_edu.runs.folder import RunFolder
+
+
+@pytest.fixture
+def info(monkeypatch, capsys):
+    monkeypatch.setattr(command_line, "COMMANDS", ("info",))
+
+    def call(path, code=0):
+        assert command_line.main(["info", str(path)]) == code
+        printed = capsys.readouterr()
+        return printed.err if code else printed.out
+
+    return call
+
+
+def scene(count=50):
+    generator = torch.Generator().manual_seed(0)
+    gaussians = Gaussians(
+        means=torch.rand(count, 3, generator=generator),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scales=torch.full((count, 3), -2.0),
+        sh0=torch.zeros(count, 1, 3),
+        sh_rest=torch.zeros(count, 8, 3),
+        logit_opacities=torch.zeros(count),
+    )
+    gaussians.means[0] = torch.tensor([-7.0, 0.5, 9.25])
+    return gaussians
+
+
+def test_a_scene_is_described_and_its_oddities_named(info, tmp_path):
+    gaussians = scene()
+    save_ply(tmp_path / "a.ply", gaussians)
+    said = info(tmp_path / "a.ply")
+    assert "50, SH degree 2" in said and "x -7 to " in said and "to 9.25" in said
+    assert "opacity    0.5, 0.5, 0.5, 0.5, 0.5" in said and "0.1353, 0.1353" in said
+    assert f"{(tmp_path / 'a.ply').stat().st_size:,} bytes" in said
+    assert "warning" not in said
+
+    gaussians.quats[3] = 0
+    gaussians.log_scales[4:6, 1] = 5.0
+    gaussians.logit_opacities[7:10] = -9.0
+    save_ply(tmp_path / "b.ply", gaussians)
+    warnings = [line for line in info(tmp_path / "b.ply").splitlines() if line.startswith("warning")]
+    assert [line.split()[1] for line in warnings] == ["1", "2", "3"]
+
+
+def test_an_empty_scene_is_described(info, tmp_path):
+    save_ply(tmp_path / "a.ply", scene(1).map(lambda t: t[:0]))
+    assert "0, SH degree 2" in info(tmp_path / "a.ply")
+
+
+def test_a_run_says_how_far_it_got(info, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.write_config(
+        {"version": "9.9", "train": {"iterations": 7000}, "backend": "cpu", "data": {"path": "x"}}
+    )
+    said = info(folder.path)
+    assert "nothing yet of 7,000" in said and "holds no scene" in said and "not judged yet" in said
+
+    folder.log_file.write_text(json.dumps({"iteration": 6999}) + "\n")
+    folder.write_metrics({"test": {"psnr": 23.456, "ssim": 0.8, "num_images": 3}, "seconds": 61.0})
+    save_ply(folder.scene(7000), scene())
+    said = info(folder.path)
+    for words in (
+        "9.9",
+        "iteration 6999 of 7,000",
+        "PSNR 23.46 dB, SSIM 0.8000, 3 images",
+        "61.0 s",
+        "50, SH",
+        "path x",
+    ):
+        assert words in said, words
+    assert "train      PSNR" not in said
+
+
+def test_a_dataset_is_described_and_no_photo_is_decoded(info, tmp_path, monkeypatch):
+    views, points, colors = procedural_capture(size=32, count=9)
+    write_colmap(tmp_path / "capture", views, points, colors)
+
+    def decode(*_):
+        raise AssertionError("a photo was decoded")
+
+    monkeypatch.setattr("gsplat_edu.data.images.ImageStore.read", decode)
+    said = info(tmp_path / "capture")
+    for words in ("COLMAP", "9: 32x24", "7 for training, 2 held out", f"{len(points):,}", "extent", "fx "):
+        assert words in said, words
+
+
+def test_what_is_none_of_them_is_one_line(info, tmp_path):
+    assert "is not there; give a dataset folder" in info(tmp_path / "gone", code=2)
+    assert "is no capture" in info(tmp_path, code=2)
+    (tmp_path / "a.txt").write_text("hello")
+    assert "a.txt: is not a PLY" in info(tmp_path / "a.txt", code=2)
+
+
+def test_help_shows_an_example(info, capsys):
+    with pytest.raises(SystemExit):
+        command_line.main(["info", "--help"])
+    assert "example: gsplat-edu info " in capsys.readouterr().out

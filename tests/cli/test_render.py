@@ -1,0 +1,134 @@
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import gsplat_edu.cli.main as command_line
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply import load_ply, save_ply
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.folder import RunFolder
+
+ORIGIN = (512.0, -64.0, 8.0)
+BLUE = (0.0, 0.0, 1.0)
+
+
+@pytest.fixture
+def cli(monkeypatch, tmp_path):
+    monkeypatch.setattr(command_line, "COMMANDS", ("render",))
+    monkeypatch.chdir(tmp_path)
+    return command_line.main
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A capture, and a run of it whose coordinates were moved and whose background is blue."""
+    root = tmp_path_factory.mktemp("made")
+    views, points, colors = procedural_capture(size=32, count=6)
+    write_colmap(root / "capture", views, points, colors)
+    count = len(points)
+    gaussians = Gaussians(
+        means=torch.tensor(points, dtype=torch.float32),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scales=torch.full((count, 3), -2.5),
+        sh0=torch.tensor((colors - 0.5) / 0.28209479177387814, dtype=torch.float32)[:, None],
+        sh_rest=torch.zeros(count, 0, 3),
+        logit_opacities=torch.full((count,), 2.0),
+    )
+    folder = RunFolder(root / "run")
+    folder.write_config(
+        {"render": dataclasses.asdict(RenderSettings(background=BLUE)), "origin": list(ORIGIN), "data": {}}
+    )
+    save_ply(folder.scene(30), gaussians, ORIGIN)
+    folder.write_cameras(views[:4], views[4:], ORIGIN)
+    save_ply(root / "bare.ply", gaussians)
+    return folder, root / "capture", root / "bare.ply", views
+
+
+def pixels(path):
+    return np.array(Image.open(path))
+
+
+def test_a_run_is_rendered_as_an_orbit_into_its_folder(made, cli, capsys):
+    folder, *_ = made
+    assert cli(["render", str(folder.path), "--frames", "3"]) == 0
+    printed = capsys.readouterr().out
+    path = folder.renders / "orbit.mp4"
+    assert printed.splitlines()[-1].startswith(f"wrote {path}: 3 images of ") and "32x24" in printed
+    video = cv2.VideoCapture(str(path))
+    frames = [video.read() for _ in range(4)]
+    assert [read for read, _ in frames] == [True] * 3 + [False]
+    assert frames[0][1][0, 0].argmax() == 0, "blue, which is BGR's first, behind the scene"
+
+
+def test_the_runs_cameras_see_what_they_saw_in_training(made, cli, capsys, tmp_path):
+    folder, _, bare, views = made
+    assert cli(["render", str(folder.path), "--dataset", "--out", str(tmp_path / "seen")]) == 0
+    assert f"wrote {tmp_path / 'seen'}/: 6 images" in capsys.readouterr().out
+    assert sorted(p.name for p in (tmp_path / "seen").iterdir()) == [f"view_{i:03d}.png" for i in range(6)]
+    settings = RenderSettings(background=BLUE)
+    for i in (0, 5):
+        direct = render(load_ply(bare), views[i].camera, settings=settings).image.clamp(0, 1).numpy()
+        # the scene went through a file at 512, where float32 steps are 6e-5 world units: under 0.01 px, and a
+        # colour changes by less than a byte over that
+        difference = pixels(tmp_path / "seen" / f"view_{i:03d}.png") - 255.0 * direct
+        assert np.abs(difference).max() < 2
+
+
+def test_a_datasets_cameras_a_size_and_a_background_can_be_asked_for(made, cli, tmp_path):
+    _, capture, bare, _ = made
+    words = [
+        "render",
+        str(bare),
+        "--dataset",
+        str(capture),
+        "--size",
+        "64",
+        "--white-background",
+        "--out",
+        "big",
+    ]
+    assert cli(words) == 0
+    image = pixels(tmp_path / "big" / "view_002.png")
+    assert image.shape == (48, 64, 3) and (image[0, 0] == 255).all()
+
+
+def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path):
+    bare = made[2]
+    assert cli(["render", str(bare), "--frames", "2", "--size", "40", "--out", "frames"]) == 0
+    image = pixels(tmp_path / "frames" / "frame_0001.png").astype(int).sum(axis=2)
+    assert image.shape == (40, 40) and image[15:25, 15:25].min() > 0
+    assert cli(["render", str(bare), "--frames", "2", "--size", "40"]) == 0
+    assert (tmp_path / "out" / "bare_orbit.mp4").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["gone"], "gone: is not there; give the folder of a run, or a scene PLY"),
+        (["."], "is no run (it has no config.json)"),
+        (["BARE", "--dataset"], "--dataset: a PLY comes without cameras"),
+        (["BARE", "--frames", "0"], "--frames: is 0"),
+        (["BARE", "--size", "0"], "--size: is 0"),
+        (["BARE", "--fps", "-1"], "--fps: is -1"),
+        (["BARE", "--backend", "abacus"], "backend 'abacus'"),
+        (["BARE", "--dataset", "."], "is no capture"),
+    ],
+)
+def test_mistakes_are_one_line(made, cli, capsys, arguments, says):
+    words = [str(made[2]) if word == "BARE" else word for word in arguments]
+    assert cli(["render", *words]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and says in error
+
+
+def test_help_shows_an_example(cli, capsys):
+    with pytest.raises(SystemExit):
+        cli(["render", "--help"])
+    assert "example: gsplat-edu render " in capsys.readouterr().out

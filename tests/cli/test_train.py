@@ -1,0 +1,168 @@
+"""`gsplat-edu train`: options become a recipe, and bad input costs one line."""
+
+import json
+
+import pytest
+from PIL import Image
+
+from gsplat_edu.cli.arguments import bytes_text, seconds_text
+from gsplat_edu.cli.main import build_parser, main
+from gsplat_edu.cli.train import options_from
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap, write_transforms
+from gsplat_edu.train.config import TrainConfig, recipe
+
+
+def options(*words):
+    return options_from(build_parser().parse_args(["train", "somewhere", "--out", "run", *words]))
+
+
+def test_no_options_are_the_recipe():
+    chosen = options()
+    assert chosen.config == TrainConfig() == recipe()
+    assert chosen.data_settings.background == (0.0, 0.0, 0.0)
+
+
+def test_options_reach_the_recipe():
+    words = "--iterations 7000 --strategy mcmc --max-gaussians 500 --seed 3 --antialiased --white-background"
+    words += " --densify-stop 4000 --jacobian-limit none --random-background --view-order random --opacities-rate 0.025"
+    chosen = options(*words.split())
+    assert chosen.config == recipe(
+        7_000,
+        strategy="mcmc",
+        max_gaussians=500,
+        seed=3,
+        antialiased=True,
+        background=(1.0, 1.0, 1.0),
+        densify_stop=4_000,
+        jacobian_limit=None,
+        random_background=True,
+        view_order="random",
+        opacities_rate=0.025,
+    )
+    assert chosen.data_settings.background is None, "photos keep their alpha for backgrounds drawn later"
+
+
+def test_every_field_of_the_recipe_has_an_option(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    said = capsys.readouterr().out
+    import dataclasses
+
+    for field in dataclasses.fields(TrainConfig):
+        assert f"--{field.name.replace('_', '-')}" in said or field.name == "background", field.name
+    assert "example: gsplat-edu train" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90", 90), ("90s", 90), ("1.5m", 90), ("1h30m", 5400), ("2h", 7200)]
+)
+def test_durations(text, seconds):
+    assert seconds_text(text) == seconds
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("4GiB", 4 * 2**30), ("500MB", 500e6), ("1e9", 1e9), ("0", 0), ("3k", 3000)]
+)
+def test_sizes(text, size):
+    assert bytes_text(text) == size
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--iterations", "0"], "iterations"),
+        (["--strategy", "best"], "strategy"),
+        (["--strategy", "mcmc"], "--max-gaussians"),
+        (["--time-limit", "soon"], "--time-limit"),
+        (["--image-memory", "much"], "--image-memory"),
+        (["--resolution", "-2"], "resolution"),
+        (["--test-every", "1"], "test_every"),
+        (["--backend", "gpu"], "backend"),
+        (["--max-gaussians", "0"], "max_gaussians"),
+        (["--densify-start", "20000"], "densify_stop"),
+        (["--opacities-rate", "fast"], "--opacities-rate"),
+    ],
+)
+@pytest.mark.usefixtures("as_shipped")
+def test_options_out_of_range_cost_one_line(tmp_path, capsys, words, named):
+    try:
+        code = main(["train", str(tmp_path), "--out", str(tmp_path / "run"), *words])
+    except SystemExit as stop:  # what argparse refuses
+        code = stop.code
+    said = capsys.readouterr().err
+    assert code == 2 and named in said and said.count("\n") == 1
+    assert not (tmp_path / "run").exists(), "nothing was begun"
+
+
+def _nothing(folder):
+    folder.mkdir()
+
+
+def _photos_only(folder):
+    (folder / "images").mkdir(parents=True)
+    Image.new("RGB", (8, 6)).save(folder / "images" / "a.png")
+
+
+def _no_images(folder):
+    write_colmap(folder, *CAPTURE)
+    for file in (folder / "images").iterdir():
+        file.unlink()
+
+
+def _corrupt_jpeg(folder):
+    write_colmap(folder, *CAPTURE)
+    photo = folder / "images" / "view_002.png"
+    Image.open(photo).save(photo.with_suffix(".jpg"))
+    photo.write_bytes(photo.with_suffix(".jpg").read_bytes()[:-200])
+
+
+def _mask_of_another_size(folder):
+    write_colmap(folder, *CAPTURE)
+    (folder / "masks").mkdir()
+    Image.new("L", (8, 6), 255).save(folder / "masks" / "view_001.png")
+
+
+def _nan_pose(folder):
+    write_transforms(folder, *CAPTURE)
+    file = folder / "transforms.json"
+    meta = json.loads(file.read_text())
+    meta["frames"][1]["transform_matrix"][0][3] = float("nan")
+    file.write_text(json.dumps(meta))
+
+
+def _syntax_error(folder):
+    write_transforms(folder, *CAPTURE)
+    (folder / "transforms.json").write_text('{\n  "frames": [,\n')
+
+
+CAPTURE = procedural_capture(16, 3, splats=20)
+FAULTS = {
+    _nothing: "transforms.json",
+    _photos_only: "poses",
+    _no_images: "view_000.png",
+    _corrupt_jpeg: "view_002.png",
+    _mask_of_another_size: "view_001.png",
+    _nan_pose: "view_001.png: its pose",
+    _syntax_error: "line 2",
+}
+
+
+@pytest.mark.parametrize("make", FAULTS, ids=lambda make: make.__name__)
+@pytest.mark.usefixtures("as_shipped")
+def test_a_capture_that_cannot_be_used_costs_one_line(tmp_path, capsys, make):
+    make(tmp_path / "capture")
+    code = main(["train", str(tmp_path / "capture"), "--out", str(tmp_path / "run"), "--iterations", "2"])
+    said = capsys.readouterr().err
+    assert code == 2 and FAULTS[make] in said and said.count("\n") == 1, said
+    assert not (tmp_path / "run").exists(), "nothing was begun"
+
+
+def test_one_photo_is_enough(tmp_path):
+    views, points, colors = procedural_capture(16, 3, splats=20)
+    write_colmap(tmp_path / "capture", views[:1], points, colors)
+    assert (
+        main(["train", str(tmp_path / "capture"), "--out", str(tmp_path / "run"), "--iterations", "5"]) == 0
+    )
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["train"]["num_images"] == 1 and metrics["test"]["num_images"] == 0

@@ -1,0 +1,94 @@
+import functools
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.evaluation import Judged, evaluate_run
+from gsplat_edu.runs.folder import RunFolder
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return procedural_capture(size=32, count=5)
+
+
+def scene(points, colors):
+    count = len(points)
+    return Gaussians(
+        means=torch.tensor(points, dtype=torch.float32),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scales=torch.full((count, 3), -2.5),
+        sh0=torch.tensor((colors - 0.5) / 0.28209479177387814, dtype=torch.float32)[:, None],
+        sh_rest=torch.zeros(count, 0, 3),
+        logit_opacities=torch.full((count,), 2.0),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.write_config({"version": "0", "backend": "cpu"})
+    return folder
+
+
+RENDER = functools.partial(render, settings=RenderSettings(depth=False))
+
+
+def test_a_run_is_judged_and_everything_is_written(capture, folder):
+    views, points, colors = capture
+    gaussians = scene(points, colors)
+    folder.write_metrics({"seconds": 12.5, "num_gaussians": 1, "mine": "kept"})
+    told = []
+    judged = Judged(views[:2], views[2:], notes=["a note"])
+    result = evaluate_run(
+        folder,
+        judged,
+        gaussians,
+        RENDER,
+        {"iterations": 70},
+        lambda split, score: told.append((split, score.name)),
+    )
+    assert told == [("test", v.name) for v in views[:2]] + [("train", v.name) for v in views[2:]]
+    metrics = folder.read_metrics()
+    assert metrics == json.loads(json.dumps(result.metrics))
+    assert (metrics["seconds"], metrics["mine"], metrics["iterations"]) == (12.5, "kept", 70)
+    assert (metrics["num_gaussians"], metrics["train"]["num_images"]) == (len(points), 3)
+
+    # the numbers are those of rendering and comparing by hand
+    images = [RENDER(gaussians, view.camera).image for view in views[:2]]
+    by_hand = [psnr(image, view.image) for image, view in zip(images, views, strict=False)]
+    assert [entry["psnr"] for entry in metrics["test_views"]] == by_hand
+    assert metrics["test"]["psnr"] == pytest.approx(np.mean(by_hand), abs=1e-12)
+    assert min(by_hand) > 10, "the start points already look a little like the scene"
+
+    picture = np.array(Image.open(folder.renders / "test" / "view_000.png"))
+    assert picture.shape == (24, 32 + 4 + 32, 3)
+    np.testing.assert_array_equal(picture[:, 36:], views[0].image)
+    np.testing.assert_array_equal(
+        picture[:, :32], np.floor(255 * images[0].clamp(0, 1).double().numpy() + 0.5)
+    )
+    assert sorted(p.name for p in (folder.renders / "test").iterdir()) == ["view_000.png", "view_001.png"]
+    page = folder.report.read_text()
+    assert "view_001.png" in page and "a note" in page
+
+
+def test_no_test_views_are_no_obstacle(capture, folder):
+    views, points, colors = capture
+    result = evaluate_run(folder, Judged([], views[:1]), scene(points, colors), RENDER)
+    assert result.metrics["test"] == {
+        "psnr": None,
+        "psnr_8bit": None,
+        "ssim": None,
+        "l1": None,
+        "num_images": 0,
+    }
+    assert result.metrics["train"]["num_images"] == 1
+    assert folder.report.is_file() and not folder.renders.exists()

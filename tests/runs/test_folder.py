@@ -1,0 +1,207 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
+from gsplat_edu.views import View
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return RunFolder(tmp_path / "run")
+
+
+def views(count=3):
+    rng = np.random.default_rng(0)
+    result = []
+    for i in range(count):
+        R = Rotation.random(random_state=i).as_matrix()
+        camera = Camera(R, rng.normal(size=3), *rng.uniform(50, 60, 2), *rng.uniform(2, 4, 2), 5, 7)
+        result.append(View(camera, np.zeros((5, 7, 3)), name=f"left/{i}.jpg"))
+    return result
+
+
+def test_where_things_lie(folder):
+    root = folder.path
+    assert not folder.exists()
+    folder.write_config({"version": "1"})
+    assert folder.exists()
+    assert folder.config == root / "config.json" and folder.log_file == root / "log.jsonl"
+    assert folder.metrics == root / "metrics.json" and folder.cameras == root / "cameras.json"
+    assert folder.renders == root / "renders" and folder.checkpoints == root / "checkpoints"
+    assert folder.report == root / "report.html"
+    assert folder.scene(70) == root / "point_cloud" / "iteration_70" / "point_cloud.ply"
+
+
+def test_config_and_metrics_come_back(folder):
+    config = {"version": "0.1", "origin": [0.1, 1e-300, -3.0], "data": {"path": "ä", "points": None}}
+    folder.write_config(config)
+    assert folder.read_config() == config
+    assert folder.read_metrics() == {}
+    folder.write_metrics({"test": {"psnr": 0.1 + 0.2}})
+    assert folder.read_metrics() == {"test": {"psnr": 0.1 + 0.2}}
+
+
+def test_json_is_strict(folder):
+    folder.write_metrics({"psnr": 1.0})
+    before = folder.metrics.read_bytes()
+    for bad in (float("nan"), float("inf"), {1, 2}):
+        with pytest.raises(ArgumentError, match=r"metrics\.json: cannot be written as JSON"):
+            folder.write_metrics({"psnr": bad})
+    assert folder.metrics.read_bytes() == before
+    folder.metrics.write_text('{"psnr": NaN}')
+    with pytest.raises(CheckpointError, match=r"metrics\.json: is not JSON \(NaN is no JSON\)"):
+        folder.read_metrics()
+
+
+def test_what_is_missing_or_damaged_is_named(folder):
+    with pytest.raises(CheckpointError, match=r"run: is no run: it has no config\.json; give the folder"):
+        folder.read_config()
+    with pytest.raises(CheckpointError, match="run: holds no scene"):
+        folder.latest_scene()
+    with pytest.raises(CheckpointError, match=r"cameras\.json: is not there"):
+        folder.read_cameras()
+    folder.write_config({})
+    for text, says in (("[1]", "is not a JSON object"), ("{", "is not JSON"), ("", "is not JSON")):
+        folder.config.write_text(text)
+        with pytest.raises(CheckpointError, match=rf"config\.json: {says}") as caught:
+            folder.read_config()
+        assert "\n" not in str(caught.value)
+
+
+def test_a_torn_last_line_is_left_out_and_no_other(folder):
+    assert folder.log() == []
+    folder.write_config({})
+    lines = [{"iteration": 1, "loss": 0.5}, {"iteration": 2, "loss": 0.25}]
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    for torn in ("", '{"iteration": 3, "lo', '{"iteration": 3}'):  # the last may have been longer
+        folder.log_file.write_text(text + torn)
+        assert folder.log() == lines
+    folder.log_file.write_text('{"iterat\n' + text)
+    with pytest.raises(CheckpointError, match=r"log\.jsonl: line 1: is not JSON"):
+        folder.log()
+    folder.log_file.write_text(text + "7\n")
+    with pytest.raises(CheckpointError, match=r"log\.jsonl: line 3: is not a JSON object"):
+        folder.log()
+
+
+def test_the_latest_scene_is_that_of_most_iterations(folder):
+    for iteration in (900, 7000, 30):
+        path = folder.scene(iteration)
+        path.parent.mkdir(parents=True)
+        path.write_bytes(b"")
+    folder.scene(99999).parent.mkdir()  # was being written when the run stopped
+    (folder.path / "point_cloud" / "iteration_best").mkdir()
+    (folder.path / "point_cloud" / "iteration_best" / "point_cloud.ply").write_bytes(b"")
+    assert folder.latest_scene() == (folder.scene(7000), 7000)
+
+
+def same(a, b):
+    numbers = ("fx", "fy", "cx", "cy", "H", "W")
+    return (
+        a.R.tobytes() == b.R.tobytes()
+        and a.eye.tobytes() == b.eye.tobytes()
+        and all(getattr(a, n) == getattr(b, n) for n in numbers)
+    )
+
+
+def test_cameras_come_back_to_the_bit(folder):
+    train, test = views()[:2], views()[2:]
+    folder.write_cameras(train, test)
+    read = folder.read_cameras()
+    assert [(name, split) for name, split, _ in read] == [
+        ("left/0.jpg", "train"),
+        ("left/1.jpg", "train"),
+        ("left/2.jpg", "test"),
+    ]
+    assert all(same(view.camera, camera) for view, (_, _, camera) in zip(views(), read, strict=True))
+
+
+def test_cameras_are_written_as_viewers_read_them(folder):
+    folder.write_cameras(views(), [], origin=(100.0, 0.0, 0.0))
+    entry, camera = json.loads(folder.cameras.read_text())[1], views()[1].camera
+    assert (entry["id"], entry["img_name"], entry["width"], entry["height"]) == (1, "left/1.jpg", 7, 5)
+    np.testing.assert_array_equal(entry["position"], np.add(camera.eye, (100.0, 0.0, 0.0)))
+    # camera to world: the camera's forward axis is the third column
+    np.testing.assert_array_equal(np.array(entry["rotation"])[:, 2], camera.R[2])
+    back = folder.read_cameras((100.0, 0.0, 0.0))[1][2]
+    np.testing.assert_allclose(back.eye, camera.eye, atol=1e-13)  # a float64 near 100 is within 2^-47
+
+
+def test_a_file_without_our_keys_is_read(folder):
+    """Inria's: no principal point, so the image's middle; no split."""
+    folder.write_cameras(views(1), [])
+    (entry,) = json.loads(folder.cameras.read_text())
+    folder.cameras.write_text(
+        json.dumps([{k: v for k, v in entry.items() if k not in ("cx", "cy", "split")}])
+    )
+    ((_, split, camera),) = folder.read_cameras()
+    assert (split, camera.cx, camera.cy) == ("train", 3.0, 2.0)
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"rotation": None}, "entry 0: R: "),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "entry 0: R: is not a rotation"),
+        ({"position": [1, 2]}, r"entry 0: position: expected shape \(3,\)"),
+        ({"fx": "wide"}, "entry 0: fx: cannot be read"),
+        ({"height": 2.5}, "entry 0: H: is 2.5"),
+        ({"width": ...}, "entry 0: lacks 'width'"),
+    ],
+)
+def test_a_damaged_camera_is_named(folder, change, says):
+    folder.write_cameras(views(1), [])
+    (entry,) = json.loads(folder.cameras.read_text())
+    entry = {k: v for k, v in {**entry, **change}.items() if v is not ...}
+    folder.cameras.write_text(json.dumps([entry]))
+    with pytest.raises(CheckpointError, match=rf"cameras\.json: {says}"):
+        folder.read_cameras()
+
+
+def test_render_settings_come_from_the_config():
+    settings = RenderSettings(background=(1.0, 0.5, 0.0), sh_degree=2, antialiased=True)
+    config = json.loads(json.dumps({"render": dataclasses.asdict(settings)}))
+    assert render_settings(config) == settings
+    assert render_settings({}) == RenderSettings()
+    assert render_settings({"render": {"sh_degree": 1}}) == RenderSettings(sh_degree=1)
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize(
+    ("section", "says"),
+    [
+        ({"glow": 1, "fog": 2}, "render: fog, glow: not known to this version"),
+        ([], "render: is no object"),
+        ({"sh_degree": 9}, "render: sh_degree: is 9"),
+        ({"background": "white"}, "render: background: cannot be read"),
+    ],
+)
+def test_render_settings_that_cannot_be_are_named(section, says):
+    with pytest.raises(CheckpointError, match=rf"config\.json: {says}"):
+        render_settings({"render": section})
+
+
+def test_image_names_become_different_file_names():
+    names = [
+        "left/0001.jpg",
+        "left_0001.png",
+        "../../etc/passwd",
+        "",
+        "ä b.JPEG",
+        "v1.25",
+        ".hidden",
+        "LEFT_0001",
+    ]
+    files = image_file_names(names)
+    assert files[0] == "left_0001.png" and files[1] == "left_0001_2.png"
+    assert files[3] == "view_0003.png" and files[4] == "ä_b.png" and files[5] == "v1.25.png"
+    assert len({file.lower() for file in files}) == len(names)
+    assert not any("/" in file or file.startswith(".") for file in files)

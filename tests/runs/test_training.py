@@ -1,0 +1,297 @@
+"""Whole runs, through the command line: what a folder holds, and what a kill, a full disk or a mistake costs."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.cli.main import build_parser, main
+from gsplat_edu.cli.train import options_from
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.io.ply import load_ply
+from gsplat_edu.render.api import render
+from gsplat_edu.runs.folder import RunFolder, render_settings
+from gsplat_edu.runs.training import CaptureRun
+
+SHORT = ["--iterations", "40", "--eval-every", "20", "--save-every", "10", "--densify-start", "5"]
+SHORT += ["--densify-every", "10", "--densify-stop", "35", "--grad-threshold", "5e-5"]
+
+# Long enough to be killed on the way: about two seconds.
+LONG = ["--iterations", "600", "--eval-every", "150", "--save-every", "40", "--densify-start", "20"]
+LONG += ["--densify-every", "20", "--densify-stop", "500", "--grad-threshold", "5e-5", "--sh-every", "100"]
+STRATEGIES = {
+    "adc": ["--reset-every", "100", "--max-gaussians", "1500", "--random-background"],
+    "mcmc": ["--strategy", "mcmc", "--max-gaussians", "1200", "--mcmc-stop", "500"],
+}
+COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "egg"
+    write_colmap(folder, *procedural_capture(64, 16))
+    return folder
+
+
+def train(capture, out, *options):
+    return main(["train", str(capture), "--out", str(out), *options])
+
+
+def ply(out, iterations):
+    return (out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def finished(capture, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "egg"
+    assert train(capture, out, *SHORT) == 0
+    return out
+
+
+def test_a_run_folder_holds_what_it_should(finished):
+    folder = RunFolder(finished)
+    metrics = json.loads(folder.metrics.read_text())
+    assert metrics["iterations"] == 40 and metrics["seconds"] > 0
+    assert metrics["test"]["num_images"] == 2 and metrics["train"]["num_images"] == 14
+    assert metrics["test"]["psnr"] > 12 and 0 < metrics["test"]["ssim"] <= 1
+    lines = [json.loads(line) for line in folder.log_file.read_text().splitlines()]
+    assert all("iteration" in line for line in lines)
+    assert [line["iteration"] for line in lines if "loss" in line] == [10, 20, 30, 40]
+    assert [line["iteration"] for line in lines if "psnr" in line] == [20]
+    assert {line["event"] for line in lines if "event" in line} == {"densify"}
+    assert len(list((finished / "checkpoints").iterdir())) == 2
+    assert len(list((finished / "renders" / "test").glob("*.png"))) == 2
+    assert "data:image" in folder.report.read_text()
+    assert len(folder.read_cameras()) == 16
+    config = folder.read_config()
+    assert config["train"]["densify_start"] == 5 and config["train"]["iterations"] == 40
+    assert metrics["num_gaussians"] == len(load_ply(folder.latest_scene()[0]))
+
+
+def test_the_saved_scene_gives_the_same_images_to_the_bit(capture, tmp_path):
+    """What was trained, against what was written, read and rendered at every training camera."""
+    parsed = build_parser().parse_args(["train", str(capture), "--out", str(tmp_path / "run"), *SHORT])
+    run = CaptureRun(options_from(parsed))
+    trainer = run.start()
+    run.train()
+    run.finish()
+    loaded = load_ply(run.folder.latest_scene()[0])
+    settings = render_settings(run.folder.read_config())
+    cameras = {name: camera for name, _, camera in run.folder.read_cameras()}
+    for view in run.dataset.train:
+        with torch.no_grad():
+            ours = render(trainer.gaussians, view.camera, settings=settings).image
+            theirs = render(loaded, cameras[view.name], settings=settings).image
+        assert torch.equal(ours, theirs), view.name
+
+
+def start(capture, out, *options, threads=2):
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
+    words = [*COMMAND, "train", str(capture), "--out", str(out), *options]
+    return subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def completed(capture, out, *options, threads=2):
+    process = start(capture, out, *options, threads=threads)
+    said, complained = process.communicate(timeout=120)
+    assert process.returncode == 0, complained
+    return said
+
+
+def wait_for(condition, process, patience=60.0):
+    end = time.monotonic() + patience
+    while not condition():
+        assert process.poll() is None, "the run ended before it could be killed"
+        assert time.monotonic() < end
+        time.sleep(0.0005)
+
+
+def checkpoints(out):
+    return sorted(
+        (out / "checkpoints").glob("iteration_*.safetensors"), key=lambda p: int(p.stem.split("_")[1])
+    )
+
+
+def newest(out):
+    found = checkpoints(out)
+    return int(found[-1].stem.split("_")[1]) if found else 0
+
+
+@pytest.mark.slow
+@pytest.mark.own_process
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_killed_at_any_moment_and_resumed_gives_the_same_bytes(capture, tmp_path, strategy):
+    """kill -9 before the first checkpoint, on the way, while one is written, and on one thread and two."""
+    options = [*LONG, *STRATEGIES[strategy]]
+    whole = tmp_path / "whole"
+    completed(capture, whole, *options, threads=2)
+    assert RunFolder(whole).read_metrics()["num_gaussians"] > 320
+    for threads in (1, 2):
+        out = tmp_path / f"killed{threads}"
+        moments = [
+            lambda out=out: (out / "log.jsonl").exists(),
+            lambda out=out: newest(out) >= 80,
+            lambda out=out: newest(out) >= 160 and any((out / "checkpoints").glob(".iteration*")),
+            lambda out=out: newest(out) >= 400,
+        ]
+        for k, moment in enumerate(moments):
+            process = start(capture, out, *options, *(["--resume"] if k else []), threads=threads)
+            wait_for(moment, process)
+            process.kill()
+            process.communicate()
+            assert process.returncode == -signal.SIGKILL
+        completed(capture, out, *options, "--resume", threads=threads)
+        assert ply(out, 600) == ply(whole, 600), f"{threads} threads"
+        iterations = [line["iteration"] for line in RunFolder(out).log() if "loss" in line]
+        assert iterations == list(range(10, 601, 10)), "the log has every step once"
+
+
+@pytest.mark.own_process
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_saves_and_exits_with_130(capture, tmp_path, number):
+    process = start(capture, tmp_path / "run", *LONG, "--save-every", "0")
+    wait_for((tmp_path / "run" / "log.jsonl").exists, process)
+    process.send_signal(number)
+    _, complained = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "--resume" in complained and complained.count("\n") == 1
+    assert len(checkpoints(tmp_path / "run")) == 1
+    completed(capture, tmp_path / "run", *LONG, "--save-every", "0", "--resume")
+    completed(capture, tmp_path / "whole", *LONG)
+    assert ply(tmp_path / "run", 600) == ply(tmp_path / "whole", 600)
+
+
+def test_a_finished_run_has_nothing_to_do(capture, finished, capsys):
+    before = ply(finished, 40)
+    assert train(capture, finished, *SHORT, "--resume") == 0
+    assert "nothing to do" in capsys.readouterr().out
+    assert ply(finished, 40) == before
+
+
+def test_a_run_is_not_overwritten(capture, finished, capsys):
+    assert train(capture, finished, *SHORT) == 2
+    assert "holds a run already; add --resume" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (["--iterations", "50"], "iterations"),
+        (["--seed", "3"], "seed"),
+        (["--test-every", "4"], "test_every"),
+    ],
+)
+def test_another_schedule_is_refused(capture, finished, capsys, change, named):
+    assert train(capture, finished, *SHORT, *change, "--resume") == 2
+    said = capsys.readouterr().err
+    assert named in said and said.count("\n") == 1
+
+
+def test_resume_without_a_run_starts_over_and_says_so(capture, tmp_path, capsys):
+    assert train(capture, tmp_path / "new", *SHORT, "--resume") == 0
+    assert "holds no run to resume; starting at the beginning" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_resume_without_a_checkpoint_starts_over_and_says_so(capture, finished, tmp_path, capsys):
+    out = tmp_path / "bare"
+    out.mkdir()
+    for name in ("config.json", "log.jsonl"):
+        (out / name).write_bytes((finished / name).read_bytes())
+    assert train(capture, out, *SHORT, "--resume") == 0
+    assert "holds no checkpoint; starting at the beginning" in capsys.readouterr().out.replace("\n", " ")
+    assert ply(out, 40) == ply(finished, 40)
+
+
+def test_a_truncated_checkpoint_costs_one_line(capture, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(capture, out, *SHORT, "--time-limit", "0.001s") == 0
+    (out / "checkpoints" / "iteration_1.safetensors").write_bytes(b"\0" * 100)
+    capsys.readouterr()
+    assert train(capture, out, *SHORT, "--resume") == 2
+    said = capsys.readouterr().err
+    assert "is damaged" in said and "delete it" in said and said.count("\n") == 1
+
+
+def test_a_time_limit_leaves_a_scene_and_metrics_and_can_be_lifted(capture, finished, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(capture, out, *SHORT, "--time-limit", "0.001s") == 0
+    metrics = RunFolder(out).read_metrics()
+    assert metrics["iterations"] == 1 and metrics["test"]["num_images"] == 2
+    assert "time limit" in capsys.readouterr().out
+    assert train(capture, out, *SHORT, "--resume") == 0
+    assert ply(out, 40) == ply(finished, 40)
+
+
+@pytest.mark.own_process
+def test_a_full_disk_leaves_the_last_checkpoint(capture, tmp_path):
+    """A limit on the size of files stands for the disk: the log still fits, the checkpoint that grew does not."""
+    out = tmp_path / "run"
+    completed(capture, out, *LONG, "--time-limit", "0.001s")
+    good = checkpoints(out)[-1]
+    before = good.read_bytes()
+    words = [*COMMAND, "train", str(capture), "--out", str(out), *LONG, "--resume"]
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) - 1000,) * 2)
+
+    done = subprocess.run(words, check=False, preexec_fn=limit, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    assert "cannot be written" in done.stderr and done.stderr.count("\n") == 1
+    assert good.read_bytes() == before and checkpoints(out) == [good]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_costs_one_line(capture, tmp_path, capsys):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    assert train(capture, tmp_path / "locked" / "run", *SHORT) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_file_in_the_place_of_the_folder(capture, tmp_path, capsys):
+    (tmp_path / "file").write_text("x")
+    assert train(capture, tmp_path / "file", *SHORT) == 2
+    assert train(capture, tmp_path / "file" / "run", *SHORT) == 2
+    assert capsys.readouterr().err.count("\n") == 2
+
+
+@pytest.mark.parametrize(("strategy", "cap"), [("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 320)])
+def test_the_cap_holds_from_the_first_iteration_to_the_last(capture, tmp_path, strategy, cap):
+    """The start cloud has more points than the lower cap."""
+    options = [*LONG[2:], "--iterations", "300", "--strategy", strategy, "--max-gaussians", str(cap)]
+    assert train(capture, tmp_path / "run", *options, "--eval-every", "0", "--save-every", "0") == 0
+    counts = [line["num_gaussians"] for line in RunFolder(tmp_path / "run").log() if "num_gaussians" in line]
+    assert max(counts) <= cap and min(counts) > 0
+    if strategy == "mcmc":
+        reached = counts.index(cap)
+        assert set(counts[reached:]) == {cap}, "and stays there"
+
+
+def test_far_coordinates_are_trained_near_and_written_far(tmp_path):
+    views, points, colors = procedural_capture(48, 8)
+    shift = np.array([1e5, -2e5, 3e4])
+    moved = []
+    for view in views:
+        camera = view.camera
+        there = type(camera)(
+            camera.R, camera.eye + shift, camera.fx, camera.fy, camera.cx, camera.cy, camera.H, camera.W
+        )
+        moved.append(type(view)(there, view.image, name=view.name))
+    write_colmap(tmp_path / "near", views, points, colors)
+    write_colmap(tmp_path / "far", moved, points + shift, colors)
+    scores, means = [], []
+    for name in ("near", "far"):
+        assert train(tmp_path / name, tmp_path / f"run_{name}", *SHORT) == 0
+        folder = RunFolder(tmp_path / f"run_{name}")
+        scores.append(folder.read_metrics()["test"]["psnr"])
+        means.append(load_ply(folder.latest_scene()[0]).means.double().median(dim=0).values.numpy())
+    assert scores[0] == pytest.approx(scores[1], abs=0.3)
+    np.testing.assert_allclose(means[1] - shift, means[0], atol=0.1)

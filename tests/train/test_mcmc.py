@@ -1,0 +1,149 @@
+"""MCMC: relocation keeps the image, the cap holds, noise moves what is faint, regularisers are their gradients."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu import ArgumentError, Camera
+from gsplat_edu.gaussians import cov3d_t
+from gsplat_edu.render.api import render
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.density.mcmc import MCMC, MOST_SHARERS, shared_shape
+from gsplat_edu.train.initialize import random_ball
+from gsplat_edu.train.optimizer import Adam
+
+CONFIG = TrainConfig(strategy="mcmc", max_gaussians=100)
+
+
+def scene(count=60, dtype=torch.float64):
+    return random_ball(count, torch.Generator().manual_seed(0), dtype).trainable()
+
+
+def made(gaussians, config=CONFIG, seed=0):
+    return MCMC(config, torch.Generator().manual_seed(seed)), Adam(gaussians, config.learning_rates)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7, MOST_SHARERS])
+@pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
+def test_sharers_have_the_papers_opacity_and_scale(n, opacity):
+    """The double sum of eq. 9, term by term with exact binomials, against ours."""
+    each, factor = shared_shape(torch.tensor([opacity], dtype=torch.float64), torch.tensor([n]))
+    assert 1 - (1 - float(each)) ** n == pytest.approx(opacity, rel=1e-12)
+    o = float(each)
+    total = math.fsum(
+        math.comb(i - 1, k) * (-1) ** k * o ** (k + 1) / math.sqrt(k + 1)
+        for i in range(1, n + 1)
+        for k in range(i)
+    )
+    # The sums cancel: terms up to (1 + o')^n, here at most 500, in double.
+    assert float(factor) == pytest.approx(opacity / total, rel=1e-9)
+
+
+def test_sharers_look_like_the_one_before():
+    """Along a line through its middle, n equal splats composited have nearly the integral of the one."""
+    x = np.linspace(-6, 6, 4001)
+    for n, opacity in ((2, 0.5), (5, 0.9), (20, 0.99)):
+        each, factor = (float(t) for t in shared_shape(torch.tensor([opacity]).double(), torch.tensor([n])))
+        before = opacity * np.exp(-0.5 * x**2)
+        after = 1 - (1 - each * np.exp(-0.5 * (x / factor) ** 2)) ** n
+        assert np.trapezoid(after, x) == pytest.approx(np.trapezoid(before, x), rel=1e-6)
+
+
+def test_the_dead_move_to_the_living():
+    gaussians = scene()
+    control, optimizer = made(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
+    with torch.no_grad():
+        gaussians.logit_opacities[:10] = -8.0
+        gaussians.logit_opacities[10:] = 1.0
+    for moments in (optimizer.first, optimizer.second):
+        for tensor in moments.values():
+            tensor.fill_(1.0)
+    before = gaussians.map(lambda t: t.detach().clone())
+    optimizer.learning_rates["means"] = 0.0  # no noise
+    changed, (event,) = control.update(600, gaussians, optimizer)
+    assert (event.num_relocated, event.num_added, event.num_gaussians) == (10, 0, 60) and len(changed) == 60
+    places = [int((before.means - changed.means[i]).norm(dim=1).argmin()) for i in range(10)]
+    assert all(p >= 10 and torch.equal(changed.means[i], before.means[p]) for i, p in enumerate(places))
+    hosts = sorted(set(places))
+    untouched = [i for i in range(10, 60) if i not in hosts]
+    assert torch.equal(changed.logit_opacities[untouched], before.logit_opacities[untouched])
+    assert (changed.opacities[hosts] < before.opacities[hosts]).all()
+    assert (optimizer.first["means"][[*range(10), *hosts]] == 0).all()
+    assert (optimizer.first["means"][untouched] == 1).all()
+
+
+def test_growth_reaches_the_cap_and_stays():
+    gaussians = scene(30)
+    control, optimizer = made(gaussians)
+    counts = []
+    for iteration in range(600, 5_000, 100):
+        gaussians, _ = control.update(iteration, gaussians, optimizer)
+        counts.append(len(gaussians))
+    assert counts[0] == 31 and max(counts) == 100 == counts[-1]
+    assert counts == sorted(counts)
+    assert all(len(moments["means"]) == 100 for moments in (optimizer.first, optimizer.second))
+
+
+@pytest.mark.parametrize(
+    ("iteration", "due"), [(500, False), (600, True), (650, False), (24_900, True), (25_000, False)]
+)
+def test_the_window(iteration, due):
+    gaussians = scene()
+    control, optimizer = made(gaussians)
+    assert bool(control.update(iteration, gaussians, optimizer)[1]) == due
+
+
+def test_noise_moves_the_faint_along_their_own_axes():
+    """20,000 copies of one faint Gaussian: the covariance of their moves is (rate noise gate)² Sigma Sigma."""
+    gaussians = scene(1).map(lambda t: t.detach().repeat(20_000, *([1] * (t.ndim - 1))).clone())
+    gaussians.log_scales[:] = torch.tensor([-1.0, -2.0, -3.0]).double()
+    gaussians.logit_opacities[:] = math.log(0.005 / 0.995)
+    gaussians = gaussians.trainable()
+    control, optimizer = made(gaussians)
+    optimizer.learning_rates["means"] = 1e-6
+    before = gaussians.means.detach().clone()
+    changed, _ = control.update(0, gaussians, optimizer)
+    moves = (changed.means - before).detach().numpy()
+    sigma = cov3d_t(gaussians.log_scales[:1], gaussians.quats[:1])[0].detach().numpy()
+    expected = (1e-6 * 5e5 * 0.5) ** 2 * sigma @ sigma
+    # Relative error of a sample covariance: sqrt(2 / 20,000) = 1 %; five of those.
+    assert np.abs(np.cov(moves.T) - expected).max() < 0.05 * np.abs(expected).max()
+
+
+def test_opaque_gaussians_stay_where_they_are():
+    gaussians = scene()
+    with torch.no_grad():
+        gaussians.logit_opacities.fill_(3.0)
+    control, optimizer = made(gaussians)
+    before = gaussians.means.detach().clone()
+    changed, _ = control.update(0, gaussians, optimizer)
+    assert (changed.means - before).abs().max() < 1e-12
+
+
+def test_regularisers_add_their_gradients():
+    gaussians = scene()
+    output = render(gaussians, Camera.looking_at((0, 0, -3), (0, 0, 0), 9, 9, 8, 8))
+    (0.0 * output.image.sum()).backward()
+    control, _ = made(gaussians)
+    control.observe(gaussians, output)
+    twin = gaussians.trainable()
+    (0.01 * twin.opacities.mean() + 0.01 * twin.scales.mean()).backward()
+    torch.testing.assert_close(gaussians.logit_opacities.grad, twin.logit_opacities.grad)
+    torch.testing.assert_close(gaussians.log_scales.grad, twin.log_scales.grad)
+    assert (gaussians.means.grad == 0).all()
+
+
+def test_all_dead_is_survived():
+    gaussians = scene()
+    with torch.no_grad():
+        gaussians.logit_opacities.fill_(-9.0)
+    control, optimizer = made(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
+    changed, (event,) = control.update(600, gaussians, optimizer)
+    assert event.num_relocated == 0 and len(changed) == 60
+
+
+def test_a_cap_is_needed():
+    with pytest.raises(ArgumentError, match="^max_gaussians: "):
+        MCMC(TrainConfig(strategy="mcmc"), torch.Generator())
