@@ -1,0 +1,38 @@
+"""Blender's synthetic scenes: transforms_train.json, transforms_val.json and transforms_test.json.
+
+The frames are those of transforms.json. Source: the scenes of Mildenhall et al. 2020, "NeRF".
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsplat_edu.data.capture import Capture, Frame, is_file, missing_note
+from gsplat_edu.data.points import BLENDER_CUBE
+from gsplat_edu.data.transforms import nothing_found, read_frames, read_json
+
+TRAIN_FILE = "transforms_train.json"
+
+
+def read_blender(folder: Path) -> Capture:
+    """Read a Blender scene: its training views, and to test with those of test, or of val where there is no test.
+
+    Args:
+        folder: The folder with transforms_train.json.
+
+    Raises:
+        DatasetError: as for `read_transforms`.
+    """
+    frames, missing = list[Frame](), list[str]()
+    held_out = next((p for part in ("test", "val") if is_file(p := folder / f"transforms_{part}.json")), None)
+    for part, path in (("train", folder / TRAIN_FILE), ("test", held_out)):
+        if path is None:
+            continue
+        contents = read_json(path)
+        found = read_frames(path, contents, part)
+        if part == "train" and not found.frames:
+            raise nothing_found(path, found.missing)
+        frames += found.frames
+        missing += found.missing
+    notes = [missing_note(missing, len(frames) + len(missing))] if missing else []
+    return Capture("Blender", tuple(frames), None, tuple(notes), cube=BLENDER_CUBE)

@@ -1,0 +1,381 @@
+"""COLMAP's sparse models: cameras, images and points3D, as .bin or .txt.
+
+World and camera axes are those of this project. Quaternions are (w, x, y, z) and turn world into camera
+coordinates, x_cam = R x + t; so the camera stands at -R' t. What rigs.bin and frames.bin of newer versions say is
+in images.bin too, so they are not read.
+
+Source: COLMAP's documentation, "Output Format" and "Camera Models".
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsplat_edu.data.capture import Capture, Cloud, Frame, checked_frame, is_file, missing_note
+from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.gaussian_math import quat_to_R
+
+MODELS: tuple[tuple[str, str], ...] = (
+    ("SIMPLE_PINHOLE", "f cx cy"),
+    ("PINHOLE", "fx fy cx cy"),
+    ("SIMPLE_RADIAL", "f cx cy k1"),
+    ("RADIAL", "f cx cy k1 k2"),
+    ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
+    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    ("FOV", ""),
+    ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
+    ("RADIAL_FISHEYE", "f cx cy k1 k2"),
+    ("THIN_PRISM_FISHEYE", ""),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", ""),
+    ("SIMPLE_DIVISION", ""),
+    ("DIVISION", ""),
+    ("SIMPLE_FISHEYE", "f cx cy"),
+    ("FISHEYE", "fx fy cx cy"),
+    ("EUCM", ""),
+    ("EQUIRECTANGULAR", ""),
+)
+"""COLMAP's camera models by their number, with their parameters; none where this project does not undistort it."""
+
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+"""Where a model is looked for in a capture, in this order."""
+
+
+class Pose(NamedTuple):
+    """An image of a model."""
+
+    name: str
+    camera: int
+    quat: tuple[float, ...]  # (w, x, y, z), world to camera
+    shift: tuple[float, ...]  # world units
+
+
+def find_model(folder: Path) -> Path | None:
+    """Find the folder that holds a model, by its cameras file or its images file.
+
+    Args:
+        folder: The capture.
+    """
+    for place in PLACES:
+        model = folder / place
+        if any(
+            is_file(model / f"{part}{suffix}")
+            for part in ("cameras", "images")
+            for suffix in (".bin", ".txt")
+        ):
+            return model
+    return None
+
+
+def read_colmap(folder: Path, model: Path) -> Capture:
+    """Read a capture whose poses COLMAP found.
+
+    Args:
+        folder: The capture, with the photos in images/ or beside.
+        model: The folder with cameras, images and perhaps points3D.
+
+    Raises:
+        DatasetError: a file is missing, cut short or malformed; a camera model is not undistorted here; a pose is
+            none; or no image has a file.
+    """
+    suffix = _suffix(model)
+    lenses = read_cameras(model / f"cameras{suffix}")
+    listed = model / f"images{suffix}"
+    poses = read_images(listed)
+    if not poses:
+        raise DatasetError(f"{listed}: lists no images; run COLMAP's mapper, or name another model")
+    photos, masks = _photo_folders(folder, model)
+    frames, missing = list[Frame](), list[str]()
+    for pose in poses:
+        where = f"{listed}, image {pose.name}"
+        if pose.camera not in lenses:
+            raise DatasetError(
+                f"{where}: its camera {pose.camera} is not in cameras{suffix}; the two do not belong together"
+            )
+        R, eye = _placed(where, pose)
+        image = next((p for p in _candidates(photos, pose.name) if is_file(p)), None)
+        mask = next((p for p in _masks(masks, pose.name) if is_file(p)), None)
+        frame = Frame(pose.name, image or folder, lenses[pose.camera], R, eye, mask)
+        frame = checked_frame(where, frame)
+        if image is None:
+            missing.append(pose.name)
+        else:
+            frames.append(frame)
+    if not frames:
+        raise DatasetError(
+            f"{folder}: none of the {len(poses)} photos that {listed.name} lists has a file, first {missing[0]}; put "
+            "them into images/"
+        )
+    notes = [missing_note(missing, len(poses))] if missing else []
+    others = sorted(
+        p.name for p in model.parent.iterdir() if p.is_dir() and p.name.isdecimal() and p != model
+    )
+    if model.name == "0" and others:
+        notes.append(f"{model.parent} holds {len(others) + 1} models: 0 is read, {', '.join(others)} not")
+    return Capture("COLMAP", tuple(frames), read_points(model), tuple(notes))
+
+
+def read_points(model: Path) -> Cloud | None:
+    """Read the points of a model, or nothing where there is no such file or it is empty.
+
+    Args:
+        model: The folder with points3D.bin or points3D.txt.
+
+    Raises:
+        DatasetError: the file is cut short or malformed.
+    """
+    suffix = _suffix(model)
+    path = model / f"points3D{suffix}"
+    if not is_file(path):
+        return None
+    rows = _points_bin(path) if suffix == ".bin" else _points_txt(path)
+    if not rows:
+        return None
+    table = np.array(rows, dtype=np.float64)
+    return Cloud(table[:, :3], np.clip(table[:, 3:] / 255.0, 0.0, 1.0))
+
+
+def read_cameras(path: Path) -> dict[int, Lens]:
+    """Read the lenses of a model, by camera number.
+
+    Args:
+        path: cameras.bin or cameras.txt.
+
+    Raises:
+        DatasetError: the file is cut short or malformed, or a camera model is not undistorted here.
+    """
+    lenses = {}
+    for where, camera, model, W, H, values in (
+        _cameras_bin(path) if path.suffix == ".bin" else _cameras_txt(path)
+    ):
+        try:
+            lenses[camera] = _lens(model, W, H, values)
+        except DatasetError as error:
+            raise DatasetError(f"{where}: {error}") from None
+    return lenses
+
+
+def read_images(path: Path) -> list[Pose]:
+    """Read names and poses, in the order of the file.
+
+    Args:
+        path: images.bin or images.txt.
+
+    Raises:
+        DatasetError: the file is cut short or malformed.
+    """
+    return _images_bin(path) if path.suffix == ".bin" else _images_txt(path)
+
+
+def _suffix(model: Path) -> str:
+    for suffix in (".bin", ".txt"):
+        if is_file(model / f"cameras{suffix}") and is_file(model / f"images{suffix}"):
+            return suffix
+    raise DatasetError(
+        f"{model}: holds not both of cameras and images, as .bin or as .txt; copy the whole model"
+    )
+
+
+def _photo_folders(folder: Path, model: Path) -> tuple[list[Path], list[Path]]:
+    """Return where photos may lie, and where masks may."""
+    photos, masks = [folder / "images", folder], [folder / "masks"]
+    if model == folder / ".":  # the model itself was named; its photos lie where they would for the capture
+        above = folder.absolute().parents[:2]
+        photos += [parent / "images" for parent in above]
+        masks += [parent / "masks" for parent in above]
+    return photos, masks
+
+
+def _candidates(folders: Sequence[Path], name: str) -> Iterator[Path]:
+    yield from (folder / name for folder in folders)
+    yield from (folder / Path(name).name for folder in folders if folder.name == "images")
+
+
+def _masks(folders: Sequence[Path], name: str) -> Iterator[Path]:
+    for folder in folders:
+        for base in (name, Path(name).name):
+            yield folder / f"{base}.png"
+            if Path(base).name:
+                yield (folder / base).with_suffix(".png")
+
+
+def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+    shift = np.array(pose.shift)
+    if not np.all(np.abs(shift) < 1e100):  # what is left is for checked_frame
+        raise DatasetError(f"{where}: its pose is NaN or infinite; take the image out of the model")
+    if not np.all(np.isfinite(pose.quat)) or not np.any(pose.quat):
+        raise DatasetError(
+            f"{where}: its quaternion {pose.quat} is no rotation; take the image out of the model"
+        )
+    R = quat_to_R(pose.quat)
+    return R, -R.T @ shift
+
+
+def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
+    names = dict(MODELS).get(model, "").split()
+    if not names:
+        raise DatasetError(
+            f"camera model {model} is not undistorted here; run `colmap image_undistorter` and load its output"
+        )
+    if len(values) != len(names):
+        raise DatasetError(f"{model} has {len(names)} parameters ({', '.join(names)}), got {len(values)}")
+    named = dict(zip(names, values, strict=True))
+    if "f" in named:
+        named["fx"] = named["fy"] = named.pop("f")
+    return lens_of(named, W, H, fisheye=model.endswith("FISHEYE"))
+
+
+class _Binary:
+    """Little-endian numbers from a file that may be cut short."""
+
+    def __init__(self, path: Path, smallest: int) -> None:
+        self.path, self.at, self.where = path, 0, "its header"
+        try:
+            self.data = path.read_bytes()
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+        (self.count,) = self.take(struct.Struct("<Q"))
+        if self.count * smallest > len(self.data) - self.at:
+            raise self.corrupt(f"its header says {self.count} entries, more than it has room for")
+
+    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Read the numbers of a layout."""
+        if self.at + layout.size > len(self.data):
+            raise self.corrupt(f"it ends inside {self.where}")
+        self.at += layout.size
+        return layout.unpack_from(self.data, self.at - layout.size)
+
+    def skip(self, count: int, size: int) -> None:
+        """Leave out so many entries of so many bytes."""
+        if count * size > len(self.data) - self.at:
+            raise self.corrupt(f"it ends inside {self.where}")
+        self.at += count * size
+
+    def word(self) -> str:
+        """Read up to a zero byte."""
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise self.corrupt(f"it ends inside {self.where}")
+        text, self.at = self.data[self.at : end].decode("utf-8", "replace"), end + 1
+        return text
+
+    def corrupt(self, what: str) -> DatasetError:
+        """Make the error that names the file."""
+        return DatasetError(f"{self.path}: {what}; the file is cut short or corrupt, copy it again")
+
+
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I7dI")
+_POINT = struct.Struct("<Q3d3BdQ")
+_COUNT = struct.Struct("<Q")
+_CameraRow = tuple[str, int, str, int, int, tuple[float, ...]]
+
+
+def _cameras_bin(path: Path) -> Iterator[_CameraRow]:
+    file = _Binary(path, _CAMERA.size)
+    for _ in range(file.count):
+        file.where = "a camera"
+        camera, kind, W, H = file.take(_CAMERA)
+        file.where = f"camera {camera}"
+        where = f"{path}, camera {camera}"
+        if not 0 <= kind < len(MODELS):
+            raise DatasetError(
+                f"{where}: camera model number {kind} is unknown; run `colmap image_undistorter` and load its output"
+            )
+        model, names = MODELS[kind]
+        values = file.take(struct.Struct(f"<{len(names.split())}d"))
+        yield where, camera, model, W, H, values
+
+
+def _images_bin(path: Path) -> list[Pose]:
+    file, poses = _Binary(path, _IMAGE.size + 1 + _COUNT.size), []
+    for number in range(file.count):
+        file.where = f"image {number + 1} of {file.count}"
+        _, *pose, camera = file.take(_IMAGE)
+        name = file.word()
+        file.skip(file.take(_COUNT)[0], 24)
+        poses.append(Pose(name, camera, tuple(pose[:4]), tuple(pose[4:])))
+    return poses
+
+
+def _points_bin(path: Path) -> list[tuple[float, ...]]:
+    file, rows = _Binary(path, _POINT.size), list[tuple[float, ...]]()
+    for number in range(file.count):
+        file.where = f"point {number + 1} of {file.count}"
+        row = file.take(_POINT)
+        file.skip(row[-1], 8)
+        rows.append(row[1:7])
+    return rows
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").split("\n")
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+
+
+def _malformed(path: Path, number: int, expected: str) -> DatasetError:
+    return DatasetError(f"{path}, line {number}: expected {expected}; the file is malformed, export it again")
+
+
+def _cameras_txt(path: Path) -> Iterator[_CameraRow]:
+    for number, line in enumerate(_lines(path), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            camera, model, W, H, *values = words
+            yield (
+                f"{path}, line {number}",
+                int(camera),
+                model,
+                int(W),
+                int(H),
+                tuple(float(v) for v in values),
+            )
+        except ValueError:
+            raise _malformed(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from None
+
+
+def _images_txt(path: Path) -> list[Pose]:
+    poses, lines = list[Pose](), enumerate(_lines(path), 1)
+    for number, line in lines:
+        words = line.split(maxsplit=9)
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            _, *pose, camera, name = words
+            values = [float(v) for v in pose]
+            if len(values) != 7:
+                raise ValueError
+            poses.append(Pose(name.strip(), int(camera), tuple(values[:4]), tuple(values[4:])))
+        except ValueError:
+            raise _malformed(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
+        # The image's 2D points follow on a line of their own, which may be empty but is never left out.
+        _, observed = next(lines, (number + 1, ""))
+        if len(observed.split()) % 3:
+            raise _malformed(path, number + 1, "the image's points as X Y POINT3D_ID, or an empty line")
+    return poses
+
+
+def _points_txt(path: Path) -> list[tuple[float, ...]]:
+    rows = []
+    for number, line in enumerate(_lines(path), 1):
+        words = line.split(maxsplit=7)
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            if len(words) < 8:
+                raise ValueError
+            rows.append(tuple(float(v) for v in words[1:7]))
+        except ValueError:
+            raise _malformed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from None
+    return rows

@@ -1,0 +1,297 @@
+"""The door to captures: a folder on disk in, views with cameras, photos and start points out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.blender import TRAIN_FILE, read_blender
+from gsplat_edu.data.capture import Capture, Cloud, Frame, is_file, photo_file
+from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
+from gsplat_edu.data.images import ImageStore
+from gsplat_edu.data.points import finite_cloud, looked_at, random_cloud, read_points_ply
+from gsplat_edu.data.transforms import read_transforms
+from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.validation import float64_array, in_range, whole_number
+from gsplat_edu.views import View
+
+TEST_EVERY = 8
+"""Every how manieth view is for testing where the capture does not say: the habit of the field."""
+
+FAR = 1e4
+"""Camera coordinates beyond which the origin is moved, world units: float32 then keeps less than 1e-3 of them."""
+
+EXTENT_MARGIN = 1.1
+"""The extent is this much larger than the cameras' spread (the code of Kerbl et al. 2023)."""
+
+UNEVEN = 1.5
+"""Ratio of the two focal lengths beyond which the user is told: pixels of real cameras are all but square."""
+
+PHOTO_ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic")
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """How a capture is read.
+
+    Args:
+        resolution: None: as the photos are. Below 32: a factor to divide both sizes by, 2 for half. From 32 on:
+            the longest side in px; nothing is enlarged.
+        test_every: Every n-th view by sorted name is for testing, 0 for none; a split that the capture has of
+            its own is then dissolved. None: the capture's own split if it has one, else every 8th.
+        background: (r, g, b), 0 to 1: photos with alpha are put over it when read. None keeps the alpha, for a
+            background that is chosen later.
+        image_memory: Bytes of decoded photos kept in memory; the others are read again when they are needed.
+
+    Raises:
+        ArgumentError: a value is not one of these, or the split would leave no view to train on.
+    """
+
+    resolution: float | None = None
+    test_every: int | None = None
+    background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
+    image_memory: int = 4 * 2**30
+
+    def __post_init__(self) -> None:
+        if self.resolution is not None and (in_range("resolution", self.resolution, 1.0) > 1e6):
+            raise ArgumentError("resolution: is above 1e6; give a factor below 32, or the longest side in px")
+        if self.test_every is not None and whole_number("test_every", self.test_every, 0) == 1:
+            raise ArgumentError(
+                "test_every: is 1, which leaves no view to train on; give 0 for none, or 2 and more"
+            )
+        if self.background is not None:
+            r, g, b = (
+                in_range(f"background[{i}]", value, 0.0, 1.0)
+                for i, value in enumerate(float64_array("background", self.background, (3,)))
+            )
+            object.__setattr__(self, "background", (r, g, b))
+        whole_number("image_memory", self.image_memory, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A capture, ready to train on.
+
+    Args:
+        path: What was loaded.
+        layout: "COLMAP", "transforms.json" or "Blender".
+        train: Views to train on, sorted by name; at least one.
+        test: Views to judge with, sorted by name.
+        points: (N, 3) where to start, in the frame of the cameras, world units.
+        colors: (N, 3) their colours, 0 to 1.
+        origin: (3,) what was subtracted from all coordinates; zero unless they were beyond 1e4.
+        notes: Sentences the user wants to read: what was skipped, rescaled, undistorted or made up.
+        images: Where the photos are kept.
+    """
+
+    path: Path
+    layout: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    points: Float64[np.ndarray, "N 3"]
+    colors: Float64[np.ndarray, "N 3"]
+    origin: Float64[np.ndarray, "3"]
+    notes: tuple[str, ...]
+    images: ImageStore
+
+    def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
+        """Decode every photo once, on all cores, and keep those within the budget.
+
+        Args:
+            progress: Called with the photos done and their total after each, from the calling thread.
+
+        Raises:
+            DatasetError: names the first photo, by name, that cannot be decoded.
+        """
+        views = (*self.train, *self.test)
+
+        def decode(view: View) -> None:
+            view.read()  # the photo is not returned: the futures would keep what is over the budget
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            futures = [pool.submit(decode, view) for view in views]
+            try:
+                for done, future in enumerate(futures, 1):
+                    future.result()
+                    if progress is not None:
+                        progress(done, len(views))
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+
+def load_dataset(
+    path: str | Path, settings: DataSettings = DataSettings(), *, points: Path | None = None
+) -> Dataset:
+    """Load a capture. Photos are opened for their sizes only; their pixels are read when asked for.
+
+    Args:
+        path: The folder of a capture of COLMAP, nerfstudio, instant-ngp or Blender; or a transforms.json.
+        settings: Resolution, split, background and memory.
+        points: A PLY to start from instead of the capture's points, in the capture's coordinates.
+
+    Raises:
+        DatasetError: nothing of that kind is there, or it cannot be used; names the file and what to do.
+    """
+    path = Path(path)
+    capture = _read(path)
+    notes = list(capture.notes)
+    frames = sorted(capture.frames, key=lambda frame: frame.name)
+    frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
+    store = ImageStore(settings.image_memory)
+    made = [_view(frame, settings, store) for frame in frames]
+    views = [view for view, _ in made]
+    notes += _lens_notes(frames, [rescaled for _, rescaled in made])
+    train, test = _split(path, views, [frame.part for frame in frames], settings.test_every, notes)
+    start = _start(cloud, [view.camera for view in views], capture.cube, notes, origin)
+    return Dataset(path, capture.layout, train, test, start.points, start.colors, origin, tuple(notes), store)
+
+
+def scene_extent(cameras: Sequence[Camera]) -> float:
+    """Measure how large a scene is by where its cameras stand.
+
+    1.1 max_i |e_i - mean e|,  e_i: centre of camera i
+
+    Args:
+        cameras: At least one.
+
+    Returns:
+        World units; 1 where all cameras stand at one place, since that says nothing about the scene.
+
+    Raises:
+        ArgumentError: there is no camera.
+
+    Source: the code of Kerbl et al. 2023.
+    """
+    if not cameras:
+        raise ArgumentError("cameras: is empty; the extent of a scene needs at least one")
+    eyes = np.stack([camera.eye for camera in cameras])
+    spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
+    # Cameras that differ by rounding alone stand at one place too.
+    return EXTENT_MARGIN * spread if spread > 1e-9 * max(1.0, float(np.abs(eyes).max())) else 1.0
+
+
+def _read(path: Path) -> Capture:
+    """Find out what a path holds, and read it."""
+    if path.suffix.lower() == ".json" and is_file(path):
+        return read_blender(path.parent) if path.name == TRAIN_FILE else read_transforms(path)
+    if not path.is_dir():
+        raise DatasetError(f"{path}: is no folder and no .json file; name the folder of a capture")
+    if is_file(path / TRAIN_FILE):
+        return read_blender(path)
+    model = find_model(path)
+    if is_file(path / "transforms.json"):
+        capture = read_transforms(path / "transforms.json")
+        note = f"{path} holds transforms.json and a COLMAP model: the poses are those of transforms.json"
+        return capture if model is None else replace(capture, notes=(note, *capture.notes))
+    if model is not None:
+        return read_colmap(path, model)
+    places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
+    looked = f"{TRAIN_FILE}, transforms.json, and cameras and images (.bin or .txt) in {places}"
+    folders = [folder for folder in (path, path / "images") if folder.is_dir()]
+    if any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in folder.iterdir()):
+        raise DatasetError(
+            f"{path}: holds photos but no camera poses; find them with structure from motion, such as "
+            f"`colmap automatic_reconstructor` (looked for {looked})"
+        )
+    raise DatasetError(f"{path}: is no capture; looked for {looked}")
+
+
+def _near_origin(
+    frames: list[Frame], cloud: Cloud | None, notes: list[str]
+) -> tuple[list[Frame], Cloud | None, Float64[np.ndarray, "3"]]:
+    """Move a scene whose coordinates float32 cannot hold, such as map coordinates, to the origin."""
+    eyes = np.stack([frame.eye for frame in frames])
+    if cloud is not None:
+        cloud, note = finite_cloud(cloud)
+        notes += [note] if note else []
+        cloud = cloud if len(cloud.points) else None
+    if np.abs(eyes).max() <= FAR:
+        return frames, cloud, np.zeros(3)
+    origin = np.round(eyes.mean(axis=0))
+    notes.append(f"coordinates are large: {tuple(origin.tolist())} was subtracted from all of them")
+    frames = [replace(frame, eye=frame.eye - origin) for frame in frames]
+    return frames, None if cloud is None else replace(cloud, points=cloud.points - origin), origin
+
+
+def _view(frame: Frame, settings: DataSettings, store: ImageStore) -> tuple[View, bool]:
+    """Make the view of a frame; say whether its intrinsics were rescaled."""
+    source, camera, rescaled = photo_file(frame, settings.resolution, settings.background)
+    return View.stored(camera, partial(store.read, source), frame.name), rescaled
+
+
+def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
+    """Say what was done to the intrinsics."""
+    notes, distorted = [], [frame for frame in frames if frame.lens.distorts]
+    if distorted:
+        notes.append(
+            f"{len(distorted)} of {len(frames)} photos come from a lens that distorts: undistorted when read"
+        )
+    if others := [frame for frame, is_it in zip(frames, rescaled, strict=True) if is_it]:
+        notes.append(
+            f"{len(others)} of {len(frames)} photos have another size than their camera, first {others[0].name}: "
+            "intrinsics rescaled"
+        )
+    uneven = [frame for frame in frames if not 1 / UNEVEN < frame.lens.fx / frame.lens.fy < UNEVEN]
+    if uneven:
+        lens = uneven[0].lens
+        notes.append(
+            f"{len(uneven)} of {len(frames)} cameras have focal lengths far apart, first {lens.fx:.4g} and "
+            f"{lens.fy:.4g} px: the calibration may be wrong"
+        )
+    return notes
+
+
+def _split(
+    path: Path, views: Sequence[View], parts: Sequence[str], test_every: int | None, notes: list[str]
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """Divide views, sorted by name, into those to train on and those to test with."""
+    if test_every is None and any(parts):
+        train, test = (
+            tuple(v for v, p in zip(views, parts, strict=True) if p == part) for part in ("train", "test")
+        )
+        if left_out := len(views) - len(train) - len(test):
+            notes.append(f"{left_out} of {len(views)} photos are in none of the capture's lists: left out")
+    elif test_every == 0 or (test_every is None and len(views) == 1):
+        train, test = tuple(views), ()
+        if test_every is None:
+            notes.append("the capture has one photo: it is trained on, and there is none to test with")
+    else:
+        every = test_every or TEST_EVERY
+        train = tuple(view for i, view in enumerate(views) if i % every)
+        test = tuple(view for i, view in enumerate(views) if i % every == 0)
+    if not train:
+        raise DatasetError(
+            f"{path}: the split leaves none of its {len(views)} photos to train on; set test_every to 0"
+        )
+    return train, test
+
+
+def _start(
+    cloud: Cloud | None,
+    cameras: Sequence[Camera],
+    cube: float | None,
+    notes: list[str],
+    origin: Float64[np.ndarray, "3"],
+) -> Cloud:
+    """Return the points to start from, made up where there are none."""
+    if cloud is not None:
+        return cloud
+    if cube is not None:
+        made = random_cloud(-origin, cube)
+        where = f"in the cube +-{cube:g}"
+    else:
+        half_edge = scene_extent(cameras)
+        centre = looked_at(cameras)
+        made = random_cloud(centre, half_edge)
+        where = f"within {half_edge:.4g} of ({', '.join(f'{c:.4g}' for c in centre)})"
+    notes.append(f"the capture has no points: {len(made.points):,} random ones {where} are the start")
+    return made

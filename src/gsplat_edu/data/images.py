@@ -1,0 +1,229 @@
+"""From an image file to the pixels of a view: decode, undistort, downscale, mask, and keep what memory allows."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from PIL import Image
+
+from gsplat_edu.data.lens import Lens, Maps, undistortion
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.views import Photo
+
+# What Pillow's decoders raise on files that are cut short, corrupt, absurdly large or no images.
+_UNDECODABLE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    KeyError,
+    IndexError,
+    OverflowError,
+    struct.error,
+    Image.DecompressionBombError,
+)
+
+ALL_OF_IT = 0.9999
+"""Share of a pixel's sources that have to count for it to count: all, up to float32 rounding."""
+
+
+@dataclass(frozen=True)
+class PhotoFile:
+    """All that the pixels of a view depend on.
+
+    Args:
+        path: The image file.
+        mask: An image of the same size, zero where a pixel does not count; None where all do.
+        lens: The camera that took it, at the file's size.
+        W: Width to downscale to, px.
+        H: Height to downscale to, px.
+        background: (r, g, b), 0 to 1, behind what is transparent; None keeps the alpha.
+    """
+
+    path: Path
+    mask: Path | None
+    lens: Lens
+    W: int
+    H: int
+    background: tuple[float, float, float] | None
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Read width and height from a file's header, px. EXIF orientation is ignored, as COLMAP ignores it.
+
+    Raises:
+        DatasetError: the file is no image.
+    """
+    try:
+        with Image.open(path) as file:
+            return file.size
+    except _UNDECODABLE as error:
+        raise _undecodable(path, error) from None
+
+
+def decode(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
+    """Decode an image file of any kind Pillow knows to 8 bits.
+
+    Returns:
+        RGB, and the alpha: None where the photo is opaque.
+
+    Raises:
+        DatasetError: the file is cut short, corrupt or no image.
+    """
+    try:
+        with Image.open(path) as file:
+            if file.mode.startswith("I"):  # 16-bit gray
+                gray = np.clip(np.asarray(file, dtype=np.int64), 0, 65535)
+                return np.repeat(((gray + 128) // 257).astype(np.uint8)[..., None], 3, axis=2), None
+            if file.mode == "F":
+                raise ValueError("its pixels are floats")
+            if not file.has_transparency_data:
+                return np.array(file.convert("RGB")), None
+            pixels = np.array(file.convert("RGBA"))
+    except _UNDECODABLE as error:
+        raise _undecodable(path, error) from None
+    rgb, alpha = np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
+    return rgb, None if alpha.min() == 255 else alpha
+
+
+def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
+    """Decode a mask: true where it is not zero.
+
+    Raises:
+        DatasetError: the file is cut short, corrupt or no image.
+    """
+    try:
+        with Image.open(path) as file:
+            plain = file if file.mode[0] in "IF" else file.convert("L")
+            mask: Bool[np.ndarray, "H W"] = np.asarray(plain) != 0
+            return mask
+    except _UNDECODABLE as error:
+        raise _undecodable(path, error) from None
+
+
+def develop(source: PhotoFile) -> Photo:
+    """Decode a photo and bring it to the view's camera: over the background, undistorted, downscaled.
+
+    Raises:
+        DatasetError: the photo or its mask cannot be decoded, or is not of the size its header said before.
+    """
+    image, alpha = decode(source.path)
+    mask = None if source.mask is None else decode_mask(source.mask)
+    for path, plane in ((source.path, image), (source.mask, mask)):
+        if plane is not None and plane.shape[:2] != (source.lens.H, source.lens.W):
+            raise DatasetError(f"{path}: its size changed while it was in use; load the capture again")
+    if alpha is not None and source.background is not None:
+        image, alpha = np.asarray(Photo(image, alpha).over(source.background)), None
+    if not source.lens.distorts and (source.W, source.H) == (source.lens.W, source.lens.H):
+        return Photo(image, alpha, mask)
+    try:
+        maps = undistortion(source.lens) if source.lens.distorts else None
+    except DatasetError as error:
+        raise DatasetError(f"{source.path}: {error}") from None
+    if alpha is None:
+        pixels = _resampled(image, maps, source.W, source.H)
+    else:
+        image, alpha = _with_alpha(image, alpha, maps, source.W, source.H)
+        pixels = image
+    return Photo(pixels, alpha, _resampled_mask(mask, maps, source.W, source.H))
+
+
+class ImageStore:
+    """The photos of a dataset: those within a budget of memory are kept, the others read again each time.
+
+    The pixels are the same either way. Any number of threads may read.
+
+    Args:
+        budget: Bytes of decoded photos to keep.
+    """
+
+    def __init__(self, budget: int) -> None:
+        self.budget = budget
+        self._kept: dict[PhotoFile, Photo] = {}
+        self._nbytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the photos kept."""
+        return self._nbytes
+
+    def __len__(self) -> int:
+        """Count the photos kept."""
+        return len(self._kept)
+
+    def read(self, source: PhotoFile) -> Photo:
+        """Return a photo, from memory where it was kept.
+
+        Raises:
+            DatasetError: as for `develop`.
+        """
+        with self._lock:
+            kept = self._kept.get(source)
+        if kept is not None:
+            return kept
+        photo = develop(source)  # outside the lock: this is what takes long
+        with self._lock:
+            if source not in self._kept and self._nbytes + photo.nbytes <= self.budget:
+                self._kept[source] = photo
+                self._nbytes += photo.nbytes
+        return photo
+
+
+def _with_alpha(
+    image: UInt8[np.ndarray, "H W 3"],
+    alpha: UInt8[np.ndarray, "H W"],
+    maps: Maps | None,
+    W: int,
+    H: int,
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
+    """Resample colour weighted by alpha: a transparent pixel has no colour to mix in."""
+    share = alpha[..., None].astype(np.float32) / 255.0
+    weighted = np.concatenate([image * share, 255.0 * share], axis=2)
+    weighted = _resampled(weighted, maps, W, H)
+    opacity = weighted[..., 3:] / 255.0
+    color = weighted[..., :3] / np.maximum(opacity, 1e-6)
+    return (
+        np.clip(np.round(color), 0, 255).astype(np.uint8),
+        np.clip(np.round(weighted[..., 3]), 0, 255).astype(np.uint8),
+    )
+
+
+def _resampled(
+    pixels: UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"], maps: Maps | None, W: int, H: int
+) -> UInt8[np.ndarray, "h w c"] | Float32[np.ndarray, "h w c"]:
+    if maps is not None:
+        pixels = cv2.remap(pixels, maps.columns, maps.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if pixels.shape[:2] != (H, W):
+        pixels = cv2.resize(pixels, (W, H), interpolation=cv2.INTER_AREA)
+    return pixels
+
+
+def _resampled_mask(
+    mask: Bool[np.ndarray, "H W"] | None, maps: Maps | None, W: int, H: int
+) -> Bool[np.ndarray, "h w"] | None:
+    if maps is not None and mask is not None:
+        moved = cv2.remap(mask.astype(np.uint8), maps.columns, maps.rows, cv2.INTER_NEAREST)
+        mask = moved != 0
+    if maps is not None and maps.valid is not None:
+        mask = maps.valid if mask is None else mask & maps.valid
+    if mask is None or mask.shape == (H, W):
+        return mask
+    shares = cv2.resize(mask.astype(np.float32), (W, H), interpolation=cv2.INTER_AREA)
+    counts: Bool[np.ndarray, "h w"] = shares >= ALL_OF_IT
+    return counts
+
+
+def _undecodable(path: Path, error: BaseException) -> DatasetError:
+    reason = getattr(error, "strerror", None) or str(error).split("\n")[0] or type(error).__name__
+    if "cannot identify" in reason:
+        reason = "it is no image that Pillow knows"
+    return DatasetError(
+        f"{path}: cannot be decoded ({reason}); replace the file, or take it out of the capture"
+    )

@@ -1,0 +1,251 @@
+"""transforms.json, in the dialects of nerfstudio and instant-ngp.
+
+`transform_matrix` is camera to world with OpenGL's camera axes (+x right, +y up, +z backward); its y and z columns
+are turned round here, once, which makes it OpenCV's. The world stays the file's.
+
+Source: nerfstudio's documentation, "Data conventions"; instant-ngp's "nerf_dataset_tips".
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsplat_edu.data.capture import Capture, Cloud, Frame, checked_frame, is_file, missing_note
+from gsplat_edu.data.colmap import find_model, read_points
+from gsplat_edu.data.images import image_size
+from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.data.points import read_points_ply
+from gsplat_edu.errors import DatasetError
+
+FISHEYE_MODEL = "OPENCV_FISHEYE"
+
+CAMERA_MODELS = ("OPENCV", FISHEYE_MODEL, "PINHOLE", "SIMPLE_PINHOLE")
+"""Words for `camera_model` that are understood; without the word it is OPENCV."""
+
+ENDINGS = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+"""What is tried behind a file_path, in this order."""
+
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+class Found(NamedTuple):
+    """The frames of a file that have a photo, and the names of those that have none."""
+
+    frames: list[Frame]
+    missing: list[str]
+
+
+def read_transforms(path: Path) -> Capture:
+    """Read a capture whose poses stand in a transforms.json.
+
+    Args:
+        path: The file; the paths in it are relative to its folder.
+
+    Raises:
+        DatasetError: the file is not JSON or lacks something, a camera model or pose cannot be used, or no frame
+            has a photo.
+    """
+    contents = read_json(path)
+    frames, missing = read_frames(path, contents)
+    if not frames:
+        raise nothing_found(path, missing)
+    notes = [missing_note(missing, len(frames) + len(missing))] if missing else []
+    return Capture("transforms.json", tuple(frames), _cloud(path, contents), tuple(notes))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds one object.
+
+    Raises:
+        DatasetError: it does not; a syntax error is named by line and column.
+    """
+    try:
+        contents = json.loads(path.read_text(encoding="utf-8-sig"))
+    except json.JSONDecodeError as error:
+        raise DatasetError(
+            f"{path}, line {error.lineno} column {error.colno}: is not JSON ({error.msg}); repair the file"
+        ) from None
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    except (UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise DatasetError(f"{path}: is not JSON ({type(error).__name__}); repair the file") from None
+    if not isinstance(contents, dict) or not isinstance(contents.get("frames"), list):
+        raise DatasetError(f"{path}: has no list of frames; it has to be a transforms.json")
+    return contents
+
+
+def nothing_found(path: Path, missing: list[str]) -> DatasetError:
+    """Make the error for a file none of whose frames has a photo."""
+    what = (
+        f"none of its {len(missing)} photos has a file, first {missing[0]}" if missing else "lists no frames"
+    )
+    return DatasetError(f"{path}: {what}; put the photos where the file says they are")
+
+
+def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Found:
+    """Read the frames of a transforms.json.
+
+    Args:
+        path: The file.
+        contents: What it holds.
+        part: The part of the dataset all frames belong to; "": what the file's own lists say.
+
+    Raises:
+        DatasetError: names the frame, and the key it lacks or that cannot be used.
+    """
+    frames, missing = list[Frame](), list[str]()
+    parts = _parts(path, contents)
+    for number, frame in enumerate(contents["frames"]):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise DatasetError(f"{path}, frame {number}: has no file_path; every frame names its photo")
+        name = _tidy(frame["file_path"])
+        image = next((p for end in ENDINGS if is_file(p := path.parent / f"{name}{end}")), None)
+        if image is None:
+            missing.append(name)
+            continue
+        where = f"{path}, frame {name}"
+        lens = _lens(where, {**contents, **frame}, image)
+        R, eye = _pose(where, frame)
+        found = Frame(
+            name, image, lens, R, eye, _mask(where, path.parent, frame), part or parts.get(name, parts[""])
+        )
+        frames.append(checked_frame(where, found))
+    return Found(frames, missing)
+
+
+def _tidy(file_path: str) -> str:
+    """Spell a path as POSIX does, without a dot in front."""
+    return PurePosixPath(file_path.replace("\\", "/")).as_posix()
+
+
+def _parts(path: Path, contents: Mapping[str, Any]) -> dict[str, str]:
+    """Say which part each name belongs to, and under "" that of all other names."""
+    lists = {}
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        names = contents.get(key, [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise DatasetError(f"{path}: {key} is not a list of file paths; repair or remove it")
+        lists[key] = [_tidy(name) for name in names]
+    held_out = lists["test_filenames"] or lists["val_filenames"]
+    parts = dict.fromkeys(held_out, "test")
+    parts.update(dict.fromkeys(lists["train_filenames"], "train"))
+    if lists["train_filenames"]:
+        return {"": "left out", **parts}
+    return {"": "train" if held_out else "", **parts}
+
+
+def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
+    """Read the intrinsics of one frame: its own where it has them, else those of the whole file."""
+    model = FISHEYE_MODEL if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
+    if model not in CAMERA_MODELS:
+        raise DatasetError(
+            f"{where}: camera_model {model!r} is not undistorted here, only {', '.join(CAMERA_MODELS)}; undistort the "
+            "capture first"
+        )
+    W, H = (
+        (_whole(where, values, "w"), _whole(where, values, "h"))
+        if "w" in values and "h" in values
+        else (0, 0)
+    )
+    if not W:
+        W, H = image_size(image)
+    if "fl_x" in values:
+        fx = _number(where, values, "fl_x")
+        fy = _number(where, values, "fl_y") if "fl_y" in values else fx
+    elif "camera_angle_x" in values:
+        fx = _focal(where, values, "camera_angle_x", W)
+        fy = _focal(where, values, "camera_angle_y", H) if "camera_angle_y" in values else fx
+        fy = _number(where, values, "fl_y") if "fl_y" in values else fy
+    else:
+        raise DatasetError(f"{where}: has neither fl_x nor camera_angle_x, nor has the file; add one of them")
+    named = {"fx": fx, "fy": fy, "cx": W / 2, "cy": H / 2}
+    for key in ("cx", "cy", *COEFFICIENTS):
+        if key in values:
+            named[key] = _number(where, values, key)
+    try:
+        return lens_of(named, W, H, fisheye=model == FISHEYE_MODEL)
+    except DatasetError as error:
+        raise DatasetError(f"{where}: {error}") from None
+
+
+def _focal(where: str, values: Mapping[str, Any], key: str, size: int) -> float:
+    """Turn a field of view into a focal length: f = size / (2 tan(angle / 2))."""
+    angle = _number(where, values, key)
+    if not 0.0 < angle < math.pi:
+        raise DatasetError(f"{where}: {key} is {angle:g}, but has to be between 0 and pi radians")
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+def _number(where: str, values: Mapping[str, Any], key: str) -> float:
+    value = values[key]
+    try:
+        number = float("nan") if isinstance(value, bool | str) else float(value)
+    except (TypeError, OverflowError):
+        number = float("nan")
+    if not math.isfinite(number):
+        raise DatasetError(f"{where}: {key} is {str(value)[:40]}, but has to be a number")
+    return number
+
+
+def _whole(where: str, values: Mapping[str, Any], key: str) -> int:
+    number = _number(where, values, key)
+    if number != round(number) or number < 1:
+        raise DatasetError(f"{where}: {key} is {number:g}, but has to be a size in pixels")
+    return int(number)
+
+
+def _pose(
+    where: str, frame: Mapping[str, Any]
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+    """Turn camera to world in OpenGL axes into a world-to-camera rotation in OpenCV axes, and the centre."""
+    if "transform_matrix" not in frame:
+        raise DatasetError(f"{where}: has no transform_matrix; every frame needs its pose")
+    matrix = _matrix(where, frame, "transform_matrix")
+    return (matrix[:3, :3] * np.array([1.0, -1.0, -1.0])).T, matrix[:3, 3].copy()
+
+
+def _matrix(where: str, values: Mapping[str, Any], key: str) -> Float64[np.ndarray, "rows 4"]:
+    try:
+        matrix = np.array(values[key], dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise DatasetError(f"{where}: {key} is not 3x4 or 4x4 numbers; repair it")
+    if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=1e-6):
+        raise DatasetError(f"{where}: {key} has the last row {matrix[3].tolist()}, but it has to be 0 0 0 1")
+    return matrix
+
+
+def _mask(where: str, folder: Path, frame: Mapping[str, Any]) -> Path | None:
+    if frame.get("mask_path") is None:
+        return None
+    mask = folder / _tidy(str(frame["mask_path"]))
+    if not is_file(mask):
+        raise DatasetError(f"{where}: its mask {mask} is not there; put it there or remove mask_path")
+    return mask
+
+
+def _cloud(path: Path, contents: Mapping[str, Any]) -> Cloud | None:
+    """Read the start cloud: the PLY the file names, else the points of the COLMAP model the poses came from.
+
+    The PLY is in the frame of the poses already. COLMAP's points are in the frame before `applied_transform`, so
+    they are moved by it; without that key nobody knows how the two are related, and they are not used.
+    """
+    if contents.get("ply_file_path") is not None:
+        return read_points_ply(path.parent / _tidy(str(contents["ply_file_path"])))
+    model = find_model(path.parent)
+    if model is None or "applied_transform" not in contents:
+        return None
+    cloud, matrix = read_points(model), _matrix(str(path), contents, "applied_transform")
+    if cloud is None:
+        return None
+    if not np.all(np.isfinite(matrix)):
+        raise DatasetError(f"{path}: applied_transform is NaN or infinite; repair or remove it")
+    return Cloud(cloud.points @ matrix[:3, :3].T + matrix[:3, 3], cloud.colors)

@@ -1,0 +1,258 @@
+"""Captures written to disk in each layout that is read, so that tests and examples need no download."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.blender import TRAIN_FILE
+from gsplat_edu.data.capture import Cloud
+from gsplat_edu.data.points import write_points_ply
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.validation import ArrayLike, float64_array
+from gsplat_edu.views import Photo, View
+
+PINHOLE = 1
+"""COLMAP's number for a pinhole with two focal lengths."""
+
+
+def write_colmap(
+    folder: Path, views: Sequence[View], points: ArrayLike, colors: ArrayLike, *, binary: bool = True
+) -> None:
+    """Write images/NAME, masks/NAME.png where a view has a mask, and a model in sparse/0.
+
+    Args:
+        folder: The capture; made where it is missing.
+        views: Views with different names that end in .png; a name may have folders.
+        points: (N, 3) world units.
+        colors: (N, 3) 0 to 1, rounded to 8 bits.
+        binary: Whether the model is written as .bin or as .txt.
+
+    Raises:
+        ShapeError: points and colours are not (N, 3).
+    """
+    cloud = _cloud(points, colors)
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True, exist_ok=True)
+    cameras: dict[tuple[float, ...], int] = {}
+    for view in views:
+        cameras.setdefault(_intrinsics(view.camera), len(cameras) + 1)
+        photo = view.read()
+        _save_photo(folder / "images" / view.name, photo)
+        _save_mask(folder / "masks" / f"{view.name}.png", photo)
+    poses = [
+        (
+            i,
+            _quaternion(view.camera),
+            -view.camera.R @ view.camera.eye,
+            cameras[_intrinsics(view.camera)],
+            view.name,
+        )
+        for i, view in enumerate(views, 1)
+    ]
+    rgb = np.round(255.0 * np.clip(cloud.colors, 0.0, 1.0)).astype(int)
+    if binary:
+        _write_bin(model, cameras, poses, cloud.points, rgb)
+    else:
+        _write_txt(model, cameras, poses, cloud.points, rgb)
+
+
+def write_transforms(
+    folder: Path,
+    views: Sequence[View],
+    points: ArrayLike | None = None,
+    colors: ArrayLike | None = None,
+    *,
+    extra: dict[str, Any] | None = None,
+) -> None:
+    """Write images/NAME, masks/NAME.png where a view has a mask, points.ply and transforms.json.
+
+    Args:
+        folder: The capture; made where it is missing.
+        views: Views with different names that end in .png.
+        points: (N, 3) world units, the start cloud; None for none.
+        colors: (N, 3) 0 to 1, rounded to 8 bits; given with the points.
+        extra: More keys for the file, such as `test_filenames`.
+
+    Raises:
+        ShapeError: points and colours are not (N, 3).
+    """
+    frames = []
+    for view in views:
+        camera, photo = view.camera, view.read()
+        frame = {
+            "file_path": f"images/{view.name}",
+            "transform_matrix": _camera_to_world(camera),
+            "w": camera.W,
+            "h": camera.H,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx + 0.5,
+            "cy": camera.cy + 0.5,
+        }
+        _save_photo(folder / "images" / view.name, photo)
+        if _save_mask(folder / "masks" / f"{view.name}.png", photo):
+            frame["mask_path"] = f"masks/{view.name}.png"
+        frames.append(frame)
+    contents: dict[str, Any] = {"camera_model": "PINHOLE", "frames": frames, **(extra or {})}
+    folder.mkdir(parents=True, exist_ok=True)
+    if points is not None and colors is not None:
+        write_points_ply(folder / "points.ply", _cloud(points, colors))
+        contents["ply_file_path"] = "points.ply"
+    _save_json(folder / "transforms.json", contents)
+
+
+def write_blender(folder: Path, train: Sequence[View], test: Sequence[View]) -> None:
+    """Write train/NAME.png, test/NAME.png and the two transforms files.
+
+    Args:
+        folder: The scene; made where it is missing.
+        train: Views to train on.
+        test: Views to test with. All have square pixels, one field of view, and their principal point in the
+            middle, because the format can say nothing else.
+
+    Raises:
+        ArgumentError: a camera is not like that.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for part, views in (("train", train), ("test", test)):
+        frames = []
+        for view in views:
+            _check_blender(view, (*train, *test)[0].camera)
+            _save_photo(folder / part / Path(view.name).with_suffix(".png"), view.read())
+            name = f"./{part}/{Path(view.name).with_suffix('')}"
+            frames.append({"file_path": name, "transform_matrix": _camera_to_world(view.camera)})
+        angle = 2.0 * math.atan(0.5 * views[0].camera.W / views[0].camera.fx) if views else 1.0
+        name = TRAIN_FILE if part == "train" else f"transforms_{part}.json"
+        _save_json(folder / name, {"camera_angle_x": angle, "frames": frames})
+
+
+def _check_blender(view: View, first: Camera) -> None:
+    camera = view.camera
+    middle = np.allclose((camera.cx, camera.cy), ((camera.W - 1) / 2, (camera.H - 1) / 2), rtol=0, atol=1e-9)
+    one_field = math.isclose(camera.fx / camera.W, first.fx / first.W, rel_tol=1e-9)
+    if not (middle and one_field and math.isclose(camera.fx, camera.fy, rel_tol=1e-9)):
+        raise ArgumentError(
+            f"{view.name}: Blender's layout needs square pixels, one field of view and the principal point in the "
+            "middle; write transforms.json instead"
+        )
+
+
+def _cloud(points: ArrayLike, colors: ArrayLike) -> Cloud:
+    sizes: dict[str, int] = {}
+    return Cloud(
+        float64_array("points", points, ("N", 3), sizes), float64_array("colors", colors, ("N", 3), sizes)
+    )
+
+
+def _intrinsics(camera: Camera) -> tuple[float, ...]:
+    return camera.W, camera.H, camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5
+
+
+def _camera_to_world(camera: Camera) -> list[list[float]]:
+    """Return the 4x4 matrix with OpenGL's camera axes."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = camera.R.T * np.array([1.0, -1.0, -1.0])
+    matrix[:3, 3] = camera.eye
+    rows: list[list[float]] = matrix.tolist()
+    return rows
+
+
+def _quaternion(camera: Camera) -> tuple[float, ...]:
+    """Turn R into (w, x, y, z): the eigenvector, of the largest eigenvalue, of a matrix linear in R.
+
+    Source: Bar-Itzhack 2000, "New method for extracting the quaternion from a rotation matrix".
+    """
+    (a, b, c), (d, e, f), (g, h, i) = camera.R
+    matrix = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    quat = np.linalg.eigh(matrix)[1][:, -1]
+    w, x, y, z = (float(q) for q in (quat if quat[0] >= 0 else -quat))
+    return w, x, y, z
+
+
+_Pose = tuple[int, tuple[float, ...], np.ndarray, int, str]
+
+
+def _write_bin(
+    model: Path,
+    cameras: dict[tuple[float, ...], int],
+    poses: Sequence[_Pose],
+    points: np.ndarray,
+    rgb: np.ndarray,
+) -> None:
+    data = struct.pack("<Q", len(cameras))
+    for (W, H, *values), camera in cameras.items():
+        data += struct.pack("<IiQQ4d", camera, PINHOLE, int(W), int(H), *values)
+    (model / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", len(poses))
+    for image, quat, shift, camera, name in poses:
+        data += (
+            struct.pack("<I7dI", image, *quat, *shift, camera) + name.encode() + b"\0" + struct.pack("<Q", 0)
+        )
+    (model / "images.bin").write_bytes(data)
+    rows = [
+        struct.pack("<Q3d3BdQ", i, *point, *color, 0.0, 0)
+        for i, (point, color) in enumerate(zip(points, rgb, strict=True), 1)
+    ]
+    (model / "points3D.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
+
+
+def _write_txt(
+    model: Path,
+    cameras: dict[tuple[float, ...], int],
+    poses: Sequence[_Pose],
+    points: np.ndarray,
+    rgb: np.ndarray,
+) -> None:
+    def line(*values: Any) -> str:  # noqa: ANN401
+        return " ".join(v if isinstance(v, str) else repr(v) for v in values) + "\n"
+
+    text = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    for values, camera in cameras.items():
+        text += line(camera, "PINHOLE", int(values[0]), int(values[1]), *(float(v) for v in values[2:]))
+    (model / "cameras.txt").write_text(text, encoding="utf-8")
+    text = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points\n"
+    for image, quat, shift, camera, name in poses:
+        text += line(image, *quat, *shift.tolist(), camera, name) + "\n"
+    (model / "images.txt").write_text(text, encoding="utf-8")
+    rows = zip(points.tolist(), rgb.tolist(), strict=True)
+    text = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n"
+    text += "".join(line(i, *point, *color, 0.0) for i, (point, color) in enumerate(rows, 1))
+    (model / "points3D.txt").write_text(text, encoding="utf-8")
+
+
+def _save_photo(path: Path, photo: Photo) -> None:
+    pixels = photo.image
+    if pixels.dtype != np.uint8:
+        pixels = np.round(255.0 * pixels).astype(np.uint8)
+    if photo.alpha is not None:
+        pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path)
+
+
+def _save_mask(path: Path, photo: Photo) -> bool:
+    if photo.mask is None:
+        return False
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.where(photo.mask, 255, 0).astype(np.uint8)).save(path)
+    return True
+
+
+def _save_json(path: Path, contents: dict[str, Any]) -> None:
+    path.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")

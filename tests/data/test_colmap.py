@@ -1,0 +1,317 @@
+"""COLMAP's files: odd models, refusals by name, photos in folders, and files that are cut short or garbled."""
+
+import shutil
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from gsplat_edu.data.colmap import MODELS, find_model, read_cameras, read_colmap, read_images, read_points
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.errors import DatasetError
+
+EVERYTHING = DataSettings(test_every=0)
+MODEL_FILES = ("cameras", "images", "points3D")
+
+
+@pytest.fixture
+def capture(written):
+    return written("colmap")
+
+
+@pytest.fixture
+def text(written):
+    return written("text")
+
+
+def test_bin_and_txt_say_the_same(capture, text):
+    a, b = load_dataset(capture, EVERYTHING), load_dataset(text, EVERYTHING)
+    np.testing.assert_array_equal(a.points, b.points)
+    np.testing.assert_array_equal(a.colors, b.colors)
+    for one, other in zip(a.train, b.train, strict=True):
+        assert (one.name, one.camera.fx, one.camera.cx) == (other.name, other.camera.fx, other.camera.cx)
+        np.testing.assert_array_equal(one.camera.R, other.camera.R)
+        np.testing.assert_array_equal(one.camera.eye, other.camera.eye)
+
+
+def test_bin_wins_over_txt(capture):
+    (capture / "sparse" / "0" / "cameras.txt").write_text("nonsense\n")
+    (capture / "sparse" / "0" / "images.txt").write_text("nonsense\n")
+    assert len(load_dataset(capture).train) == 7
+
+
+@pytest.mark.parametrize("name", ["rigs.bin", "frames.bin"])
+def test_newer_files_are_no_trouble(capture, name):
+    (capture / "sparse" / "0" / name).write_bytes(b"\1\2\3")
+    assert len(load_dataset(capture).train) == 7
+
+
+# Each line of cameras.txt with fx, fy, cx, cy and coefficients worked out by hand from COLMAP's documentation.
+READ = [
+    ("SIMPLE_PINHOLE 24 18 30 12 9", (30, 30, 11.5, 8.5), (), False),
+    ("PINHOLE 24 18 30 31 12 9", (30, 31, 11.5, 8.5), (), False),
+    ("SIMPLE_RADIAL 24 18 30 12 9 0.1", (30, 30, 11.5, 8.5), (0.1,), False),
+    ("RADIAL 24 18 30 12 9 0.1 0.2", (30, 30, 11.5, 8.5), (0.1, 0.2), False),
+    ("OPENCV 24 18 30 31 12 9 .1 .2 .3 .4", (30, 31, 11.5, 8.5), (0.1, 0.2, 0.3, 0.4), False),
+    (
+        "FULL_OPENCV 24 18 30 31 12 9 .1 .2 .3 .4 .5 .6 .7 .8",
+        (30, 31, 11.5, 8.5),
+        (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
+        False,
+    ),
+    ("OPENCV_FISHEYE 24 18 30 31 12 9 .1 .2 .3 .4", (30, 31, 11.5, 8.5), (0.1, 0.2, 0.3, 0.4), True),
+    ("SIMPLE_RADIAL_FISHEYE 24 18 30 12 9 0.1", (30, 30, 11.5, 8.5), (0.1,), True),
+    ("RADIAL_FISHEYE 24 18 30 12 9 0.1 0.2", (30, 30, 11.5, 8.5), (0.1, 0.2), True),
+    ("SIMPLE_FISHEYE 24 18 30 12 9", (30, 30, 11.5, 8.5), (), True),
+    ("FISHEYE 24 18 30 31 12 9", (30, 31, 11.5, 8.5), (), True),
+]
+
+
+@pytest.mark.parametrize(
+    ("line", "intrinsics", "coefficients", "fisheye"), READ, ids=lambda v: str(v).split()[0]
+)
+def test_camera_models(tmp_path, line, intrinsics, coefficients, fisheye):
+    """The text and the binary form of a camera; its number in the binary form is its place in MODELS."""
+    model, W, H, *values = line.split()
+    (tmp_path / "cameras.txt").write_text(f"# a comment\n\n7 {line}\n")
+    number = [name for name, _ in MODELS].index(model)
+    floats = [float(v) for v in values]
+    data = struct.pack(f"<QIiQQ{len(floats)}d", 1, 7, number, int(W), int(H), *floats)
+    (tmp_path / "cameras.bin").write_bytes(data)
+    for suffix in ("bin", "txt"):
+        (lens,) = read_cameras(tmp_path / f"cameras.{suffix}").values()
+        assert (lens.fx, lens.fy, lens.cx, lens.cy) == intrinsics and (lens.W, lens.H) == (24, 18)
+        assert lens.fisheye == fisheye
+        assert lens.coefficients == (*coefficients, *[0.0] * ((4 if fisheye else 8) - len(coefficients)))
+
+
+def test_the_numbers_of_the_models():
+    """The numbers of COLMAP's documentation, which a table in another order would get wrong."""
+    names = [name for name, _ in MODELS]
+    assert names[:6] == ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+    assert names[6:9] == ["FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE"]
+    assert names[11] == "RAD_TAN_THIN_PRISM_FISHEYE" and len(names) == 18
+
+
+@pytest.mark.parametrize("number", [7, 10, 11, 12, 13, 16, 17, 18, 99, -1])
+def test_models_that_are_not_read_are_refused_by_name(tmp_path, number):
+    path = tmp_path / "cameras.bin"
+    path.write_bytes(struct.pack("<QIiQQ16d", 1, 7, number, 24, 18, *range(1, 17)))
+    with pytest.raises(DatasetError) as caught:
+        read_cameras(path)
+    message = str(caught.value)
+    assert "camera 7" in message and "image_undistorter" in message
+    assert (MODELS[number][0] if 0 <= number < 18 else str(number)) in message
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "content"),
+    [
+        ("cameras", 2, "1 PINHOLE 24 18 30"),
+        ("cameras", 2, "1 NOTHING 24 18 30 30 12 9"),
+        ("cameras", 2, "1 PINHOLE 24"),
+        ("cameras", 2, "1 PINHOLE 24 18 30 x 12 9"),
+        ("cameras", 2, "1 PINHOLE 24 18 -30 30 12 9"),
+        ("cameras", 2, "1 PINHOLE 24 18 nan 30 12 9"),
+        ("cameras", 2, "1 PINHOLE 0 18 30 30 12 9"),
+        ("images", 4, "1 1 0 0 0 0 0"),
+        ("images", 5, "1 1 0 0 0 0 0 0 1 next.png"),
+        ("points3D", 3, "1 2 3 4 5"),
+        ("points3D", 3, "1 2 3 x 5 6 7 0"),
+    ],
+)
+def test_a_malformed_line_is_named(text, file, line, content):
+    path = text / "sparse" / "0" / f"{file}.txt"
+    lines = path.read_text().split("\n")
+    lines[line - 1] = content
+    path.write_text("\n".join(lines))
+    with pytest.raises(DatasetError, match=rf"{file}\.txt, line {line}: ") as caught:
+        load_dataset(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_with_gaps_and_a_name_with_a_space(text):
+    """COLMAP numbers images and cameras as it likes, and drops some."""
+    model = text / "sparse" / "0"
+    for file, old, new in (("cameras", "1 PINHOLE", "907 PINHOLE"), ("images", " 1 view_", " 907 view_")):
+        path = model / f"{file}.txt"
+        path.write_text(path.read_text().replace(old, new))
+    path = model / "images.txt"
+    path.write_text(path.read_text().replace("\n3 ", "\n4000000000 ").replace("view_002.png", "view 002.png"))
+    (text / "images" / "view_002.png").rename(text / "images" / "view 002.png")
+    dataset = load_dataset(text, EVERYTHING)
+    assert len(dataset.train) == 9 and dataset.train[0].name == "view 002.png" and dataset.notes == ()
+
+
+def test_a_camera_that_is_not_there(text):
+    path = text / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text().replace(" 1 view_003", " 5 view_003"))
+    with pytest.raises(DatasetError, match=r"image view_003\.png: its camera 5 is not in cameras\.txt"):
+        load_dataset(text)
+
+
+@pytest.mark.parametrize("quat", ["0 0 0 0", "nan 0 0 0", "inf 0 0 0"])
+@pytest.mark.parametrize("shift", ["0 0 0", "nan 0 0", "1e300 0 0", "1e13 0 0"])
+def test_a_pose_that_is_none(text, quat, shift):
+    path = text / "sparse" / "0" / "images.txt"
+    lines = path.read_text().split("\n")
+    lines[3] = f"2 {quat} {shift} 1 view_001.png"
+    path.write_text("\n".join(lines))
+    with pytest.raises(DatasetError, match=r"view_001\.png"):
+        load_dataset(text)
+
+
+@pytest.mark.parametrize("place", ["images/a/b.png", "a/b.png", "images/b.png"])
+def test_names_with_folders(tmp_path, small, place):
+    """As images/NAME, as NAME from the capture, and by the bare name in images/."""
+    view = small[0][0]
+    write_colmap(tmp_path, [view], *small[1:])
+    path = tmp_path / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"view_000.png", b"a/b.png"))
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    shutil.move(tmp_path / "images" / "view_000.png", tmp_path / place)
+    (found,) = load_dataset(tmp_path).train
+    assert found.name == "a/b.png"
+    np.testing.assert_array_equal(found.image, view.image)
+
+
+def test_missing_photos_are_told_and_skipped(capture):
+    for i in (2, 5):
+        (capture / "images" / f"view_00{i}.png").unlink()
+    dataset = load_dataset(capture, EVERYTHING)
+    assert len(dataset.train) == 7
+    assert dataset.notes == ("2 of 9 photos have no file: skipped, first view_002.png",)
+    shutil.rmtree(capture / "images")
+    with pytest.raises(DatasetError, match="none of the 9 photos"):
+        load_dataset(capture)
+
+
+def test_a_model_of_no_images(capture):
+    (capture / "sparse" / "0" / "images.bin").write_bytes(struct.pack("<Q", 0))
+    with pytest.raises(DatasetError, match=r"images\.bin: lists no images"):
+        load_dataset(capture)
+
+
+@pytest.mark.parametrize("lost", ["cameras", "images"])
+def test_half_a_model(capture, lost):
+    (capture / "sparse" / "0" / f"{lost}.bin").unlink()
+    with pytest.raises(DatasetError, match="not both of cameras and images"):
+        load_dataset(capture)
+
+
+@pytest.mark.parametrize("how", ["missing", "empty", "not finite"])
+def test_without_points_the_start_is_random(capture, how):
+    path = capture / "sparse" / "0" / "points3D.bin"
+    path.unlink()
+    if how == "empty":
+        path.write_bytes(struct.pack("<Q", 0))
+    if how == "not finite":
+        path.write_bytes(struct.pack("<QQ3d3BdQ", 1, 1, np.nan, 0, 0, 1, 2, 3, 0, 0))
+    dataset = load_dataset(capture)
+    assert len(dataset.points) == 100_000 and any("no points" in note for note in dataset.notes)
+
+
+def test_tracks_and_observations_are_stepped_over(tmp_path):
+    """Both have a length of their own per entry; written here by hand, with the numbers that have to come out."""
+    data = struct.pack("<Q", 2)
+    for i, track in ((3, 2), (9, 0)):
+        data += struct.pack("<Q3d3BdQ", i, i, i + 0.5, -i, 255, 0, 51, 0.7, track) + b"\xff" * 8 * track
+    (tmp_path / "points3D.bin").write_bytes(data)
+    data = struct.pack("<Q", 2)
+    for i, observed in ((4, 3), (8, 1)):
+        data += struct.pack("<I7dI", i, 1, 0, 0, 0, i, 2, 3, 5) + f"{i}.jpg".encode() + b"\0"
+        data += struct.pack("<Q", observed) + b"\xff" * 24 * observed
+    (tmp_path / "images.bin").write_bytes(data)
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 0))
+    cloud = read_points(tmp_path)
+    np.testing.assert_array_equal(cloud.points, [[3, 3.5, -3], [9, 9.5, -9]])
+    np.testing.assert_allclose(cloud.colors, [[1, 0, 0.2]] * 2, atol=1e-15)
+    poses = read_images(tmp_path / "images.bin")
+    assert [(p.name, p.camera, p.shift) for p in poses] == [("4.jpg", 5, (4, 2, 3)), ("8.jpg", 5, (8, 2, 3))]
+
+
+@pytest.mark.parametrize("stem", [".png.png", ".png"])
+def test_masks_beside_the_images(capture, stem):
+    mask = np.zeros((18, 24), np.uint8)
+    mask[3:9, 4:20] = 1
+    (capture / "masks").mkdir()
+    Image.fromarray(mask).save(capture / "masks" / f"view_004{stem}")
+    views = {view.name: view for view in load_dataset(capture, EVERYTHING).train}
+    np.testing.assert_array_equal(views["view_004.png"].read().mask, mask == 1)
+    assert views["view_003.png"].read().mask is None
+    Image.fromarray(mask[:-1]).save(capture / "masks" / f"view_004{stem}")
+    with pytest.raises(DatasetError, match=r"view_004.*\.png: the mask is 24x17 but its photo 24x18"):
+        load_dataset(capture)
+
+
+@pytest.mark.parametrize("file", MODEL_FILES)
+def test_every_truncation_is_told(capture, file):
+    """Whatever byte a file ends at, the error names the file; a file that lacks bytes is never read as whole."""
+    path = capture / "sparse" / "0" / f"{file}.bin"
+    data = path.read_bytes()
+    for end in range(
+        0, len(data), 7 if len(data) > 500 else 1
+    ):  # 7 and the 51 bytes of a point share no factor
+        path.write_bytes(data[:end])
+        with pytest.raises(DatasetError, match=rf"{file}\.bin"):
+            read_colmap(capture, capture / "sparse" / "0")
+
+
+def test_a_count_beyond_the_file_allocates_nothing(capture):
+    for file in MODEL_FILES:
+        path = capture / "sparse" / "0" / f"{file}.bin"
+        whole = path.read_bytes()
+        path.write_bytes(struct.pack("<Q", 2**63) + whole[8:])
+        with pytest.raises(DatasetError, match="more than it has room for"):
+            load_dataset(capture)
+        path.write_bytes(whole)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
+@given(
+    file=st.sampled_from(MODEL_FILES),
+    flips=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(1, 255)), min_size=1, max_size=6),
+    head=st.booleans(),
+)
+def test_garbled_files_end_in_a_dataset_error_or_a_dataset(capture, file, flips, head):
+    """Nothing but DatasetError comes out, whatever bytes are flipped; half of the time early in the file."""
+    path = capture / "sparse" / "0" / f"{file}.bin"
+    whole = path.read_bytes()
+    data = bytearray(whole)
+    for where, change in flips:
+        data[int(where * (min(96, len(data)) if head else len(data)))] ^= change
+    path.write_bytes(bytes(data))
+    try:
+        load_dataset(capture).preload()
+    except DatasetError as error:
+        assert "\n" not in str(error)
+    finally:
+        path.write_bytes(whole)
+
+
+def test_the_statue_as_bin_and_as_txt(real, tmp_path):
+    """One model in both forms. The text has six digits for the camera, and points without rounding."""
+    folder = real("odd/statue_sparse_bin_and_txt")
+    (a,), (b,) = (read_cameras(folder / f"cameras.{s}").values() for s in ("bin", "txt"))
+    np.testing.assert_allclose((a.fx, a.fy, a.cx, a.cy), (b.fx, b.fy, b.cx, b.cy), rtol=5e-6)
+    np.testing.assert_allclose(a.coefficients, b.coefficients, rtol=5e-6)
+    binary, text = ({p.name: p for p in read_images(folder / f"images.{s}")} for s in ("bin", "txt"))
+    assert binary.keys() == text.keys() and len(binary) == 40
+    for name in binary:
+        np.testing.assert_allclose(binary[name].quat, text[name].quat, atol=2e-5)
+        np.testing.assert_allclose(binary[name].shift, text[name].shift, rtol=1e-4, atol=1e-4)
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        shutil.copy(folder / name, tmp_path)
+    clouds = [read_points(place) for place in (folder, tmp_path)]
+    order = [np.lexsort(cloud.points.T) for cloud in clouds]
+    assert len(order[0]) == 1816
+    for field in ("points", "colors"):
+        one, other = (getattr(cloud, field)[index] for cloud, index in zip(clouds, order, strict=True))
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    with pytest.raises(DatasetError, match="none of the 40 photos"):
+        load_dataset(folder)
+    assert find_model(folder) == folder

@@ -1,0 +1,259 @@
+"""What is done to every capture after reading: detection, split, origin, start points, settings, preloading."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.data.capture import Cloud
+from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.data.points import write_points_ply
+from gsplat_edu.data.writers import write_colmap, write_transforms
+from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.views import View
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        ({"resolution": 0.5}, "resolution"),
+        ({"resolution": float("nan")}, "resolution"),
+        ({"resolution": float("inf")}, "resolution"),
+        ({"test_every": 1}, "test_every"),
+        ({"test_every": -2}, "test_every"),
+        ({"background": (0.0, 0.0, 1.5)}, r"background\[2\]"),
+        ({"background": (0.0, 0.0)}, "background"),
+        ({"image_memory": -1}, "image_memory"),
+    ],
+)
+def test_settings_that_cannot_be(as_shipped, values, word):
+    with pytest.raises(ArgumentError, match=word):
+        DataSettings(**values)
+
+
+@pytest.mark.parametrize("name", ["nothing", "empty", "photos", "photos/images"])
+def test_what_is_no_capture_says_what_was_looked_for(tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "photos" / "images").mkdir(parents=True)
+    Image.new("RGB", (4, 4)).save(tmp_path / "photos" / "images" / "a.JPG")
+    with pytest.raises(DatasetError) as caught:
+        load_dataset(tmp_path / name)
+    message = str(caught.value)
+    assert str(tmp_path / name) in message and "\n" not in message
+    if name == "empty":
+        assert "sparse/0" in message and "transforms.json" in message
+    if name.startswith("photos"):
+        assert "no camera poses" in message and "colmap" in message
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_a_model_is_found_in_each_place(written, tmp_path, place):
+    folder = written("colmap")
+    model = folder / "model"
+    shutil.move(folder / "sparse" / "0", model)
+    shutil.rmtree(folder / "sparse")
+    (folder / place).mkdir(parents=True, exist_ok=True)
+    for file in model.iterdir():
+        shutil.move(file, folder / place)
+    assert len(load_dataset(folder).train) == 7
+
+
+def test_the_model_folder_itself_may_be_named(written):
+    folder = written("colmap")
+    assert len(load_dataset(folder / "sparse" / "0").train) == 7
+
+
+def test_both_kinds_of_poses(written, small):
+    folder = written("colmap")
+    write_transforms(folder, small[0][:5])
+    dataset = load_dataset(folder)
+    assert dataset.layout == "transforms.json" and len(dataset.train) + len(dataset.test) == 5
+    assert any("transforms.json and a COLMAP model" in note for note in dataset.notes)
+
+
+def test_several_models_are_told(written):
+    folder = written("colmap")
+    (folder / "sparse" / "1").mkdir()
+    assert any("2 models: 0 is read, 1 not" in note for note in load_dataset(folder).notes)
+
+
+def test_every_eighth_view_by_name_is_for_testing(written, small):
+    folder, names = written("colmap"), sorted(view.name for view in small[0])
+    dataset = load_dataset(folder)
+    assert [v.name for v in dataset.test] == [names[0], names[8]]
+    assert [v.name for v in dataset.train] == names[1:8]
+    third = load_dataset(folder, DataSettings(test_every=3))
+    assert [v.name for v in third.test] == names[::3] and len(third.train) == 6
+    everything = load_dataset(folder, DataSettings(test_every=0))
+    assert [v.name for v in everything.train] == names and everything.test == ()
+
+
+def test_one_photo_is_trained_on(tmp_path, small):
+    write_transforms(tmp_path, small[0][:1])
+    dataset = load_dataset(tmp_path)
+    assert len(dataset.train) == 1 and dataset.test == ()
+    assert any("one photo" in note for note in dataset.notes)
+    assert any("no points: 100,000 random ones" in note for note in dataset.notes)
+    assert np.isfinite(dataset.points).all()
+    with pytest.raises(DatasetError, match="to train on"):
+        load_dataset(tmp_path, DataSettings(test_every=8))
+
+
+def test_the_captures_own_split(tmp_path, small):
+    views = small[0]
+    names = [f"images/{view.name}" for view in views]
+    write_transforms(tmp_path, views, extra={"train_filenames": names[:4], "test_filenames": names[6:]})
+    dataset = load_dataset(tmp_path)
+    assert [v.name for v in dataset.train] == names[:4] and [v.name for v in dataset.test] == names[6:]
+    assert any("2 of 9 photos are in none" in note for note in dataset.notes)
+    assert len(load_dataset(tmp_path, DataSettings(test_every=0)).train) == 9  # asked for another split
+    write_transforms(tmp_path, views, extra={"val_filenames": names[:2]})
+    assert [v.name for v in load_dataset(tmp_path).train] == names[2:]
+    write_transforms(tmp_path, views, extra={"test_filenames": names})
+    with pytest.raises(DatasetError, match="none of its 9 photos to train on"):
+        load_dataset(tmp_path)
+
+
+def test_far_coordinates_are_moved_to_the_origin(tmp_path, small):
+    """Integers are subtracted, so at 1e5 all but the last bits (1e-11 of 1e5) of the distances survive."""
+    views, points, colors = small
+    shift = np.array([1e5, -2.5e5, 3e4])
+    moved = []
+    for v in views:
+        c = v.camera
+        camera = Camera(c.R, c.eye + shift, c.fx, c.fy, c.cx, c.cy, c.H, c.W)
+        moved.append(View(camera, v.image, name=v.name))
+    for write in (write_colmap, write_transforms):
+        folder = tmp_path / write.__name__
+        write(folder, moved, points + shift, colors)
+        dataset = load_dataset(folder, DataSettings(test_every=0))
+        np.testing.assert_array_equal(
+            dataset.origin, np.round(np.mean([v.camera.eye for v in moved], axis=0))
+        )
+        for view, before in zip(dataset.train, moved, strict=True):
+            # COLMAP stores -R e: its rounding is that of numbers of 2.5e5, 3e-11 each, three of them summed twice.
+            np.testing.assert_allclose(view.camera.eye + dataset.origin, before.camera.eye, rtol=0, atol=1e-9)
+            assert np.abs(view.camera.eye).max() < 10
+        np.testing.assert_allclose(dataset.points + dataset.origin, points + shift, rtol=0, atol=1e-9)
+        assert any("coordinates are large" in note for note in dataset.notes)
+
+
+def test_points_of_another_file(written, tmp_path, small):
+    cloud = Cloud(np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]]), np.array([[0.2, 0.4, 0.6]] * 2))
+    write_points_ply(tmp_path / "p.ply", cloud)
+    dataset = load_dataset(written("colmap"), points=tmp_path / "p.ply")
+    np.testing.assert_array_equal(dataset.points, [[1.0, 2.0, 3.0]])
+    np.testing.assert_allclose(dataset.colors, [[0.2, 0.4, 0.6]], atol=1e-12)
+    assert any("1 of 2 points are NaN" in note for note in dataset.notes)
+    with pytest.raises(DatasetError, match=r"none\.ply"):
+        load_dataset(written("colmap"), points=tmp_path / "none.ply")
+
+
+def test_random_points_lie_where_the_cameras_look(tmp_path, small):
+    """All axes of the procedural cameras meet at one point, so the least-squares point is that one."""
+    write_transforms(tmp_path, small[0])
+    dataset = load_dataset(tmp_path)
+    extent = scene_extent([v.camera for v in (*dataset.train, *dataset.test)])
+    offset = np.abs(dataset.points - (0.1, -0.05, 0.15))
+    assert len(offset) == 100_000 and 0.999 * extent < offset.max() <= extent + 1e-9
+    again = load_dataset(tmp_path)
+    np.testing.assert_array_equal(dataset.points, again.points)
+    np.testing.assert_array_equal(dataset.colors, again.colors)
+    assert 0 <= dataset.colors.min() < 0.01 and 0.99 < dataset.colors.max() <= 1
+
+
+def test_parallel_cameras_surround_their_mean(tmp_path):
+    """Parallel axes meet nowhere: the cube lies around the cameras."""
+    pixels = np.zeros((4, 4, 3), np.uint8)
+    eyes = [(0.0, 0, 0), (2.0, 0, 0)]
+    views = [
+        View(Camera(np.eye(3), e, 4, 4, 1.5, 1.5, 4, 4), pixels, name=f"{i}.png") for i, e in enumerate(eyes)
+    ]
+    write_transforms(tmp_path, views)
+    points = load_dataset(tmp_path).points
+    np.testing.assert_allclose((points.min(axis=0) + points.max(axis=0)) / 2, (1, 0, 0), atol=1e-3)
+    np.testing.assert_allclose(np.ptp(points, axis=0), 2 * 1.1, rtol=1e-3)
+
+
+def test_extent():
+    cameras = [Camera(np.eye(3), (x, 0, 0), 4, 4, 1.5, 1.5, 4, 4) for x in (0.0, 1.0, 5.0)]
+    assert scene_extent(cameras) == pytest.approx(1.1 * 3.0)
+    assert scene_extent(cameras[:1]) == 1.0 and scene_extent([cameras[2]] * 3) == 1.0
+    with pytest.raises(ArgumentError, match="cameras"):
+        scene_extent([])
+
+
+def test_poses_that_are_none_name_the_frame(tmp_path, small):
+    write_transforms(tmp_path, small[0])
+    path = tmp_path / "transforms.json"
+    contents = json.loads(path.read_text())
+    good = np.array(contents["frames"][4]["transform_matrix"])
+    far = good.copy()
+    far[0, 3] = 1e15
+    bad = {
+        "NaN": np.where(np.eye(4)[1] * np.eye(4)[0][:, None] > 0, np.nan, good),
+        "absurdly far": far,
+        "scaled by 2": good * np.array([2, 2, 2, 1]),
+        "mirrors": good * np.array([-1, 1, 1, 1]),
+        "not orthonormal": good * np.array([1, 1.1, 1, 1]),
+        "last row": good + np.diag([0, 0, 0, 1]),
+    }
+    for what, matrix in bad.items():
+        contents["frames"][4]["transform_matrix"] = matrix.tolist()
+        path.write_text(json.dumps(contents))
+        with pytest.raises(DatasetError, match=what) as caught:
+            load_dataset(tmp_path)
+        assert "view_004" in str(caught.value)
+
+
+def test_a_rotation_of_few_digits_is_made_one_again(tmp_path, small):
+    write_transforms(tmp_path, small[0])
+    path = tmp_path / "transforms.json"
+    contents = json.loads(path.read_text())
+    for frame in contents["frames"]:
+        frame["transform_matrix"] = np.round(frame["transform_matrix"], 3).tolist()
+    path.write_text(json.dumps(contents))
+    for view, truth in zip(load_dataset(tmp_path, DataSettings(test_every=0)).train, small[0], strict=True):
+        R = view.camera.R
+        np.testing.assert_allclose(R @ R.T, np.eye(3), rtol=0, atol=1e-14)
+        # Nine roundings of at most 5e-4 have a norm of at most 1.5e-3; the nearest rotation is as near as the truth.
+        np.testing.assert_allclose(R, truth.camera.R, rtol=0, atol=2 * 1.5e-3)
+
+
+def test_preload_keeps_what_fits_and_counts(written):
+    folder, seen = written("colmap"), []
+    dataset = load_dataset(folder)
+    assert len(dataset.images) == 0
+    dataset.preload(lambda done, total: seen.append((done, total)))
+    assert seen == [(i + 1, 9) for i in range(9)]
+    assert len(dataset.images) == 9 and dataset.images.nbytes == 9 * 24 * 18 * 3
+    assert dataset.train[0].read() is dataset.train[0].read()
+
+
+def test_what_is_over_the_budget_is_read_again_alike(written):
+    folder = written("colmap")
+    roomy, tight = load_dataset(folder), load_dataset(folder, DataSettings(image_memory=3 * 24 * 18 * 3 + 5))
+    tight.preload()
+    assert len(tight.images) == 3 and tight.images.nbytes == 3 * 24 * 18 * 3
+    for a, b in zip(roomy.train, tight.train, strict=True):
+        np.testing.assert_array_equal(a.image, b.image)
+        np.testing.assert_array_equal(b.image, b.image)
+    assert len(tight.images) == 3
+
+
+def test_preload_names_the_corrupt_photo(written, as_shipped):
+    folder = written("colmap")
+    file = folder / "images" / "view_005.png"
+    file.write_bytes(file.read_bytes()[:-60])
+    dataset = load_dataset(folder)  # headers are fine
+    with pytest.raises(DatasetError, match=r"view_005\.png: cannot be decoded"):
+        dataset.preload()
+
+
+def test_a_camera_with_uneven_pixels_is_told(tmp_path):
+    camera = Camera(look_at((0, 0, -3), (0, 0, 0)), (0, 0, -3), 40, 20, 3.5, 3.5, 8, 8)
+    write_transforms(tmp_path, [View(camera, np.zeros((8, 8, 3), np.uint8), name="a.png")])
+    assert any("calibration may be wrong" in note for note in load_dataset(tmp_path).notes)

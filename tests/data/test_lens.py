@@ -1,0 +1,156 @@
+"""Undistortion against the lens formulas, written down here once more from OpenCV's documentation."""
+
+import numpy as np
+import pytest
+
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.lens import PERSPECTIVE, Lens, lens_of, straightened, undistortion
+from gsplat_edu.errors import DatasetError
+
+W, H, FX, FY, CX, CY = 160, 120, 140.0, 133.0, 83.0, 57.0  # corner convention: what a file says
+
+
+def perspective(x, y, **given):
+    k1, k2, p1, p2, k3, k4, k5, k6 = (given.get(name, 0.0) for name in PERSPECTIVE)
+    r2 = x * x + y * y
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def fisheye(x, y, k1=0.0, k2=0.0, k3=0.0, k4=0.0):
+    r = np.hypot(x, y)
+    t = np.arctan(r)
+    scale = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8) / r
+    return x * scale, y * scale
+
+
+def dots(distort, coefficients):
+    """Draw one soft dot per channel and corner where the lens shows three rays; return photo and rays."""
+    rays = np.array([[-0.31, -0.22], [0.27, 0.19], [0.05, -0.24]])
+    y, x = np.mgrid[:H, :W]
+    photo = np.zeros((H, W, 3))
+    for channel, ray in enumerate(rays):
+        u, v = distort(*ray, **coefficients)
+        u, v = FX * u + CX - 0.5, FY * v + CY - 0.5
+        photo[..., channel] = 250 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 2.5**2))
+    return np.round(photo).astype(np.uint8), rays
+
+
+def centres(image):
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    weights = image.astype(float) / image.sum(axis=(0, 1))
+    return np.stack(
+        [(weights * x[..., None]).sum(axis=(0, 1)), (weights * y[..., None]).sum(axis=(0, 1))], axis=1
+    )
+
+
+@pytest.mark.parametrize("resolution", [None, 2.0])
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("OPENCV", {"k1": -0.25, "k2": 0.06, "p1": 0.004, "p2": -0.003}),
+        ("OPENCV", {"k1": 0.2, "k2": 0.05, "k3": 0.02}),
+        ("OPENCV", {"k1": 0.4, "k4": 0.15, "k5": 0.02, "k6": 0.01}),
+        ("OPENCV_FISHEYE", {}),
+        ("OPENCV_FISHEYE", {"k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": -0.002}),
+    ],
+)
+def test_rays_lie_where_the_pinhole_puts_them(one_photo, model, coefficients, resolution):
+    """Dots drawn through the distorting lens are found at u = fx x + cx of the view's camera.
+
+    Rounding to 8 bits, bilinear maps and the dots' own bending move a centre by some hundredths of a pixel; the bound
+    of 0.15 px catches half a pixel lost in a convention, at half size too, where it would be a quarter.
+    """
+    photo, rays = dots(fisheye if "FISHEYE" in model else perspective, coefficients)
+    folder = one_photo(photo, camera_model=model, fl_x=FX, fl_y=FY, cx=CX, cy=CY, **coefficients)
+    view = load_dataset(folder, DataSettings(resolution=resolution)).train[0]
+    camera = view.camera
+    expected = np.stack([camera.fx * rays[:, 0] + camera.cx, camera.fy * rays[:, 1] + camera.cy], axis=1)
+    np.testing.assert_allclose(centres(view.image), expected, rtol=0, atol=0.15)
+    assert ((W, H) if resolution is None else (W // 2, H // 2)) == (camera.W, camera.H)
+    moved = np.hypot(*(centres(photo) - (expected if resolution is None else 2 * expected + 0.5)).T)
+    assert moved.max() > 1.0  # the test would notice if nothing were undistorted
+
+
+@pytest.mark.parametrize(
+    ("values", "is_fisheye", "some_outside"),
+    [
+        ({"k1": -0.25, "p1": 0.02}, False, False),
+        ({"k1": 0.3, "p1": 0.02}, False, False),
+        ({"k1": 1.0}, True, True),  # bulges so that the corners of the straightened photo lie outside
+    ],
+)
+def test_the_mask_is_what_lies_outside_of_the_photo(values, is_fisheye, some_outside):
+    """A pixel counts exactly where the formula leads inside the edges; maps are float32, good to 1e-4 px here."""
+    lens = lens_of({"fx": FX, "fy": FY, "cx": CX, "cy": CY, **values}, W, H, fisheye=is_fisheye)
+    maps, pinhole = undistortion(lens), straightened(lens)
+    y, x = np.mgrid[:H, :W]
+    distort = fisheye if is_fisheye else perspective
+    u, v = distort((x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy, **values)
+    u, v = FX * u + CX - 0.5, FY * v + CY - 0.5
+    np.testing.assert_allclose(maps.columns, u, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(maps.rows, v, rtol=0, atol=1e-4)
+    inside = (u > -0.5) & (u < W - 0.5) & (v > -0.5) & (v < H - 0.5)
+    valid = np.ones((H, W), bool) if maps.valid is None else maps.valid
+    clear = np.minimum.reduce([abs(u + 0.5), abs(u - W + 0.5), abs(v + 0.5), abs(v - H + 0.5)]) > 1e-3
+    np.testing.assert_array_equal(valid[clear], inside[clear])
+    assert some_outside == bool((~inside).any())
+
+
+def test_where_the_image_is_folded_no_pixel_counts():
+    """With k1 = -0.6 the formula r (1 + k1 r²) turns round at r² = 1 / 1.8 and shows the same again, mirrored.
+
+    Slopes are differences between neighbours, so within 5 % of that radius either answer will do.
+    """
+    lens = Lens(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.6,))
+    pinhole, maps = straightened(lens), undistortion(lens)
+    y, x = np.mgrid[:48, :64]
+    radius = np.hypot((x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy) * np.sqrt(1.8)
+    assert (radius > 1.05).sum() > 200 and not maps.valid[radius > 1.05].any()
+    assert maps.valid[radius < 0.95].all()
+
+
+def test_pinholes_have_no_maps(one_photo):
+    photo = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    view = load_dataset(one_photo(photo, k1=0.0, k2=0.0, p1=0.0)).train[0]
+    np.testing.assert_array_equal(view.image, photo)
+    assert view.read().mask is None
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(64, 48, 40.0, 40.0, 31.5, 23.5, (-1e9,)),
+        Lens(64, 48, 40.0, 40.0, 31.5, 23.5, (1e300, 1e300)),
+        Lens(64, 48, 8.0, 8.0, 31.5, 23.5, (), fisheye=True),  # sees more than half a turn
+        Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,)),  # one pixel wide: no slope to tell a fold by
+        Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,), fisheye=True),
+        Lens(64, 48, 20.0, 20.0, 31.5, 23.5, (-0.5, 0.0, 0.0, 0.0), fisheye=True),
+    ],
+)
+def test_what_no_pinhole_shows_is_refused(lens):
+    with pytest.raises(DatasetError, match="distortion"):
+        straightened(lens)
+        undistortion(lens)
+
+
+def test_the_statues_strong_distortion_gives_a_sane_camera():
+    """k = -0.684 of real internet photos, at the calibrated size and at a quarter of it."""
+    lens = lens_of({"fx": 2395.65, "fy": 2395.65, "cx": 400, "cy": 600, "k1": -0.684122}, 800, 1200)
+    for one in (lens, lens.resized(200, 300)):
+        pinhole = straightened(one)
+        assert 0.9 < pinhole.fx / one.fx <= 1.1 and 0.9 < pinhole.fy / one.fy <= 1.1
+        valid = undistortion(one).valid
+        assert valid is None or valid.mean() > 0.98
+
+
+def test_sizes_scale_about_the_corner():
+    """The middle of the image stays the middle, and the principal point's share of the width stays the same."""
+    lens = lens_of({"fx": 100, "fy": 90, "cx": 20, "cy": 15}, 40, 30)
+    half = lens.resized(20, 15)
+    assert (half.fx, half.fy, half.cx, half.cy) == (50, 45, 9.5, 7.0)
+    uneven = lens.resized(10, 15)
+    assert (uneven.fx, uneven.fy, uneven.cx, uneven.cy) == (25, 45, 4.5, 7.0)
