@@ -10,6 +10,7 @@ from gsplat_edu.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
+RECIPE = (ROOT / "docs" / "RECIPE.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
@@ -29,7 +30,10 @@ def test_every_command_and_option_is_in_the_readme(command, capsys):
         main([command, "--help"])
     options = set(re.findall(r"--[a-z0-9-]+", capsys.readouterr().out)) - {"--help"}
     assert f"`gsplat-edu {command}`" in README
-    assert options - set(re.findall(r"--[a-z0-9-]+", README)) == set()
+    recipe = {
+        f"--{name.replace('_', '-')}" for name in re.findall(r"^\| `(\w+)` \|", RECIPE, flags=re.MULTILINE)
+    }
+    assert options - recipe - set(re.findall(r"--[a-z0-9-]+", README)) == set()
 
 
 def test_every_make_target_is_in_the_readme_and_explained_by_make_help():

@@ -17,7 +17,7 @@ from gsplat_edu.data.blender import TRAIN_FILE, read_blender
 from gsplat_edu.data.capture import Capture, Cloud, Frame, is_file, photo_file
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import ImageStore
-from gsplat_edu.data.points import finite_cloud, looked_at, random_cloud, read_points_ply
+from gsplat_edu.data.points import finite_cloud, common_target, random_cloud, read_points_ply
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.validation import float64_array, in_range, whole_number
@@ -290,7 +290,7 @@ def _start(
         where = f"in the cube +-{cube:g}"
     else:
         half_edge = scene_extent(cameras)
-        centre = looked_at(cameras)
+        centre = common_target(cameras)
         made = random_cloud(centre, half_edge)
         where = f"within {half_edge:.4g} of ({', '.join(f'{c:.4g}' for c in centre)})"
     notes.append(f"the capture has no points: {len(made.points):,} random ones {where} are the start")

@@ -122,7 +122,7 @@ def random_cloud(centre: Float64[np.ndarray, "3"], half_edge: float) -> Cloud:
     return Cloud(points, rng.uniform(0.0, 1.0, (RANDOM_POINTS, 3)))
 
 
-def looked_at(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
+def common_target(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
     """Find the point closest to all optical axes, in the least-squares sense.
 
     p minimises sum_i |(I - d_i d_i') (p - e_i)|²,  e_i: centre of camera i,  d_i: direction it looks in

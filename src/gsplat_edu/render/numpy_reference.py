@@ -65,8 +65,7 @@ def render_gaussians(
         jacobian_limit: As for `project_cov3d`: the course clamps nothing, captures are trained with 1.3.
 
     Returns:
-        image: (H, W, 3) float64, not clipped; an empty scene is the background.
-        transmittance: (H, W) T_final, in [0, 1].
+        image (H, W, 3), not clipped, the background where the scene is empty; T_final (H, W), in [0, 1].
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
@@ -78,12 +77,11 @@ def render_gaussians(
     bg, z_near = float64_array("bg", bg, (3,)), in_range("z_near", z_near, 0.0)
     one_of("extent", extent, ("box3sigma", "exact"))
     one_of("stop", stop, ("box", "tile", "none"))
-    splats = project(cam, means, cov3ds, z_near, jacobian_limit)
     image = np.zeros((cam.H, cam.W, 3))
     # Whole tiles are kept; pixels outside the image have no transmittance and keep no tile alive.
     padded = np.pad(np.ones((cam.H, cam.W)), ((0, -cam.H % TILE), (0, -cam.W % TILE)))
     transmittance = padded[: cam.H, : cam.W]
-    for i, mean2d, cov2d in zip(*splats, strict=True):
+    for i, mean2d, cov2d in zip(*project(cam, means, cov3ds, z_near, jacobian_limit), strict=True):
         box = _box(mean2d, cov2d, opacities[i], cam, extent)
         T = transmittance[box]
         if T.size == 0 or (stop == "box" and T.max() < T_STOP):

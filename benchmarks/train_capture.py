@@ -1,0 +1,81 @@
+"""What does a whole training of a capture come to, and where does its time go as the scene grows?
+
+    python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--out FILE.json] [options of gsplat-edu train]
+
+Trains as `gsplat-edu train CAPTURE --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or
+../shared/data), and takes an iteration apart at the start, after 1,000 and 3,000 iterations and at the end: medians
+over 20 views. The wall time is that of the training with its checkpoints and evaluations, without these measurements.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import sys
+import tempfile
+from pathlib import Path
+
+import hardware
+from train_step import STAGES, measure
+
+from gsplat_edu.cli import train as command
+from gsplat_edu.cli.arguments import OneLineParser, run_command
+from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.trainer import Trainer
+
+MOMENTS = (0, 1_000, 3_000)
+ROWS = (*STAGES, "loss", "Adam", "rest", "iteration", "pairs")
+
+
+def train(options: argparse.Namespace, out: Path | None) -> None:
+    """Train, measure at the moments, print and write what came out."""
+    run = CaptureRun(command.options_from(options), print)
+    table: dict[int, dict[str, float]] = {}
+
+    def take_apart(trainer: Trainer, event: Event) -> None:
+        if isinstance(event, StepEvent) and trainer.iteration in MOMENTS:
+            with run.clock_stopped():
+                table[trainer.iteration] = measure(trainer.gaussians, run.dataset.train)
+
+    trainer = run.start(callbacks=[take_apart])
+    table[0] = measure(trainer.gaussians, run.dataset.train)
+    run.train()
+    table[trainer.iteration] = measure(trainer.gaussians, run.dataset.train)
+    evaluation = run.finish()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    result = {"seconds": run.seconds, "peak_rss_gib": peak, "metrics": evaluation.metrics, "stages_ms": table}
+    hardware.report({"capture": options.data.name, "config": run.options.document(), **result}, out)
+    metrics = evaluation.metrics
+    print(
+        f"{trainer.iteration} iterations in {run.seconds:.0f} s, {len(trainer.gaussians)} Gaussians, "
+        f"peak {peak:.2f} GiB"
+    )
+    for split in ("test", "train"):
+        if metrics[split]["num_images"]:
+            print(f"{split}: PSNR {metrics[split]['psnr']:.3f} dB, SSIM {metrics[split]['ssim']:.4f}")
+    print(f"{'ms after iterations':20}" + "".join(f"{moment:12}" for moment in table))
+    for name in ROWS:
+        print(f"{name:20}" + "".join(f"{found[name]:12.2f}" for found in table.values()))
+
+
+def main() -> int:
+    """Read the command line and train."""
+    data = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data"))
+    outer = argparse.ArgumentParser(add_help=False)
+    outer.add_argument("--out", type=Path, help="JSON file to write")
+    outer.add_argument("--run", type=Path, help="folder of the run (default: one that is thrown away)")
+    mine, theirs = outer.parse_known_args()
+    parser = OneLineParser(prog="train_capture.py", description="A whole training of a capture, taken apart.")
+    command.add_arguments(parser)
+    if not theirs or theirs[0].startswith("-"):
+        theirs = [str(data / "snowmiku97"), *theirs]
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = str(mine.run or Path(scratch) / "run")
+        options = parser.parse_args([theirs[0], "--iterations", "7000", *theirs[1:], "--out", folder])
+        return run_command("train_capture.py", lambda: train(options, mine.out), debug=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
