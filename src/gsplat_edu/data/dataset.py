@@ -17,7 +17,7 @@ from gsplat_edu.data.blender import TRAIN_FILE, read_blender
 from gsplat_edu.data.capture import Capture, Cloud, Frame, is_file, photo_file
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import ImageStore
-from gsplat_edu.data.points import finite_cloud, common_target, random_cloud, read_points_ply
+from gsplat_edu.data.points import common_target, finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.validation import float64_array, in_range, whole_number
