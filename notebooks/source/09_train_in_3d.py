@@ -40,8 +40,7 @@ from gsplat_edu.gaussians import cov3d_t, quat_to_R_t
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.torch_reference import eval_sh_t, render_t
-from gsplat_edu.train import config as training_config
-from gsplat_edu.train.config import DensityConfig, TrainConfig
+from gsplat_edu.train import course
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.initialize import random_ball
@@ -162,16 +161,15 @@ print("spherical harmonics, degrees 0 to 3: autograd agrees with finite differen
 # place. This is that place:
 
 # %%
-print(inspect.getdoc(training_config))
+print(inspect.getdoc(course))
 
 # %%
 SEED = 9
 generator = torch.Generator().manual_seed(SEED)
 cloud = random_ball(400, generator)
-density = DensityConfig(max_gaussians=CAP)
-config = TrainConfig(iterations=ITERATIONS, seed=SEED)
+config = course.course_config(ITERATIONS, SEED, CAP)
 print(f"{len(cloud)} splats at scale {float(cloud.scales[0, 0].detach()):.3f}")
-print(f"opacity {float(cloud.opacities[0]):.4f}, learning rates {dict(config.learning_rates)}")
+print(f"opacity {float(cloud.opacities[0]):.4f}, cap {config.max_gaussians}")
 
 # %% [markdown]
 # ## Where splats are missing, and where they are not needed
@@ -185,7 +183,7 @@ print(f"opacity {float(cloud.opacities[0]):.4f}, learning rates {dict(config.lea
 # The rule, as it runs below:
 
 # %%
-print(inspect.getsource(AdaptiveDensityControl.update))
+print(inspect.getsource(AdaptiveDensityControl._densify))
 
 # %% [markdown]
 # ## The loop
@@ -220,8 +218,10 @@ def follow(trainer, event):
         snapshots[MIDDLE] = held_out_image(trainer.gaussians)
 
 
-control = AdaptiveDensityControl(density, generator, cloud)
-trainer = Trainer(cloud, capture.train, config, render=RENDER, density=control, callbacks=[follow])
+control = AdaptiveDensityControl(config, course.EXTENT, generator, cloud)
+trainer = Trainer(
+    cloud, capture.train, config, render=RENDER, extent=course.EXTENT, density=control, callbacks=[follow]
+)
 snapshots[0] = held_out_image(trainer.gaussians)
 result = trainer.run()
 snapshots[ITERATIONS] = held_out_image(trainer.gaussians)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,13 +30,57 @@ def written_aside(path: Path) -> Iterator[Path]:
     os.close(handle)
     aside = Path(name)
     try:
-        yield aside
+        with named_failure(path):
+            yield aside
         umask = os.umask(0)
         os.umask(umask)
         aside.chmod(0o666 & ~umask)  # mkstemp makes files that only their owner can read
         aside.replace(path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+@contextmanager
+def named_failure(path: Path) -> Iterator[None]:
+    """Give an OSError that names no file, as that of a full disk does, the name of the file being written."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+
+
+_LEFTOVER = re.compile(r"\..+\.[a-z0-9_]{8}\.[a-z]+")  # as mkstemp names them in written_aside
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what `written_aside` left behind in a folder and below when its process was killed."""
+    for path in folder.rglob(".*"):
+        if path.is_file() and _LEFTOVER.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
+def check_folder(name: str, path: Path) -> None:
+    """Find out before hours of work whether files can be written into a folder. Nothing is made.
+
+    Args:
+        name: What the user calls the folder, for the message.
+        path: The folder; it need not be there yet.
+
+    Raises:
+        ArgumentError: files cannot be written there, and why.
+    """
+    nearest = next(place for place in (path, *path.absolute().parents) if place.exists())
+    if not nearest.is_dir():
+        raise ArgumentError(f"{name}: {nearest} is a file; name a folder")
+    try:
+        with tempfile.TemporaryFile(dir=nearest):
+            pass
+    except OSError as error:
+        raise ArgumentError(
+            f"{name}: cannot write to {nearest} ({error.strerror}); choose another place"
+        ) from None
 
 
 def check_writable(name: str, path: Path) -> None:

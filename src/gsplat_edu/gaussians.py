@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsplat_edu.errors import ArgumentError, ShapeError
@@ -97,6 +97,12 @@ class Gaussians:
         """
         for name, tensor in self.tensors().items():
             check_tensor(name, tensor, ("...",), {})
+
+    def finite_rows(self) -> Bool[Tensor, " N"]:
+        """Say of each Gaussian whether all its raw parameters are finite."""
+        finite = [torch.isfinite(t.detach()).flatten(1).all(dim=1) for t in (self.sh0, self.sh_rest)]
+        flat = (self.means, self.quats, self.log_scales, self.logit_opacities[:, None])
+        return torch.stack([*finite, *(torch.isfinite(t.detach()).all(dim=1) for t in flat)]).all(dim=0)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Gaussians:
         """Return new Gaussians with the same change made to every raw parameter."""

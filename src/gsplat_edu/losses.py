@@ -40,7 +40,7 @@ def photo_loss(
     if target.dtype != torch.uint8:
         target = target.to(image.dtype)
     if mask is not None:
-        counts = torch.from_numpy(mask)[..., None]
+        counts = torch.from_numpy(mask)[..., None]  # times 0 or 1: exact, on any number of threads
         check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
         image, target = image * counts, target * counts
     return l1_ssim(image, target, ssim_weight) if ssim_weight else l1(image, target)

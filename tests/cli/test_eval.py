@@ -15,8 +15,7 @@ from gsplat_edu.runs.folder import RunFolder
 
 
 @pytest.fixture
-def cli(monkeypatch):
-    monkeypatch.setattr(command_line, "COMMANDS", ("eval",))
+def cli():
     return command_line.main
 
 

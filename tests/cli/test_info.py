@@ -12,8 +12,7 @@ from gsplat_edu.runs.folder import RunFolder
 
 
 @pytest.fixture
-def info(monkeypatch, capsys):
-    monkeypatch.setattr(command_line, "COMMANDS", ("info",))
+def info(capsys):
 
     def call(path, code=0):
         assert command_line.main(["info", str(path)]) == code

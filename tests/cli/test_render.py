@@ -21,7 +21,6 @@ BLUE = (0.0, 0.0, 1.0)
 
 @pytest.fixture
 def cli(monkeypatch, tmp_path):
-    monkeypatch.setattr(command_line, "COMMANDS", ("render",))
     monkeypatch.chdir(tmp_path)
     return command_line.main
 

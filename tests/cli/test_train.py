@@ -1,5 +1,6 @@
 """`gsplat-edu train`: options become a recipe, and bad input costs one line."""
 
+import dataclasses
 import json
 
 import pytest
@@ -13,8 +14,12 @@ from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.train.config import TrainConfig, recipe
 
 
+def parsed(words):
+    return build_parser(words).parse_args(words)
+
+
 def options(*words):
-    return options_from(build_parser().parse_args(["train", "somewhere", "--out", "run", *words]))
+    return options_from(parsed(["train", "somewhere", "--out", "run", *words]))
 
 
 def test_no_options_are_the_recipe():
@@ -25,7 +30,7 @@ def test_no_options_are_the_recipe():
 
 def test_options_reach_the_recipe():
     words = "--iterations 7000 --strategy mcmc --max-gaussians 500 --seed 3 --antialiased --white-background"
-    words += " --densify-stop 4000 --jacobian-limit none --random-background --view-order random --opacities-rate 0.025"
+    words += " --mcmc-stop 4000 --jacobian-limit none --random-background --view-order random --opacities-rate 0.025"
     chosen = options(*words.split())
     assert chosen.config == recipe(
         7_000,
@@ -34,7 +39,7 @@ def test_options_reach_the_recipe():
         seed=3,
         antialiased=True,
         background=(1.0, 1.0, 1.0),
-        densify_stop=4_000,
+        mcmc_stop=4_000,
         jacobian_limit=None,
         random_background=True,
         view_order="random",
@@ -43,14 +48,19 @@ def test_options_reach_the_recipe():
     assert chosen.data_settings.background is None, "photos keep their alpha for backgrounds drawn later"
 
 
+def test_the_other_strategies_and_colours():
+    assert options("--strategy", "none").config.strategy == "none"
+    assert options("--background", "0.1", "0.2", "0.3").config.background == (0.1, 0.2, 0.3)
+    late = options("--no-rescale", "--densify-start", "26000", "--densify-stop", "28000").config
+    assert late.densify_stop == 28_000, "the window of the other strategy is not looked at"
+
+
 def test_every_field_of_the_recipe_has_an_option(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     said = capsys.readouterr().out
-    import dataclasses
-
     for field in dataclasses.fields(TrainConfig):
-        assert f"--{field.name.replace('_', '-')}" in said or field.name == "background", field.name
+        assert f"--{field.name.replace('_', '-')}" in said, field.name
     assert "example: gsplat-edu train" in said
 
 
@@ -81,6 +91,11 @@ def test_sizes(text, size):
         (["--backend", "gpu"], "backend"),
         (["--max-gaussians", "0"], "max_gaussians"),
         (["--densify-start", "20000"], "densify_stop"),
+        (["--image-memory", "1e400"], "--image-memory"),
+        (["--means-rate", "none"], "--means-rate"),
+        (["--mcmc-noise", "1"], "--mcmc-noise"),
+        (["--strategy", "none", "--reset-every", "5"], "--reset-every"),
+        (["--background", "1", "1", "2", "--white-background"], "--background"),
         (["--opacities-rate", "fast"], "--opacities-rate"),
     ],
 )

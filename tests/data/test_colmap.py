@@ -1,5 +1,6 @@
 """COLMAP's files: odd models, refusals by name, photos in folders, and files that are cut short or garbled."""
 
+import os
 import shutil
 import struct
 
@@ -315,3 +316,119 @@ def test_the_statue_as_bin_and_as_txt(real, tmp_path):
     with pytest.raises(DatasetError, match="none of the 40 photos"):
         load_dataset(folder)
     assert find_model(folder) == folder
+
+
+def renamed(capture, names):
+    """Give images of the text model other names; their files stay where they are."""
+    path = capture / "sparse" / "0" / "images.txt"
+    text = path.read_text()
+    for old, new in names.items():
+        text = text.replace(old, new)
+    path.write_text(text)
+
+
+def test_a_bare_name_that_two_images_share_is_nobodys(text):
+    """Else both views would be trained on one photo, with two poses."""
+    renamed(text, {"view_001.png": "a/view_000.png"})
+    with pytest.raises(DatasetError, match=r"none of the 9 photos"):
+        (text / "images").rename(text / "elsewhere")
+        load_dataset(text)
+    (text / "elsewhere").rename(text / "images")
+    dataset = load_dataset(text, EVERYTHING)
+    assert len(dataset.train) == 8 and "a/view_000.png" not in [view.name for view in dataset.train]
+    assert dataset.notes == ("1 of 9 photos have no file: skipped, first a/view_000.png",)
+
+
+def test_two_images_of_one_file_are_refused(text):
+    renamed(text, {"view_001.png": "images/view_000.png"})
+    with pytest.raises(DatasetError, match=r"view_000\.png: is the file of two images, (images/)?view_000"):
+        load_dataset(text)
+    renamed(text, {"images/view_000.png": "view_000.png"})
+    with pytest.raises(DatasetError, match=r"lists the image view_000\.png twice"):
+        load_dataset(text)
+
+
+def test_a_bare_mask_that_two_images_share_is_not_used_and_told(text):
+    renamed(text, {"view_001.png": "a/view_000.png", "view_000.png 1": "view_000.png 1"})
+    (text / "images" / "a").mkdir()
+    (text / "images" / "view_001.png").rename(text / "images" / "a" / "view_000.png")
+    (text / "masks").mkdir()
+    Image.new("L", (24, 18), 255).save(text / "masks" / "view_000.png.png")
+    dataset = load_dataset(text, EVERYTHING)
+    masked = [view.name for view in dataset.train if view.read().mask is not None]
+    assert masked == ["view_000.png"]
+    assert any("a mask only by a bare name" in n and "first a/view_000.png" in n for n in dataset.notes)
+
+
+@pytest.mark.parametrize("number", [7, 10, 11, 12, 13, 16, 17])
+def test_a_refused_camera_that_nothing_uses_is_no_trouble(capture, number):
+    """The parameters of every model are known, so that the cameras behind it are read from the right byte."""
+    path = capture / "sparse" / "0" / "cameras.bin"
+    values = range(1, 1 + len(dict(MODELS)[MODELS[number][0]].split()))
+    odd = struct.pack(f"<IiQQ{len(values)}d", 99, number, 24, 18, *values)
+    path.write_bytes(struct.pack("<Q", 2) + odd + path.read_bytes()[8:])
+    assert len(load_dataset(capture, EVERYTHING).train) == 9
+    assert len(values) == {7: 5, 10: 12, 11: 16, 12: 4, 13: 5, 16: 6, 17: 2}[number]
+
+
+def test_a_pose_without_a_photo_may_be_anything(text):
+    renamed(text, {"view_001.png": "gone.png"})
+    path = text / "sparse" / "0" / "images.txt"
+    lines = path.read_text().split("\n")
+    lines[3] = "2 nan 0 0 0 0 0 0 77 gone.png"
+    path.write_text("\n".join(lines))
+    dataset = load_dataset(text, EVERYTHING)
+    assert len(dataset.train) == 8
+    assert dataset.notes == ("1 of 9 photos have no file: skipped, first gone.png",)
+
+
+@pytest.mark.parametrize("named", [".", "sparse", "sparse/1"])
+def test_the_folder_of_models_and_a_model_that_is_not_0(capture, named):
+    (capture / "sparse" / "0").rename(capture / "sparse" / "1")
+    (capture / "sparse" / "10").mkdir()
+    dataset = load_dataset(capture / named, EVERYTHING)
+    assert len(dataset.train) == 9
+    assert [n for n in dataset.notes if "models" in n] == [
+        f"{capture / 'sparse'} holds 2 models: 1 is read, 10 not"
+    ]
+
+
+def test_points_of_the_other_kind(capture, text):
+    """cameras.bin and images.bin with a points3D.txt."""
+    (capture / "sparse" / "0" / "points3D.bin").unlink()
+    shutil.copy(text / "sparse" / "0" / "points3D.txt", capture / "sparse" / "0")
+    a, b = load_dataset(capture), load_dataset(text)
+    np.testing.assert_array_equal(a.points, b.points)
+
+
+@pytest.mark.parametrize("layout", ["colmap", "text"])
+def test_names_of_other_systems(written, layout):
+    """A backslash is a folder's end, and a name that is not UTF-8 is the file's of those bytes."""
+    folder = written(layout)
+    path = folder / "sparse" / "0" / ("images.bin" if layout == "colmap" else "images.txt")
+    data = path.read_bytes().replace(b"view_000.png", b"a\\view0.png").replace(b"view_001", b"view\xff01")
+    path.write_bytes(data)
+    (folder / "images" / "a").mkdir()
+    (folder / "images" / "view_000.png").rename(folder / "images" / "a" / "view0.png")
+    (folder / "images" / "view_001.png").rename(os.fsdecode(bytes(folder / "images") + b"/view\xff01.png"))
+    dataset = load_dataset(folder, EVERYTHING)
+    names = [view.name for view in dataset.train]
+    assert len(names) == 9 and "a/view0.png" in names and "view\ufffd01.png" in names
+
+
+def test_a_colour_that_is_no_number_is_gray(text):
+    path = text / "sparse" / "0" / "points3D.txt"
+    lines = path.read_text().split("\n")
+    lines[1] = "1 0 0 0 nan 51 255 0"
+    path.write_text("\n".join(lines))
+    np.testing.assert_allclose(load_dataset(text).colors[0], [0.5, 0.2, 1.0])
+
+
+def test_a_full_photo_beside_wins_over_a_smaller_copy(capture):
+    """Photos beside the model, not in images/, and an images_2 from somewhere."""
+    (capture / "images").rename(capture / "images_2")
+    for file in (capture / "images_2").iterdir():
+        shutil.copy(file, capture)
+        Image.new("RGB", (12, 9)).save(file)
+    dataset = load_dataset(capture, EVERYTHING)
+    assert {view.image.shape for view in dataset.train} == {(18, 24, 3)}

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from PIL import Image
 from gsplat_edu.camera import Camera, look_at
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
-from gsplat_edu.data.points import write_points_ply
+from gsplat_edu.data.images import ImageStore, PhotoFile
+from gsplat_edu.data.lens import Lens
+from gsplat_edu.data.points import read_points_ply, write_points_ply
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.views import View
@@ -242,6 +245,77 @@ def test_what_is_over_the_budget_is_read_again_alike(written):
         np.testing.assert_array_equal(a.image, b.image)
         np.testing.assert_array_equal(b.image, b.image)
     assert len(tight.images) == 3
+
+
+def test_what_memory_is_too_small_for_is_told(written):
+    folder = written("colmap")
+    assert not any("memory" in note for note in load_dataset(folder).notes)
+    (note,) = load_dataset(folder, DataSettings(image_memory=9 * 24 * 18 * 3 - 1)).notes
+    assert "take 0.01112 MiB of memory" in note and "--image-memory" in note and "--resolution" in note
+    assert load_dataset(folder, DataSettings(image_memory=9 * 24 * 18 * 3)).notes == ()
+    assert load_dataset(folder, DataSettings(image_memory=9 * 12 * 9 * 3, resolution=2.0)).notes == ()
+
+
+def test_photos_decoded_at_once_are_limited_by_their_size(monkeypatch):
+    """Sixty-four megapixels at a time: five of 12, one of 100."""
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    for W, H, workers in ((4000, 3000, 5), (10_000, 10_000, 1), (100, 100, 64)):
+        lens = Lens(W, H, 1000.0, 1000.0, 0.0, 0.0)
+        source = PhotoFile(Path("a.jpg"), None, lens, 20, 10, None)
+        assert ImageStore(0, [source]).workers == workers
+        assert ImageStore(0, [source] * 3).needed == 3 * 20 * 10 * 3
+    assert ImageStore(0, []).workers == 64
+
+
+@pytest.mark.parametrize("resolution", [None, 2.0])
+def test_ready_made_sizes_are_the_photos_where_there_are_no_others(written, resolution):
+    """Only images_2 and images_4: the real sizes decide, and no photo is halved twice."""
+    for layout in ("colmap", "transforms"):
+        folder = written(layout)
+        for factor in (2, 4):
+            (folder / f"images_{factor}").mkdir()
+            for file in (folder / "images").iterdir():
+                pixels = np.full((18 // factor, 24 // factor, 3), 10 * factor, np.uint8)
+                Image.fromarray(pixels).save(folder / f"images_{factor}" / file.name)
+        shutil.rmtree(folder / "images")
+        dataset = load_dataset(folder, DataSettings(resolution=resolution, test_every=0))
+        assert len(dataset.train) == 9 and any("intrinsics rescaled" in note for note in dataset.notes)
+        for view in dataset.train:
+            assert view.image.shape == (9, 12, 3) and (view.image == 20).all()
+            assert view.camera.fx == pytest.approx(1.15 * 12)
+        four = load_dataset(folder, DataSettings(resolution=4.0, test_every=0))
+        assert four.train[0].image.shape == (4, 6, 3) and (four.train[0].image == 40).all()
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + ".json", "a\0b"])
+def test_names_that_nothing_can_have(tmp_path, name):
+    with pytest.raises(DatasetError, match="is no folder and no"):
+        load_dataset(tmp_path / name)
+    with pytest.raises(DatasetError, match="name a point cloud"):
+        read_points_ply(tmp_path / name)
+
+
+def test_a_photo_whose_name_is_too_long_is_missing(written):
+    folder = written("text")
+    path = folder / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text().replace("view_003.png", "x" * 300))
+    assert any("1 of 9 photos have no file" in note for note in load_dataset(folder).notes)
+
+
+@pytest.mark.parametrize("place", ["images", "sparse"])
+def test_a_folder_that_cannot_be_read_is_named(written, place, monkeypatch):
+    folder, listed = written("colmap"), Path.iterdir
+    if place == "images":
+        shutil.rmtree(folder / "sparse")
+
+    def iterdir(self):
+        if self.name == place:
+            raise PermissionError(13, "Permission denied")
+        return listed(self)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    with pytest.raises(DatasetError, match=rf"{place}: cannot be read \(Permission denied\)"):
+        load_dataset(folder)
 
 
 def test_preload_names_the_corrupt_photo(written, as_shipped):

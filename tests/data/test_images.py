@@ -2,6 +2,7 @@
 
 import json
 import threading
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -168,6 +169,59 @@ def test_a_photo_of_another_size_rescales_its_camera(one_photo):
         load_dataset(folder)
 
 
+@pytest.mark.parametrize("photo", [(1920, 1088), (1920, 1072), (1900, 1080), (960, 544)])
+def test_a_cropped_photo_is_refused(one_photo, photo):
+    """A 1920x1080 video that an encoder padded to 1088 rows has other rows than its camera."""
+    folder = one_photo(np.zeros((photo[1], photo[0], 3), np.uint8), w=1920, h=1080)
+    with pytest.raises(DatasetError, match="another aspect ratio"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    ("camera", "photo"),
+    [
+        ((1333, 1000), (333, 250)),
+        ((333, 250), (1333, 1000)),
+        ((1957, 1091), (979, 546)),
+        ((1957, 1091), (978, 545)),
+    ],
+)
+def test_sizes_that_were_rounded_are_one_camera(one_photo, camera, photo):
+    folder = one_photo(np.zeros((photo[1], photo[0], 3), np.uint8), w=camera[0], h=camera[1])
+    found = load_dataset(folder).train[0].camera
+    assert photo == (found.W, found.H)
+
+
+@pytest.mark.parametrize("limit", [150, 50])
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp"])
+def test_large_photos_are_photos(tmp_path, name, limit, monkeypatch):
+    """Pillow warns of an attack beyond its limit, and refuses beyond twice of it; it has to stand there afterwards."""
+    path = saved(tmp_path, Image.fromarray(NOISE), name, **({"lossless": True} if "webp" in name else {}))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
+    found = []
+
+    def read():
+        for _ in range(20):
+            found.append(decode(path)[0])
+            decode_mask(path)
+
+    threads = [threading.Thread(target=read) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert image_size(path) == (16, 12) and len(found) == 80
+    for image in found:
+        np.testing.assert_array_equal(image, NOISE)
+    assert limit == Image.MAX_IMAGE_PIXELS
+
+
+def test_an_absurd_size_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("gsplat_edu.data.images.MAX_PIXELS", 100)
+    with pytest.raises(DatasetError, match=r"a\.png: .*16x12 px are more than a photo has"):
+        image_size(saved(tmp_path, Image.fromarray(NOISE)))
+
+
 def test_photos_of_different_sizes(tmp_path):
     sizes = [(20, 30), (31, 17), (8, 8)]
     views = [
@@ -206,7 +260,7 @@ def test_kept_alpha_downscales_like_the_composite(one_photo, values):
     pixels = RNG.integers(0, 256, (24, 32, 3), dtype=np.uint8)
     folder = one_photo(np.dstack([pixels, alpha]), **values)
     kept = load_dataset(folder, DataSettings(resolution=3.0, background=None)).train[0].read()
-    assert kept.alpha is not None and np.unique(kept.alpha).size > 0
+    assert kept.alpha is not None and np.unique(kept.alpha).size > 1
     for background in ((1.0, 1.0, 1.0), (0.0, 0.3, 0.8)):
         over = load_dataset(folder, DataSettings(resolution=3.0, background=background)).train[0].read()
         np.testing.assert_allclose(kept.over(background).astype(int), over.image.astype(int), rtol=0, atol=2)
@@ -269,18 +323,55 @@ def test_a_file_that_changes_later_is_told(one_photo):
         view.read()
 
 
-def test_many_threads_read_the_same_pixels(written):
-    """A prefetcher reads from its own thread while the trainer reads from another."""
-    dataset, found = load_dataset(written("colmap"), DataSettings(resolution=2.0, image_memory=400)), {}
+@pytest.mark.parametrize(
+    "distortion", [{}, {"k1": -0.2, "p1": 0.01}, {"camera_model": "OPENCV_FISHEYE", "k1": 1.0}]
+)
+def test_many_threads_read_the_same_pixels(tmp_path, distortion):
+    """A prefetcher reads from its own thread while the trainer reads from another; and memory makes no difference.
+
+    Every frame has a focal length of its own, so that nothing can be kept from one to the next.
+    """
+    camera = Camera(np.eye(3), (0, 0, 0), 60, 60, 31.5, 75, 150, 64)
+    pixels = RNG.integers(0, 256, (6, 150, 64, 3), dtype=np.uint8)
+    write_transforms(tmp_path, [View(camera, image, name=f"{i}.png") for i, image in enumerate(pixels)])
+    path = tmp_path / "transforms.json"
+    contents = {**json.loads(path.read_text()), **distortion}
+    for i, frame in enumerate(contents["frames"]):
+        frame.update(fl_x=130.0 + i, fl_y=130.0 + i)
+    path.write_text(json.dumps(contents))
+    roomy = load_dataset(tmp_path, DataSettings(test_every=0))
+    tight, found = load_dataset(tmp_path, DataSettings(test_every=0, image_memory=64 * 150 * 4)), {}
 
     def read(worker):
-        found[worker] = [view.read().image.copy() for view in dataset.train]
+        found[worker] = [view.read() for view in tight.train]
 
     threads = [threading.Thread(target=read, args=(i,)) for i in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    for worker in range(1, 4):
-        np.testing.assert_array_equal(found[worker], found[0])
-    assert dataset.images.nbytes <= 400
+    expected = [view.read() for view in roomy.train]
+    assert len(roomy.images) == 6 and len(tight.images) == 1
+    for photos in found.values():
+        for photo, other in zip(photos, expected, strict=True):
+            np.testing.assert_array_equal(photo.image, other.image)
+            np.testing.assert_array_equal(photo.mask, other.mask)
+    assert all((photo.mask is not None) == (distortion.get("k1") == 1.0) for photo in expected)
+
+
+@pytest.mark.parametrize("distortion", [{"k1": -0.2}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}])
+def test_undistorting_takes_little_memory_and_keeps_none(one_photo, distortion):
+    """The maps of a whole photo are 8 bytes a pixel, and were 96 MB for one of 12 megapixels, outside of the budget.
+
+    What is needed is the photo, the undistorted one and a byte for what counts, 7 bytes, and some for 128 of 1500 rows.
+    """
+    folder = one_photo(np.zeros((1500, 2000, 3), np.uint8), **distortion)
+    view = load_dataset(folder, DataSettings(image_memory=0)).train[0]
+    tracemalloc.start()
+    try:
+        photo = view.read()
+        kept, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert photo.image.nbytes == 3 * 2000 * 1500
+    assert peak < 10 * 2000 * 1500 and kept < 4.1 * 2000 * 1500

@@ -76,20 +76,21 @@ def test_colours(tmp_path):
         (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
         (b"ply\nformat ascii 1.0\nend_header\n", "x, y and z"),
         (HEADER.format(kind="ascii", fields=XYZ[:-17], more="").encode(), "x, y and z"),
-        (HEADER.format(kind="ascii", fields=XYZ, more="").encode() + b"1 2 3\n", "cut short"),
+        (HEADER.format(kind="ascii", fields=XYZ, more="").encode() + b"1 2 3\n", "truncated: 1 of 2"),
+        (HEADER.format(kind="ascii", fields=XYZ, more="").encode() + b"1 2 3\n4 5\n", "cannot be read"),
+        (HEADER.format(kind="ascii", fields=XYZ, more="").encode() + b"1\n4\n", "1 numbers, .* names 3"),
+        (HEADER.format(kind="ascii", fields=XYZ, more="").encode() + b"1 2 3\n4 5 x\n", "cannot be read"),
+        (HEADER.format(kind="binary_little_endian", fields=XYZ, more="").encode() + b"123", "truncated"),
         (
-            HEADER.format(kind="ascii", fields=XYZ, more="").encode() + b"1 2 3\n4 5\n",
-            "line 10: is not 3 numbers",
+            HEADER.format(kind="ascii", fields=XYZ + "property list uchar int i\n", more="").encode(),
+            "has the list i",
         ),
-        (HEADER.format(kind="ascii", fields=XYZ, more="").encode() + b"1 2 3\n4 5 x\n", "line 10"),
-        (HEADER.format(kind="binary_little_endian", fields=XYZ, more="").encode() + b"123", "cut short"),
-        (HEADER.format(kind="ascii", fields="property list uchar int i\n", more="").encode(), "line 5"),
-        (b"ply\nformat ascii 1.0\nelement face 3\nend_header\n", "line 3"),
+        (b"ply\nformat ascii 1.0\nelement face 3\nend_header\n", "no vertices"),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999999\n"
             + XYZ.encode()
             + b"end_header\n",
-            "cut",
+            "truncated",
         ),
         (b"ply\nformat ascii 1.0\nelement vertex -2\n" + XYZ.encode() + b"end_header\n", "line 3"),
     ],
@@ -100,6 +101,22 @@ def test_what_is_no_cloud(tmp_path, content, message):
     with pytest.raises(DatasetError, match=message) as caught:
         read_points_ply(path)
     assert "p.ply" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_colour_that_is_no_number_is_gray(tmp_path):
+    floats = RGB.replace("uchar", "float")
+    cloud = read_points_ply(write(tmp_path, "ascii", XYZ + floats, b"1 2 3 nan 0.5 1\n1 2 3 inf -inf 0\n"))
+    np.testing.assert_array_equal(cloud.colors, [[0.5, 0.5, 1.0], [1.0, 0.0, 0.0]])
+
+
+def test_the_vertices_need_not_come_first(tmp_path):
+    path = tmp_path / "p.ply"
+    path.write_bytes(
+        b"ply\nformat ascii 1.0\nelement sensor 1\nproperty int id\nelement vertex 1\n"
+        + XYZ.encode()
+        + b"end_header\n7\n1 2 3\n"
+    )
+    np.testing.assert_array_equal(read_points_ply(path).points, [[1, 2, 3]])
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

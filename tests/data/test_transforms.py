@@ -13,6 +13,7 @@ from gsplat_edu.errors import DatasetError
 
 EVERYTHING = DataSettings(test_every=0)
 PIXELS = np.full((20, 30, 3), 80, np.uint8)
+NOISE = np.random.default_rng(2).integers(0, 256, (20, 30, 3), dtype=np.uint8)
 
 
 @pytest.fixture
@@ -80,7 +81,7 @@ def test_axes(one_photo):
     assert z[0] == 2.0 and u[0] > camera.cx and v[0] < camera.cy  # to the right is right, above is above
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg", ".jpeg", ".JPG", ".PNG"])
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".Jpeg", ".webp", ".TIF"])
 def test_names_without_an_ending(one_photo, ending):
     folder = one_photo(PIXELS)
     Image.fromarray(PIXELS).save(folder / "images" / f"b{ending}")
@@ -210,3 +211,94 @@ def test_blenders_parts(tmp_path, small):
     shutil.rmtree(tmp_path / "train")
     with pytest.raises(DatasetError, match=r"transforms_train\.json: none of its 6 photos"):
         load_dataset(tmp_path)
+
+
+def merged_camera(one_photo, whole, frame):
+    path = one_photo(PIXELS) / "transforms.json"
+    contents = json.loads(path.read_text())
+    del contents["fl_x"]
+    contents.update(whole)
+    contents["frames"][0].update(frame)
+    path.write_text(json.dumps(contents))
+    camera = camera_of(path)
+    return camera.fx, camera.fy
+
+
+@pytest.mark.parametrize(
+    ("whole", "frame", "focal"),
+    [
+        ({"fl_x": 99.0, "fl_y": 98.0}, {"camera_angle_x": np.pi / 2}, (15.0, 15.0)),
+        ({"camera_angle_x": 1.0, "camera_angle_y": 1.0}, {"fl_x": 40.0}, (40.0, 40.0)),
+        ({"fl_x": 99.0, "fl_y": 98.0}, {"fl_x": 40.0}, (40.0, 40.0)),
+        ({"fl_x": 99.0, "fl_y": 98.0}, {"fl_y": 40.0}, (99.0, 40.0)),
+        ({"fl_x": 99.0, "fl_y": 98.0}, {"camera_angle_y": np.pi / 2}, (99.0, 10.0)),
+        ({"fl_x": 99.0}, {"fl_x": None}, (99.0, 99.0)),
+        ({"fl_x": 99.0, "camera_angle_y": np.pi / 2}, {}, (99.0, 10.0)),
+    ],
+)
+def test_a_frames_own_focal_length_wins_however_it_is_said(one_photo, whole, frame, focal):
+    assert merged_camera(one_photo, whole, frame) == pytest.approx(focal)
+
+
+@pytest.mark.parametrize(
+    ("model", "terms"), [("SIMPLE_RADIAL", {"k1": 0.05}), ("RADIAL", {"k1": 0.05, "k2": 0.01})]
+)
+def test_radial_models_are_opencvs_with_fewer_terms(one_photo, model, terms):
+    radial = load_dataset(one_photo(NOISE, camera_model=model, **terms)).train[0]
+    image, camera = radial.image, radial.camera
+    opencv = load_dataset(one_photo(NOISE, camera_model="OPENCV", p1=0.0, **terms)).train[0]
+    assert camera.fx == opencv.camera.fx != 30
+    np.testing.assert_array_equal(image, opencv.image)
+
+
+NULLS = ("camera_model", "cx", "cy", "k1", "fl_y", "is_fisheye", "train_filenames", "test_filenames")
+NULLS += ("val_filenames", "ply_file_path", "applied_transform", "applied_scale", "mask_path")
+
+
+def test_null_says_as_much_as_nothing(one_photo):
+    camera = camera_of(one_photo(PIXELS))
+    path = one_photo(PIXELS, **dict.fromkeys(NULLS)) / "transforms.json"
+    contents = json.loads(path.read_text())
+    contents["frames"][0].update(dict.fromkeys((*NULLS, "w", "h")))
+    path.write_text(json.dumps(contents))
+    found = camera_of(path)
+    assert (found.fx, found.fy, found.cx, found.cy) == (camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def test_val_is_not_trained_on(tmp_path, small):
+    views = small[0]
+    names = [f"images/{view.name}" for view in views]
+    write_transforms(tmp_path, views, extra={"val_filenames": names[:2], "test_filenames": names[6:]})
+    dataset = load_dataset(tmp_path)
+    assert [v.name for v in dataset.train] == names[2:6] and [v.name for v in dataset.test] == names[6:]
+    assert any(
+        "2 of 9 photos are in none of the capture's lists to train or test on" in n for n in dataset.notes
+    )
+
+
+def test_blenders_val_is_left_out_and_told(tmp_path, small):
+    write_blender(tmp_path, small[0][3:], small[0][:3])
+    assert not any("val" in note for note in load_dataset(tmp_path).notes)
+    shutil.copy(tmp_path / "transforms_test.json", tmp_path / "transforms_val.json")
+    dataset = load_dataset(tmp_path)
+    assert len(dataset.train) == 6 and len(dataset.test) == 3
+    assert any(note.startswith("transforms_val.json: its photos are left out") for note in dataset.notes)
+
+
+@pytest.mark.parametrize(
+    ("extra", "why"),
+    [
+        ({}, "does not say by applied_transform"),
+        ({"applied_transform": np.eye(4).tolist(), "applied_scale": 0.5}, "has poses scaled by 0.5"),
+    ],
+)
+def test_why_colmaps_points_are_not_used(tmp_path, small, extra, why):
+    views, points, colors = small
+    write_colmap(tmp_path, views, points, colors)
+    write_transforms(tmp_path, views, extra=extra)
+    dataset = load_dataset(tmp_path)
+    assert len(dataset.points) == 100_000
+    (note,) = [note for note in dataset.notes if "random ones" in note]
+    assert "points of the COLMAP model in" in note and why in note and "has no points" not in note
+    write_transforms(tmp_path, views, extra={"applied_transform": np.eye(4).tolist(), "applied_scale": 1.0})
+    np.testing.assert_array_equal(load_dataset(tmp_path).points, points)

@@ -8,7 +8,7 @@ import torch
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.render.api import render
-from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_extra, save_checkpoint
+from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_seconds, save_checkpoint
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.trainer import Trainer
@@ -46,7 +46,7 @@ def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, name, at):
     whole, first = trainer(capture, CONFIGS[name]), trainer(capture, CONFIGS[name])
     whole.run()
     steps(first, at)
-    path = save_checkpoint(tmp_path, first, {})
+    path = save_checkpoint(tmp_path, first, 1.0)
     second = trainer(capture, CONFIGS[name])
     load_checkpoint(path, second)
     assert second.iteration == at
@@ -61,16 +61,16 @@ def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, name, at):
     assert len(whole.gaussians) != len(capture[1]), "density control took part"
 
 
-def test_the_last_two_are_kept_and_extras_come_back(capture, tmp_path):
+def test_the_last_two_are_kept_and_the_time_comes_back(capture, tmp_path):
     run = trainer(capture, CONFIGS["adc"])
     for _ in range(4):
         steps(run, 3)
-        save_checkpoint(tmp_path, run, {"seconds": run.iteration / 2})
+        save_checkpoint(tmp_path, run, run.iteration / 2)
     assert [path.name for path in list_checkpoints(tmp_path)] == [
         "iteration_9.safetensors",
         "iteration_12.safetensors",
     ]
-    assert read_extra(list_checkpoints(tmp_path)[-1]) == {"seconds": 6.0}
+    assert read_seconds(list_checkpoints(tmp_path)[-1]) == 6.0
     assert list_checkpoints(tmp_path / "nowhere") == []
 
 
@@ -79,7 +79,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_too(capture, tmp_path,
     run = trainer(capture, CONFIGS["adc"])
     for _ in range(2):
         steps(run, 3)
-        save_checkpoint(tmp_path, run, {"seconds": 1.0})
+        save_checkpoint(tmp_path, run, 1.0)
     older, newer = list_checkpoints(tmp_path)
     whole = newer.read_bytes()
     contents = {
@@ -100,7 +100,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_too(capture, tmp_path,
 
 
 def test_a_checkpoint_of_another_kind_of_run_is_refused(capture, tmp_path):
-    path = save_checkpoint(tmp_path, trainer(capture, CONFIGS["mcmc"]), {})
+    path = save_checkpoint(tmp_path, trainer(capture, CONFIGS["mcmc"]), 0.0)
     other = trainer(capture, dataclasses.replace(CONFIGS["adc"]))
     with pytest.raises(CheckpointError, match=r"iteration_0.safetensors: is damaged"):
         load_checkpoint(path, other)
@@ -109,7 +109,7 @@ def test_a_checkpoint_of_another_kind_of_run_is_refused(capture, tmp_path):
 def test_what_cannot_be_written_leaves_the_last_one_alone(capture, tmp_path):
     run = trainer(capture, CONFIGS["adc"])
     steps(run, 3)
-    good = save_checkpoint(tmp_path, run, {})
+    good = save_checkpoint(tmp_path, run, 0.0)
     before = good.read_bytes()
     steps(run, 3)
     (
@@ -117,7 +117,7 @@ def test_what_cannot_be_written_leaves_the_last_one_alone(capture, tmp_path):
     ).mkdir()  # nothing can be renamed onto a folder with something in it
     (tmp_path / "iteration_6.safetensors" / "x").touch()
     with pytest.raises(CheckpointError, match="earlier checkpoints are unharmed"):
-        save_checkpoint(tmp_path, run, {})
+        save_checkpoint(tmp_path, run, 0.0)
     assert good.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "iteration_3.safetensors",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 import traceback
@@ -57,7 +58,7 @@ def bytes_text(text: str) -> int:
         number = float(match[1]) if match else -1.0
     except ValueError:
         number = -1.0
-    if match is None or number < 0:
+    if match is None or not 0 <= number < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is no size; give, for example, 4GiB or 500MB")
     return int(number * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " "))
 

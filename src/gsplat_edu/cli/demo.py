@@ -11,7 +11,6 @@ from gsplat_edu.cli.sphere import add_options, options_from, run_sphere
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
-SUMMARY = "learn a sphere from 24 renders of it and judge the result with a held-out camera"
 EXAMPLE = "example: gsplat-edu demo --iters 100 --size 48 --out out/quick.png"
 
 

@@ -19,7 +19,6 @@ from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.evaluation import Judged, evaluate_run
 from gsplat_edu.runs.folder import RunFolder, render_settings
 
-SUMMARY = "score a run's latest scene on its test and training views, and write metrics, renders and a report"
 EXAMPLE = "example: gsplat-edu eval out/plush"
 
 

@@ -19,7 +19,6 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.runs.folder import RunFolder
 
-SUMMARY = "say what a dataset folder, a run folder or a scene PLY holds"
 EXAMPLE = "example: gsplat-edu info captures/plush"
 
 PERCENTILES = (1, 25, 50, 75, 99)

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, OneLineParser, run_command
+from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
 
-COMMANDS = ("demo", "train", "eval", "render", "info")
-"""Commands, each a module `gsplat_edu.cli.NAME` with SUMMARY, EXAMPLE, add_arguments and run."""
+COMMANDS = {
+    "demo": "learn a sphere from 24 renders of it and judge the result with a held-out camera",
+    "train": "turn a folder of posed photos into a scene",
+    "eval": "score a run's latest scene on its test and training views, and write metrics, renders and a report",
+    "render": "render a run or a scene PLY: an orbit as a video, or what the dataset's cameras see",
+    "info": "say what a dataset, a run or a scene PLY holds, on one screen",
+}
+"""Commands and what they do; each is a module `gsplat_edu.cli.NAME` with EXAMPLE, add_arguments and run."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,24 +29,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0; 2 for bad input; 130 when interrupted.
     """
-    parser = build_parser()
-    parsed = parser.parse_args(arguments)
-    if parsed.command is None:
-        parser.print_help()
-        return EXIT_BAD_INPUT
-    return run_command(f"gsplat-edu {parsed.command}", lambda: parsed.run(parsed), parsed.debug)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        parser = build_parser(words)
+        parsed = parser.parse_args(words)
+        if parsed.command is None:
+            parser.print_help()
+            return EXIT_BAD_INPUT
+        return run_command(f"gsplat-edu {parsed.command}", lambda: parsed.run(parsed), parsed.debug)
+    except KeyboardInterrupt:  # while a command was still being imported
+        print("gsplat-edu: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Build the parser of all commands."""
+def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Build the parser of a command line; only commands that it names are imported, since torch takes seconds."""
     parser = OneLineParser(prog="gsplat-edu", description="3D Gaussian Splatting on the computer you have.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('gsplat-edu')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
-    for name in COMMANDS:
+    for name, summary in COMMANDS.items():
+        command = commands.add_parser(name, help=summary, description=summary)
+        if name not in words:
+            continue
         module = importlib.import_module(f"gsplat_edu.cli.{name}")
-        command = commands.add_parser(
-            name, help=module.SUMMARY, description=module.SUMMARY, epilog=module.EXAMPLE
-        )
+        command.epilog = module.EXAMPLE
         module.add_arguments(command)
         command.add_argument("--debug", action="store_true", help="print the traceback of an error")
         command.set_defaults(run=module.run)

@@ -30,7 +30,6 @@ from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
 from gsplat_edu.validation import whole_number
 
-SUMMARY = "render a run or a scene PLY: an orbit as a video, or what the dataset's cameras see"
 EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"
 
 SCENE_SIZE = 512

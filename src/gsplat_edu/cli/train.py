@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import inspect
+import re
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,15 +22,17 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore
 from gsplat_edu.render.backends import BACKENDS, resolve_backend
 from gsplat_edu.runs.training import CaptureRun, RunOptions
-from gsplat_edu.train.config import RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
+from gsplat_edu.train.config import ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
-SUMMARY = "turn a folder of posed photos into a scene"
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
 
 NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background")
 """Fields of the recipe that have their options spelled out below; the others are made from `TrainConfig`."""
+
+LINES = 20
+"""Lines that tell of the training where there is no terminal to draw a bar on."""
 
 PSNR_EVERY = 20
 """Iterations between two looks at the last view's PSNR, which cost a few milliseconds each."""
@@ -43,16 +47,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint in RUN")
     _add_budget(parser.add_argument_group("budget"))
     _add_data(parser.add_argument_group("photos"))
-    group = parser.add_argument_group("recipe, see docs/RECIPE.md")
-    group.add_argument(
+    group = parser.add_argument_group("recipe, see docs/RECIPE.md; defaults are those of 30,000 iterations")
+    behind = group.add_mutually_exclusive_group()
+    behind.add_argument(
         "--white-background", action="store_true", help="white behind everything (default: black)"
+    )
+    behind.add_argument(
+        "--background", type=float, nargs=3, metavar=("R", "G", "B"), help="another colour, 0 to 1"
     )
     group.add_argument(
         "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
     )
+    meanings = _meanings()
     for field in fields(TrainConfig):
         if field.name not in NAMED:
-            _add_field(group, field.name, field.default)
+            _add_field(group, field.name, field.default, meanings[field.name])
 
 
 def _add_budget(group: argparse._ArgumentGroup) -> None:
@@ -108,8 +117,16 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
     )
 
 
-def _add_field(group: argparse._ArgumentGroup, name: str, default: object) -> None:
-    flag, text = f"--{name.replace('_', '-')}", f"(default: {default})"
+def _meanings() -> dict[str, str]:
+    """Return what the docstring of `TrainConfig` says of each field."""
+    text = (inspect.getdoc(TrainConfig) or "").partition("Args:")[2].partition("Raises:")[0]
+    entries = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
+    found = {name: " ".join(words.split()).replace("%", "%%") for name, words in entries}
+    return {field.name: found.get(field.name, "") for field in fields(TrainConfig)}
+
+
+def _add_field(group: argparse._ArgumentGroup, name: str, default: object, meaning: str) -> None:
+    flag, text = f"--{name.replace('_', '-')}", f"{meaning} (default: {default})"
     if isinstance(default, bool):
         group.add_argument(flag, action="store_true", default=None, help=text)
     elif isinstance(default, str):
@@ -117,12 +134,15 @@ def _add_field(group: argparse._ArgumentGroup, name: str, default: object) -> No
     elif isinstance(default, int):
         group.add_argument(flag, type=whole_number_text, metavar="N", help=text)
     else:
-        group.add_argument(flag, type=_number_or_none, metavar="X", help=text)
+        kind = _number_or_none if name == "jacobian_limit" else _number
+        group.add_argument(flag, type=kind, metavar="X", help=text)
 
 
 def _number_or_none(text: str) -> float | str:
-    if text == "none":
-        return text
+    return text if text == "none" else _number(text)
+
+
+def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
@@ -140,9 +160,15 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
     for field in fields(TrainConfig):
         given = getattr(arguments, field.name, None)
         if given is not None and field.name not in ("iterations", "background"):
-            changes[field.name] = None if given == "none" else given
-    if arguments.white_background:
-        changes["background"] = (1.0, 1.0, 1.0)
+            changes[field.name] = None if field.name == "jacobian_limit" and given == "none" else given
+    if arguments.white_background or arguments.background:
+        changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
+    for strategy, names in ONLY_FOR.items():
+        if strategy != arguments.strategy and (idle := [name for name in names if name in changes]):
+            flag = f"--{idle[0].replace('_', '-')}"
+            raise ArgumentError(
+                f"{flag}: is looked at by --strategy {strategy} only; leave it out or choose that"
+            )
     config = recipe(arguments.iterations, rescale=not arguments.no_rescale, **changes)
     if config.strategy == "mcmc" and config.max_gaussians is None:
         raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
@@ -221,18 +247,33 @@ def _train(capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool]) 
         if event.iteration % PSNR_EVERY == 0:
             psnr = trainer.last_psnr()
         speed = bar.tasks[-1].speed or 0.0
-        state = f"loss {event.loss:.3f} PSNR {psnr:.1f} K {event.num_gaussians} {speed:.0f} it/s"
+        count = f"{event.num_gaussians} Gaussians"
+        state = f"loss {event.loss:.3f}  PSNR {psnr:.1f}  {count}  {speed:.0f} it/s"
         bar.update(task, completed=trainer.iteration, state=state)
+        if bar.disable and (trainer.iteration % max(iterations // LINES, 1) == 0):
+            line = f"iteration {trainer.iteration}/{iterations}: loss {event.loss:.4f}, PSNR {psnr:.2f} dB, {count}"
+            bar.console.print(line, soft_wrap=True)
 
-    trainer = capture.start(lambda done, total: bar.update(photos, completed=done, total=total), [show])
+    def loaded(done: int, total: int) -> None:
+        if interrupted():
+            raise KeyboardInterrupt("interrupted while reading photos; nothing was begun")
+        bar.update(photos, completed=done, total=total)
+
+    trainer = capture.start(loaded, [show])
     bar.remove_task(photos)
     bar.reset(task, total=iterations, completed=trainer.iteration, visible=True)
     capture.train(interrupted)
 
 
 def _bar(console: Console, state: str) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn())
-    return Progress(*columns, TextColumn(state), TimeRemainingColumn(), console=console, transient=not state)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=16),
+        MofNCompleteColumn(),
+        TextColumn(state),
+    )
+    quiet = not console.is_terminal
+    return Progress(*columns, TimeRemainingColumn(), console=console, transient=not state, disable=quiet)
 
 
 @contextmanager

@@ -34,5 +34,9 @@ def read_blender(folder: Path) -> Capture:
             raise nothing_found(path, found.missing)
         frames += found.frames
         missing += found.missing
-    notes = [missing_note(missing, len(frames) + len(missing))] if missing else []
+    val = folder / "transforms_val.json"
+    notes = list[str]()
+    if held_out is not None and held_out != val and is_file(val):
+        notes.append(f"{val.name}: its photos are left out; {held_out.name} is there to test with")
+    notes += [missing_note(missing, len(frames) + len(missing))] if missing else []
     return Capture("Blender", tuple(frames), None, tuple(notes), cube=BLENDER_CUBE)

@@ -20,14 +20,17 @@ ROTATION_SLACK = 1e-2
 MAX_COORDINATE = 1e12
 """Largest coordinate that is believed, world units."""
 
-ASPECT_SLACK = 0.01
-"""How far a photo's aspect ratio may be from its camera's; sizes that were rounded differ by a pixel."""
-
 FACTOR_BELOW = 32
 """A resolution below this divides the size; from here on it is the longest side, px."""
 
 READY_MADE = (2, 4, 8)
 """Factors for which a folder images_2, images_4 or images_8 is looked for."""
+
+PHOTO_FOLDERS = ("images", *(f"images_{factor}" for factor in READY_MADE))
+"""Folders that hold the same photos in several sizes."""
+
+PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic")
+"""What names of photos end in, in any case."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,7 @@ class Capture:
         frames: In any order; at least one.
         cloud: The capture's points; None where it has none.
         notes: Sentences for the user.
+        no_cloud: Why there are no points, where there are none.
         cube: Half the edge of the cube around the origin that holds the scene, where the layout fixes it.
     """
 
@@ -82,6 +86,7 @@ class Capture:
     frames: tuple[Frame, ...]
     cloud: Cloud | None
     notes: tuple[str, ...] = ()
+    no_cloud: str = "the capture has no points"
     cube: float | None = None
 
 
@@ -91,6 +96,38 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):
         return False
+
+
+def is_folder(path: Path) -> bool:
+    """Say whether a folder is there; names that no folder can have are not."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def entries(folder: Path) -> list[Path]:
+    """List a folder.
+
+    Raises:
+        DatasetError: it cannot be read.
+    """
+    try:
+        return sorted(folder.iterdir())
+    except OSError as error:
+        raise DatasetError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from None
+
+
+def find_photo(path: Path) -> Path | None:
+    """Find a photo; where it is not in images/, the smaller one of images_2, images_4 or images_8.
+
+    Args:
+        path: Where the capture says it is.
+    """
+    if is_file(path):
+        return path
+    copies = (_copy(path, name) for name in PHOTO_FOLDERS[1:])
+    return next((copy for copy in copies if copy is not None), None)
 
 
 def missing_note(missing: Sequence[str], total: int) -> str:
@@ -173,8 +210,9 @@ def photo_file(
 def _fitted(frame: Frame, path: Path, size: tuple[int, int]) -> Lens:
     """Return the lens at the size the file has."""
     (W, H), lens = size, frame.lens
-    scale = W / lens.W
-    if abs(H - lens.H * scale) > 1.0 and abs(H / (lens.H * scale) - 1.0) > ASPECT_SLACK:
+    # Both sizes may have been rounded by up to a pixel, of the smaller of photo and camera.
+    slack = max(1.0, W / lens.W) * (1.0 + lens.H / lens.W)
+    if abs(H - lens.H * W / lens.W) > slack:
         raise DatasetError(
             f"{path}: the photo of {frame.name} is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect "
             "ratio; was the photo cropped or turned after the poses were found?"
@@ -191,13 +229,21 @@ def _target(W: int, H: int, resolution: float | None) -> tuple[int, int]:
 
 def _smaller_copy(path: Path, resolution: float | None) -> Path | None:
     """Find images_4/NAME beside images/NAME for resolution 4."""
-    if resolution not in READY_MADE:
-        return None
+    return _copy(path, f"images_{resolution:.0f}") if resolution in READY_MADE else None
+
+
+def _copy(path: Path, name: str) -> Path | None:
+    """Find the same photo in another of the folders."""
     for folder in path.parents:
-        if folder.name == "images":
-            copy = folder.with_name(f"images_{resolution:.0f}") / path.relative_to(folder)
+        if folder.name in PHOTO_FOLDERS:
+            copy = folder.with_name(name) / path.relative_to(folder)
             return copy if is_file(copy) else None
     return None
+
+
+def unit_colors(colors: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    """Bring colours to the range 0 to 1; what is NaN becomes mid-gray."""
+    return np.asarray(np.clip(np.nan_to_num(colors, nan=0.5), 0.0, 1.0))
 
 
 def _spelled(size: tuple[int, int]) -> str:

@@ -9,15 +9,28 @@ Source: COLMAP's documentation, "Output Format" and "Camera Models".
 
 from __future__ import annotations
 
+import os
 import struct
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.data.capture import Capture, Cloud, Frame, checked_frame, is_file, missing_note
+from gsplat_edu.data.capture import (
+    Capture,
+    Cloud,
+    Frame,
+    checked_frame,
+    entries,
+    find_photo,
+    is_file,
+    is_folder,
+    missing_note,
+    unit_colors,
+)
 from gsplat_edu.data.lens import Lens, lens_of
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.gaussian_math import quat_to_R
@@ -30,22 +43,36 @@ MODELS: tuple[tuple[str, str], ...] = (
     ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
     ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
     ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
-    ("FOV", ""),
+    ("FOV", "fx fy cx cy omega"),
     ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
     ("RADIAL_FISHEYE", "f cx cy k1 k2"),
-    ("THIN_PRISM_FISHEYE", ""),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", ""),
-    ("SIMPLE_DIVISION", ""),
-    ("DIVISION", ""),
+    ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
+    ("SIMPLE_DIVISION", "f cx cy k"),
+    ("DIVISION", "fx fy cx cy k"),
     ("SIMPLE_FISHEYE", "f cx cy"),
     ("FISHEYE", "fx fy cx cy"),
-    ("EUCM", ""),
-    ("EQUIRECTANGULAR", ""),
+    ("EUCM", "fx fy cx cy alpha beta"),
+    ("EQUIRECTANGULAR", "w h"),
 )
-"""COLMAP's camera models by their number, with their parameters; none where this project does not undistort it."""
+"""COLMAP's camera models by their number, with their parameters."""
+
+REFUSED = (
+    "FOV",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "EUCM",
+    "EQUIRECTANGULAR",
+)
+"""Those that are not undistorted here."""
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-"""Where a model is looked for in a capture, in this order."""
+"""Where a model is looked for in a capture, in this order; then in folders with a number in sparse, colmap/sparse and
+the capture itself."""
+
+SUFFIXES = (".bin", ".txt")
 
 
 class Pose(NamedTuple):
@@ -61,17 +88,13 @@ def find_model(folder: Path) -> Path | None:
     """Find the folder that holds a model, by its cameras file or its images file.
 
     Args:
-        folder: The capture.
+        folder: The capture, or its folder of models, or the model.
     """
-    for place in PLACES:
-        model = folder / place
-        if any(
-            is_file(model / f"{part}{suffix}")
-            for part in ("cameras", "images")
-            for suffix in (".bin", ".txt")
-        ):
-            return model
-    return None
+    places = [folder / place for place in PLACES]
+    for parent in (folder / "sparse", folder / "colmap" / "sparse", folder):
+        places += _numbered(parent)
+    names = [f"{part}{suffix}" for part in ("cameras", "images") for suffix in SUFFIXES]
+    return next((place for place in places if any(is_file(place / name) for name in names)), None)
 
 
 def read_colmap(folder: Path, model: Path) -> Capture:
@@ -83,43 +106,47 @@ def read_colmap(folder: Path, model: Path) -> Capture:
 
     Raises:
         DatasetError: a file is missing, cut short or malformed; a camera model is not undistorted here; a pose is
-            none; or no image has a file.
+            none; two images are one file; or no image has a file.
     """
     suffix = _suffix(model)
-    lenses = read_cameras(model / f"cameras{suffix}")
     listed = model / f"images{suffix}"
     poses = read_images(listed)
     if not poses:
         raise DatasetError(f"{listed}: lists no images; run COLMAP's mapper, or name another model")
-    photos, masks = _photo_folders(folder, model)
-    frames, missing = list[Frame](), list[str]()
-    for pose in poses:
-        where = f"{listed}, image {pose.name}"
+    photos, masks, notes = _files(folder, model, [pose.name for pose in poses])
+    there = [pose for pose in poses if pose.name in photos]
+    missing = [_printable(pose.name) for pose in poses if pose.name not in photos]
+    if not there:
+        raise DatasetError(
+            f"{folder}: none of the {len(poses)} photos that {listed.name} lists has a file, first {missing[0]}; put "
+            "them into images/"
+        )
+    lenses = read_cameras(model / f"cameras{suffix}", {pose.camera for pose in there})
+    frames = []
+    for pose in there:
+        name = _printable(pose.name)
+        where = f"{listed}, image {name}"
         if pose.camera not in lenses:
             raise DatasetError(
                 f"{where}: its camera {pose.camera} is not in cameras{suffix}; the two do not belong together"
             )
         R, eye = _placed(where, pose)
-        image = next((p for p in _candidates(photos, pose.name) if is_file(p)), None)
-        mask = next((p for p in _masks(masks, pose.name) if is_file(p)), None)
-        frame = Frame(pose.name, image or folder, lenses[pose.camera], R, eye, mask)
-        frame = checked_frame(where, frame)
-        if image is None:
-            missing.append(pose.name)
-        else:
-            frames.append(frame)
-    if not frames:
-        raise DatasetError(
-            f"{folder}: none of the {len(poses)} photos that {listed.name} lists has a file, first {missing[0]}; put "
-            "them into images/"
+        frame = Frame(name, photos[pose.name], lenses[pose.camera], R, eye, masks.get(pose.name))
+        frames.append(checked_frame(where, frame))
+    if missing:
+        notes.append(missing_note(missing, len(poses)))
+    others = [place.name for place in _numbered(model.parent) if place != model]
+    if model.name.isdecimal() and others and (model.parent == folder or model.parent.name == "sparse"):
+        notes.append(
+            f"{model.parent} holds {len(others) + 1} models: {model.name} is read, {', '.join(others)} not"
         )
-    notes = [missing_note(missing, len(poses))] if missing else []
-    others = sorted(
-        p.name for p in model.parent.iterdir() if p.is_dir() and p.name.isdecimal() and p != model
-    )
-    if model.name == "0" and others:
-        notes.append(f"{model.parent} holds {len(others) + 1} models: 0 is read, {', '.join(others)} not")
     return Capture("COLMAP", tuple(frames), read_points(model), tuple(notes))
+
+
+def points_file(model: Path) -> Path | None:
+    """Find the file with the points of a model, as .bin or as .txt, whatever its other files are."""
+    paths = (model / f"points3D{suffix}" for suffix in SUFFIXES)
+    return next((path for path in paths if is_file(path)), None)
 
 
 def read_points(model: Path) -> Cloud | None:
@@ -131,22 +158,22 @@ def read_points(model: Path) -> Cloud | None:
     Raises:
         DatasetError: the file is cut short or malformed.
     """
-    suffix = _suffix(model)
-    path = model / f"points3D{suffix}"
-    if not is_file(path):
+    path = points_file(model)
+    if path is None:
         return None
-    rows = _points_bin(path) if suffix == ".bin" else _points_txt(path)
+    rows = _points_bin(path) if path.suffix == ".bin" else _points_txt(path)
     if not rows:
         return None
     table = np.array(rows, dtype=np.float64)
-    return Cloud(table[:, :3], np.clip(table[:, 3:] / 255.0, 0.0, 1.0))
+    return Cloud(table[:, :3], unit_colors(table[:, 3:] / 255.0))
 
 
-def read_cameras(path: Path) -> dict[int, Lens]:
+def read_cameras(path: Path, used: Container[int] | None = None) -> dict[int, Lens]:
     """Read the lenses of a model, by camera number.
 
     Args:
         path: cameras.bin or cameras.txt.
+        used: Numbers of the cameras that are wanted; None for all. What the others are does not matter.
 
     Raises:
         DatasetError: the file is cut short or malformed, or a camera model is not undistorted here.
@@ -155,6 +182,8 @@ def read_cameras(path: Path) -> dict[int, Lens]:
     for where, camera, model, W, H, values in (
         _cameras_bin(path) if path.suffix == ".bin" else _cameras_txt(path)
     ):
+        if used is not None and camera not in used:
+            continue
         try:
             lenses[camera] = _lens(model, W, H, values)
         except DatasetError as error:
@@ -175,7 +204,7 @@ def read_images(path: Path) -> list[Pose]:
 
 
 def _suffix(model: Path) -> str:
-    for suffix in (".bin", ".txt"):
+    for suffix in SUFFIXES:
         if is_file(model / f"cameras{suffix}") and is_file(model / f"images{suffix}"):
             return suffix
     raise DatasetError(
@@ -183,27 +212,105 @@ def _suffix(model: Path) -> str:
     )
 
 
+def _numbered(folder: Path) -> list[Path]:
+    """List the folders whose names are numbers, in their order."""
+    if not is_folder(folder):
+        return []
+    return sorted(
+        (p for p in entries(folder) if p.name.isdecimal() and is_folder(p)), key=lambda p: int(p.name)
+    )
+
+
 def _photo_folders(folder: Path, model: Path) -> tuple[list[Path], list[Path]]:
     """Return where photos may lie, and where masks may."""
     photos, masks = [folder / "images", folder], [folder / "masks"]
-    if model == folder / ".":  # the model itself was named; its photos lie where they would for the capture
+    if model == folder or (model.parent == folder and model.name.isdecimal()):
+        # The model or its folder was named; its photos lie where they would for the capture.
         above = folder.absolute().parents[:2]
         photos += [parent / "images" for parent in above]
         masks += [parent / "masks" for parent in above]
     return photos, masks
 
 
-def _candidates(folders: Sequence[Path], name: str) -> Iterator[Path]:
+def _files(
+    folder: Path, model: Path, names: Sequence[str]
+) -> tuple[dict[str, Path], dict[str, Path], list[str]]:
+    """Find photos and masks, by the names of the images, and say what was not used.
+
+    A file that lies there without the folders of its name is used where no other image has that bare name.
+
+    Raises:
+        DatasetError: two images lead to one file.
+    """
+    photo_folders, mask_folders = _photo_folders(folder, model)
+    bare = Counter(Path(name).name for name in names)
+    photos, masks, unclear = dict[str, Path](), dict[str, Path](), list[str]()
+    for name in names:
+        last = Path(name).name
+        alone = [last] if bare[last] == 1 else []
+        places = list(_candidates(photo_folders, name, alone))
+        # Photos of full size first, wherever they are; then those of images_2, images_4 and images_8.
+        photo = next((p for find in (_present, find_photo) for p in map(find, places) if p), None)
+        mask = next((p for p in _masks(mask_folders, [name, *alone]) if is_file(p)), None)
+        if photo is not None:
+            photos[name] = photo
+        if mask is not None:
+            masks[name] = mask
+        elif not alone and any(is_file(p) for p in _masks(mask_folders, [last])):
+            unclear.append(_printable(name))
+    _check_single(model, names, photos)
+    _check_single(model, names, masks)
+    notes = list[str]()
+    if unclear:
+        notes.append(
+            f"{len(unclear)} of {len(names)} photos have a mask only by a bare name that several share: not used, "
+            f"first {unclear[0]}; put masks into folders as the photos are"
+        )
+    return photos, masks, notes
+
+
+def _present(path: Path) -> Path | None:
+    return path if is_file(path) else None
+
+
+def _check_single(model: Path, names: Sequence[str], files: Mapping[str, Path]) -> None:
+    """Refuse two images with one name, or with one file."""
+    owners: dict[Path, str] = {}
+    for name in names:
+        if name not in files:
+            continue
+        if files[name] not in owners:
+            owners[files[name]] = name
+        elif (other := owners[files[name]]) == name:
+            raise DatasetError(f"{model}: lists the image {_printable(name)} twice; export the model again")
+        else:
+            raise DatasetError(
+                f"{files[name]}: is the file of two images, {_printable(other)} and {_printable(name)}; put each "
+                "where its whole name says"
+            )
+
+
+def _candidates(folders: Sequence[Path], name: str, alone: Sequence[str]) -> Iterator[Path]:
     yield from (folder / name for folder in folders)
-    yield from (folder / Path(name).name for folder in folders if folder.name == "images")
+    yield from (folder / last for last in alone for folder in folders if folder.name == "images")
 
 
-def _masks(folders: Sequence[Path], name: str) -> Iterator[Path]:
+def _masks(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Path]:
     for folder in folders:
-        for base in (name, Path(name).name):
-            yield folder / f"{base}.png"
-            if Path(base).name:
-                yield (folder / base).with_suffix(".png")
+        for name in names:
+            yield folder / f"{name}.png"
+            if Path(name).name:
+                yield (folder / name).with_suffix(".png")
+
+
+def _name(raw: bytes) -> str:
+    """Return the name of a file as the system's functions take it, with slashes."""
+    return os.fsdecode(raw).replace("\\", "/")
+
+
+def _printable(name: str) -> str:
+    """Replace what could not be decoded."""
+    return os.fsencode(name).decode("utf-8", "replace")
 
 
 def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
@@ -220,7 +327,7 @@ def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64
 
 def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
     names = dict(MODELS).get(model, "").split()
-    if not names:
+    if not names or model in REFUSED:
         raise DatasetError(
             f"camera model {model} is not undistorted here; run `colmap image_undistorter` and load its output"
         )
@@ -259,12 +366,12 @@ class _Binary:
         self.at += count * size
 
     def word(self) -> str:
-        """Read up to a zero byte."""
+        """Read a name, up to a zero byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise self.corrupt(f"it ends inside {self.where}")
-        text, self.at = self.data[self.at : end].decode("utf-8", "replace"), end + 1
-        return text
+        raw, self.at = self.data[self.at : end], end + 1
+        return _name(raw)
 
     def corrupt(self, what: str) -> DatasetError:
         """Make the error that names the file."""
@@ -317,7 +424,7 @@ def _points_bin(path: Path) -> list[tuple[float, ...]]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8", errors="replace").split("\n")
+        return path.read_text(encoding="utf-8", errors="surrogateescape").split("\n")
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
 
@@ -356,7 +463,8 @@ def _images_txt(path: Path) -> list[Pose]:
             values = [float(v) for v in pose]
             if len(values) != 7:
                 raise ValueError
-            poses.append(Pose(name.strip(), int(camera), tuple(values[:4]), tuple(values[4:])))
+            file = _name(name.strip().encode("utf-8", "surrogateescape"))
+            poses.append(Pose(file, int(camera), tuple(values[:4]), tuple(values[4:])))
         except ValueError:
             raise _malformed(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
         # The image's 2D points follow on a line of their own, which may be empty but is never left out.

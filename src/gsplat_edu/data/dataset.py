@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -14,7 +13,17 @@ from jaxtyping import Float64
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.blender import TRAIN_FILE, read_blender
-from gsplat_edu.data.capture import Capture, Cloud, Frame, is_file, photo_file
+from gsplat_edu.data.capture import (
+    PHOTO_ENDINGS,
+    PHOTO_FOLDERS,
+    Capture,
+    Cloud,
+    Frame,
+    entries,
+    is_file,
+    is_folder,
+    photo_file,
+)
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import ImageStore
 from gsplat_edu.data.points import common_target, finite_cloud, random_cloud, read_points_ply
@@ -34,8 +43,6 @@ EXTENT_MARGIN = 1.1
 
 UNEVEN = 1.5
 """Ratio of the two focal lengths beyond which the user is told: pixels of real cameras are all but square."""
-
-PHOTO_ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic")
 
 
 @dataclass(frozen=True)
@@ -103,7 +110,7 @@ class Dataset:
     images: ImageStore
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
-        """Decode every photo once, on all cores, and keep those within the budget.
+        """Decode every photo once, several at a time, and keep those within the budget.
 
         Args:
             progress: Called with the photos done and their total after each, from the calling thread.
@@ -116,7 +123,7 @@ class Dataset:
         def decode(view: View) -> None:
             view.read()  # the photo is not returned: the futures would keep what is over the budget
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(self.images.workers) as pool:
             futures = [pool.submit(decode, view) for view in views]
             try:
                 for done, future in enumerate(futures, 1):
@@ -146,12 +153,21 @@ def load_dataset(
     notes = list(capture.notes)
     frames = sorted(capture.frames, key=lambda frame: frame.name)
     frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
-    store = ImageStore(settings.image_memory)
-    made = [_view(frame, settings, store) for frame in frames]
-    views = [view for view, _ in made]
-    notes += _lens_notes(frames, [rescaled for _, rescaled in made])
+    made = [photo_file(frame, settings.resolution, settings.background) for frame in frames]
+    store = ImageStore(settings.image_memory, [source for source, _, _ in made])
+    views = [
+        View.stored(camera, partial(store.read, source), frame.name)
+        for frame, (source, camera, _) in zip(frames, made, strict=True)
+    ]
+    notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
+    if store.needed > store.budget:
+        notes.append(
+            f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} of them are kept: "
+            "the others are read again whenever they are used; raise --image-memory, or read them smaller with "
+            "--resolution"
+        )
     train, test = _split(path, views, [frame.part for frame in frames], settings.test_every, notes)
-    start = _start(cloud, [view.camera for view in views], capture.cube, notes, origin)
+    start = cloud or _random_start(capture, [view.camera for view in views], notes, origin)
     return Dataset(path, capture.layout, train, test, start.points, start.colors, origin, tuple(notes), store)
 
 
@@ -183,7 +199,7 @@ def _read(path: Path) -> Capture:
     """Find out what a path holds, and read it."""
     if path.suffix.lower() == ".json" and is_file(path):
         return read_blender(path.parent) if path.name == TRAIN_FILE else read_transforms(path)
-    if not path.is_dir():
+    if not is_folder(path):
         raise DatasetError(f"{path}: is no folder and no .json file; name the folder of a capture")
     if is_file(path / TRAIN_FILE):
         return read_blender(path)
@@ -196,8 +212,8 @@ def _read(path: Path) -> Capture:
         return read_colmap(path, model)
     places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
     looked = f"{TRAIN_FILE}, transforms.json, and cameras and images (.bin or .txt) in {places}"
-    folders = [folder for folder in (path, path / "images") if folder.is_dir()]
-    if any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in folder.iterdir()):
+    folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]
+    if any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in entries(folder)):
         raise DatasetError(
             f"{path}: holds photos but no camera poses; find them with structure from motion, such as "
             f"`colmap automatic_reconstructor` (looked for {looked})"
@@ -222,10 +238,8 @@ def _near_origin(
     return frames, None if cloud is None else replace(cloud, points=cloud.points - origin), origin
 
 
-def _view(frame: Frame, settings: DataSettings, store: ImageStore) -> tuple[View, bool]:
-    """Make the view of a frame; say whether its intrinsics were rescaled."""
-    source, camera, rescaled = photo_file(frame, settings.resolution, settings.background)
-    return View.stored(camera, partial(store.read, source), frame.name), rescaled
+def _spelled(nbytes: int) -> str:
+    return f"{nbytes / 2**30:.1f} GiB" if nbytes >= 2**30 else f"{nbytes / 2**20:.4g} MiB"
 
 
 def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
@@ -259,7 +273,9 @@ def _split(
             tuple(v for v, p in zip(views, parts, strict=True) if p == part) for part in ("train", "test")
         )
         if left_out := len(views) - len(train) - len(test):
-            notes.append(f"{left_out} of {len(views)} photos are in none of the capture's lists: left out")
+            notes.append(
+                f"{left_out} of {len(views)} photos are in none of the capture's lists to train or test on: left out"
+            )
     elif test_every == 0 or (test_every is None and len(views) == 1):
         train, test = tuple(views), ()
         if test_every is None:
@@ -275,23 +291,17 @@ def _split(
     return train, test
 
 
-def _start(
-    cloud: Cloud | None,
-    cameras: Sequence[Camera],
-    cube: float | None,
-    notes: list[str],
-    origin: Float64[np.ndarray, "3"],
+def _random_start(
+    capture: Capture, cameras: Sequence[Camera], notes: list[str], origin: Float64[np.ndarray, "3"]
 ) -> Cloud:
-    """Return the points to start from, made up where there are none."""
-    if cloud is not None:
-        return cloud
-    if cube is not None:
-        made = random_cloud(-origin, cube)
-        where = f"in the cube +-{cube:g}"
+    """Make up points to start from, and say so."""
+    if capture.cube is not None:
+        made = random_cloud(-origin, capture.cube)
+        where = f"in the cube +-{capture.cube:g}"
     else:
         half_edge = scene_extent(cameras)
         centre = common_target(cameras)
         made = random_cloud(centre, half_edge)
         where = f"within {half_edge:.4g} of ({', '.join(f'{c:.4g}' for c in centre)})"
-    notes.append(f"the capture has no points: {len(made.points):,} random ones {where} are the start")
+    notes.append(f"{capture.no_cloud}: {len(made.points):,} random ones {where} are the start")
     return made

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 
-from gsplat_edu.data.lens import Lens, Maps, undistortion
+from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.views import Photo
 
@@ -26,11 +29,16 @@ _UNDECODABLE = (
     IndexError,
     OverflowError,
     struct.error,
-    Image.DecompressionBombError,
 )
+
+MAX_PIXELS = 2**30
+"""Pixels of a photo that are believed; a header that says more is a corrupt file's or not a photo's."""
 
 ALL_OF_IT = 0.9999
 """Share of a pixel's sources that have to count for it to count: all, up to float32 rounding."""
+
+AT_ONCE = 64_000_000
+"""Pixels to decode at once: decoding takes about 10 bytes for each, and 25 more where alpha is resampled."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,42 @@ class PhotoFile:
     background: tuple[float, float, float] | None
 
 
+class _PillowsLimit:
+    """Lifts Pillow's limit of 89 megapixels, made for programs that strangers send files to, while photos are read.
+
+    The limit is the process's, and looked at while a header is read and by some decoders again. It is back as soon as
+    no thread reads.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._readers = 0
+        self._limit: int | None = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._readers == 0:
+                self._limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            self._readers += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._readers -= 1
+            if self._readers == 0:
+                Image.MAX_IMAGE_PIXELS = self._limit
+
+
+_no_limit = _PillowsLimit()
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    with _no_limit, Image.open(path) as file:
+        if file.width * file.height > MAX_PIXELS:
+            raise ValueError(f"{file.width}x{file.height} px are more than a photo has")
+        yield file
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Read width and height from a file's header, px. EXIF orientation is ignored, as COLMAP ignores it.
 
@@ -61,7 +105,7 @@ def image_size(path: Path) -> tuple[int, int]:
         DatasetError: the file is no image.
     """
     try:
-        with Image.open(path) as file:
+        with _opened(path) as file:
             return file.size
     except _UNDECODABLE as error:
         raise _undecodable(path, error) from None
@@ -77,7 +121,7 @@ def decode(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H
         DatasetError: the file is cut short, corrupt or no image.
     """
     try:
-        with Image.open(path) as file:
+        with _opened(path) as file:
             if file.mode.startswith("I"):  # 16-bit gray
                 gray = np.clip(np.asarray(file, dtype=np.int64), 0, 65535)
                 return np.repeat(((gray + 128) // 257).astype(np.uint8)[..., None], 3, axis=2), None
@@ -99,7 +143,7 @@ def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
         DatasetError: the file is cut short, corrupt or no image.
     """
     try:
-        with Image.open(path) as file:
+        with _opened(path) as file:
             plain = file if file.mode[0] in "IF" else file.convert("L")
             mask: Bool[np.ndarray, "H W"] = np.asarray(plain) != 0
             return mask
@@ -122,16 +166,19 @@ def develop(source: PhotoFile) -> Photo:
         image, alpha = np.asarray(Photo(image, alpha).over(source.background)), None
     if not source.lens.distorts and (source.W, source.H) == (source.lens.W, source.lens.H):
         return Photo(image, alpha, mask)
-    try:
-        maps = undistortion(source.lens) if source.lens.distorts else None
-    except DatasetError as error:
-        raise DatasetError(f"{source.path}: {error}") from None
-    if alpha is None:
-        pixels = _resampled(image, maps, source.W, source.H)
-    else:
-        image, alpha = _with_alpha(image, alpha, maps, source.W, source.H)
-        pixels = image
-    return Photo(pixels, alpha, _resampled_mask(mask, maps, source.W, source.H))
+    if alpha is not None:  # colour weighted by alpha, as float32: a transparent pixel has no colour to mix in
+        share = alpha[..., None].astype(np.float32) / 255.0
+        image = np.concatenate([image * share, 255.0 * share], axis=2)
+    if source.lens.distorts:
+        try:
+            image, mask = _undistorted(image, mask, source.lens)
+        except DatasetError as error:
+            raise DatasetError(f"{source.path}: {error}") from None
+    if image.shape[:2] != (source.H, source.W):
+        image = cv2.resize(image, (source.W, source.H), interpolation=cv2.INTER_AREA)
+    if alpha is not None:
+        image, alpha = _unweighted(image)
+    return Photo(image, alpha, None if mask is None else _smaller_mask(mask, source.W, source.H))
 
 
 class ImageStore:
@@ -141,10 +188,16 @@ class ImageStore:
 
     Args:
         budget: Bytes of decoded photos to keep.
+        sources: The photos that will be read.
     """
 
-    def __init__(self, budget: int) -> None:
+    def __init__(self, budget: int, sources: Sequence[PhotoFile]) -> None:
         self.budget = budget
+        self.needed = sum(source.W * source.H * (3 if source.mask is None else 4) for source in sources)
+        """Bytes that all photos take, by their sizes and masks; alpha is not known before they are decoded."""
+        largest = max((source.lens.W * source.lens.H for source in sources), default=1)
+        self.workers = max(1, min(os.cpu_count() or 1, AT_ONCE // largest))
+        """How many photos to decode at once."""
         self._kept: dict[PhotoFile, Photo] = {}
         self._nbytes = 0
         self._lock = threading.Lock()
@@ -176,44 +229,40 @@ class ImageStore:
         return photo
 
 
-def _with_alpha(
-    image: UInt8[np.ndarray, "H W 3"],
-    alpha: UInt8[np.ndarray, "H W"],
-    maps: Maps | None,
-    W: int,
-    H: int,
+def _undistorted(
+    pixels: UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"],
+    mask: Bool[np.ndarray, "H W"] | None,
+    lens: Lens,
+) -> tuple[UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"], Bool[np.ndarray, "H W"] | None]:
+    """Undistort a photo and its mask, band by band: the maps cost less than decoding, so none are kept.
+
+    Raises:
+        DatasetError: as for `undistortion`.
+    """
+    image, counts = np.empty_like(pixels), np.empty(pixels.shape[:2], dtype=np.bool_)
+    for band in bands(lens.H):
+        columns, rows, counts[band] = undistortion(lens, band)
+        image[band] = cv2.remap(pixels, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if mask is not None:
+            counts[band] &= cv2.remap(mask.view(np.uint8), columns, rows, cv2.INTER_NEAREST) != 0
+    if mask is not None:
+        return image, counts
+    return image, None if counts.all() else counts
+
+
+def _unweighted(
+    weighted: Float32[np.ndarray, "h w 4"],
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    """Resample colour weighted by alpha: a transparent pixel has no colour to mix in."""
-    share = alpha[..., None].astype(np.float32) / 255.0
-    weighted = np.concatenate([image * share, 255.0 * share], axis=2)
-    weighted = _resampled(weighted, maps, W, H)
-    opacity = weighted[..., 3:] / 255.0
-    color = weighted[..., :3] / np.maximum(opacity, 1e-6)
+    """Turn colour weighted by alpha, and alpha, into bytes of the two."""
+    color = weighted[..., :3] / np.maximum(weighted[..., 3:] / 255.0, 1e-6)
     return (
         np.clip(np.round(color), 0, 255).astype(np.uint8),
         np.clip(np.round(weighted[..., 3]), 0, 255).astype(np.uint8),
     )
 
 
-def _resampled(
-    pixels: UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"], maps: Maps | None, W: int, H: int
-) -> UInt8[np.ndarray, "h w c"] | Float32[np.ndarray, "h w c"]:
-    if maps is not None:
-        pixels = cv2.remap(pixels, maps.columns, maps.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    if pixels.shape[:2] != (H, W):
-        pixels = cv2.resize(pixels, (W, H), interpolation=cv2.INTER_AREA)
-    return pixels
-
-
-def _resampled_mask(
-    mask: Bool[np.ndarray, "H W"] | None, maps: Maps | None, W: int, H: int
-) -> Bool[np.ndarray, "h w"] | None:
-    if maps is not None and mask is not None:
-        moved = cv2.remap(mask.astype(np.uint8), maps.columns, maps.rows, cv2.INTER_NEAREST)
-        mask = moved != 0
-    if maps is not None and maps.valid is not None:
-        mask = maps.valid if mask is None else mask & maps.valid
-    if mask is None or mask.shape == (H, W):
+def _smaller_mask(mask: Bool[np.ndarray, "H W"], W: int, H: int) -> Bool[np.ndarray, "h w"]:
+    if mask.shape == (H, W):
         return mask
     shares = cv2.resize(mask.astype(np.float32), (W, H), interpolation=cv2.INTER_AREA)
     counts: Bool[np.ndarray, "h w"] = shares >= ALL_OF_IT

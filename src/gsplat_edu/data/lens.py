@@ -7,14 +7,14 @@ pixel is subtracted in `lens_of` and nowhere else.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from gsplat_edu.errors import DatasetError
 
@@ -27,9 +27,22 @@ FISHEYE = ("k1", "k2", "k3", "k4")
 MAX_SIDE = 2**20
 """Longest side of a photo that is believed, px: a larger number is a corrupt file."""
 
-FOCAL_RANGE = 20.0
+FOCAL_RANGE = 3.0
 """How many times longer or shorter undistortion may make the focal length. Beyond that the coefficients fold the
-image over itself, or the lens sees half a turn, which no pinhole does."""
+image over itself, or a pinhole would stretch its rim and blur its middle so much that it is of no use."""
+
+MAX_ANGLE = math.radians(70.0)
+"""Largest angle between the optical axis and what the middle of an edge of a pinhole image shows, radians: a field of
+view of 140 degrees."""
+
+MAX_REMAPPED = 32767
+"""OpenCV resamples photos whose sides are below this, px."""
+
+BAND = 128
+"""Rows that are undistorted at a time: maps of a whole photo would take more memory than the photo."""
+
+FOLD_GRID = 128
+"""Points along the longer side of the grid on which folds are looked for."""
 
 
 @dataclass(frozen=True)
@@ -126,18 +139,28 @@ def lens_of(values: Mapping[str, float], W: int, H: int, *, fisheye: bool = Fals
 def straightened(lens: Lens) -> Lens:
     """Return the pinhole that shows as much of the photo as it can without showing what lies outside of it.
 
+    OpenCV finds the largest rectangle of directions that the photo covers, and stretches it over the image, each
+    axis by itself. Both focal lengths are multiplied by the larger of the two ratios instead, about the middle of
+    that rectangle: pixels keep their shape, and what is shown is a part of the rectangle. OpenCV looks at points
+    of the rim only, so pixels that do lie outside are left to `undistortion`.
+
     Args:
         lens: The camera as it was; returned as it is where it is a pinhole.
 
     Returns:
-        A lens of the same size that does not distort.
+        A lens of the same size, and the same ratio of the focal lengths, that does not distort.
 
     Raises:
-        DatasetError: no such pinhole has a sensible focal length.
+        DatasetError: the photo is too large, or no such pinhole has a sensible focal length and field of view.
     """
     if not lens.distorts:
         return replace(lens, coefficients=())
     size, coefficients = (lens.W, lens.H), _padded(lens)
+    if max(size) >= MAX_REMAPPED:
+        raise DatasetError(
+            f"a photo of {lens.W}x{lens.H} px cannot be undistorted here, only sides below {MAX_REMAPPED} px; "
+            "undistort it with `colmap image_undistorter`, or make it smaller"
+        )
     try:
         if lens.fisheye:
             K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
@@ -147,53 +170,101 @@ def straightened(lens: Lens) -> Lens:
             K = cv2.getOptimalNewCameraMatrix(lens.K, coefficients, size, 0.0)[0]
     except cv2.error:
         K = np.full((3, 3), np.nan)
-    fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    sensible = min(size) > 1 and all(
-        1 / FOCAL_RANGE < new / old < FOCAL_RANGE for new, old in ((fx, lens.fx), (fy, lens.fy))
+    ratio = max(K[0, 0] / lens.fx, K[1, 1] / lens.fy)
+    found = min(size) > 1 and bool(np.isfinite(K).all()) and min(K[0, 0], K[1, 1]) > 0
+    if not found:
+        raise _not_a_pinhole(lens, "the photo covers no rectangle of directions")
+    if not 1 / FOCAL_RANGE < ratio < FOCAL_RANGE:
+        raise _not_a_pinhole(lens, f"the focal length would change {ratio:.3g}-fold")
+    fx, fy = ratio * lens.fx, ratio * lens.fy
+    middle_x, middle_y = (lens.W - 1) / 2, (lens.H - 1) / 2
+    cx = middle_x - (middle_x - K[0, 2]) * fx / K[0, 0]
+    cy = middle_y - (middle_y - K[1, 2]) * fy / K[1, 1]
+    slope = max(
+        max(abs(c + 0.5), abs(side - 0.5 - c)) / f for c, f, side in ((cx, fx, lens.W), (cy, fy, lens.H))
     )
-    if not sensible or not math.isfinite(cx + cy):
-        raise DatasetError(
-            f"distortion {lens.coefficients} at focal length {lens.fx:g} px cannot be undone in a pinhole image; "
-            "undistort the capture with a tool made for wide lenses, such as `colmap image_undistorter`"
-        )
-    return Lens(lens.W, lens.H, fx, fy, cx, cy)
+    if (angle := math.atan(slope)) > MAX_ANGLE:
+        raise _not_a_pinhole(lens, f"it would look {math.degrees(angle):.0f} degrees to the side")
+    return Lens(lens.W, lens.H, float(fx), float(fy), float(cx), float(cy))
+
+
+def _not_a_pinhole(lens: Lens, why: str) -> DatasetError:
+    return DatasetError(
+        f"distortion {lens.coefficients} at focal length {lens.fx:g} px cannot be undone in a pinhole image: {why}; "
+        "check the calibration, or undistort the capture with a tool made for wide lenses, such as "
+        "`colmap image_undistorter`"
+    )
 
 
 class Maps(NamedTuple):
-    """Where each pixel of the straightened photo lies in the photo as it was taken."""
+    """Where each pixel of some rows of the straightened photo lies in the photo as it was taken."""
 
-    columns: Float32[np.ndarray, "H W"]  # px
-    rows: Float32[np.ndarray, "H W"]  # px
-    valid: Bool[np.ndarray, "H W"] | None  # false where there is no such place; None where there always is
+    columns: Float32[np.ndarray, "h W"]  # px
+    rows: Float32[np.ndarray, "h W"]  # px
+    valid: Bool[np.ndarray, "h W"]  # false where there is no such place
 
 
-@lru_cache(maxsize=4)
-def undistortion(lens: Lens) -> Maps:
-    """Return the maps that turn a photo of `lens` into one of `straightened(lens)`.
+def bands(H: int) -> Iterator[slice]:
+    """Divide the rows of a photo into those that are undistorted at a time."""
+    return (slice(top, min(top + BAND, H)) for top in range(0, H, BAND))
+
+
+def undistortion(lens: Lens, band: slice) -> Maps:
+    """Return the maps that turn a photo of `lens` into some rows of one of `straightened(lens)`.
 
     A pixel is valid where its place lies within the photo's edges, half a pixel beyond the outermost centres, and
-    where the image is not folded: beyond the radius at which a polynomial turns round, it shows the same again
-    mirrored.
+    where the image is not folded.
+
+    Args:
+        lens: The camera that took the photo.
+        band: Which rows.
 
     Raises:
-        DatasetError: no pixel is valid.
+        DatasetError: as for `straightened`, or nothing of the photo is left.
     """
-    K, size = straightened(lens).K, (lens.W, lens.H)
-    coefficients = _padded(lens)
-    make = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
-    u, v = make(lens.K, coefficients, np.eye(3), K, size, cv2.CV_32FC1)
+    pinhole, unfolded = straightened(lens), _unfolded(lens)
+    h = band.stop - band.start
+    u, v = _maps(lens, replace(pinhole, H=h, cy=pinhole.cy - band.start))
     valid = (u >= -0.5) & (u <= lens.W - 0.5) & (v >= -0.5) & (v <= lens.H - 0.5)
+    if unfolded is not None:
+        # Pixel centres of the grid, as `Lens.resized` has them. Between good and bad grid points nothing is valid.
+        x = (np.arange(lens.W, dtype=np.float32) + 0.5) * (unfolded.shape[1] / lens.W) - 0.5
+        y = (np.arange(band.start, band.stop, dtype=np.float32) + 0.5) * (unfolded.shape[0] / lens.H) - 0.5
+        X, Y = np.meshgrid(x, y)
+        valid &= cv2.remap(unfolded, X, Y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
+    return Maps(u, v, valid)
+
+
+@lru_cache(maxsize=4096)
+def _unfolded(lens: Lens) -> UInt8[np.ndarray, "h w"] | None:
+    """Look on a coarse grid for folds; return 255 where there is none, or nothing where there is none at all.
+
+    Beyond the radius at which a polynomial turns round, the formula shows the same again, mirrored: the determinant
+    of the map's slopes is negative there, or the place lies on the other side of the principal point.
+
+    Raises:
+        DatasetError: nothing of the photo is left.
+    """
+    scale = min(1.0, FOLD_GRID / max(lens.W, lens.H))
+    w, h = max(2, round(scale * lens.W)), max(2, round(scale * lens.H))
+    small, pinhole = lens.resized(w, h), straightened(lens).resized(w, h)
+    u, v = (plane.astype(np.float64) for plane in _maps(small, pinhole))
     u_y, u_x = np.gradient(u)
     v_y, v_x = np.gradient(v)
-    valid &= u_x * v_y - u_y * v_x > 0
-    x, y = np.arange(lens.W) - K[0, 2], np.arange(lens.H)[:, None] - K[1, 2]
+    good = u_x * v_y - u_y * v_x > 0
+    x, y = np.arange(w) - pinhole.cx, np.arange(h)[:, None] - pinhole.cy
     # Tangential distortion may shift the centre itself by a few pixels; a fold lies much farther out.
-    valid &= ((u - lens.cx) * x + (v - lens.cy) * y > 0) | (x * x + y * y < 0.01 * (lens.W**2 + lens.H**2))
-    if not valid.any():
-        raise DatasetError(
-            f"distortion {lens.coefficients} leaves no pixel of the photo; check the calibration"
-        )
-    return Maps(u, v, None if valid.all() else valid)
+    good &= ((u - small.cx) * x + (v - small.cy) * y > 0) | (x * x + y * y < 0.01 * (w * w + h * h))
+    if not (good & (u > -1.0) & (u < w) & (v > -1.0) & (v < h)).any():
+        raise _not_a_pinhole(lens, "it leaves no pixel of the photo")
+    return None if good.all() else np.where(good, 255, 0).astype(np.uint8)
+
+
+def _maps(lens: Lens, pinhole: Lens) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Return column and row in a photo of `lens`, px, of each pixel of an image of `pinhole`."""
+    make = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+    u, v = make(lens.K, _padded(lens), np.eye(3), pinhole.K, (pinhole.W, pinhole.H), cv2.CV_32FC1)
+    return u, v
 
 
 def _padded(lens: Lens) -> Float64[np.ndarray, " c"]:

@@ -17,8 +17,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.data.capture import Capture, Cloud, Frame, checked_frame, is_file, missing_note
-from gsplat_edu.data.colmap import find_model, read_points
+from gsplat_edu.data.capture import (
+    PHOTO_ENDINGS,
+    Capture,
+    Cloud,
+    Frame,
+    checked_frame,
+    find_photo,
+    is_file,
+    missing_note,
+)
+from gsplat_edu.data.colmap import find_model, points_file, read_points
 from gsplat_edu.data.images import image_size
 from gsplat_edu.data.lens import Lens, lens_of
 from gsplat_edu.data.points import read_points_ply
@@ -26,11 +35,12 @@ from gsplat_edu.errors import DatasetError
 
 FISHEYE_MODEL = "OPENCV_FISHEYE"
 
-CAMERA_MODELS = ("OPENCV", FISHEYE_MODEL, "PINHOLE", "SIMPLE_PINHOLE")
-"""Words for `camera_model` that are understood; without the word it is OPENCV."""
+CAMERA_MODELS = ("OPENCV", FISHEYE_MODEL, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+"""Words for `camera_model` that are understood; without the word it is OPENCV. All but the fisheye are OPENCV with
+coefficients that are zero."""
 
-ENDINGS = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
-"""What is tried behind a file_path, in this order."""
+FOCAL_KEYS = {axis: (f"fl_{axis}", f"camera_angle_{axis}") for axis in "xy"}
+"""Where a focal length is looked for: in px, or as a field of view."""
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
@@ -57,11 +67,15 @@ def read_transforms(path: Path) -> Capture:
     if not frames:
         raise nothing_found(path, missing)
     notes = [missing_note(missing, len(frames) + len(missing))] if missing else []
-    return Capture("transforms.json", tuple(frames), _cloud(path, contents), tuple(notes))
+    cloud, no_cloud = _cloud(path, contents)
+    return Capture("transforms.json", tuple(frames), cloud, tuple(notes), no_cloud or Capture.no_cloud)
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds one object.
+
+    Returns:
+        The object. What is null, in it or in a frame, is left out: it says as much as nothing.
 
     Raises:
         DatasetError: it does not; a syntax error is named by line and column.
@@ -78,7 +92,12 @@ def read_json(path: Path) -> dict[str, Any]:
         raise DatasetError(f"{path}: is not JSON ({type(error).__name__}); repair the file") from None
     if not isinstance(contents, dict) or not isinstance(contents.get("frames"), list):
         raise DatasetError(f"{path}: has no list of frames; it has to be a transforms.json")
-    return contents
+    contents["frames"] = [_stated(f) if isinstance(f, dict) else f for f in contents["frames"]]
+    return _stated(contents)
+
+
+def _stated(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def nothing_found(path: Path, missing: list[str]) -> DatasetError:
@@ -106,18 +125,24 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise DatasetError(f"{path}, frame {number}: has no file_path; every frame names its photo")
         name = _tidy(frame["file_path"])
-        image = next((p for end in ENDINGS if is_file(p := path.parent / f"{name}{end}")), None)
+        image = _photo(path.parent / name)
         if image is None:
             missing.append(name)
             continue
         where = f"{path}, frame {name}"
-        lens = _lens(where, {**contents, **frame}, image)
+        lens = _lens(where, _merged(contents, frame), image)
         R, eye = _pose(where, frame)
         found = Frame(
             name, image, lens, R, eye, _mask(where, path.parent, frame), part or parts.get(name, parts[""])
         )
         frames.append(checked_frame(where, found))
     return Found(frames, missing)
+
+
+def _photo(path: Path) -> Path | None:
+    """Find the photo of a file_path, which may lack its ending."""
+    spelled = (s for ending in PHOTO_ENDINGS for s in (ending, ending.upper(), ending.title()))
+    return next((p for end in ("", *spelled) if (p := find_photo(Path(f"{path}{end}")))), None)
 
 
 def _tidy(file_path: str) -> str:
@@ -134,15 +159,27 @@ def _parts(path: Path, contents: Mapping[str, Any]) -> dict[str, str]:
             raise DatasetError(f"{path}: {key} is not a list of file paths; repair or remove it")
         lists[key] = [_tidy(name) for name in names]
     held_out = lists["test_filenames"] or lists["val_filenames"]
-    parts = dict.fromkeys(held_out, "test")
+    parts = {**dict.fromkeys(lists["val_filenames"], "left out"), **dict.fromkeys(held_out, "test")}
     parts.update(dict.fromkeys(lists["train_filenames"], "train"))
     if lists["train_filenames"]:
         return {"": "left out", **parts}
     return {"": "train" if held_out else "", **parts}
 
 
+def _merged(contents: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a frame, and those of the whole file that it does not state itself.
+
+    One that states its focal length in whatever way takes none of the file's; one that states only that along y takes
+    the file's along x.
+    """
+    axes = "xy" if any(key in frame for key in FOCAL_KEYS["x"]) else "y"
+    stated = any(key in frame for axis in axes for key in FOCAL_KEYS[axis])
+    dropped = [key for axis in axes for key in FOCAL_KEYS[axis]] if stated else []
+    return {**{key: value for key, value in contents.items() if key not in dropped}, **frame}
+
+
 def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
-    """Read the intrinsics of one frame: its own where it has them, else those of the whole file."""
+    """Read the intrinsics of one frame."""
     model = FISHEYE_MODEL if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
     if model not in CAMERA_MODELS:
         raise DatasetError(
@@ -156,16 +193,10 @@ def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
     )
     if not W:
         W, H = image_size(image)
-    if "fl_x" in values:
-        fx = _number(where, values, "fl_x")
-        fy = _number(where, values, "fl_y") if "fl_y" in values else fx
-    elif "camera_angle_x" in values:
-        fx = _focal(where, values, "camera_angle_x", W)
-        fy = _focal(where, values, "camera_angle_y", H) if "camera_angle_y" in values else fx
-        fy = _number(where, values, "fl_y") if "fl_y" in values else fy
-    else:
+    fx, fy = _focal(where, values, "x", W), _focal(where, values, "y", H)
+    if fx is None:
         raise DatasetError(f"{where}: has neither fl_x nor camera_angle_x, nor has the file; add one of them")
-    named = {"fx": fx, "fy": fy, "cx": W / 2, "cy": H / 2}
+    named = {"fx": fx, "fy": fx if fy is None else fy, "cx": W / 2, "cy": H / 2}
     for key in ("cx", "cy", *COEFFICIENTS):
         if key in values:
             named[key] = _number(where, values, key)
@@ -175,8 +206,13 @@ def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
         raise DatasetError(f"{where}: {error}") from None
 
 
-def _focal(where: str, values: Mapping[str, Any], key: str, size: int) -> float:
-    """Turn a field of view into a focal length: f = size / (2 tan(angle / 2))."""
+def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
+    """Read a focal length, px, or turn a field of view into one: f = size / (2 tan(angle / 2))."""
+    length, key = FOCAL_KEYS[axis]
+    if length in values:
+        return _number(where, values, length)
+    if key not in values:
+        return None
     angle = _number(where, values, key)
     if not 0.0 < angle < math.pi:
         raise DatasetError(f"{where}: {key} is {angle:g}, but has to be between 0 and pi radians")
@@ -224,7 +260,7 @@ def _matrix(where: str, values: Mapping[str, Any], key: str) -> Float64[np.ndarr
 
 
 def _mask(where: str, folder: Path, frame: Mapping[str, Any]) -> Path | None:
-    if frame.get("mask_path") is None:
+    if "mask_path" not in frame:
         return None
     mask = folder / _tidy(str(frame["mask_path"]))
     if not is_file(mask):
@@ -232,20 +268,30 @@ def _mask(where: str, folder: Path, frame: Mapping[str, Any]) -> Path | None:
     return mask
 
 
-def _cloud(path: Path, contents: Mapping[str, Any]) -> Cloud | None:
+def _cloud(path: Path, contents: Mapping[str, Any]) -> tuple[Cloud | None, str]:
     """Read the start cloud: the PLY the file names, else the points of the COLMAP model the poses came from.
 
     The PLY is in the frame of the poses already. COLMAP's points are in the frame before `applied_transform`, so
-    they are moved by it; without that key nobody knows how the two are related, and they are not used.
+    they are moved by it; without that key, or where the poses were scaled too, nobody knows how the two are related.
+
+    Returns:
+        The points; or none, and why COLMAP's are not used where that is the reason.
     """
-    if contents.get("ply_file_path") is not None:
-        return read_points_ply(path.parent / _tidy(str(contents["ply_file_path"])))
+    if "ply_file_path" in contents:
+        return read_points_ply(path.parent / _tidy(str(contents["ply_file_path"]))), ""
     model = find_model(path.parent)
-    if model is None or "applied_transform" not in contents:
-        return None
-    cloud, matrix = read_points(model), _matrix(str(path), contents, "applied_transform")
-    if cloud is None:
-        return None
+    if model is None or points_file(model) is None:
+        return None, ""
+    unused = f"the points of the COLMAP model in {model} are not used, because {path.name}"
+    if "applied_transform" not in contents:
+        return None, f"{unused} does not say by applied_transform how its poses were moved"
+    scale = _number(str(path), contents, "applied_scale") if "applied_scale" in contents else 1.0
+    if scale != 1.0:
+        return None, f"{unused} has poses scaled by {scale:g} (applied_scale)"
+    matrix = _matrix(str(path), contents, "applied_transform")
     if not np.all(np.isfinite(matrix)):
         raise DatasetError(f"{path}: applied_transform is NaN or infinite; repair or remove it")
-    return Cloud(cloud.points @ matrix[:3, :3].T + matrix[:3, 3], cloud.colors)
+    cloud = read_points(model)
+    if cloud is None:
+        return None, ""
+    return Cloud(cloud.points @ matrix[:3, :3].T + matrix[:3, 3], cloud.colors), ""

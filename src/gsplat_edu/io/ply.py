@@ -23,7 +23,7 @@ from torch import Tensor
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.ply_table import Element, read_elements, read_rows
+from gsplat_edu.ply_table import Element, read_elements, read_rows
 from gsplat_edu.validation import ArrayLike, float64_array
 
 MEANS = ("x", "y", "z")

@@ -29,7 +29,7 @@ def data_settings(config: dict[str, Any]) -> DataSettings:
 
 
 def run_dataset(config: dict[str, Any], path: Path | None = None) -> Dataset:
-    """Load the dataset that a run was trained on.
+    """Load the dataset that a run was trained on, for its views: start points given apart are not read again.
 
     Args:
         config: The run's config.json.
@@ -40,7 +40,7 @@ def run_dataset(config: dict[str, Any], path: Path | None = None) -> Dataset:
         DatasetError: the dataset cannot be read.
     """
     settings = data_settings(config)
-    place, points = config["data"].get("path"), config["data"].get("points")
+    place = config["data"].get("path")
     if path is None and not isinstance(place, str):
         raise CheckpointError(
             "config.json: data: names no path; give the dataset's folder with --dataset PATH"
@@ -49,4 +49,4 @@ def run_dataset(config: dict[str, Any], path: Path | None = None) -> Dataset:
         raise CheckpointError(
             f"{place}: the run's dataset is no longer there; name its folder with --dataset PATH"
         )
-    return load_dataset(path or Path(place), settings, points=None if points is None else Path(points))
+    return load_dataset(path or Path(place), settings)

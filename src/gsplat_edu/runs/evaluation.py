@@ -101,12 +101,12 @@ def evaluate_run(
         **(facts or {}),
         "test_views": [dataclasses.asdict(score) for score in test],
     }
-    folder.write_metrics(metrics)
     title = f"{folder.path.resolve().name}: 3D Gaussian Splatting"
     write_report(
         folder.report,
         Report(title, metrics, log, config, scores=test, pictures=gallery.pictures, notes=judged.notes),
     )
+    folder.write_metrics(metrics)  # last: it says that the run has been judged
     return Evaluation(test, train, metrics)
 
 

@@ -255,7 +255,7 @@ def write_json(path: Path, value: object) -> None:
         OSError: the file cannot be written. What stood there before is untouched.
     """
     try:
-        text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=True)
     except (ValueError, TypeError) as error:
         raise ArgumentError(f"{path}: cannot be written as JSON ({error}); nothing was changed") from None
     with written_aside(path) as aside:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any, TextIO
 
-from gsplat_edu.files import written_aside
+from gsplat_edu.files import named_failure, written_aside
 from gsplat_edu.train.events import Event, StepEvent
 
 STEPS_PER_LINE = 10
@@ -57,8 +58,10 @@ class LogWriter:
         if self._file is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("a", encoding="utf-8")
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
+        finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in line.items()}
+        with named_failure(self.path):
+            self._file.write(json.dumps(finite, allow_nan=False) + "\n")
+            self._file.flush()
 
     def cut(self, iteration: int, seconds: float = 0.0) -> None:
         """Drop the lines of steps beyond a checkpoint, which will be taken again.

@@ -17,26 +17,22 @@ from typing import Any
 
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.evaluate.metrics import ImageScore, score_views, summarize
+from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
+from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.identity import check_capture, check_options, fingerprint
 from gsplat_edu.runs.log import LogWriter
-from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_extra, save_checkpoint
+from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_seconds, save_checkpoint
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.validation import whole_number
-
-SAME = ("train", "render", "data")
-"""Sections of config.json that a resumed run has to share with the one it goes on from."""
-
-MAY_DIFFER = {"data": ("path", "image_memory")}
-"""What in them may be another all the same: the capture may have been moved."""
 
 
 @dataclass(frozen=True)
@@ -148,14 +144,19 @@ class CaptureRun:
                 raise CheckpointError(
                     f"--out: {folder.path} holds a run already; add --resume to go on with it, or name another folder"
                 )
-            _check_same(folder.read_config(), options.document(), folder.path)
+            check_options(folder, options.document())
             done = folder.read_metrics().get("iterations", 0)
+            if not isinstance(done, int):
+                raise CheckpointError(f"{folder.metrics}: iterations: is no number; mend or remove the file")
             if done >= options.config.iterations:
                 self._say(f"{folder.path}: is finished, {done} iterations; nothing to do")
                 return True
             return False
-        if folder.path.exists() and not folder.path.is_dir():
-            raise ArgumentError(f"--out: {folder.path} is a file; name a folder")
+        check_folder("--out", folder.path)
+        if list_checkpoints(folder.checkpoints):
+            raise CheckpointError(
+                f"--out: {folder.path} holds checkpoints of a run whose config.json is gone; name another folder"
+            )
         if options.resume:
             self._say(f"{folder.path}: holds no run to resume; starting at the beginning")
         return False
@@ -171,9 +172,13 @@ class CaptureRun:
         """
         options, dataset, folder = self.options, self.dataset, self.folder
         dataset.preload(progress)
-        if not folder.exists():
-            folder.write_config(options.document() | {"origin": dataset.origin.tolist()})
+        if folder.exists():
+            remove_leftovers(folder.path)
+            check_capture(folder, dataset)
+        else:  # config.json comes last: it says that the run has begun
             folder.write_cameras(dataset.train, dataset.test, dataset.origin)
+            facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
+            folder.write_config(options.document() | facts)
         extent = scene_extent([view.camera for view in dataset.train])
         gaussians = from_points(dataset.points, dataset.colors, options.config)
         if len(gaussians) < len(dataset.points):
@@ -197,7 +202,7 @@ class CaptureRun:
         checkpoints = list_checkpoints(self.folder.checkpoints)
         if checkpoints:
             load_checkpoint(checkpoints[-1], self.trainer)
-            self.seconds = float(read_extra(checkpoints[-1])["seconds"])
+            self.seconds = read_seconds(checkpoints[-1])
             self._say(f"resuming after {self.trainer.iteration} iterations")
         elif self.options.resume and self.folder.log_file.exists():
             self._say(f"{self.folder.path}: holds no checkpoint; starting at the beginning")
@@ -217,33 +222,49 @@ class CaptureRun:
 
         def ends() -> bool:
             nonlocal asked
-            self._judge_and_save_where_due()
             asked = stop()
+            if not asked:
+                self._judge_and_save_where_due(stop)
+                asked = stop()
             return asked or (limit is not None and self._elapsed() >= limit)
 
-        if limit is None or self.seconds < limit:
-            self.trainer.run(ends)
+        try:
+            if limit is None or self.seconds < limit:
+                self.trainer.run(ends)
+        finally:
+            self._log.close()
         self.seconds = self._elapsed()
         self.save()
         return asked
 
-    def _judge_and_save_where_due(self) -> None:
+    def _judge_and_save_where_due(self, stop: Callable[[], bool]) -> None:
         done, options = self.trainer.iteration, self.options
         if done == options.config.iterations:
             return  # both are done at the end
+        if options.eval_every and done % options.eval_every == 0 and self.dataset.test:
+            self._judge(stop)
         if options.save_every and done % options.save_every == 0:
             self.save()
-        if options.eval_every and done % options.eval_every == 0 and self.dataset.test:
-            means = summarize(self.scores())
-            self._log.write({"iteration": done, "psnr": means["psnr"], "ssim": means["ssim"]})
-            count = len(self.trainer.gaussians)
-            self._say(
-                f"iteration {done}: test PSNR {means['psnr']:.2f} dB, SSIM {means['ssim']:.4f}, {count} Gaussians"
-            )
+
+    def _judge(self, stop: Callable[[], bool]) -> None:
+        """Score the test views as the scene stands; say and log what came out, unless it is to stop meanwhile."""
+        settings, done = self.options.render_settings, self.trainer.iteration
+        renderer = functools.partial(render, settings=settings, backend=self.options.backend)
+        scores = []
+        for view in self.dataset.test:
+            if stop():
+                return
+            scores += score_views(self.trainer.gaussians, [view], renderer, settings.background)
+        if not scores:
+            return
+        means = summarize(scores)
+        self._log.write({"iteration": done, "psnr": means["psnr"], "ssim": means["ssim"]})
+        figures = f"test PSNR {means['psnr']:.2f} dB, SSIM {means['ssim']:.4f}"
+        self._say(f"iteration {done}: {figures}, {len(self.trainer.gaussians)} Gaussians")
 
     def save(self) -> Path:
         """Write a checkpoint; see `gsplat_edu.train.checkpoint.save_checkpoint`."""
-        return save_checkpoint(self.folder.checkpoints, self.trainer, {"seconds": self._elapsed()})
+        return save_checkpoint(self.folder.checkpoints, self.trainer, self._elapsed())
 
     def finish(self, progress: Progress | None = None) -> Evaluation:
         """Write the scene, and judge it by test and training views.
@@ -252,23 +273,19 @@ class CaptureRun:
             progress: Told of every view that was scored.
         """
         trainer, dataset = self.trainer, self.dataset
-        self._log.close()
-        save_ply(self.folder.scene(trainer.iteration), trainer.gaussians, dataset.origin)
+        gaussians = trainer.gaussians.map(lambda tensor: tensor[trainer.gaussians.finite_rows()])
+        if lost := len(trainer.gaussians) - len(gaussians):
+            self._say(f"{lost} Gaussians are NaN or infinite, and are left out of the scene")
+        save_ply(self.folder.scene(trainer.iteration), gaussians, dataset.origin)
         settings = self.options.render_settings
         return evaluate_run(
             self.folder,
             Judged(dataset.test, dataset.train, settings.background, dataset.notes),
-            trainer.gaussians,
+            gaussians,
             functools.partial(render, settings=settings, backend=self.options.backend),
             {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)},
             progress,
         )
-
-    def scores(self) -> list[ImageScore]:
-        """Score the test views as the scene stands."""
-        settings = self.options.render_settings
-        renderer = functools.partial(render, settings=settings, backend=self.options.backend)
-        return score_views(self.trainer.gaussians, self.dataset.test, renderer, settings.background)
 
     @contextmanager
     def clock_stopped(self) -> Iterator[None]:
@@ -282,18 +299,7 @@ class CaptureRun:
 
     def _record(self, trainer: Trainer, event: Event) -> None:
         self._log.record(event, self._elapsed())
-
-
-def _check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
-    for section in SAME:
-        before, now = (dict(config.get(section, {})) for config in (old, new))
-        for key in sorted({*before, *now} - set(MAY_DIFFER.get(section, ()))):
-            a, b = (_plain(values.get(key)) for values in (before, now))
-            if a != b:
-                raise CheckpointError(
-                    f"--resume: {path} was begun with {key} = {a}, not {b}; give the same options, or another --out"
-                )
-
-
-def _plain(value: object) -> object:
-    return list(value) if isinstance(value, tuple) else value
+        if not len(trainer.gaussians):
+            raise ArgumentError(
+                f"iteration {trainer.iteration}: every Gaussian was pruned; lower --min-opacity or the learning rates"
+            )

@@ -27,13 +27,13 @@ FORMAT = "1"
 _NAME = re.compile(r"iteration_(\d+)\.safetensors")
 
 
-def save_checkpoint(folder: Path, trainer: Trainer, extra: dict[str, Any]) -> Path:
+def save_checkpoint(folder: Path, trainer: Trainer, seconds: float) -> Path:
     """Write the trainer's state as folder/iteration_N.safetensors, and remove all but the last two.
 
     Args:
         folder: Where checkpoints go; made where it is missing.
         trainer: The run.
-        extra: What else is to be found again, JSON.
+        seconds: Wall time of the training so far.
 
     Returns:
         The file.
@@ -43,7 +43,7 @@ def save_checkpoint(folder: Path, trainer: Trainer, extra: dict[str, Any]) -> Pa
     """
     tensors, numbers = trainer.state()
     path = folder / f"iteration_{trainer.iteration}.safetensors"
-    header = {"format": FORMAT, "state": json.dumps(numbers), "extra": json.dumps(extra)}
+    header = {"format": FORMAT, "state": json.dumps(numbers), "seconds": json.dumps(seconds)}
     try:
         with written_aside(path) as aside:
             save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, aside, header)
@@ -63,15 +63,17 @@ def list_checkpoints(folder: Path) -> list[Path]:
     return [path for _, path in sorted(found)]
 
 
-def read_extra(path: Path) -> dict[str, Any]:
-    """Return what `save_checkpoint` was given as `extra`.
+def read_seconds(path: Path) -> float:
+    """Return the wall time of the training up to a checkpoint.
 
     Raises:
         CheckpointError: the file is damaged.
     """
-    with _opened(path) as file:
-        extra: dict[str, Any] = json.loads(file.metadata()["extra"])
-    return extra
+    try:
+        with _opened(path) as file:
+            return float(json.loads(file.metadata()["seconds"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise _damaged(path, str(error)) from None
 
 
 def load_checkpoint(path: Path, trainer: Trainer) -> None:
@@ -84,7 +86,7 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
         with _opened(path) as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             trainer.load_state(tensors, json.loads(file.metadata()["state"]))
-    except (KeyError, TypeError, ValueError, SafetensorError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, SafetensorError) as error:
         raise _damaged(path, str(error)) from None
 
 

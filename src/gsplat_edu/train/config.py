@@ -131,8 +131,8 @@ class TrainConfig:
             whole_number(name, getattr(self, name), 0)
         whole_number("seed", self.seed, 0, 2**63 - 1)
         whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE)
-        whole_number("densify_stop", self.densify_stop, self.densify_start)
-        whole_number("mcmc_stop", self.mcmc_stop, self.densify_start)
+        for name, strategy in (("densify_stop", "adc"), ("mcmc_stop", "mcmc")):
+            whole_number(name, getattr(self, name), self.densify_start if strategy == self.strategy else 0)
         if self.max_gaussians is not None:
             whole_number("max_gaussians", self.max_gaussians, 1)
         for name in _NOT_NEGATIVE:
@@ -187,6 +187,30 @@ _NOT_NEGATIVE = (
     "mcmc_opacity_weight",
     "mcmc_scale_weight",
 )
+
+ONLY_FOR = {
+    "adc": (
+        "over_cap",
+        "densify_stop",
+        "grad_threshold",
+        "percent_dense",
+        "split_shrink",
+        "prune_scale",
+        "prune_screen_size",
+        "reset_every",
+        "reset_opacity",
+    ),
+    "mcmc": (
+        "mcmc_stop",
+        "mcmc_start_opacity",
+        "mcmc_start_scale",
+        "mcmc_growth",
+        "mcmc_noise",
+        "mcmc_opacity_weight",
+        "mcmc_scale_weight",
+    ),
+}
+"""Fields that one strategy looks at and the others do not."""
 
 MILESTONES = (
     "means_rate_iterations",

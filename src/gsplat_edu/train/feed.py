@@ -29,23 +29,22 @@ class ViewFeed:
 
     def next(self) -> tuple[View, Photo]:
         """Draw a view, and begin to read the photo of the one after it."""
-        index = self._drawn(0)
+        index = self._following()
         self._queue.pop(0)
         ahead, self._ahead = self._ahead, None
         view = self.views[index]
         photo = ahead[1].result() if ahead and ahead[0] == index else view.read()
-        following = self._drawn(0)
+        following = self._following()
         if self.views[following].on_disk:
             self._ahead = following, self._reader.submit(self.views[following].read)
         return view, photo
 
-    def _drawn(self, place: int) -> int:
-        while len(self._queue) <= place:
-            if self._order == "random":
-                self._queue.append(int(self._generator.integers(len(self.views))))
-            else:
-                self._queue += self._generator.permutation(len(self.views)).tolist()
-        return self._queue[place]
+    def _following(self) -> int:
+        if not self._queue and self._order == "random":
+            self._queue.append(int(self._generator.integers(len(self.views))))
+        elif not self._queue:
+            self._queue += self._generator.permutation(len(self.views)).tolist()
+        return self._queue[0]
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint keeps: the draws that are outstanding and the generator, as JSON."""
@@ -54,4 +53,6 @@ class ViewFeed:
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint."""
         self._queue, self._ahead = [int(index) for index in state["queue"]], None
+        if any(not 0 <= index < len(self.views) for index in self._queue):
+            raise ValueError("it names a view that is not there")
         self._generator.bit_generator.state = state["generator"]

@@ -41,10 +41,13 @@ class AdaptiveDensityControl:
         self, config: TrainConfig, extent: float, generator: torch.Generator, gaussians: Gaussians
     ) -> None:
         self.config, self.extent, self.generator = config, extent, generator
+        self.is_over = False
         self._forget(gaussians)
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
         """Add this view's gradient norms to those of the Gaussians it shows."""
+        if self.is_over:
+            return
         self.norm_sums[output.visible] += output.means2d_grad_norms()
         self.times_visible[output.visible] += 1
         if self.config.prune_screen_size:
@@ -55,6 +58,7 @@ class AdaptiveDensityControl:
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Clone, split, prune and reset where the schedule has it."""
         config, events = self.config, list[Change]()
+        self.is_over = iteration + 1 >= config.densify_stop
         if not config.densify_start < iteration < config.densify_stop:
             return gaussians, events
         if iteration % config.densify_every == 0:
@@ -73,7 +77,7 @@ class AdaptiveDensityControl:
         config = self.config
         pull = self.norm_sums / self.times_visible.clamp(min=1)
         size = gaussians.scales.amax(dim=-1)
-        keep = gaussians.opacities >= config.min_opacity
+        keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
         if config.reset_every and iteration > config.reset_every:
             if config.prune_scale:
                 keep &= size <= config.prune_scale * self.extent
@@ -124,10 +128,11 @@ class AdaptiveDensityControl:
             "largest_radii": self.largest_radii,
             "generator": self.generator.get_state(),
         }
-        return tensors, {}
+        return tensors, {"is_over": self.is_over}
 
     def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
         """Go on from a checkpoint."""
         self.norm_sums, self.times_visible = tensors["norm_sums"], tensors["times_visible"]
         self.largest_radii = tensors["largest_radii"]
         self.generator.set_state(tensors["generator"])
+        self.is_over = bool(numbers["is_over"])

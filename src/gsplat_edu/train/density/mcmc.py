@@ -69,7 +69,7 @@ class MCMC:
         config, events = self.config, list[Change]()
         due = config.densify_start < iteration < config.mcmc_stop and iteration % config.densify_every == 0
         if due and len(gaussians):
-            dead = gaussians.opacities <= config.min_opacity
+            dead = (gaussians.opacities <= config.min_opacity) | ~gaussians.finite_rows()
             num_relocated = self._relocate(gaussians, optimizer, torch.nonzero(dead)[:, 0])
             gaussians, num_added = self._grow(gaussians, optimizer)
             events.append(RelocateEvent(iteration, num_relocated, num_added, len(gaussians)))
@@ -94,7 +94,10 @@ class MCMC:
         num_added = max(min(self.cap, int(self.config.mcmc_growth * count)) - count, 0)
         if not num_added:
             return gaussians, 0
-        places = self._draw(gaussians.opacities.double(), num_added)
+        weights = torch.where(gaussians.finite_rows(), gaussians.opacities.double(), 0.0)
+        if not bool((weights > 0).any()):
+            return gaussians, 0
+        places = self._draw(weights, num_added)
         self._share(gaussians, optimizer, places)
         newborn = gaussians.map(lambda tensor: tensor[places])
         keep = torch.ones(count, dtype=torch.bool, device=gaussians.means.device)

@@ -103,9 +103,11 @@ def read_elements(path: Path, file: BinaryIO) -> Header:
     """
     first = file.readline(LINE_LIMIT)
     if first.startswith(LFS_POINTER):
-        raise SceneFormatError(f"{path}: is a Git LFS pointer, not the scene; fetch it with: git lfs pull")
+        raise SceneFormatError(
+            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
+        )
     if first.strip() != b"ply":
-        raise SceneFormatError(f"{path}: is not a PLY: its first line is not 'ply'; give a scene PLY")
+        raise SceneFormatError(f"{path}: is not a PLY: its first line is not 'ply'; give another file")
     header = _HeaderLines()
     for number in range(2, HEADER_LIMIT):
         line = file.readline(LINE_LIMIT)
