@@ -59,9 +59,9 @@ class AdaptiveDensityControl:
         """Clone, split, prune and reset where the schedule has it."""
         config, events = self.config, list[Change]()
         self.is_over = iteration + 1 >= config.densify_stop
-        if not config.densify_start < iteration < config.densify_stop:
+        if iteration >= config.densify_stop:
             return gaussians, events
-        if iteration % config.densify_every == 0:
+        if iteration > config.densify_start and iteration % config.densify_every == 0:
             gaussians, densified = self._densify(iteration, gaussians, optimizer)
             events.append(densified)
         if self._reset_is_due(iteration):
@@ -112,8 +112,8 @@ class AdaptiveDensityControl:
 
     def _reset_is_due(self, iteration: int) -> bool:
         every = self.config.reset_every
-        on_white = min(self.config.background) >= 1.0 and iteration == self.config.densify_start + 1
-        return bool(every) and (iteration % every == 0 or on_white)
+        on_white = min(self.config.background) >= 1.0 and iteration == self.config.densify_start
+        return bool(every) and iteration > 0 and (iteration % every == 0 or on_white)
 
     def _forget(self, gaussians: Gaussians) -> None:
         self.norm_sums = torch.zeros_like(gaussians.logit_opacities, requires_grad=False)
