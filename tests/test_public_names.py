@@ -12,10 +12,10 @@ SIGNATURES = {
     "quat_to_R_batch": "(quats)",
     "build_cov3d": "(scale, R)",
     "build_cov3d_batch": "(scales, Rs)",
-    "project_cov3d": "(cov3d, mean_cam, cam)",
+    "project_cov3d": "(cov3d, mean_cam, cam, *, jacobian_limit=None)",
     "render_gaussians": (
         "(cam, means, cov3ds, colors, opacities, bg=(0, 0, 0), z_near=0.05, "
-        "*, extent='box3sigma', stop='box')"
+        "*, extent='box3sigma', stop='box', jacobian_limit=None)"
     ),
     "sphere_shell": "(n=2500, s_t=0.06, s_n=0.01, opacity=0.8, seed=0)",
     "sh_basis": "(dirs)",

@@ -100,7 +100,7 @@ def build_cov3d_batch(scales: ArrayLike, Rs: ArrayLike) -> Float64[np.ndarray, "
 
 
 def project_cov3d(
-    cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera, jacobian_limit: float | None = None
+    cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera, *, jacobian_limit: float | None = None
 ) -> Float64[np.ndarray, "*batch 2 2"]:
     """Project 3D covariances to the image, to first order around their means.
 

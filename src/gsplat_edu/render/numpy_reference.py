@@ -132,7 +132,9 @@ def project(
     index = np.flatnonzero(means_cam[:, 2] > z_near)
     index = index[np.argsort(means_cam[index, 2], kind="stable")]
     u, v, _ = cam.project(means_cam[index])
-    cov2d = project_cov3d(cov3ds[index], means_cam[index], cam, jacobian_limit) + DILATION * np.eye(2)
+    cov2d = project_cov3d(
+        cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit
+    ) + DILATION * np.eye(2)
     return Projection(index, np.stack([u, v], axis=-1), cov2d)
 
 
