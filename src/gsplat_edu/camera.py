@@ -6,6 +6,7 @@ Axes are OpenCV's, for the world and the camera alike: +x right, +y down, +z for
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -216,3 +217,46 @@ def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius:
     )
     direction = (np.cos(elevation) * np.sin(azimuth), np.sin(elevation), -np.cos(elevation) * np.cos(azimuth))
     return Camera.looking_at(radius * np.array(direction), (0.0, 0.0, 0.0), fx, fx, size, size)
+
+
+def point_nearest_axes(cameras: Sequence[Camera], parallel: float) -> Float64[np.ndarray, "3"] | None:
+    """Find the point closest to all optical axes, in the least-squares sense.
+
+    p minimises sum_i |(I - d_i d_i') (p - e_i)|²,  e_i: centre of camera i,  d_i: direction it looks in
+
+    Args:
+        cameras: At least one.
+        parallel: Smallest eigenvalue of mean_i (I - d_i d_i') that fixes a point.
+
+    Returns:
+        (3,) world units; None where the axes are so nearly parallel that where they cross is noise.
+    """
+    eyes = np.stack([camera.eye for camera in cameras])
+    axes = np.stack([camera.R[2] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    A, mean = across.mean(axis=0), eyes.mean(axis=0)
+    if np.linalg.eigvalsh(A)[0] < parallel:
+        return None
+    b = (across @ (eyes - mean)[:, :, None]).mean(axis=0)[:, 0]
+    return np.asarray(mean + np.linalg.solve(A, b))
+
+
+def scaled_intrinsics(
+    fx: float, fy: float, cx: float, cy: float, sx: float, sy: float
+) -> tuple[float, float, float, float]:
+    """Return the intrinsics of the same photo at another size.
+
+    f' = f s,  c' = (c + 1/2) s - 1/2: the image's edge, not the centre of its first pixel, stays in place.
+
+    Args:
+        fx: Focal length along x, px.
+        fy: Focal length along y, px.
+        cx: Column of the principal point, px.
+        cy: Row of the principal point, px.
+        sx: New width over old.
+        sy: New height over old.
+
+    Returns:
+        fx', fy', cx', cy', px.
+    """
+    return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5

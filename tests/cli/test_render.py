@@ -3,17 +3,16 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 import gsplat_edu.cli.main as command_line
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
+from splats import splats_on
 
 ORIGIN = (512.0, -64.0, 8.0)
 BLUE = (0.0, 0.0, 1.0)
@@ -31,15 +30,7 @@ def made(tmp_path_factory):
     root = tmp_path_factory.mktemp("made")
     views, points, colors = procedural_capture(size=32, count=6)
     write_colmap(root / "capture", views, points, colors)
-    count = len(points)
-    gaussians = Gaussians(
-        means=torch.tensor(points, dtype=torch.float32),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        log_scales=torch.full((count, 3), -2.5),
-        sh0=torch.tensor((colors - 0.5) / 0.28209479177387814, dtype=torch.float32)[:, None],
-        sh_rest=torch.zeros(count, 0, 3),
-        logit_opacities=torch.full((count,), 2.0),
-    )
+    gaussians = splats_on(points, colors)
     folder = RunFolder(root / "run")
     folder.write_config(
         {"render": dataclasses.asdict(RenderSettings(background=BLUE)), "origin": list(ORIGIN), "data": {}}

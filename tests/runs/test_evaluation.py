@@ -3,33 +3,20 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.evaluation import Judged, evaluate_run
 from gsplat_edu.runs.folder import RunFolder
+from splats import splats_on
 
 
 @pytest.fixture(scope="module")
 def capture():
     return procedural_capture(size=32, count=5)
-
-
-def scene(points, colors):
-    count = len(points)
-    return Gaussians(
-        means=torch.tensor(points, dtype=torch.float32),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        log_scales=torch.full((count, 3), -2.5),
-        sh0=torch.tensor((colors - 0.5) / 0.28209479177387814, dtype=torch.float32)[:, None],
-        sh_rest=torch.zeros(count, 0, 3),
-        logit_opacities=torch.full((count,), 2.0),
-    )
 
 
 @pytest.fixture
@@ -44,7 +31,7 @@ RENDER = functools.partial(render, settings=RenderSettings(depth=False))
 
 def test_a_run_is_judged_and_everything_is_written(capture, folder):
     views, points, colors = capture
-    gaussians = scene(points, colors)
+    gaussians = splats_on(points, colors)
     folder.write_metrics({"seconds": 12.5, "num_gaussians": 1, "mine": "kept"})
     told = []
     judged = Judged(views[:2], views[2:], notes=["a note"])
@@ -82,7 +69,7 @@ def test_a_run_is_judged_and_everything_is_written(capture, folder):
 
 def test_no_test_views_are_no_obstacle(capture, folder):
     views, points, colors = capture
-    result = evaluate_run(folder, Judged([], views[:1]), scene(points, colors), RENDER)
+    result = evaluate_run(folder, Judged([], views[:1]), splats_on(points, colors), RENDER)
     assert result.metrics["test"] == {
         "psnr": None,
         "psnr_8bit": None,

@@ -30,6 +30,16 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
+def add_backend(parser: argparse._ActionsContainer) -> None:
+    """Add the option --backend."""
+    from gsplat_edu.render.backends import (
+        BACKENDS,  # it imports torch, which the line for --help can do without
+    )
+
+    names = ", ".join(("auto", *BACKENDS))
+    parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+
+
 def whole_number_text(text: str) -> int:
     """Read a whole number from the command line."""
     try:

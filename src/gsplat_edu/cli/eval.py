@@ -11,10 +11,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsplat_edu.cli.arguments import add_backend
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import BACKENDS, resolve_backend
+from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.evaluation import Judged, evaluate_run
 from gsplat_edu.runs.folder import RunFolder, render_settings
@@ -31,8 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="the dataset's folder, where it is not where the run had it",
     )
-    names = ", ".join(("auto", *BACKENDS))
-    parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+    add_backend(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:

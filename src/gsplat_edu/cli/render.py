@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsplat_edu.camera import Camera
-from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.images import write_frames
@@ -24,7 +24,7 @@ from gsplat_edu.evaluate.paths import orbit_of_scene, orbit_path, resized
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import BACKENDS, resolve_backend
+from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
@@ -85,8 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--white-background", action="store_true", help="render over white (default: the run's background)"
     )
-    names = ", ".join(("auto", *BACKENDS))
-    parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+    add_backend(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
@@ -25,7 +25,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import BACKENDS, resolve_backend
+from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
@@ -120,8 +120,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=whole_number_text, metavar="N", help=f"{text} {default}")
     number("--k0", 400, "Gaussians at the start")
     number("--seed", 9, "seed of the start, the splits and the view order")
-    names = ", ".join(("auto", *BACKENDS))
-    parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+    add_backend(parser)
     parser.add_argument(
         "--out",
         type=Path,

@@ -15,12 +15,13 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gsplat_edu.cli.arguments import bytes_text, seconds_text, whole_number_text
+from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.data.dataset import DataSettings
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore
-from gsplat_edu.render.backends import BACKENDS, resolve_backend
+from gsplat_edu.evaluate.metrics import psnr as shown_psnr
+from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.train.config import ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
 from gsplat_edu.train.events import Event, StepEvent
@@ -78,18 +79,18 @@ def _add_budget(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--strategy", metavar="NAME", default="adc", help=f"one of {names} (default: adc)")
     number("--max-gaussians", "cap on the number of Gaussians (default: none; mcmc needs one)")
     number("--seed", "seed of all that is drawn at random (default: 0)", 0)
-    number(
-        "--eval-every", "iterations between judgements by the test views, 0 for none (default: 1000)", 1000
-    )
-    number("--save-every", "iterations between checkpoints, 0 for none (default: 500)", 500)
+    for flag, what, every in (
+        ("--eval-every", "judgements by the test views", RunOptions.eval_every),
+        ("--save-every", "checkpoints", RunOptions.save_every),
+    ):
+        number(flag, f"iterations between {what}, 0 for none (default: {every})", every)
     group.add_argument(
         "--time-limit",
         type=seconds_text,
         metavar="TIME",
         help="end training after, for example, 90s, 20m or 2h",
     )
-    names = ", ".join(("auto", *BACKENDS))
-    group.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+    add_backend(group)
 
 
 def _add_data(group: argparse._ArgumentGroup) -> None:
@@ -244,8 +245,9 @@ def _train(capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool]) 
         nonlocal psnr
         if not isinstance(event, StepEvent):
             return
-        if event.iteration % PSNR_EVERY == 0:
-            psnr = trainer.last_psnr()
+        if event.iteration % PSNR_EVERY == 0 and trainer.last is not None:
+            image, photo, mask = trainer.last
+            psnr = shown_psnr(image, photo, mask)
         speed = bar.tasks[-1].speed or 0.0
         count = f"{event.num_gaussians} Gaussians"
         state = f"loss {event.loss:.3f}  PSNR {psnr:.1f}  {count}  {speed:.0f} it/s"

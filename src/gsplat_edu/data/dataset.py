@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, point_nearest_axes
 from gsplat_edu.data.blender import TRAIN_FILE, read_blender
 from gsplat_edu.data.capture import (
     PHOTO_ENDINGS,
@@ -26,7 +26,7 @@ from gsplat_edu.data.capture import (
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import ImageStore
-from gsplat_edu.data.points import common_target, finite_cloud, random_cloud, read_points_ply
+from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.validation import float64_array, in_range, whole_number
@@ -40,6 +40,9 @@ FAR = 1e4
 
 EXTENT_MARGIN = 1.1
 """The extent is this much larger than the cameras' spread (the code of Kerbl et al. 2023)."""
+
+PARALLEL = 1e-4
+"""Smallest mean squared sine between optical axes at which they are said to meet: about half a degree."""
 
 UNEVEN = 1.5
 """Ratio of the two focal lengths beyond which the user is told: pixels of real cameras are all but square."""
@@ -300,7 +303,9 @@ def _random_start(
         where = f"in the cube +-{capture.cube:g}"
     else:
         half_edge = scene_extent(cameras)
-        centre = common_target(cameras)
+        centre = point_nearest_axes(cameras, PARALLEL)
+        if centre is None:
+            centre = np.mean([camera.eye for camera in cameras], axis=0)
         made = random_cloud(centre, half_edge)
         where = f"within {half_edge:.4g} of ({', '.join(f'{c:.4g}' for c in centre)})"
     notes.append(f"{capture.no_cloud}: {len(made.points):,} random ones {where} are the start")

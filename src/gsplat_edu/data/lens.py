@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from gsplat_edu.camera import scaled_intrinsics
 from gsplat_edu.errors import DatasetError
 
 PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -95,25 +96,15 @@ class Lens:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def resized(self, W: int, H: int) -> Lens:
-        """Return the lens of the same photo at another size.
-
-        c' = (c + 1/2) s - 1/2,  f' = f s,  s = new size / old size, each axis its own: the image's edge, not
-        the centre of its first pixel, is what stays in place.
+        """Return the lens of the same photo at another size, see `gsplat_edu.camera.scaled_intrinsics`.
 
         Args:
             W: New width, px.
             H: New height, px.
         """
-        sx, sy = W / self.W, H / self.H
-        return replace(
-            self,
-            W=W,
-            H=H,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=(self.cx + 0.5) * sx - 0.5,
-            cy=(self.cy + 0.5) * sy - 0.5,
-        )
+        intrinsics = (self.fx, self.fy, self.cx, self.cy)
+        fx, fy, cx, cy = scaled_intrinsics(*intrinsics, W / self.W, H / self.H)
+        return replace(self, W=W, H=H, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def lens_of(values: Mapping[str, float], W: int, H: int, *, fisheye: bool = False) -> Lens:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.constants import C0
 from gsplat_edu.data.capture import MAX_COORDINATE, Cloud, unit_colors
 from gsplat_edu.errors import DatasetError, SceneFormatError
@@ -19,9 +18,6 @@ RANDOM_POINTS = 100_000
 
 BLENDER_CUBE = 1.3
 """Half the edge of the cube that holds a Blender scene, world units: that of Kerbl et al. 2023's code."""
-
-PARALLEL = 1e-4
-"""Smallest mean squared sine between optical axes at which they are said to meet: about half a degree."""
 
 RGB = ("red", "green", "blue")
 SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -98,27 +94,6 @@ def random_cloud(centre: Float64[np.ndarray, "3"], half_edge: float) -> Cloud:
     rng = np.random.default_rng(0)
     points = centre + half_edge * rng.uniform(-1.0, 1.0, (RANDOM_POINTS, 3))
     return Cloud(points, rng.uniform(0.0, 1.0, (RANDOM_POINTS, 3)))
-
-
-def common_target(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
-    """Find the point closest to all optical axes, in the least-squares sense.
-
-    p minimises sum_i |(I - d_i d_i') (p - e_i)|²,  e_i: centre of camera i,  d_i: direction it looks in
-
-    Args:
-        cameras: At least one.
-
-    Returns:
-        (3,) world units; the mean of the camera centres where the axes are all but parallel.
-    """
-    eyes = np.stack([camera.eye for camera in cameras])
-    axes = np.stack([camera.R[2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    A, mean = across.mean(axis=0), eyes.mean(axis=0)
-    if np.linalg.eigvalsh(A)[0] < PARALLEL:
-        return np.asarray(mean)
-    b = (across @ (eyes - mean)[:, :, None]).mean(axis=0)[:, 0]
-    return np.asarray(mean + np.linalg.solve(A, b))
 
 
 def _columns(table: np.ndarray, names: Sequence[str]) -> Float64[np.ndarray, "N c"]:

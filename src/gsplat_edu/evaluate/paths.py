@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import WORLD_UP, Camera, look_at
+from gsplat_edu.camera import WORLD_UP, Camera, look_at, point_nearest_axes, scaled_intrinsics
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.validation import in_range, whole_number
@@ -122,8 +122,6 @@ def orbit_of_scene(gaussians: Gaussians, frames: int, size: int) -> list[Camera]
 def resized(camera: Camera, longest: int) -> Camera:
     """Return the camera with an image whose longer side has the given length; what it sees stays the same.
 
-    u' = s (u + 1/2) - 1/2: the edges of the image keep their places, not the centres of its pixels.
-
     Args:
         camera: The camera.
         longest: Longer side, px.
@@ -134,9 +132,8 @@ def resized(camera: Camera, longest: int) -> Camera:
     longest = whole_number("longest", longest, 1)
     share = longest / max(camera.W, camera.H)
     W, H = (max(1, round(side * share)) for side in (camera.W, camera.H))
-    sx, sy = W / camera.W, H / camera.H
-    cx, cy = sx * (camera.cx + 0.5) - 0.5, sy * (camera.cy + 0.5) - 0.5
-    return Camera(camera.R, camera.eye, sx * camera.fx, sy * camera.fy, cx, cy, H, W)
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return Camera(camera.R, camera.eye, *scaled_intrinsics(*intrinsics, W / camera.W, H / camera.H), H, W)
 
 
 def _common_up(cameras: Sequence[Camera]) -> Vector:
@@ -152,14 +149,11 @@ def _common_up(cameras: Sequence[Camera]) -> Vector:
 def _point_looked_at(cameras: Sequence[Camera], depth: float) -> Vector:
     forwards = np.stack([camera.R[2] for camera in cameras])
     eyes = np.stack([camera.eye for camera in cameras])
-    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
-    normal = across.mean(axis=0)
-    if np.linalg.eigvalsh(normal)[0] > PARALLEL:
-        point: Vector = np.linalg.solve(normal, np.einsum("nij,nj->i", across, eyes) / len(cameras))
+    point = point_nearest_axes(cameras, PARALLEL)
+    if point is not None:
         ahead = np.sum((point - eyes) * forwards, axis=1)
-        if (
-            np.median(ahead) > 1e-9 * np.abs(eyes).max()
-        ):  # most cameras have it in front, and do not stand in it
+        # most cameras have it in front, and do not stand in it
+        if np.median(ahead) > 1e-9 * np.abs(eyes).max():
             return point
     in_front: Vector = eyes.mean(axis=0) + depth * _unit(forwards.sum(axis=0), forwards[0])
     return in_front

@@ -17,7 +17,7 @@ from typing import Any
 
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.evaluate.metrics import score_views, summarize
+from gsplat_edu.evaluate.metrics import Renderer, score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.io.ply import save_ply
@@ -90,6 +90,11 @@ class RunOptions:
             depth=False,
         )
 
+    @property
+    def renderer(self) -> Renderer:
+        """Renders the scene so."""
+        return functools.partial(render, settings=self.render_settings, backend=self.backend)
+
     def document(self) -> dict[str, Any]:
         """Return what config.json holds."""
         data = dataclasses.asdict(self.data_settings)
@@ -122,8 +127,8 @@ class CaptureRun:
 
     Attributes:
         finished: The run was complete already; there is nothing to do.
-        trainer: The training; None where the run is finished.
-        dataset: The capture.
+        dataset: The capture; not there where the run is finished.
+        trainer: The training; there after `start`.
     """
 
     def __init__(self, options: RunOptions, say: Callable[[str], None] = lambda sentence: None) -> None:
@@ -248,13 +253,11 @@ class CaptureRun:
 
     def _judge(self, stop: Callable[[], bool]) -> None:
         """Score the test views as the scene stands; say and log what came out, unless it is to stop meanwhile."""
-        settings, done = self.options.render_settings, self.trainer.iteration
-        renderer = functools.partial(render, settings=settings, backend=self.options.backend)
-        scores = []
+        options, done, scores = self.options, self.trainer.iteration, []
         for view in self.dataset.test:
             if stop():
                 return
-            scores += score_views(self.trainer.gaussians, [view], renderer, settings.background)
+            scores += score_views(self.trainer.gaussians, [view], options.renderer, options.config.background)
         if not scores:
             return
         means = summarize(scores)
@@ -277,12 +280,11 @@ class CaptureRun:
         if lost := len(trainer.gaussians) - len(gaussians):
             self._say(f"{lost} Gaussians are NaN or infinite, and are left out of the scene")
         save_ply(self.folder.scene(trainer.iteration), gaussians, dataset.origin)
-        settings = self.options.render_settings
         return evaluate_run(
             self.folder,
-            Judged(dataset.test, dataset.train, settings.background, dataset.notes),
+            Judged(dataset.test, dataset.train, self.options.config.background, dataset.notes),
             gaussians,
-            functools.partial(render, settings=settings, backend=self.options.backend),
+            self.options.renderer,
             {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)},
             progress,
         )

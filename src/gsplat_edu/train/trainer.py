@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -194,13 +193,3 @@ class Trainer:
         self._backgrounds.bit_generator.state = numbers["backgrounds"]
         if self.density is not None:
             self.density.load_state(part("density"), numbers["density"])
-
-    def last_psnr(self) -> float:
-        """Return the PSNR of the last image that was rendered for a step, dB; NaN before the first."""
-        if self.last is None:
-            return math.nan
-        image, target, mask = self.last
-        truth = target.numpy().astype(np.float32) / (255.0 if target.dtype == torch.uint8 else 1.0)
-        error = np.square(np.clip(image.numpy(force=True), 0.0, 1.0) - truth)
-        mean = float(error[mask].mean() if mask is not None else error.mean())
-        return -10.0 * math.log10(max(mean, 1e-10))

@@ -1,0 +1,19 @@
+"""Scenes that tests of runs and commands share."""
+
+import torch
+
+from gsplat_edu import C0
+from gsplat_edu.gaussians import Gaussians
+
+
+def splats_on(points, colors) -> Gaussians:
+    """Put a ball of one size on every point, of the point's colour."""
+    count = len(points)
+    return Gaussians(
+        means=torch.tensor(points, dtype=torch.float32),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scales=torch.full((count, 3), -2.5),
+        sh0=torch.tensor((colors - 0.5) / C0, dtype=torch.float32)[:, None],
+        sh_rest=torch.zeros(count, 0, 3),
+        logit_opacities=torch.full((count,), 2.0),
+    )
