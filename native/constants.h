@@ -10,6 +10,7 @@ constexpr double ALPHA_MAX = 0.99;
 constexpr double T_STOP = 0.0001;
 constexpr double DET_FLOOR = 1e-12;
 constexpr double COLOR_LIMIT = 1000000.0;
+constexpr double RIM_SLACK = 0.001;
 constexpr double C0 = 0.28209479177387814;
 constexpr double C1 = 0.4886025119029199;
 constexpr double C2[3] = {1.0925484305920792, 0.31539156525252005, 0.5462742152960396};

@@ -148,9 +148,6 @@ struct LossArgs {
         4 * (SSIM_BAND + 4 * SSIM_HALF) * SSIM_MAP + 3 * (SSIM_BAND + 2 * SSIM_HALF) * SSIM_STRIP;
 };
 
-// px, added around an ellipse where its tiles and rows are worked out: rounding must not lose a pixel on the rim, and what
-// comes in besides is below the floor.
-constexpr double RIM_SLACK = 1e-3;
 
 constexpr int64_t BLOCK = 256;                         // Gaussians a thread takes at a time
 

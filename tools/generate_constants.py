@@ -20,6 +20,7 @@ NAMES = (
     "T_STOP",
     "DET_FLOOR",
     "COLOR_LIMIT",
+    "RIM_SLACK",
     "C0",
     "C1",
     "C2",

@@ -32,6 +32,10 @@ Source: Kerbl et al. 2023, appendix C."""
 TILE: Final = 16
 """px: edge of the square tiles in which kernels composite and stop. Source: Kerbl et al. 2023, section 6."""
 
+RIM_SLACK: Final = 1e-3
+"""px, added around an ellipse where kernels work out its tiles and rows: rounding must not lose a pixel on the rim, and
+what lies within it costs a pair at most."""
+
 COLOR_LIMIT: Final = 1e6
 """The kernels take a colour beyond this for one that is not finite and leave its Gaussian out. No photo comes near, and
 the gradients of the Gaussians around it would lose all their digits to it. Source: ours."""

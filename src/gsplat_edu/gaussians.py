@@ -108,6 +108,10 @@ class Gaussians:
         """Return new Gaussians with the same change made to every raw parameter."""
         return Gaussians(**{name: change(tensor) for name, tensor in self.tensors().items()})
 
+    def to(self, device: torch.device) -> Gaussians:
+        """Return the same Gaussians with their parameters on a device."""
+        return self.map(lambda tensor: tensor.to(device))
+
     def trainable(self) -> Gaussians:
         """Return a copy whose parameters are leaves that collect gradients."""
         return self.map(lambda tensor: tensor.detach().clone().requires_grad_())

@@ -40,9 +40,15 @@ def photo_loss(
     if target.dtype != torch.uint8:
         target = target.to(image.dtype)
     if mask is not None:
-        counts = torch.from_numpy(mask)[..., None]  # times 0 or 1: exact, on any number of threads
+        counts = torch.from_numpy(mask).to(image.device)[
+            ..., None
+        ]  # times 0 or 1: exact, on any number of threads
         check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
         image, target = image * counts, target * counts
+    if image.device.type == "cuda":
+        from gsplat_edu.render.triton.loss import l1_ssim_triton  # what was rendered there has triton
+
+        return l1_ssim_triton(image, target, ssim_weight)
     return l1_ssim(image, target, ssim_weight) if ssim_weight else l1(image, target)
 
 

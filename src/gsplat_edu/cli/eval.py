@@ -15,7 +15,7 @@ from gsplat_edu.cli.arguments import add_backend
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.evaluation import Judged, evaluate_run
 from gsplat_edu.runs.folder import RunFolder, render_settings
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
     settings = dataclasses.replace(render_settings(config), depth=False)
     scene, iteration = folder.latest_scene()
     dataset = run_dataset(config, arguments.dataset)
-    gaussians = load_ply(scene, dataset.origin)  # the frame its cameras stand in
+    gaussians = load_ply(scene, dataset.origin).to(device_of(backend))  # the frame its cameras stand in
     judged = Judged(dataset.test, dataset.train, settings.background, dataset.notes)
     with Progress(
         TextColumn("{task.description}"),

@@ -24,7 +24,7 @@ from gsplat_edu.evaluate.paths import orbit_of_scene, orbit_path, resized
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
@@ -112,7 +112,7 @@ def run(arguments: argparse.Namespace) -> None:
     console = Console(highlight=False, markup=False)
     started = time.perf_counter()
     frames = track(
-        _frames(shot, backend),
+        _frames(replace(shot, gaussians=shot.gaussians.to(device_of(backend))), backend),
         "rendering",
         total=len(shot.cameras),
         console=console,

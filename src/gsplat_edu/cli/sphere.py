@@ -25,7 +25,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
@@ -208,7 +208,7 @@ def _trainer(
 ) -> Trainer:
     config = course_config(options.budget.iters, options.seed, options.budget.cap)
     generator = torch.Generator().manual_seed(options.seed)
-    gaussians = random_ball(options.k0, generator)
+    gaussians = random_ball(options.k0, generator).to(device_of(options.backend))
     control = AdaptiveDensityControl(config, EXTENT, generator, gaussians)
     return Trainer(
         gaussians, capture.train, config, render=renderer, extent=EXTENT, density=control, callbacks=callbacks

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import inspect
 import re
 import signal
@@ -19,8 +20,7 @@ from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whol
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.data.dataset import DataSettings
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.metrics import ImageScore
-from gsplat_edu.evaluate.metrics import psnr as shown_psnr
+from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.train.config import ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
@@ -36,7 +36,7 @@ LINES = 20
 """Lines that tell of the training where there is no terminal to draw a bar on."""
 
 PSNR_EVERY = 20
-"""Iterations between two looks at the last view's PSNR, which cost a few milliseconds each."""
+"""Iterations between two looks at the last view's loss and PSNR, which cost a few milliseconds each."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -239,22 +239,18 @@ def _train(capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool]) 
     iterations = capture.options.config.iterations
     photos = bar.add_task("photos", total=None, state="")
     task = bar.add_task("training", total=iterations, state="", visible=False)
-    psnr = float("nan")
 
     def show(trainer: Trainer, event: Event) -> None:
-        nonlocal psnr
         if not isinstance(event, StepEvent):
             return
-        if event.iteration % PSNR_EVERY == 0 and trainer.last is not None:
-            image, photo, mask = trainer.last
-            psnr = shown_psnr(image, photo, mask)
-        speed = bar.tasks[-1].speed or 0.0
-        count = f"{event.num_gaussians} Gaussians"
-        state = f"loss {event.loss:.3f}  PSNR {psnr:.1f}  {count}  {speed:.0f} it/s"
-        bar.update(task, completed=trainer.iteration, state=state)
-        if bar.disable and (trainer.iteration % max(iterations // LINES, 1) == 0):
-            line = f"iteration {trainer.iteration}/{iterations}: loss {event.loss:.4f}, PSNR {psnr:.2f} dB, {count}"
-            bar.console.print(line, soft_wrap=True)
+        if event.iteration % PSNR_EVERY == 0 or trainer.iteration == iterations:
+            speed = bar.tasks[-1].speed or 0.0
+            state = f"loss {event.loss:.3f}  PSNR {_psnr(trainer):.1f}  {event.num_gaussians} Gaussians"
+            bar.update(task, state=f"{state}  {speed:.0f} it/s")
+        bar.update(task, completed=trainer.iteration)
+        if bar.disable and trainer.iteration % max(iterations // LINES, 1) == 0:
+            figures = f"loss {event.loss:.4f}, PSNR {_psnr(trainer):.2f} dB, {event.num_gaussians} Gaussians"
+            bar.console.print(f"iteration {trainer.iteration}/{iterations}: {figures}", soft_wrap=True)
 
     def loaded(done: int, total: int) -> None:
         if interrupted():
@@ -265,6 +261,12 @@ def _train(capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool]) 
     bar.remove_task(photos)
     bar.reset(task, total=iterations, completed=trainer.iteration, visible=True)
     capture.train(interrupted)
+
+
+def _psnr(trainer: Trainer) -> float:
+    if trainer.last is None:
+        return math.nan
+    return psnr(*trainer.last)
 
 
 def _bar(console: Console, state: str) -> Progress:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import overload
 
@@ -51,11 +52,12 @@ def render(
     """Render Gaussians as seen by a camera, or by several of one size.
 
     Args:
-        gaussians: N Gaussians, raw parameters, float32 or float64.
+        gaussians: N Gaussians, raw parameters, float32 or float64 (cuda: float32).
         camera: The camera, or a sequence of cameras of one image size.
         settings: Background, SH degree, antialiasing, depth; the defaults where None.
         background: (3,) background as a tensor, to differentiate in; that of the settings where None.
-        backend: "auto" for the fastest there is, or a backend by name (see `gsplat_edu.render.backends`).
+        backend: "auto" for the fastest there is where the Gaussians are, or a backend by name (see
+            `gsplat_edu.render.backends`).
 
     Returns:
         The view and what density control needs; for several cameras their views stacked.
@@ -69,12 +71,11 @@ def render(
     Differentiable in: every raw parameter of the Gaussians, and the background. Not in: the camera.
     """
     settings = settings or RenderSettings()
-    name = resolve_backend(backend)
+    name = resolve_backend(backend, gaussians.means.device)
     if background is None:
-        background = torch.tensor(
-            settings.background, dtype=gaussians.means.dtype, device=gaussians.means.device
-        )
-    check_tensor("background", background, (3,), {})
+        background = _background(settings.background, gaussians.means.dtype, gaussians.means.device)
+    else:
+        check_tensor("background", background, (3,), {})
     if isinstance(camera, Camera):
         return _render_one(name, gaussians, camera, settings, background)
     if len({(c.H, c.W) for c in camera}) != 1:
@@ -91,6 +92,12 @@ def render(
     )
 
 
+@functools.lru_cache(maxsize=64)
+def _background(color: tuple[float, float, float], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return a colour, which the settings have checked, as a tensor; it is sent to a device once."""
+    return torch.tensor(color, dtype=dtype, device=device)
+
+
 def _render_one(
     name: str, gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Float[Tensor, "3"]
 ) -> RenderOutput:
@@ -98,4 +105,8 @@ def _render_one(
         from gsplat_edu.render.cpu import render_cpu  # the native module is there: backends.py has seen to it
 
         return render_cpu(gaussians, camera, settings, background)
+    if name == "cuda":
+        from gsplat_edu.render.triton.rasterize import render_triton  # so is triton
+
+        return render_triton(gaussians, camera, settings, background)
     return render_dense(gaussians, camera, settings, background)

@@ -12,7 +12,7 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
 
-SAME = ("train", "render", "data", "backend")
+SAME = ("train", "render", "data")
 """What of config.json a resumed run has to share with the one it goes on from."""
 
 MAY_DIFFER = {"data": ("path", "points", "image_memory")}
@@ -78,8 +78,6 @@ def _alike(a: Camera, b: Camera) -> bool:
 
 def _section(folder: RunFolder, config: dict[str, Any], name: str) -> dict[str, Any]:
     value = config.get(name, {})
-    if name == "backend":
-        return {"backend": value}
     if not isinstance(value, dict):
         raise CheckpointError(f"{folder.config}: {name}: is no object; mend the file or name another --out")
     return value

@@ -8,6 +8,9 @@ import math
 from pathlib import Path
 from typing import Any, TextIO
 
+import torch
+from torch import Tensor
+
 from gsplat_edu.files import named_failure, written_aside
 from gsplat_edu.train.events import Event, StepEvent
 
@@ -25,7 +28,7 @@ class LogWriter:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file: TextIO | None = None
-        self._losses: list[float] = []
+        self._losses: list[Tensor] = []
         self._last = 0.0
 
     def record(self, event: Event, seconds: float) -> None:
@@ -40,12 +43,12 @@ class LogWriter:
             kind = type(event).__name__.removesuffix("Event").lower()
             self.write({**dataclasses.asdict(event), "iteration": iteration, "event": kind})
             return
-        self._losses.append(event.loss)
+        self._losses.append(event.loss_tensor)
         if iteration % STEPS_PER_LINE == 0:
             count = len(self._losses)
             line = {
                 "iteration": iteration,
-                "loss": sum(self._losses) / count,
+                "loss": sum(torch.stack(self._losses).tolist()) / count,  # one wait for a GPU in ten steps
                 "num_gaussians": event.num_gaussians,
                 "ms": round(1e3 * (seconds - self._last) / count, 3),
                 "seconds": round(seconds, 3),

@@ -22,6 +22,7 @@ from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import device_of
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
 from gsplat_edu.runs.folder import RunFolder
@@ -150,6 +151,10 @@ class CaptureRun:
                     f"--out: {folder.path} holds a run already; add --resume to go on with it, or name another folder"
                 )
             check_options(folder, options.document())
+            if (before := folder.read_config().get("backend")) != options.backend:
+                self._say(
+                    f"{folder.path}: was begun on the backend {before}; {options.backend} rounds differently"
+                )
             done = folder.read_metrics().get("iterations", 0)
             if not isinstance(done, int):
                 raise CheckpointError(f"{folder.metrics}: iterations: is no number; mend or remove the file")
@@ -185,7 +190,7 @@ class CaptureRun:
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
             folder.write_config(options.document() | facts)
         extent = scene_extent([view.camera for view in dataset.train])
-        gaussians = from_points(dataset.points, dataset.colors, options.config)
+        gaussians = from_points(dataset.points, dataset.colors, options.config).to(device_of(options.backend))
         if len(gaussians) < len(dataset.points):
             self._say(
                 f"the start cloud has {len(dataset.points)} points; {len(gaussians)} of them are taken, the cap"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 
 @dataclass(frozen=True)
 class StepEvent:
@@ -11,13 +13,18 @@ class StepEvent:
 
     Args:
         iteration: Counted from 0.
-        loss: Loss of the view before the step.
+        loss_tensor: () loss of the view before the step, where the Gaussians are.
         num_gaussians: Gaussians that were rendered.
     """
 
     iteration: int
-    loss: float
+    loss_tensor: Tensor
     num_gaussians: int
+
+    @property
+    def loss(self) -> float:
+        """Loss of the view before the step. Reading it waits for a GPU to come to it."""
+        return float(self.loss_tensor)
 
 
 @dataclass(frozen=True)

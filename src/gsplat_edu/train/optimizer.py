@@ -20,8 +20,8 @@ class Adam:
     p -= rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)
 
     The step count t is shared by all and survives density control, as in Kerbl et al.'s code. On the CPU a
-    step is one native pass over each parameter, the same to the bit on any number of threads; elsewhere it is
-    torch's, as it is where the native module is not there.
+    step is one native pass over each parameter, the same to the bit on any number of threads; on a GPU it is one
+    kernel. Where the native module is not there it is torch's.
 
     Args:
         gaussians: The parameters to move.
@@ -73,8 +73,8 @@ class Adam:
                 raise ArgumentError(
                     f"{name}: has shape {tuple(parameter.shape)}, its moments {tuple(m.shape)}; call follow"
                 )
-            step = _step_natively if _native_takes(parameter) else _step_in_torch
-            step(parameter, m, v, numbers)
+            step = _step_on_gpu if _gpu_takes(parameter) else _step_in_torch
+            (_step_natively if _native_takes(parameter) else step)(parameter, m, v, numbers)
         for parameter in tensors.values():
             parameter.grad = None
 
@@ -110,6 +110,17 @@ def _native_takes(parameter: Tensor) -> bool:
         parameter.device.type == "cpu" and parameter.dtype in kernels.SUFFIXES and parameter.is_contiguous()
     )
     return here and kernels.REASON is None
+
+
+def _gpu_takes(parameter: Tensor) -> bool:
+    return parameter.device.type == "cuda" and parameter.dtype == torch.float32 and parameter.is_contiguous()
+
+
+def _step_on_gpu(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:
+    from gsplat_edu.render.triton.adam import adam_triton  # what was rendered there has triton
+
+    if parameter.grad is not None:
+        adam_triton(parameter, m, v, parameter.grad, numbers)
 
 
 def _step_natively(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:

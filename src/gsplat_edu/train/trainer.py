@@ -24,7 +24,7 @@ from gsplat_edu.train.feed import ViewFeed
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import means_rate, sh_degree
 from gsplat_edu.train.threads import one_thread
-from gsplat_edu.views import View
+from gsplat_edu.views import Photo, View
 
 
 @runtime_checkable
@@ -106,6 +106,7 @@ class Trainer:
         self.iteration = 0
         self.last: tuple[Tensor, Tensor, np.ndarray[Any, Any] | None] | None = None
         self._render, self._callbacks = render, tuple(callbacks)
+        self._photos: dict[View, Tensor] = {}
         self._feed = ViewFeed(views, config.view_order, config.seed)
         self._optimizer = Adam(self.gaussians, config.learning_rates, eps=config.adam_eps)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
@@ -120,7 +121,7 @@ class Trainer:
         start = time.perf_counter()
         while self.iteration < self.config.iterations:
             step = self._step()
-            losses.append(step.loss)
+            losses.append(step.loss_tensor)
             counts.append(step.num_gaussians)
             self._tell(step)
             if self.density is not None:
@@ -131,7 +132,8 @@ class Trainer:
                     self._tell(event)
             if stop():
                 break
-        return TrainResult(losses, counts, time.perf_counter() - start)
+        read = torch.stack(losses).tolist() if losses else []
+        return TrainResult(read, counts, time.perf_counter() - start)
 
     def _step(self) -> StepEvent:
         iteration, config = self.iteration, self.config
@@ -147,7 +149,7 @@ class Trainer:
             depth=False,
         )
         output = self._render(self.gaussians, view.camera, settings=settings)
-        target = torch.from_numpy(photo.over(background))
+        target = self._on_device(view, photo, background)
         loss = photo_loss(output.image, target, photo.mask, config.ssim_weight)
         loss.backward()  # type: ignore[no-untyped-call]
         if self.density is not None:
@@ -157,7 +159,16 @@ class Trainer:
         self._optimizer.step(self.gaussians)
         self.last = output.image.detach(), target, photo.mask
         self.iteration += 1
-        return StepEvent(iteration, float(loss.detach()), len(self.gaussians))
+        return StepEvent(iteration, loss.detach(), len(self.gaussians))
+
+    def _on_device(self, view: View, photo: Photo, background: Sequence[float]) -> Tensor:
+        """Return the photo where the Gaussians are; one that no background shows through stays there."""
+        device = self.gaussians.means.device
+        if device.type == "cpu" or (photo.alpha is not None and self.config.random_background):
+            return torch.from_numpy(photo.over(background)).to(device)
+        if view not in self._photos:
+            self._photos[view] = torch.from_numpy(photo.over(background)).to(device)
+        return self._photos[view]
 
     def _tell(self, event: Event) -> None:
         for callback in self._callbacks:
@@ -186,10 +197,15 @@ class Trainer:
         def part(name: str) -> dict[str, Tensor]:
             return {key.split(".", 1)[1]: t for key, t in tensors.items() if key.startswith(f"{name}.")}
 
-        self.gaussians = Gaussians(**part("gaussians")).trainable()
-        self._optimizer.first, self._optimizer.second = part("first"), part("second")
+        device = self.gaussians.means.device
+        self.gaussians = Gaussians(**part("gaussians")).to(device).trainable()
+        for name in ("first", "second"):
+            setattr(self._optimizer, name, {key: tensor.to(device) for key, tensor in part(name).items()})
         self._optimizer.steps, self.iteration = numbers["steps"], numbers["iteration"]
         self._feed.load_state(numbers["feed"])
         self._backgrounds.bit_generator.state = numbers["backgrounds"]
         if self.density is not None:
-            self.density.load_state(part("density"), numbers["density"])
+            statistics = {
+                k: t if t.dtype == torch.uint8 else t.to(device) for k, t in part("density").items()
+            }
+            self.density.load_state(statistics, numbers["density"])

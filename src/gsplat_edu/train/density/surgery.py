@@ -28,7 +28,9 @@ def split_children(parents: Gaussians, shrink: float, generator: torch.Generator
 
     Source: Kerbl et al. 2023, section 5.2.
     """
-    noise = torch.randn(len(parents), 3, generator=generator, dtype=parents.means.dtype)
+    noise = torch.randn(len(parents), 3, generator=generator, dtype=parents.means.dtype).to(
+        parents.means.device
+    )
     offset = (quat_to_R_t(parents.quats) @ (parents.scales * noise)[..., None])[..., 0]
     changed = {"means": parents.means + offset, "log_scales": parents.log_scales - math.log(shrink)}
     return Gaussians(**(parents.tensors() | changed))

@@ -1,0 +1,197 @@
+"""What does a training iteration cost on a GPU, stage by stage, and how near is it to the machine's limits?
+
+    python benchmarks/gpu.py [--out FILE.json]
+
+Random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 - SSIM), backward,
+Adam. Milliseconds per stage are the kernels' own, from torch's profiler, over 20 iterations; the profiler also counts how
+often the host waits. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. Then the
+gradients' error and the time with each precision of matrix products, against the native kernels in float64; and, where
+gsplat can be imported, the same scene through it: times, and the agreement of images. Needs a GPU.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import hardware
+import torch
+
+from gsplat_edu import Camera
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.losses import photo_loss
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.optimizer import Adam
+
+COUNTS = (100_000, 1_000_000, 3_000_000)
+SIZES = ((1297, 840), (1920, 1080))
+ROUNDS = 20
+SETTINGS = RenderSettings(depth=False, jacobian_limit=1.3)
+STAGES = {
+    "project_backward": "reduce and project_backward",
+    "project_kernel": "project",
+    "composite_backward": "composite_backward",
+    "composite_kernel": "composite",
+    "count_kernel": "intersect",
+    "emit_kernel": "intersect",
+    "sort": "sort",
+    "Sort": "sort",
+    "moments": "loss",
+    "similarity": "loss",
+    "maps": "loss",
+    "gradient_down": "loss",
+    "adam": "Adam",
+}
+"""Parts of kernels' names, and the stage they belong to; the first that fits."""
+
+
+def scene(count: int, device: str, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """Fill a box in front of the camera with Gaussians of about two pixels."""
+    generator = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([4.0, 2.6, 2.0]) - torch.tensor(
+        [2.0, 1.3, 1.0]
+    )
+    parts = {
+        "means": means,
+        "quats": draw(count, 4),
+        "log_scales": 0.3 * draw(count, 3) - 5.5,
+        "sh0": draw(count, 1, 3),
+        "sh_rest": 0.1 * draw(count, 15, 3),
+        "logit_opacities": 1.5 * draw(count),
+    }
+    return Gaussians(**{name: tensor.to(device, dtype) for name, tensor in parts.items()}).trainable()
+
+
+def camera(width: int, height: int) -> Camera:
+    """Look at the box."""
+    return Camera.looking_at((0, 0, -3.0), (0, 0, 0), 0.9 * width, 0.9 * width, height, width)
+
+
+def milliseconds(work: Callable[[], object], rounds: int = ROUNDS) -> float:
+    """Time work on the GPU, after three rounds of warming up."""
+    for _ in range(3):
+        work()
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    for _ in range(rounds):
+        work()
+    torch.cuda.synchronize()
+    return 1e3 * (time.perf_counter() - start) / rounds
+
+
+def iteration(gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer: Adam) -> None:
+    """Take one step of training."""
+    output = render(gaussians, cam, settings=SETTINGS, backend="cuda")
+    photo_loss(output.image, photo).backward()
+    optimizer.step(gaussians)
+
+
+def stages(count: int, width: int, height: int) -> dict[str, float]:
+    """Return milliseconds per iteration, in all and by stage, waits per iteration and the peak of memory."""
+    gaussians, cam = scene(count, "cuda"), camera(width, height)
+    photo = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, device="cuda")
+    config = TrainConfig()
+    optimizer = Adam(gaussians, config.learning_rates, eps=config.adam_eps)
+    torch.cuda.reset_peak_memory_stats()
+    found = {"iteration": milliseconds(lambda: iteration(gaussians, cam, photo, optimizer))}
+    activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=activities) as profile:
+        for _ in range(ROUNDS):
+            iteration(gaussians, cam, photo, optimizer)
+        torch.cuda.synchronize()
+    found["waits"] = -1.0 / ROUNDS  # the one above
+    for event in profile.key_averages():
+        if event.key in ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"):
+            found["waits"] += event.count / ROUNDS
+        elif spent := getattr(event, "self_device_time_total", 0.0):
+            stage = next((s for part, s in STAGES.items() if part in event.key), "torch around them")
+            found[stage] = found.get(stage, 0.0) + spent / 1e3 / ROUNDS
+    found["peak GiB"] = torch.cuda.max_memory_allocated() / 2**30
+    return found
+
+
+def ceilings() -> dict[str, float]:
+    """Measure what the machine can do: copying, and float32 products."""
+    block = torch.empty(2**28, device="cuda")
+    square = torch.randn(8192, 8192, device="cuda")
+    torch.backends.cuda.matmul.allow_tf32 = False
+    copy, product = milliseconds(block.clone), milliseconds(lambda: square @ square, 5)
+    return {"copy GB/s": 2 * block.nbytes / copy / 1e6, "float32 TFLOP/s": 2 * 8192**3 / product / 1e9}
+
+
+def precisions() -> dict[str, dict[str, float]]:
+    """Return the largest gradient error relative to the largest gradient, and the time, by precision."""
+    from gsplat_edu.render.triton import rasterize
+
+    cam = camera(640, 420)
+
+    def gradients(backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+        gaussians = scene(50_000, "cuda" if backend == "cuda" else "cpu", dtype)
+        render(gaussians, cam, settings=SETTINGS, backend=backend).image.square().sum().backward()
+        return {name: tensor.grad.double().cpu() for name, tensor in gaussians.tensors().items()}
+
+    truth, found, before = gradients("cpu", torch.float64), {}, rasterize.PRECISION
+    for name in ("ieee", "tf32x3", "tf32"):
+        rasterize.PRECISION = name
+        ours = gradients("cuda", torch.float32)
+        error = max(float((ours[key] - t).abs().max() / t.abs().max()) for key, t in truth.items())
+        large, wide = scene(1_000_000, "cuda"), camera(1297, 840)
+        work = lambda: render(large, wide, settings=SETTINGS, backend="cuda").image.sum().backward()  # noqa: E731, B023
+        found[name] = {"error": error, "ms": milliseconds(work)}
+    rasterize.PRECISION = before
+    return found
+
+
+def beside_gsplat() -> dict[str, float] | None:
+    """Render a million Gaussians with gsplat and with us; None where it is not installed."""
+    try:
+        from gsplat import rasterization
+    except ImportError:
+        return None
+    gaussians, cam = scene(1_000_000, "cuda"), camera(1297, 840)
+    view = torch.eye(4, device="cuda")
+    view[:3, :3] = torch.tensor(cam.R)
+    view[:3, 3] = torch.tensor(-cam.R @ cam.eye)
+    # It evaluates pixels at half-integers, we at integers.
+    K = torch.tensor([[cam.fx, 0, cam.cx + 0.5], [0, cam.fy, cam.cy + 0.5], [0, 0, 1.0]], device="cuda")
+
+    def theirs() -> torch.Tensor:
+        quats, scales, opacities = gaussians.quats, gaussians.scales, gaussians.opacities
+        given = (gaussians.means, quats, scales, opacities, gaussians.sh, view[None], K[None], cam.W, cam.H)
+        image: torch.Tensor = rasterization(*given, sh_degree=3, near_plane=0.05, packed=False)[0][0]
+        return image
+
+    def ours() -> torch.Tensor:
+        return render(gaussians, cam, settings=SETTINGS, backend="cuda").image
+
+    with torch.no_grad():
+        found = {"largest difference of the images": float((ours() - theirs()).abs().max())}
+        found |= {"ours, forward ms": milliseconds(ours), "gsplat, forward ms": milliseconds(theirs)}
+    found["ours, forward and backward ms"] = milliseconds(lambda: ours().sum().backward())
+    found["gsplat, forward and backward ms"] = milliseconds(lambda: theirs().sum().backward())
+    return found
+
+
+def main() -> None:
+    """Measure, print the tables, write the JSON."""
+    arguments = hardware.parser("A training iteration on a GPU, stage by stage.").parse_args()
+    if not torch.cuda.is_available():
+        raise SystemExit("gpu.py: torch sees no GPU; benchmarks/train_step.py measures the CPU")
+    result: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "ceilings": ceilings(), "stages": {}}
+    for count in COUNTS:
+        for width, height in SIZES:
+            result["stages"][f"{count} at {width}x{height}"] = stages(count, width, height)
+    result |= {"precisions": precisions(), "gsplat": beside_gsplat()}
+    hardware.report(result, arguments.out)
+    for name, table in result.items():
+        print(f"{name}: {table}" if not isinstance(table, dict) else name)
+        for key, value in table.items() if isinstance(table, dict) else ():
+            print(f"  {key}: {value}")
+
+
+if __name__ == "__main__":
+    main()

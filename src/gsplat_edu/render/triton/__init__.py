@@ -1,0 +1,1 @@
+"""The backend cuda: project, intersect, composite, loss and Adam as Triton kernels."""

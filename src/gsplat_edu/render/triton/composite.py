@@ -1,0 +1,217 @@
+"""composite: a tile's Gaussians, near to far, into its pixels; and back in the same order.
+
+    alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
+
+A program takes one tile and goes through its pairs in batches, as a matrix of pixels by Gaussians: T before each comes
+from a running product along the batch, colours and all sums of the way back are matrix products.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+import triton
+import triton.language as tl
+
+from gsplat_edu import constants
+from gsplat_edu.render.triton.project import RECORD, SLOT
+
+TILE = tl.constexpr(constants.TILE)
+PIXELS = tl.constexpr(constants.TILE * constants.TILE)
+T_STOP = tl.constexpr(constants.T_STOP)
+LOG2_ALPHA_MIN = tl.constexpr(math.log2(constants.ALPHA_MIN))
+LOG2_ALPHA_MAX = tl.constexpr(math.log2(constants.ALPHA_MAX))
+CHANNELS = tl.constexpr(16)
+"""Columns of the matrices of channels: red, green, blue, depth, and zeros, because matrix units take no fewer."""
+
+
+@triton.jit
+@no_type_check
+def _pixels(tile, tiles_x, W, H):
+    """Return the column and row of a tile's pixels, and which lie in the image."""
+    lane = tl.arange(0, PIXELS)
+    x = tile % tiles_x * TILE + lane % TILE
+    y = tile // tiles_x * TILE + lane // TILE
+    return x, y, (x < W) & (y < H)
+
+
+@triton.jit
+@no_type_check
+def _alphas(records, ids, mask, x, y):
+    """Return p and alpha of every pixel and Gaussian."""
+    row = records + ids.to(tl.int64) * RECORD
+    dx = x[:, None].to(tl.float32) - tl.load(row, mask=mask, other=0.0)[None, :]
+    dy = y[:, None].to(tl.float32) - tl.load(row + 1, mask=mask, other=0.0)[None, :]
+    a, b = tl.load(row + 2, mask=mask, other=0.0), tl.load(row + 3, mask=mask, other=0.0)
+    c, log2_o = tl.load(row + 4, mask=mask, other=0.0), tl.load(row + 5, mask=mask, other=-1000.0)
+    p = log2_o[None, :] + a[None, :] * dx * dx + dy * (b[None, :] * dx + c[None, :] * dy)
+    p = tl.minimum(p, log2_o[None, :])  # the largest there is, whatever rounding says
+    return p, tl.where(p >= LOG2_ALPHA_MIN, tl.exp2(tl.minimum(p, LOG2_ALPHA_MAX)), 0.0)
+
+
+@triton.jit
+@no_type_check
+def _weights(alpha, T):
+    """Return T before each Gaussian, alpha until every pixel of the tile is below 1e-4, and T after the batch."""
+    after = T[:, None] * tl.cumprod(1 - alpha, axis=1)
+    before = after / (1 - alpha)
+    live = tl.max(before, axis=0) >= T_STOP
+    alpha = tl.where(live[None, :], alpha, 0.0)
+    return before, alpha, tl.min(tl.where(live[None, :], after, T[:, None]), axis=1)
+
+
+@triton.jit
+@no_type_check
+def _channels(records, ids, mask):
+    """Return red, green, blue and depth of the Gaussians as rows of a matrix."""
+    column = tl.arange(0, CHANNELS)[None, :]
+    place = tl.where(column < 4, column + 6, 0)  # red, green, blue and depth stand at 6 to 9
+    return tl.load(
+        records + ids.to(tl.int64)[:, None] * RECORD + place, mask=mask[:, None] & (column < 4), other=0.0
+    )
+
+
+@triton.jit
+@no_type_check
+def composite_kernel(
+    records, gaussians, tile_begin, background, image, transmittance, depth, W, H, tiles_x,
+    WITH_DEPTH: tl.constexpr, BATCH: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Composite one tile."""
+    tile = tl.program_id(0)
+    x, y, inside = _pixels(tile, tiles_x, W, H)
+    k, end = tl.load(tile_begin + tile), tl.load(tile_begin + tile + 1)
+    T = tl.where(inside, 1.0, 0.0)
+    mixed = tl.zeros([PIXELS, CHANNELS], tl.float32)
+    while (k < end) & (tl.max(T, axis=0) >= T_STOP):
+        lane = k + tl.arange(0, BATCH)
+        mask = lane < end
+        ids = tl.load(gaussians + lane, mask=mask, other=0)
+        _, alpha = _alphas(records, ids, mask, x, y)
+        before, alpha, T = _weights(alpha, T)
+        mixed += tl.dot(before * alpha, _channels(records, ids, mask), input_precision=PRECISION)
+        k += BATCH
+    column = tl.arange(0, CHANNELS)[None, :]
+    behind = tl.load(background + column, mask=column < 3, other=0.0)
+    mixed += T[:, None] * behind
+    pixel = (y * W + x).to(tl.int64)
+    tl.store(image + 3 * pixel[:, None] + column, mixed, mask=inside[:, None] & (column < 3))
+    tl.store(transmittance + pixel, T, mask=inside)
+    if WITH_DEPTH:
+        deep = tl.sum(tl.where(column == 3, mixed, 0.0), axis=1)
+        tl.store(depth + pixel, deep, mask=inside)
+
+
+@triton.jit
+@no_type_check
+def _gradients(
+    image,
+    transmittance,
+    depth,
+    grad_image,
+    grad_transmittance,
+    grad_depth,
+    pixel,
+    inside,
+    WITH_T: tl.constexpr,
+    WITH_DEPTH: tl.constexpr,
+):
+    """Return the gradients of the channels as a matrix, and R = g . image + t T_final + gd depth at the end."""
+    column = tl.arange(0, CHANNELS)[None, :]
+    where = inside[:, None] & (column < 3)
+    g = tl.load(grad_image + 3 * pixel[:, None] + column, mask=where, other=0.0)
+    rest = tl.sum(g * tl.load(image + 3 * pixel[:, None] + column, mask=where, other=0.0), axis=1)
+    if WITH_T:
+        t = tl.load(transmittance + pixel, mask=inside, other=0.0)
+        rest += t * tl.load(grad_transmittance + pixel, mask=inside, other=0.0)
+    if WITH_DEPTH:
+        gd = tl.load(grad_depth + pixel, mask=inside, other=0.0)
+        rest += gd * tl.load(depth + pixel, mask=inside, other=0.0)
+        g += tl.where(column == 3, gd[:, None], 0.0)
+    return g, rest
+
+
+@triton.jit
+@no_type_check
+def composite_backward_kernel(
+    records, gaussians, perm, tile_begin, image, transmittance, depth,
+    grad_image, grad_transmittance, grad_depth, slots, W, H, tiles_x,
+    WITH_T: tl.constexpr, WITH_DEPTH: tl.constexpr, BATCH: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Write every pair's sums over one tile to a slot of its own; slots of pairs that were not drawn stay as they are.
+
+    cg = g . c;   R -= w cg;   dL/dalpha = T cg - R / (1 - alpha);   h = alpha dL/dalpha, 0 where alpha was clamped
+    """
+    tile = tl.program_id(0)
+    x, y, inside = _pixels(tile, tiles_x, W, H)
+    pixel = (y * W + x).to(tl.int64)
+    g, rest = _gradients(
+        image,
+        transmittance,
+        depth,
+        grad_image,
+        grad_transmittance,
+        grad_depth,
+        pixel,
+        inside,
+        WITH_T,
+        WITH_DEPTH,
+    )
+    # Moments are taken about the tile's middle, and moved to each mean afterwards.
+    x0, y0 = (
+        (tile % tiles_x * TILE + TILE // 2).to(tl.float32),
+        (tile // tiles_x * TILE + TILE // 2).to(tl.float32),
+    )
+    basis = _moment_basis(x.to(tl.float32) - x0, y.to(tl.float32) - y0)
+    k, end = tl.load(tile_begin + tile), tl.load(tile_begin + tile + 1)
+    T = tl.where(inside, 1.0, 0.0)
+    while (k < end) & (tl.max(T, axis=0) >= T_STOP):
+        lane = k + tl.arange(0, BATCH)
+        mask = lane < end
+        ids = tl.load(gaussians + lane, mask=mask, other=0)
+        p, alpha = _alphas(records, ids, mask, x, y)
+        before, alpha, T = _weights(alpha, T)
+        w = before * alpha
+        cg = tl.dot(g, tl.trans(_channels(records, ids, mask)), input_precision=PRECISION)
+        left = rest[:, None] - tl.cumsum(w * cg, axis=1)
+        rest -= tl.sum(w * cg, axis=1)
+        h = tl.where(p >= LOG2_ALPHA_MAX, 0.0, alpha * (before * cg - left / (1 - alpha)))
+        mixed = tl.dot(tl.trans(w), g, input_precision=PRECISION)
+        moments = tl.dot(tl.trans(h), basis, input_precision=PRECISION)
+        row = records + ids.to(tl.int64) * RECORD
+        u, v = tl.load(row, mask=mask, other=0.0) - x0, tl.load(row + 1, mask=mask, other=0.0) - y0
+        _store_slots(slots + tl.load(perm + lane, mask=mask, other=0) * SLOT, mixed, moments, u, v, mask)
+        k += BATCH
+
+
+@triton.jit
+@no_type_check
+def _moment_basis(x, y):
+    """Return 1, x, y, x², x y, y² of every pixel as columns 0 to 5 of a matrix."""
+    j = tl.arange(0, CHANNELS)[None, :]
+    one = tl.where(j == 0, 1.0, 0.0)
+    linear = tl.where(j == 1, x[:, None], 0.0) + tl.where(j == 2, y[:, None], 0.0)
+    square = tl.where(j == 3, (x * x)[:, None], 0.0) + tl.where(j == 4, (x * y)[:, None], 0.0)
+    return one + linear + square + tl.where(j == 5, (y * y)[:, None], 0.0)
+
+
+@triton.jit
+@no_type_check
+def _column(matrix, j: tl.constexpr):
+    return tl.sum(tl.where(tl.arange(0, CHANNELS)[None, :] == j, matrix, 0.0), axis=1)
+
+
+@triton.jit
+@no_type_check
+def _store_slots(row, mixed, moments, u, v, mask):
+    """Move the moments to the means at (u, v), and store all sums."""
+    s, sx, sy = _column(moments, 0), _column(moments, 1), _column(moments, 2)
+    for j in tl.static_range(4):
+        tl.store(row + j, _column(mixed, j), mask=mask)
+    tl.store(row + 4, s, mask=mask)
+    tl.store(row + 5, sx - u * s, mask=mask)
+    tl.store(row + 6, sy - v * s, mask=mask)
+    tl.store(row + 7, _column(moments, 3) - 2 * u * sx + u * u * s, mask=mask)
+    tl.store(row + 8, _column(moments, 4) - u * sy - v * sx + u * v * s, mask=mask)
+    tl.store(row + 9, _column(moments, 5) - 2 * v * sy + v * v * s, mask=mask)

@@ -1,0 +1,310 @@
+"""project: raw parameters to ellipses on the screen, one packed record per Gaussian; and back.
+
+    Sigma2d = J W Sigma W' J' + 0.3 I,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
+
+A record holds u, v, a, b, c, log2 o, red, green, blue, depth, half width, half height: alpha is
+2^(log2 o + a dx² + b dx dy + c dy²). A half width of 0 says that nothing of it can be seen.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+import triton
+import triton.language as tl
+
+from gsplat_edu import constants
+from gsplat_edu.render.triton.gaussian import (
+    C0,
+    DET_FLOOR,
+    DILATION,
+    FOCAL_AT,
+    MIDDLE_AT,
+    NEAR_AT,
+    SIZE_AT,
+    dot3,
+    harmonic,
+    harmonic_slope,
+    into_camera,
+    jacobian_row,
+    load3,
+    onto_axes,
+    rotation,
+    shape_on_screen,
+    store3,
+    unit_quaternion,
+)
+
+RECORD = tl.constexpr(16)
+"""Numbers in a record; twelve are used, sixteen are a line of cache."""
+
+SLOT = tl.constexpr(16)
+"""Numbers in a slot: sums of w g (3), of w times the depth's gradient, and six moments of h."""
+
+ALPHA_MIN = tl.constexpr(constants.ALPHA_MIN)
+COLOR_LIMIT = tl.constexpr(constants.COLOR_LIMIT)
+SH_OFFSET = tl.constexpr(constants.SH_OFFSET)
+LOG2E = tl.constexpr(math.log2(math.e))
+
+
+@triton.jit
+@no_type_check
+def _colors(sh0, sh_rest, i, d0, d1, d2, mask, DEGREE: tl.constexpr, REST: tl.constexpr):
+    """Colour = sum_i b_i(d) sh_i + 0.5, before the floor at 0."""
+    red, green, blue = load3(sh0, i, mask)
+    red, green, blue = red * C0 + SH_OFFSET, green * C0 + SH_OFFSET, blue * C0 + SH_OFFSET
+    for j in tl.static_range(1, (DEGREE + 1) * (DEGREE + 1)):
+        basis = harmonic(j, d0, d1, d2)
+        r, g, b = load3(sh_rest, i * REST + j - 1, mask)
+        red, green, blue = red + basis * r, green + basis * g, blue + basis * b
+    return red, green, blue
+
+
+@triton.jit
+@no_type_check
+def _is_finite(x):
+    return x - x == 0.0
+
+
+@triton.jit
+@no_type_check
+def project_kernel(
+    means, quats, log_scales, sh0, sh_rest, logits, camera, records, n,
+    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write the records of a block of Gaussians."""
+    i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    mask = i < n
+    o0, o1, o2, x, y, z = into_camera(means, camera, i, mask)
+    front = z > tl.load(camera + NEAR_AT)
+    z = tl.where(front, z, 1.0)
+    qw, qx, qy, qz, length = unit_quaternion(quats, i, mask)
+    R = rotation(qw, qx, qy, qz)
+    l0, l1, l2 = load3(log_scales, i, mask)
+    s0, s1, s2 = tl.exp(l0), tl.exp(l1), tl.exp(l2)
+    t0, t1, t2, _ = jacobian_row(camera, 0, x, z)
+    r = onto_axes(t0, t1, t2, R, s0, s1, s2)
+    t0, t1, t2, _ = jacobian_row(camera, 1, y, z)
+    q = onto_axes(t0, t1, t2, R, s0, s1, s2)
+    a, b, c, det0, det = shape_on_screen(r, q)
+    a, c = a + DILATION, c + DILATION
+    opacity = 1 / (1 + tl.exp(-tl.load(logits + i, mask=mask, other=0.0)))
+    if ANTIALIASED:
+        opacity = opacity * tl.sqrt(tl.maximum(det0, DET_FLOOR) / det)
+
+    distance = tl.sqrt(dot3(o0, o1, o2, o0, o1, o2))
+    red, green, blue = _colors(
+        sh0, sh_rest, i, o0 / distance, o1 / distance, o2 / distance, mask, DEGREE, REST
+    )
+    bright = tl.maximum(tl.maximum(tl.abs(red), tl.abs(green)), tl.abs(blue))
+    fine = _is_finite(a * c + det + x + y + z * z + opacity + length + red + green + blue) & (
+        bright <= COLOR_LIMIT
+    )
+    seen = mask & front & fine & (det > 0) & (opacity >= ALPHA_MIN)
+    level = 2 * tl.log(tl.where(seen, opacity / ALPHA_MIN, 1.0))
+    u = tl.load(camera + FOCAL_AT) * x / z + tl.load(camera + MIDDLE_AT)
+    v = tl.load(camera + FOCAL_AT + 1) * y / z + tl.load(camera + MIDDLE_AT + 1)
+    ex, ey = tl.sqrt(level * a), tl.sqrt(level * c)
+    W, H = tl.load(camera + SIZE_AT), tl.load(camera + SIZE_AT + 1)
+    seen &= (tl.ceil(u - ex) <= W - 1) & (tl.floor(u + ex) >= 0)
+    seen &= (tl.ceil(v - ey) <= H - 1) & (tl.floor(v + ey) >= 0)
+    fields = (
+        u, v, -c / det * (LOG2E / 2), b / det * LOG2E, -a / det * (LOG2E / 2), tl.log(opacity) * LOG2E,
+        tl.maximum(red, 0.0), tl.maximum(green, 0.0), tl.maximum(blue, 0.0), z, ex, ey,
+    )  # fmt: skip
+    for j in tl.static_range(12):
+        tl.store(records + i * RECORD + j, tl.where(seen, fields[j], 0.0), mask=mask)
+
+
+@triton.jit
+@no_type_check
+def _sums(slots, slot_begin, pairs_of, i, mask, BLOCK: tl.constexpr):
+    """Add up each Gaussian's slots, in order."""
+    begin = tl.load(slot_begin + i, mask=mask, other=0)
+    count = tl.load(pairs_of + i, mask=mask, other=0)
+    zero = tl.zeros([BLOCK], tl.float32)
+    red, green, blue, deep, h, hx, hy, hxx, hxy, hyy = (
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+        zero,
+    )
+    k, most = 0, tl.max(count, 0)
+    while k < most:
+        here = mask & (k < count)
+        row = slots + (begin + k) * SLOT
+        red += tl.load(row, mask=here, other=0.0)
+        green += tl.load(row + 1, mask=here, other=0.0)
+        blue += tl.load(row + 2, mask=here, other=0.0)
+        deep += tl.load(row + 3, mask=here, other=0.0)
+        h += tl.load(row + 4, mask=here, other=0.0)
+        hx += tl.load(row + 5, mask=here, other=0.0)
+        hy += tl.load(row + 6, mask=here, other=0.0)
+        hxx += tl.load(row + 7, mask=here, other=0.0)
+        hxy += tl.load(row + 8, mask=here, other=0.0)
+        hyy += tl.load(row + 9, mask=here, other=0.0)
+        k += 1
+    return red, green, blue, deep, h, hx, hy, hxx, hxy, hyy, count > 0
+
+
+@triton.jit
+@no_type_check
+def _shape_gradient(a, b, c, det0, det, a0, c0, h, hxx, hxy, hyy, ANTIALIASED: tl.constexpr):
+    """From the moments of h to Sigma2d: -K G K, K = Sigma2d^-1, G the gradient of K; and antialiasing's share."""
+    A, B, C = c / det, -b / det, a / det
+    gA, gB, gC = -hxx / 2, -hxy / 2, -hyy / 2
+    m00, m01, m10, m11 = gA * A + gB * B, gA * B + gB * C, gB * A + gC * B, gB * B + gC * C
+    da, db, dc = -(A * m00 + B * m10), -2 * (A * m01 + B * m11), -(B * m01 + C * m11)
+    if ANTIALIASED:
+        half = h / 2
+        floored = det0 <= DET_FLOOR
+        over = tl.where(floored, 0.0, half / tl.where(floored, 1.0, det0))
+        da += over * c0 - half * A
+        db += -2 * over * b - 2 * half * B
+        dc += over * a0 - half * C
+    return da, db, dc
+
+
+@triton.jit
+@no_type_check
+def _color_gradient(
+    sh0, sh_rest, grad_sh0, grad_sh_rest, i, direction, colors, sums, mask, touched,
+    DEGREE: tl.constexpr, REST: tl.constexpr,
+):  # fmt: skip
+    """From the colour to the coefficients; returns the gradient of the direction."""
+    d0, d1, d2 = direction
+    gr = tl.where(touched & (colors[0] > 0), sums[0], 0.0)
+    gg = tl.where(touched & (colors[1] > 0), sums[1], 0.0)
+    gb = tl.where(touched & (colors[2] > 0), sums[2], 0.0)
+    store3(grad_sh0, i, gr * C0, gg * C0, gb * C0, mask)
+    e0, e1, e2 = 0.0 * gr, 0.0 * gr, 0.0 * gr
+    for j in tl.static_range(1, REST + 1):
+        if j < (DEGREE + 1) * (DEGREE + 1):
+            basis = tl.where(touched, harmonic(j, d0, d1, d2), 0.0)
+            store3(grad_sh_rest, i * REST + j - 1, basis * gr, basis * gg, basis * gb, mask)
+            r, g, b = load3(sh_rest, i * REST + j - 1, mask)
+            pull = dot3(r, g, b, gr, gg, gb)
+            s0, s1, s2 = harmonic_slope(j, d0, d1, d2)
+            e0, e1, e2 = e0 + pull * s0, e1 + pull * s1, e2 + pull * s2
+        else:
+            store3(grad_sh_rest, i * REST + j - 1, 0.0 * gr, 0.0 * gr, 0.0 * gr, mask)
+    return e0, e1, e2
+
+
+@triton.jit
+@no_type_check
+def _turn_gradient(w, x, y, z, G):
+    """dL/dq of a unit quaternion from G = dL/dR, without the part along q."""
+    dw = 2 * (x * (G[7] - G[5]) + y * (G[2] - G[6]) + z * (G[3] - G[1]))
+    dx = 2 * (y * (G[1] + G[3]) + z * (G[2] + G[6]) + w * (G[7] - G[5]) - 2 * x * (G[4] + G[8]))
+    dy = 2 * (x * (G[1] + G[3]) + z * (G[5] + G[7]) + w * (G[2] - G[6]) - 2 * y * (G[0] + G[8]))
+    dz = 2 * (x * (G[2] + G[6]) + y * (G[5] + G[7]) + w * (G[3] - G[1]) - 2 * z * (G[0] + G[4]))
+    along = dw * w + dot3(dx, dy, dz, x, y, z)
+    return dw - along * w, dx - along * x, dy - along * y, dz - along * z
+
+
+@triton.jit
+@no_type_check
+def _store_if(pointer, stride: tl.constexpr, place: tl.constexpr, i, value, touched, mask):
+    """Store a gradient; zero where the Gaussian was not drawn, whose numbers may be anything."""
+    tl.store(pointer + stride * i + place, tl.where(touched, value, 0.0), mask=mask)
+
+
+@triton.jit
+@no_type_check
+def project_backward_kernel(
+    means, quats, log_scales, sh0, sh_rest, logits, camera, slots, slot_begin, pairs_of,
+    grad_means, grad_quats, grad_log_scales, grad_sh0, grad_sh_rest, grad_logits, norms, n,
+    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Add up slots and go on to raw parameters: conic -> Sigma2d -> (J W, M); colour -> (coefficients, direction)."""
+    i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    mask = i < n
+    sums = _sums(slots, slot_begin, pairs_of, i, mask, BLOCK)
+    touched = mask & sums[10]
+    o0, o1, o2, x, y, z = into_camera(means, camera, i, mask)
+    qw, qx, qy, qz, length = unit_quaternion(quats, i, mask)
+    R = rotation(qw, qx, qy, qz)
+    l0, l1, l2 = load3(log_scales, i, mask)
+    s0, s1, s2 = tl.exp(l0), tl.exp(l1), tl.exp(l2)
+    t0, t1, t2, ratio_x = jacobian_row(camera, 0, x, z)
+    p0, p1, p2, ratio_y = jacobian_row(camera, 1, y, z)
+    r = onto_axes(t0, t1, t2, R, s0, s1, s2)
+    q = onto_axes(p0, p1, p2, R, s0, s1, s2)
+    a0, b, c0, det0, det = shape_on_screen(r, q)
+    a, c = a0 + DILATION, c0 + DILATION
+    opacity = 1 / (1 + tl.exp(-tl.load(logits + i, mask=mask, other=0.0)))
+    _store_if(grad_logits, 1, 0, i, (1 - opacity) * sums[4], touched, mask)
+    A, B, C = c / det, -b / det, a / det
+    gu, gv = A * sums[5] + B * sums[6], B * sums[5] + C * sums[6]
+    nu, nv = gu * tl.load(camera + SIZE_AT) / 2, gv * tl.load(camera + SIZE_AT + 1) / 2
+    _store_if(norms, 1, 0, i, tl.sqrt(nu * nu + nv * nv), touched, mask)
+    da, db, dc = _shape_gradient(a, b, c, det0, det, a0, c0, sums[4], sums[7], sums[8], sums[9], ANTIALIASED)
+
+    # Sigma2d to r and q, the rows of J W M; then to M's rotation and scales, and to J W.
+    f0, f1, f2 = 2 * da * r[0] + db * q[0], 2 * da * r[1] + db * q[1], 2 * da * r[2] + db * q[2]
+    g0, g1, g2 = 2 * dc * q[0] + db * r[0], 2 * dc * q[1] + db * r[1], 2 * dc * q[2] + db * r[2]
+    G = (
+        (t0 * f0 + p0 * g0) * s0, (t0 * f1 + p0 * g1) * s1, (t0 * f2 + p0 * g2) * s2,
+        (t1 * f0 + p1 * g0) * s0, (t1 * f1 + p1 * g1) * s1, (t1 * f2 + p1 * g2) * s2,
+        (t2 * f0 + p2 * g0) * s0, (t2 * f1 + p2 * g1) * s1, (t2 * f2 + p2 * g2) * s2,
+    )  # fmt: skip
+    _store_if(grad_log_scales, 3, 0, i, dot3(R[0], R[3], R[6], G[0], G[3], G[6]), touched, mask)
+    _store_if(grad_log_scales, 3, 1, i, dot3(R[1], R[4], R[7], G[1], G[4], G[7]), touched, mask)
+    _store_if(grad_log_scales, 3, 2, i, dot3(R[2], R[5], R[8], G[2], G[5], G[8]), touched, mask)
+    turn = _turn_gradient(qw, qx, qy, qz, G)
+    for k in tl.static_range(4):
+        _store_if(grad_quats, 4, k, i, turn[k] / length, touched, mask)
+    d = _along_rows(R, s0 * f0, s1 * f1, s2 * f2)
+    e = _along_rows(R, s0 * g0, s1 * g1, s2 * g2)
+    m0, m1, m2 = _mean_gradient(
+        camera, x, y, z, ratio_x, ratio_y, (t0, t1, t2), (p0, p1, p2), d, e, gu, gv, sums[3]
+    )
+
+    distance = tl.sqrt(dot3(o0, o1, o2, o0, o1, o2))
+    direction = (o0 / distance, o1 / distance, o2 / distance)
+    colors = _colors(sh0, sh_rest, i, direction[0], direction[1], direction[2], mask, DEGREE, REST)
+    w0, w1, w2 = _color_gradient(
+        sh0, sh_rest, grad_sh0, grad_sh_rest, i, direction, colors, sums, mask, touched, DEGREE, REST
+    )
+    along = dot3(w0, w1, w2, direction[0], direction[1], direction[2])
+    _store_if(grad_means, 3, 0, i, m0 + (w0 - along * direction[0]) / distance, touched, mask)
+    _store_if(grad_means, 3, 1, i, m1 + (w1 - along * direction[1]) / distance, touched, mask)
+    _store_if(grad_means, 3, 2, i, m2 + (w2 - along * direction[2]) / distance, touched, mask)
+
+
+@triton.jit
+@no_type_check
+def _along_rows(R, v0, v1, v2):
+    """Return R v."""
+    return (
+        dot3(R[0], R[1], R[2], v0, v1, v2),
+        dot3(R[3], R[4], R[5], v0, v1, v2),
+        dot3(R[6], R[7], R[8], v0, v1, v2),
+    )
+
+
+@triton.jit
+@no_type_check
+def _mean_gradient(camera, x, y, z, ratio_x, ratio_y, t, p, d, e, gu, gv, deep):
+    """From the gradients d, e of the rows of J W, of the image position and of the depth to the mean, world axes."""
+    u, v = x / z, y / z
+    r6, r7, r8 = tl.load(camera + 6), tl.load(camera + 7), tl.load(camera + 8)
+    # J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³ W_2. A clamped x/z is a constant.
+    w0 = tl.where(ratio_x == u, dot3(d[0], d[1], d[2], r6, r7, r8), 0.0)
+    w1 = tl.where(ratio_y == v, dot3(e[0], e[1], e[2], r6, r7, r8), 0.0)
+    along = dot3(d[0], d[1], d[2], t[0], t[1], t[2]) + dot3(e[0], e[1], e[2], p[0], p[1], p[2])
+    fx, fy = tl.load(camera + FOCAL_AT) / z, tl.load(camera + FOCAL_AT + 1) / z
+    gx, gy = fx * gu - fx / z * w0, fy * gv - fy / z * w1
+    gz = deep - u * fx * gu - v * fy * gv - along / z + (fx * u * w0 + fy * v * w1) / z
+    m0 = dot3(tl.load(camera), tl.load(camera + 3), r6, gx, gy, gz)
+    m1 = dot3(tl.load(camera + 1), tl.load(camera + 4), r7, gx, gy, gz)
+    m2 = dot3(tl.load(camera + 2), tl.load(camera + 5), r8, gx, gy, gz)
+    return m0, m1, m2

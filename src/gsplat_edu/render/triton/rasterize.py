@@ -1,0 +1,230 @@
+"""The backend cuda: Triton kernels behind one autograd function, from Python source, without nvcc.
+
+    project -> intersect -> composite, and back: composite_backward -> project_backward
+
+Every sum has its place: pairs write to slots of their own and Gaussians add theirs up in order, without atomics, so
+two runs give the same bits. All launches are on torch's current stream; the host waits once per render, for the
+numbers of pairs and of visible Gaussians. With TRITON_INTERPRET=1 the same kernels run on CPU tensors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.constants import TILE, Z_NEAR
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.render.triton.composite import composite_backward_kernel, composite_kernel
+from gsplat_edu.render.triton.intersect import count_kernel, emit_kernel
+from gsplat_edu.render.triton.project import RECORD, SLOT, project_backward_kernel, project_kernel
+
+BLOCK = 128
+"""Gaussians per program of project, count and emit."""
+
+BACKWARD_BLOCK = 64
+"""Gaussians per program of project_backward, which keeps many numbers of each."""
+
+BATCH = 16
+"""Gaussians per step of composite: the least a matrix unit takes."""
+
+PRECISION = "ieee"
+"""How matrix products are computed: exactly as float32 has them; tf32x3 and tf32 are faster and round more."""
+
+RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
+"""Raw parameters in the order in which the kernels take them."""
+
+_camera_rows: WeakKeyDictionary[Camera, dict[tuple[str, float | None], Tensor]] = WeakKeyDictionary()
+
+
+@dataclass
+class _Call:
+    """What one render needs besides tensors, and what it leaves besides images."""
+
+    camera: Camera
+    settings: RenderSettings
+    sh_degree: int
+    visible: Tensor = field(init=False)
+    radii: Tensor = field(init=False)
+    num_pairs: int = field(init=False)
+    norms: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """Records of all Gaussians, and the pairs of every tile, near to far."""
+
+    records: Tensor
+    pairs_of: Tensor
+    slot_begin: Tensor
+    gaussians: Tensor
+    slots: Tensor
+    tile_begin: Tensor
+
+
+def render_triton(
+    gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Tensor
+) -> RenderOutput:
+    """Render raw parameters; see `gsplat_edu.render.api.render`, which checks them.
+
+    Args:
+        gaussians: N Gaussians, float32, on the GPU; on the CPU under Triton's interpreter.
+        camera: The camera.
+        settings: The settings.
+        background: (3,) colour behind everything, of the Gaussians' dtype and device.
+
+    Returns:
+        The view. Differentiable in every raw parameter and the background.
+
+    Raises:
+        ArgumentError: the Gaussians are not float32.
+    """
+    if gaussians.means.dtype != torch.float32:
+        raise ArgumentError(f"means: are {gaussians.means.dtype}, but the backend cuda takes float32")
+    call = _Call(camera, settings, min(settings.sh_degree, gaussians.sh_degree))
+    tensors = gaussians.tensors()
+    image, transmittance, depth = _Rasterize.apply(call, background, *(tensors[name] for name in RAW))  # type: ignore[no-untyped-call]
+
+    def norms() -> Tensor:
+        if call.norms is None:
+            raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
+        return call.norms[call.visible]
+
+    depth = depth if settings.depth else None
+    return RenderOutput(image, transmittance, depth, call.visible, call.radii, call.num_pairs, norms)
+
+
+class _Rasterize(torch.autograd.Function):
+    """The whole of the renderer as one differentiable step."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401
+        call: _Call,
+        background: Tensor,
+        *parameters: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        camera, settings = call.camera, call.settings
+        kept = [p.detach().contiguous() for p in parameters]
+        lists = _intersect(call, _project(call, kept))
+        image = background.new_empty(camera.H, camera.W, 3)
+        transmittance = background.new_empty(camera.H, camera.W)
+        depth = background.new_empty((camera.H, camera.W) if settings.depth else 0)
+        tiles_x, tiles = _grid(camera)
+        composite_kernel[(tiles,)](
+            lists.records, lists.gaussians, lists.tile_begin, background.detach().contiguous(),
+            image, transmittance, depth, camera.W, camera.H, tiles_x, WITH_DEPTH=settings.depth, BATCH=BATCH,
+            PRECISION=PRECISION,
+        )  # fmt: skip
+        ctx.set_materialize_grads(False)
+        ctx.call, ctx.lists = call, lists
+        ctx.save_for_backward(*kept, image, transmittance, depth)
+        return image, transmittance, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        *kept, image, transmittance, depth = ctx.saved_tensors
+        call: _Call = ctx.call
+        lists: _Lists = ctx.lists
+        grad_image, grad_T, grad_depth = (None if g is None else g.contiguous() for g in grads)
+        grad_image = torch.zeros_like(image) if grad_image is None else grad_image
+        slots = image.new_zeros(max(len(lists.gaussians), 1), SLOT.value)
+        tiles_x, tiles = _grid(call.camera)
+        composite_backward_kernel[(tiles,)](
+            lists.records, lists.gaussians, lists.slots, lists.tile_begin, image, transmittance, depth,
+            grad_image, image if grad_T is None else grad_T, image if grad_depth is None else grad_depth, slots,
+            call.camera.W, call.camera.H, tiles_x,
+            WITH_T=grad_T is not None, WITH_DEPTH=grad_depth is not None and call.settings.depth, BATCH=BATCH,
+            PRECISION=PRECISION,
+        )  # fmt: skip
+        outgoing = [torch.zeros_like(p) for p in kept]
+        count = len(kept[0])
+        norms = kept[0].new_zeros(count)
+        if count:
+            project_backward_kernel[(-(-count // BACKWARD_BLOCK),)](
+                *kept, _camera_row(call, image.device), slots, lists.slot_begin, lists.pairs_of, *outgoing, norms,
+                count,
+                DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
+                BLOCK=BACKWARD_BLOCK,
+            )  # fmt: skip
+        call.norms = norms if call.norms is None else call.norms + norms
+        background = (grad_image * transmittance[..., None]).sum(dim=(0, 1))
+        return None, background, *outgoing
+
+
+def _project(call: _Call, kept: list[Tensor]) -> Tensor:
+    count = len(kept[0])
+    records = kept[0].new_empty(count, RECORD.value)
+    if count:
+        project_kernel[(-(-count // BLOCK),)](
+            *kept, _camera_row(call, kept[0].device), records, count,
+            DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased, BLOCK=BLOCK,
+        )  # fmt: skip
+    return records
+
+
+def _intersect(call: _Call, records: Tensor) -> _Lists:
+    """Sort by depth, count and write the pairs in that order, and sort them by tile, stably."""
+    camera, count, device = call.camera, len(records), records.device
+    tiles_x, tiles = _grid(camera)
+    seen = records[:, 10] > 0
+    order = torch.sort(torch.where(seen, records[:, 9], torch.inf), stable=True).indices
+    pairs_of = torch.zeros(count, dtype=torch.int32, device=device)
+    blocks = (-(-count // BLOCK),)
+    if count:
+        count_kernel[blocks](records, pairs_of, count, camera.W, camera.H, BLOCK=BLOCK)
+    ends = torch.cumsum(pairs_of[order], dim=0, dtype=torch.int64)
+    begin = torch.empty_like(ends)
+    begin[order] = ends - pairs_of[order]
+    totals = torch.stack([pairs_of.sum(dtype=torch.int64), seen.sum()])
+    call.num_pairs, num_visible = totals.tolist()  # the one place where the host waits
+    call.visible = order[:num_visible]
+    call.radii = records[call.visible, 10:12]
+    tile_of = torch.empty(call.num_pairs, dtype=torch.int32, device=device)
+    gaussians = torch.empty_like(tile_of)
+    if call.num_pairs:
+        emit_kernel[blocks](
+            records, order, begin, tile_of, gaussians, count, camera.W, camera.H, tiles_x, BLOCK=BLOCK
+        )
+    tile_of, slots = torch.sort(tile_of, stable=True)
+    edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)
+    tile_begin = torch.searchsorted(tile_of, edges).to(torch.int32)
+    return _Lists(records, pairs_of, begin, gaussians[slots], slots, tile_begin)
+
+
+def _grid(camera: Camera) -> tuple[int, int]:
+    """Return the number of tiles in a row, and in all."""
+    tiles_x = -(-camera.W // TILE)
+    return tiles_x, tiles_x * -(-camera.H // TILE)
+
+
+def _camera_row(call: _Call, device: torch.device) -> Tensor:
+    """Return the camera's numbers on the device: R, eye, f, c, size, bounds of x/z and y/z, near plane.
+
+    They are kept with the camera, so that nothing is copied when it is rendered from again.
+    """
+    camera, key = call.camera, (str(device), call.settings.jacobian_limit)
+    rows = _camera_rows.setdefault(camera, {})
+    if key not in rows:
+        x_bounds, y_bounds = camera.jacobian_bounds(call.settings.jacobian_limit)
+        numbers = [
+            *camera.R.ravel(),
+            *camera.eye,
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            camera.W,
+            camera.H,
+        ]
+        rows[key] = torch.tensor([*numbers, *x_bounds, *y_bounds, Z_NEAR], dtype=torch.float32, device=device)
+    return rows[key]

@@ -1,0 +1,213 @@
+"""The backend cuda against the NumPy reference and the native kernels in float64.
+
+On a machine without a GPU the kernels run in Triton's interpreter, on the same scenes as the native kernels, with
+the bounds that the native float32 kernels have (tests/native): forward, four times what moves of 4 eps of the
+parameters do to each pixel, plus the rounding of the sum; backward, 3e-4 of the largest gradient, 4e-3 where conics
+are ill conditioned. Batches are 16 Gaussians, so that most scenes have tiles with several; 41 x 35 and 17 x 33 px are
+no multiples of a tile.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu import Camera
+from gsplat_edu.errors import ArgumentError, BackendUnavailableError
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.settings import RenderSettings
+from native_scenes import BACKGROUND, SCENES, random
+
+SETTINGS = RenderSettings(background=BACKGROUND)
+SMALLER = {name: scene for name, scene in SCENES.items() if name != "thousands of layers"}
+SMALLER["hundreds of layers"] = dataclasses.replace(
+    SCENES["thousands of layers"],
+    **{
+        key: getattr(SCENES["thousands of layers"], key)[::10]
+        for key in ("means", "quats", "log_scales", "sh", "logits")
+    },
+)
+ILL = ("needles 100:1", "partly behind")
+
+
+def everything(scene, backend, device, settings=SETTINGS):
+    """Images and gradients of a loss that weighs every pixel of image, transmittance and depth at random."""
+    dtype = torch.float32 if backend == "cuda" else torch.float64
+    where = device if backend == "cuda" else "cpu"
+    gaussians = scene.gaussians(dtype).to(torch.device(where)).trainable()
+    background = torch.tensor(BACKGROUND, dtype=dtype, device=where, requires_grad=True)
+    out = render(gaussians, scene.camera, settings=settings, background=background, backend=backend)
+    generator = torch.Generator().manual_seed(3)
+    draws = [
+        torch.randn(t.shape, generator=generator, dtype=torch.float64)
+        for t in (out.image, out.transmittance, out.depth)
+    ]
+    images = (out.image, out.transmittance, out.depth)
+    sum((t * draw.to(t)).sum() for t, draw in zip(images, draws, strict=True)).backward()
+    norms = torch.zeros(len(gaussians), dtype=dtype, device=where)
+    norms[out.visible] = out.means2d_grad_norms()
+    gradients = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
+    gradients |= {"background": background.grad, "means2d": norms}
+    values = {"image": out.image, "T": out.transmittance, "depth": out.depth}
+    numpy = lambda found: {k: t.detach().double().cpu().numpy() for k, t in found.items()}  # noqa: E731
+    return numpy(values), numpy(gradients), out
+
+
+def sensitivity(scene) -> np.ndarray:
+    """Largest change of each pixel over eight perturbations of the parameters by 4 float32 eps."""
+    rng = np.random.default_rng(0)
+    exact = scene.gaussians()
+    base = render(exact, scene.camera, settings=SETTINGS, backend="cpu").image.numpy()
+    worst = np.zeros(base.shape[:2])
+    for _ in range(8):
+        noise = lambda t: t * (1 + 4 * 1.2e-7 * torch.tensor(rng.choice([-1.0, 1.0], t.shape)))  # noqa: E731
+        moved = render(exact.map(noise), scene.camera, settings=SETTINGS, backend="cpu").image.numpy()
+        worst = np.maximum(worst, np.abs(moved - base).max(axis=-1))
+    return worst
+
+
+@pytest.mark.parametrize("name", [name for name in SMALLER if name != "ties in depth"])
+def test_images_are_the_references(device, name):
+    scene = SMALLER[name]
+    values, _, _ = everything(scene, "cuda", device)
+    truth, truth_T, truth_depth = scene.truth()
+    bright = max(1.0, np.abs(values["image"]).max())
+    error = np.maximum(np.abs(values["image"] - truth).max(axis=-1), np.abs(values["T"] - truth_T))
+    over = error > 4 * sensitivity(scene) + 100 * np.finfo(np.float32).eps * bright
+    assert over.sum() <= 2 and error.max() < 1.1 * bright / 255
+    assert np.abs(values["depth"] - truth_depth).max() < 1.1 * max(1.0, truth_depth.max()) / 255
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("name", SMALLER)
+def test_gradients_are_those_of_the_native_kernels_in_double(device, name, antialiased):
+    """Scenes with ties too: the same order, and in float32 the same ties, since one camera axis is along z."""
+    settings = dataclasses.replace(SETTINGS, antialiased=antialiased, jacobian_limit=1.3)
+    values, gradients, out = everything(SMALLER[name], "cuda", device, settings)
+    truths, expected, oracle = everything(SMALLER[name], "cpu", device, settings)
+    assert abs(out.num_pairs - oracle.num_pairs) <= 2 and len(out.visible) == len(oracle.visible)
+    for key, truth in truths.items():
+        assert np.abs(values[key] - truth).max() < 1.1 * max(1.0, np.abs(truth).max()) / 255, key
+    bound = 4e-3 if name in ILL else 3e-4
+    for key, truth in expected.items():
+        assert np.abs(gradients[key] - truth).max() <= bound * np.abs(truth).max(), key
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_lower_degrees(device, degree):
+    settings = dataclasses.replace(SETTINGS, sh_degree=degree)
+    _, gradients, _ = everything(SMALLER["random"], "cuda", device, settings)
+    _, expected, _ = everything(SMALLER["random"], "cpu", device, settings)
+    for key, truth in expected.items():
+        assert np.abs(gradients[key] - truth).max() <= 3e-4 * np.abs(truth).max(), key
+
+
+def test_two_runs_give_the_same_bits(device):
+    first, second = (everything(SMALLER["random"], "cuda", device)[:2] for _ in range(2))
+    for ours, other in zip(first, second, strict=True):
+        for key, array in ours.items():
+            np.testing.assert_array_equal(array, other[key], err_msg=key)
+
+
+def test_several_cameras_and_no_depth(device):
+    scene = random(30, (20, 18), seed=5)
+    gaussians = scene.gaussians(torch.float32).to(torch.device(device))
+    settings = RenderSettings(depth=False)
+    stack = render(gaussians, [scene.camera, scene.camera], settings=settings, backend="cuda")
+    assert stack.image.shape == (2, 18, 20, 3) and stack.depth is None
+    assert torch.equal(stack.image[0], stack.image[1])
+
+
+@pytest.mark.parametrize("kind", ["empty", "behind", "faint", "one"])
+def test_scenes_of_almost_nothing(device, kind):
+    scene = random(0 if kind == "empty" else 1 if kind == "one" else 9, (17, 33), seed=2)
+    gaussians = scene.gaussians(torch.float32).to(torch.device(device))
+    if kind == "behind":
+        gaussians.means[:, 2] -= 100.0
+    if kind == "faint":
+        gaussians.logit_opacities[:] = -9.0
+    gaussians = gaussians.trainable()
+    out = render(gaussians, scene.camera, settings=SETTINGS, backend="cuda")
+    out.image.sum().backward()
+    assert (out.num_pairs > 0) == (kind == "one") == bool(len(out.visible))
+    if kind != "one":
+        expected = torch.tensor(BACKGROUND, device=device).expand(33, 17, 3)
+        torch.testing.assert_close(out.image.detach(), expected)
+        assert all((t.grad == 0).all() for t in gaussians.tensors().values())
+
+
+POISON = (
+    ("means", np.nan),
+    ("quats", 0.0),
+    ("log_scales", np.inf),
+    ("sh0", np.inf),
+    ("sh_rest", np.nan),
+    ("logit_opacities", np.nan),
+)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # NumPy's, in the interpreter
+@pytest.mark.parametrize(("name", "value"), POISON)
+def test_one_bad_gaussian_spoils_nothing(device, name, value):
+    scene = random(20, (17, 33), seed=3)
+    good = scene.gaussians(torch.float32).to(torch.device(device))
+    bad = good.map(torch.clone)
+    bad.tensors()[name][7] = value
+    without = good.map(lambda t: torch.cat([t[:7], t[8:]])).trainable()
+    bad = bad.trainable()
+    images = [render(g, scene.camera, settings=SETTINGS, backend="cuda").image for g in (bad, without)]
+    assert torch.equal(*images)
+    for image in images:
+        image.square().sum().backward()
+    for key, tensor in bad.tensors().items():
+        assert (tensor.grad[7] == 0).all(), key
+        assert torch.equal(torch.cat([tensor.grad[:7], tensor.grad[8:]]), without.tensors()[key].grad), key
+
+
+def test_means_far_outside_their_tiles(device):
+    """A wide Gaussian whose mean is 400 px beside the image: moments are moved a long way without losing digits."""
+    scene = random(4, (41, 35), seed=6)
+    far = scene.gaussians(torch.float64)
+    far.means[0, 0] += 25.0
+    far.log_scales[0] = 2.2
+    found = []
+    for backend, dtype in (("cuda", torch.float32), ("cpu", torch.float64)):
+        where = torch.device(device if backend == "cuda" else "cpu")
+        moved = far.map(lambda t, dtype=dtype: t.to(dtype)).to(where).trainable()
+        out = render(moved, scene.camera, settings=SETTINGS, backend=backend)
+        out.image.square().sum().backward()
+        found.append({key: tensor.grad.double().cpu() for key, tensor in moved.tensors().items()})
+    assert float(found[1]["means"][0].abs().max()) > 0
+    for key, truth in found[1].items():
+        assert float((found[0][key] - truth).abs().max()) <= 3e-4 * float(truth.abs().max()), key
+
+
+def test_double_is_refused(device):
+    scene = random(3, (8, 8))
+    with pytest.raises(ArgumentError, match=r"^means: are torch.float64"):
+        render(scene.gaussians(torch.float64).to(torch.device(device)), scene.camera, backend="cuda")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_without_a_gpu_auto_stays_away_and_asking_says_why(monkeypatch):
+    assert resolve_backend("auto") == "cpu"
+    monkeypatch.setenv("TRITON_INTERPRET", "0")
+    assert resolve_backend("auto") == "cpu"
+    with pytest.raises(BackendUnavailableError, match="torch sees no GPU; use the backend cpu"):
+        resolve_backend("cuda")
+
+
+def test_the_camera_is_sent_once(device):
+    from gsplat_edu.render.triton.rasterize import _camera_rows
+
+    scene = random(3, (8, 8))
+    gaussians = scene.gaussians(torch.float32).to(torch.device(device))
+    other = Camera(**{f.name: getattr(scene.camera, f.name) for f in dataclasses.fields(scene.camera)})
+    before = len(_camera_rows)
+    rows = []
+    for _ in range(2):
+        render(gaussians, other, backend="cuda")
+        rows.append(next(iter(_camera_rows[other].values())))
+    assert len(_camera_rows) == before + 1 and rows[0] is rows[1]
