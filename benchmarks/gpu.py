@@ -3,8 +3,8 @@
     python benchmarks/gpu.py [--out FILE.json]
 
 Random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 - SSIM), backward,
-Adam. Milliseconds per stage are the kernels' own, from torch's profiler, over 20 iterations; the profiler also counts how
-often the host waits. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. Then the
+Adam. Milliseconds per stage are the kernels' own, from torch's profiler, over 20 iterations; the profiler also counts
+how often the host waits. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. Then the
 gradients' error and the time with each precision of matrix products, against the native kernels in float64; and, where
 gsplat can be imported, the same scene through it: times, and the agreement of images. Needs a GPU.
 """
