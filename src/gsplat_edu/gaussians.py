@@ -139,12 +139,26 @@ def quat_to_R_t(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     Differentiable in: quats.
     """
     check_tensor("quats", quats, ("N", 4), {})
-    # The largest entry is divided out first, so that the norm neither overflows nor underflows. It may be a
-    # constant to autograd: a rotation does not depend on the quaternion's length.
     largest = quats.detach().abs().amax(dim=-1, keepdim=True)
     if not bool((largest > 0).all()):
         raise ArgumentError(f"quats{first_index((largest[:, 0] == 0).numpy(force=True))}: has zero length")
-    scaled = quats / largest
+    return unchecked_rotations(quats)
+
+
+def unchecked_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+    """Turn quaternions into rotation matrices as `quat_to_R_t` does, unchecked: NaN where one has zero length.
+
+    Args:
+        quats: (N, 4) quaternions (w, x, y, z).
+
+    Returns:
+        (N, 3, 3) rotations.
+
+    Differentiable in: quats.
+    """
+    # The largest entry is divided out first, so that the norm neither overflows nor underflows. It may be a
+    # constant to autograd: a rotation does not depend on the quaternion's length.
+    scaled = quats / quats.detach().abs().amax(dim=-1, keepdim=True)
     w, x, y, z = (scaled / scaled.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -12,13 +12,14 @@ from torch.autograd.function import once_differentiable
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.kernels import REASON, SUFFIXES, kernel
+from gsplat_edu.render.backends import unavailable
 from gsplat_edu.validation import check_shape, in_range
 
 
 def photo_loss(
     image: Float[Tensor, "H W 3"],
     target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
-    mask: Bool[np.ndarray, "H W"] | None = None,
+    mask: Bool[np.ndarray, "H W"] | Bool[Tensor, "H W"] | None = None,
     ssim_weight: float = 0.2,
 ) -> Float[Tensor, ""]:
     """Return the loss a trainer steps down: `l1_ssim`, or `l1` where SSIM has no weight, of what a mask leaves.
@@ -40,15 +41,15 @@ def photo_loss(
     if target.dtype != torch.uint8:
         target = target.to(image.dtype)
     if mask is not None:
-        counts = torch.from_numpy(mask).to(image.device)[
-            ..., None
-        ]  # times 0 or 1: exact, on any number of threads
+        counts = torch.as_tensor(mask, device=image.device)[..., None]
+        # Times 0 or 1: exact, on any number of threads.
         check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
         image, target = image * counts, target * counts
-    if image.device.type == "cuda":
-        from gsplat_edu.render.triton.loss import l1_ssim_triton  # what was rendered there has triton
+    if image.device.type == "cuda" and image.dtype == torch.float32 and unavailable("cuda") is None:
+        from gsplat_edu.render.triton.loss import l1_ssim_triton
 
-        return l1_ssim_triton(image, target, ssim_weight)
+        with torch.cuda.device_of(image):  # type: ignore[no-untyped-call]
+            return l1_ssim_triton(image, target, ssim_weight)
     return l1_ssim(image, target, ssim_weight) if ssim_weight else l1(image, target)
 
 

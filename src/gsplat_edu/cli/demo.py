@@ -13,6 +13,9 @@ from gsplat_edu.train.trainer import Trainer
 
 EXAMPLE = "example: gsplat-edu demo --iters 100 --size 48 --out out/quick.png"
 
+LOSS_EVERY = 20
+"""Iterations between two looks at the loss, each of which waits for a GPU."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
@@ -43,7 +46,9 @@ def run(arguments: argparse.Namespace) -> None:
 
         def advance(trainer: Trainer, event: Event) -> None:
             if isinstance(event, StepEvent):
-                bar.update(task, advance=1, loss=event.loss, count=event.num_gaussians)
+                bar.update(task, advance=1, count=event.num_gaussians)
+                if event.iteration % LOSS_EVERY == 0 or trainer.iteration == options.budget.iters:
+                    bar.update(task, loss=event.loss)
 
         run_sphere(options, [advance], say=closing.append)
     console.print(*closing, sep="\n", soft_wrap=True)

@@ -76,6 +76,7 @@ def render(
         background = _background(settings.background, gaussians.means.dtype, gaussians.means.device)
     else:
         check_tensor("background", background, (3,), {})
+        background = background.to(gaussians.means)
     if isinstance(camera, Camera):
         return _render_one(name, gaussians, camera, settings, background)
     if len({(c.H, c.W) for c in camera}) != 1:
@@ -92,10 +93,17 @@ def render(
     )
 
 
-@functools.lru_cache(maxsize=64)
 def _background(color: tuple[float, float, float], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return a colour, which the settings have checked, as a tensor; it is sent to a device once."""
-    return torch.tensor(color, dtype=dtype, device=device)
+    """Return a colour, which the settings have checked, as a tensor; it is sent to a GPU once, as that waits."""
+    if device.type == "cpu":
+        return torch.tensor(color, dtype=dtype)
+    return _sent(color, dtype, device)
+
+
+@functools.lru_cache(maxsize=64)
+def _sent(color: tuple[float, float, float], dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # else the first render decides what the others may do with it
+        return torch.tensor(color, dtype=dtype, device=device)
 
 
 def _render_one(

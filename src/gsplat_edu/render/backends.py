@@ -19,7 +19,7 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
     """Turn a backend's name, or "auto", into the backend that will run.
 
     Args:
-        name: "auto" for the fastest there is, or a backend by name.
+        name: "auto" for the GPU's where torch sees one, else the CPU's; or a backend by name.
         device: Where the tensors are that are to be rendered, if they are anywhere yet: "auto" does not move them.
 
     Returns:
@@ -30,7 +30,7 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
     """
     if name == "auto":
         on_gpu = torch.cuda.is_available() if device is None else device.type == "cuda"
-        name = "cuda" if on_gpu and (device is not None or unavailable("cuda") is None) else "cpu"
+        name = "cuda" if on_gpu and not interpreted() else "cpu"
     if name not in BACKENDS:
         raise BackendUnavailableError(
             f"backend {name!r}: not in this version of gsplat_edu; use auto or one of: {', '.join(BACKENDS)}"

@@ -19,7 +19,7 @@ class RenderOutput:
         depth: (H, W) expected depth, sum of w z, world units: not divided by the sum of w, no background.
             None where `RenderSettings.depth` is off.
         visible: (M,) indices of the Gaussians that take part. On the backend torch: those in front of the
-            camera. On cpu: those whose ellipse alpha >= 1/255 also reaches the image.
+            camera. On cpu and cuda: those whose ellipse alpha >= 1/255 also reaches the image.
         radii: (M, 2) half width and height of that ellipse, px; 0 where a Gaussian is nowhere above 1/255.
         num_pairs: Pairs of Gaussian and tile that were composited; None on torch, which has no tiles.
         grad_norms: Gives `means2d_grad_norms`.

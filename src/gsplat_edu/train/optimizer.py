@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Mapping
 
 import torch
@@ -113,14 +114,16 @@ def _native_takes(parameter: Tensor) -> bool:
 
 
 def _gpu_takes(parameter: Tensor) -> bool:
-    return parameter.device.type == "cuda" and parameter.dtype == torch.float32 and parameter.is_contiguous()
+    here = parameter.device.type == "cuda" and parameter.dtype == torch.float32 and parameter.is_contiguous()
+    return here and importlib.util.find_spec("triton") is not None
 
 
 def _step_on_gpu(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:
-    from gsplat_edu.render.triton.adam import adam_triton  # what was rendered there has triton
+    from gsplat_edu.render.triton.adam import adam_triton
 
     if parameter.grad is not None:
-        adam_triton(parameter, m, v, parameter.grad, numbers)
+        with torch.cuda.device_of(parameter):  # type: ignore[no-untyped-call]
+            adam_triton(parameter, m, v, parameter.grad, numbers)
 
 
 def _step_natively(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:

@@ -106,7 +106,7 @@ class Trainer:
         self.iteration = 0
         self.last: tuple[Tensor, Tensor, np.ndarray[Any, Any] | None] | None = None
         self._render, self._callbacks = render, tuple(callbacks)
-        self._photos: dict[View, Tensor] = {}
+        self._photos: dict[View, tuple[Tensor, Tensor | None]] = {}
         self._feed = ViewFeed(views, config.view_order, config.seed)
         self._optimizer = Adam(self.gaussians, config.learning_rates, eps=config.adam_eps)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
@@ -149,8 +149,8 @@ class Trainer:
             depth=False,
         )
         output = self._render(self.gaussians, view.camera, settings=settings)
-        target = self._on_device(view, photo, background)
-        loss = photo_loss(output.image, target, photo.mask, config.ssim_weight)
+        target, mask = self._on_device(view, photo, background)
+        loss = photo_loss(output.image, target, mask, config.ssim_weight)
         loss.backward()  # type: ignore[no-untyped-call]
         if self.density is not None:
             with one_thread():
@@ -161,13 +161,20 @@ class Trainer:
         self.iteration += 1
         return StepEvent(iteration, loss.detach(), len(self.gaussians))
 
-    def _on_device(self, view: View, photo: Photo, background: Sequence[float]) -> Tensor:
-        """Return the photo where the Gaussians are; one that no background shows through stays there."""
+    def _on_device(
+        self, view: View, photo: Photo, background: Sequence[float]
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return photo and mask where the Gaussians are; they stay there unless random backgrounds show through."""
         device = self.gaussians.means.device
+
+        def sent() -> tuple[Tensor, Tensor | None]:
+            mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(device)
+            return torch.from_numpy(photo.over(background)).to(device), mask
+
         if device.type == "cpu" or (photo.alpha is not None and self.config.random_background):
-            return torch.from_numpy(photo.over(background)).to(device)
+            return sent()
         if view not in self._photos:
-            self._photos[view] = torch.from_numpy(photo.over(background)).to(device)
+            self._photos[view] = sent()
         return self._photos[view]
 
     def _tell(self, event: Event) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import no_type_check
 
 import torch
+import triton
 import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-import triton
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.validation import check_shape
 

@@ -3,7 +3,8 @@
     alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 
 A program takes one tile and goes through its pairs in batches, as a matrix of pixels by Gaussians: T before each comes
-from a running product along the batch, colours and all sums of the way back are matrix products.
+from a running product along the batch, the colours are a matrix product. The sums of the way back are plain sums: as
+exact matrix products they would take more registers than there are.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def _gradients(
 def composite_backward_kernel(
     records, gaussians, perm, tile_begin, image, transmittance, depth,
     grad_image, grad_transmittance, grad_depth, slots, W, H, tiles_x,
-    WITH_T: tl.constexpr, WITH_DEPTH: tl.constexpr, BATCH: tl.constexpr, PRECISION: tl.constexpr,
+    WITH_T: tl.constexpr, WITH_DEPTH: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
     """Write every pair's sums over one tile to a slot of its own; slots of pairs that were not drawn stay as they are.
 
@@ -163,7 +164,8 @@ def composite_backward_kernel(
         (tile % tiles_x * TILE + TILE // 2).to(tl.float32),
         (tile // tiles_x * TILE + TILE // 2).to(tl.float32),
     )
-    basis = _moment_basis(x.to(tl.float32) - x0, y.to(tl.float32) - y0)
+    bx, by = x.to(tl.float32) - x0, y.to(tl.float32) - y0
+    g0, g1, g2, g3 = _column(g, 0), _column(g, 1), _column(g, 2), _column(g, 3)
     k, end = tl.load(tile_begin + tile), tl.load(tile_begin + tile + 1)
     T = tl.where(inside, 1.0, 0.0)
     while (k < end) & (tl.max(T, axis=0) >= T_STOP):
@@ -173,27 +175,24 @@ def composite_backward_kernel(
         p, alpha = _alphas(records, ids, mask, x, y)
         before, alpha, T = _weights(alpha, T)
         w = before * alpha
-        cg = tl.dot(g, tl.trans(_channels(records, ids, mask)), input_precision=PRECISION)
+        row = records + ids.to(tl.int64) * RECORD
+        cg = g0[:, None] * tl.load(row + 6, mask=mask, other=0.0)[None, :]
+        cg += g1[:, None] * tl.load(row + 7, mask=mask, other=0.0)[None, :]
+        cg += g2[:, None] * tl.load(row + 8, mask=mask, other=0.0)[None, :]
+        if WITH_DEPTH:
+            cg += g3[:, None] * tl.load(row + 9, mask=mask, other=0.0)[None, :]
         left = rest[:, None] - tl.cumsum(w * cg, axis=1)
         rest -= tl.sum(w * cg, axis=1)
         h = tl.where(p >= LOG2_ALPHA_MAX, 0.0, alpha * (before * cg - left / (1 - alpha)))
-        mixed = tl.dot(tl.trans(w), g, input_precision=PRECISION)
-        moments = tl.dot(tl.trans(h), basis, input_precision=PRECISION)
-        row = records + ids.to(tl.int64) * RECORD
+        out = slots + tl.load(perm + lane, mask=mask, other=0) * SLOT
+        tl.store(out, tl.sum(w * g0[:, None], axis=0), mask=mask)
+        tl.store(out + 1, tl.sum(w * g1[:, None], axis=0), mask=mask)
+        tl.store(out + 2, tl.sum(w * g2[:, None], axis=0), mask=mask)
+        if WITH_DEPTH:
+            tl.store(out + 3, tl.sum(w * g3[:, None], axis=0), mask=mask)
         u, v = tl.load(row, mask=mask, other=0.0) - x0, tl.load(row + 1, mask=mask, other=0.0) - y0
-        _store_slots(slots + tl.load(perm + lane, mask=mask, other=0) * SLOT, mixed, moments, u, v, mask)
+        _store_moments(out, h, bx, by, u, v, mask)
         k += BATCH
-
-
-@triton.jit
-@no_type_check
-def _moment_basis(x, y):
-    """Return 1, x, y, x², x y, y² of every pixel as columns 0 to 5 of a matrix."""
-    j = tl.arange(0, CHANNELS)[None, :]
-    one = tl.where(j == 0, 1.0, 0.0)
-    linear = tl.where(j == 1, x[:, None], 0.0) + tl.where(j == 2, y[:, None], 0.0)
-    square = tl.where(j == 3, (x * x)[:, None], 0.0) + tl.where(j == 4, (x * y)[:, None], 0.0)
-    return one + linear + square + tl.where(j == 5, (y * y)[:, None], 0.0)
 
 
 @triton.jit
@@ -204,14 +203,15 @@ def _column(matrix, j: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def _store_slots(row, mixed, moments, u, v, mask):
-    """Move the moments to the means at (u, v), and store all sums."""
-    s, sx, sy = _column(moments, 0), _column(moments, 1), _column(moments, 2)
-    for j in tl.static_range(4):
-        tl.store(row + j, _column(mixed, j), mask=mask)
-    tl.store(row + 4, s, mask=mask)
-    tl.store(row + 5, sx - u * s, mask=mask)
-    tl.store(row + 6, sy - v * s, mask=mask)
-    tl.store(row + 7, _column(moments, 3) - 2 * u * sx + u * u * s, mask=mask)
-    tl.store(row + 8, _column(moments, 4) - u * sy - v * sx + u * v * s, mask=mask)
-    tl.store(row + 9, _column(moments, 5) - 2 * v * sy + v * v * s, mask=mask)
+def _store_moments(out, h, x, y, u, v, mask):
+    """Sum h and its moments over the pixels, about the tile's middle, and store them about the means at (u, v)."""
+    hx, hy = h * x[:, None], h * y[:, None]
+    s, sx, sy = tl.sum(h, axis=0), tl.sum(hx, axis=0), tl.sum(hy, axis=0)
+    sxx, sxy = tl.sum(hx * x[:, None], axis=0), tl.sum(hx * y[:, None], axis=0)
+    syy = tl.sum(hy * y[:, None], axis=0)
+    tl.store(out + 4, s, mask=mask)
+    tl.store(out + 5, sx - u * s, mask=mask)
+    tl.store(out + 6, sy - v * s, mask=mask)
+    tl.store(out + 7, sxx - 2 * u * sx + u * u * s, mask=mask)
+    tl.store(out + 8, sxy - u * sy - v * sx + u * v * s, mask=mask)
+    tl.store(out + 9, syy - 2 * v * sy + v * v * s, mask=mask)

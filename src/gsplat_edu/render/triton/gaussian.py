@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import no_type_check
 
+import triton
 import triton.language as tl
 
-import triton
 from gsplat_edu import constants
 
 C0 = tl.constexpr(constants.C0)

@@ -87,8 +87,10 @@ def count_kernel(records, pairs_of, n, width, height, BLOCK: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def emit_kernel(records, order, begin, tiles, gaussians, n, width, height, tiles_x, BLOCK: tl.constexpr):
-    """Write tile and Gaussian of every pair, Gaussian by Gaussian in the given order."""
+def emit_kernel(
+    records, order, begin, pairs_of, tiles, gaussians, n, width, height, tiles_x, BLOCK: tl.constexpr
+):
+    """Write tile and Gaussian of every pair, Gaussian by Gaussian in the given order; never more than were counted."""
     k = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = k < n
     i = tl.load(order + k, mask=mask, other=0)
@@ -96,13 +98,14 @@ def emit_kernel(records, order, begin, tiles, gaussians, n, width, height, tiles
     first, rows = _rows(v, ey, height, seen)
     ey = tl.where(seen, ey, 1.0)
     place = tl.load(begin + i, mask=mask, other=0)
+    end = place + tl.load(pairs_of + i, mask=mask, other=0)
     row, most_rows = 0, tl.max(rows, 0)
     while row < most_rows:
         tx, columns = _columns(u, v, ex, ey, slant, tangent, half, first + row, width)
         columns = tl.where(row < rows, columns, 0)
         column, most_columns = 0, tl.max(columns, 0)
         while column < most_columns:
-            here = mask & (column < columns)
+            here = mask & (column < columns) & (place + column < end)
             tl.store(tiles + place + column, (first + row) * tiles_x + tx + column, mask=here)
             tl.store(gaussians + place + column, i.to(tl.int32), mask=here)
             column += 1

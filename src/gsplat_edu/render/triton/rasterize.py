@@ -37,7 +37,10 @@ BATCH = 16
 """Gaussians per step of composite: the least a matrix unit takes."""
 
 PRECISION = "ieee"
-"""How matrix products are computed: exactly as float32 has them; tf32x3 and tf32 are faster and round more."""
+"""How composite's matrix product is computed: as float32 has it; tf32x3 and tf32 are faster and round more."""
+
+COMPOSITE_BACKWARD_WARPS, PROJECT_BACKWARD_WARPS = 8, 2
+"""Warps of a program: chosen so that the compilers of triton 3.6 and 3.9 keep all numbers in registers."""
 
 RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 """Raw parameters in the order in which the kernels take them."""
@@ -91,7 +94,8 @@ def render_triton(
         raise ArgumentError(f"means: are {gaussians.means.dtype}, but the backend cuda takes float32")
     call = _Call(camera, settings, min(settings.sh_degree, gaussians.sh_degree))
     tensors = gaussians.tensors()
-    image, transmittance, depth = _Rasterize.apply(call, background, *(tensors[name] for name in RAW))  # type: ignore[no-untyped-call]
+    with torch.cuda.device_of(gaussians.means):  # type: ignore[no-untyped-call]
+        image, transmittance, depth = _Rasterize.apply(call, background, *(tensors[name] for name in RAW))  # type: ignore[no-untyped-call]
 
     def norms() -> Tensor:
         if call.norms is None:
@@ -144,9 +148,9 @@ class _Rasterize(torch.autograd.Function):
             grad_image, image if grad_T is None else grad_T, image if grad_depth is None else grad_depth, slots,
             call.camera.W, call.camera.H, tiles_x,
             WITH_T=grad_T is not None, WITH_DEPTH=grad_depth is not None and call.settings.depth, BATCH=BATCH,
-            PRECISION=PRECISION,
+            num_warps=COMPOSITE_BACKWARD_WARPS,
         )  # fmt: skip
-        outgoing = [torch.zeros_like(p) for p in kept]
+        outgoing = [torch.empty_like(p) for p in kept]  # written whole
         count = len(kept[0])
         norms = kept[0].new_zeros(count)
         if count:
@@ -154,10 +158,11 @@ class _Rasterize(torch.autograd.Function):
                 *kept, _camera_row(call, image.device), slots, lists.slot_begin, lists.pairs_of, *outgoing, norms,
                 count,
                 DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
-                BLOCK=BACKWARD_BLOCK,
+                BLOCK=BACKWARD_BLOCK, num_warps=PROJECT_BACKWARD_WARPS,
             )  # fmt: skip
         call.norms = norms if call.norms is None else call.norms + norms
-        background = (grad_image * transmittance[..., None]).sum(dim=(0, 1))
+        wanted = ctx.needs_input_grad[1]
+        background = (grad_image * transmittance[..., None]).sum(dim=(0, 1)) if wanted else None
         return None, background, *outgoing
 
 
@@ -189,11 +194,21 @@ def _intersect(call: _Call, records: Tensor) -> _Lists:
     call.num_pairs, num_visible = totals.tolist()  # the one place where the host waits
     call.visible = order[:num_visible]
     call.radii = records[call.visible, 10:12]
-    tile_of = torch.empty(call.num_pairs, dtype=torch.int32, device=device)
-    gaussians = torch.empty_like(tile_of)
+    tile_of = torch.zeros(call.num_pairs, dtype=torch.int32, device=device)
+    gaussians = torch.zeros_like(tile_of)
     if call.num_pairs:
         emit_kernel[blocks](
-            records, order, begin, tile_of, gaussians, count, camera.W, camera.H, tiles_x, BLOCK=BLOCK
+            records,
+            order,
+            begin,
+            pairs_of,
+            tile_of,
+            gaussians,
+            count,
+            camera.W,
+            camera.H,
+            tiles_x,
+            BLOCK=BLOCK,
         )
     tile_of, slots = torch.sort(tile_of, stable=True)
     edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians, quat_to_R_t
+from gsplat_edu.gaussians import Gaussians, unchecked_rotations
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
@@ -105,10 +105,10 @@ class MCMC:
 
     def _draw(self, weights: Float[Tensor, " N"], count: int) -> Int64[Tensor, " count"]:
         """Draw indices with replacement, each as probable as its weight."""
-        cumulated = torch.cumsum(weights, dim=0)
-        uniform = torch.rand(count, generator=self.generator, dtype=torch.float64).to(weights.device)
+        cumulated = torch.cumsum(weights.cpu(), dim=0)  # a GPU's has other bits every time
+        uniform = torch.rand(count, generator=self.generator, dtype=torch.float64)
         places = torch.searchsorted(cumulated, uniform * cumulated[-1], right=True)
-        return places.clamp(max=len(weights) - 1)
+        return places.clamp(max=len(weights) - 1).to(weights.device)
 
     def _share(self, gaussians: Gaussians, optimizer: Adam, places: Int64[Tensor, " D"]) -> None:
         """Make room at places for those that come: fainter and of another size, in place."""
@@ -124,8 +124,14 @@ class MCMC:
     def _add_noise(self, gaussians: Gaussians, rate: float) -> None:
         """Means += rate noise sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I)."""
         means = gaussians.means
-        draw = torch.randn(len(means), 3, generator=self.generator, dtype=means.dtype).to(means.device)
-        R, scales = quat_to_R_t(gaussians.quats.detach()), gaussians.scales
+        generator = self.generator
+        if (
+            means.device.type != "cpu"
+        ):  # drawn where it is needed, from a seed that checkpoints keep on the CPU
+            seed = int(torch.randint(2**62, (1,), generator=self.generator))
+            generator = torch.Generator(means.device).manual_seed(seed)
+        draw = torch.randn(len(means), 3, generator=generator, dtype=means.dtype, device=means.device)
+        R, scales = unchecked_rotations(gaussians.quats.detach()), gaussians.scales
         wander = (R @ (scales.square() * (R.mT @ draw[..., None])[..., 0])[..., None])[..., 0]
         gate = torch.sigmoid(NOISE_SHARPNESS * (NOISE_THRESHOLD - gaussians.opacities))
         means += (rate * self.config.mcmc_noise) * gate[:, None] * wander

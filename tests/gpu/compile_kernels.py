@@ -1,0 +1,84 @@
+"""Compile every kernel for a GPU that need not be there: python compile_kernels.py CAPABILITY
+
+Prints the name of each, and the bytes per thread that its numbers do not fit into registers, as the assembler says.
+Run by test_compile.py in a process of its own, because the interpreter is chosen when a kernel is imported.
+"""
+
+import re
+import subprocess
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+
+from triton.backends import nvidia
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from triton.compiler import compile as compiled
+
+from gsplat_edu.render.triton import adam, composite, intersect, loss, project
+
+INTEGERS = {"n", "width", "height", "tiles_x", "W", "H"}
+KINDS = {
+    **dict.fromkeys(("pairs_of", "tiles", "gaussians", "tile_begin"), "*i32"),
+    **dict.fromkeys(("order", "begin", "slot_begin", "perm"), "*i64"),
+}
+FLOATS = "*fp32"
+SIZE = ("i32", "i32")
+CAPABILITY = int(sys.argv[1])
+
+
+def spilled(ptx: str) -> int:
+    with tempfile.TemporaryDirectory() as scratch:
+        file = Path(scratch) / "kernel.ptx"
+        file.write_text(ptx)
+        for tool in sorted((Path(nvidia.__file__).parent / "bin").glob("ptxas*")):
+            architecture = f"-arch=sm_{CAPABILITY}{'a' if CAPABILITY == 90 else ''}"
+            words = [tool, "-v", architecture, file, "-o", file.with_suffix(".cubin")]
+            said = subprocess.run(words, check=False, capture_output=True, text=True)
+            if said.returncode == 0:
+                return sum(int(number) for number in re.findall(r"(\d+) bytes spill", said.stderr))
+    raise RuntimeError(said.stderr)
+
+
+def build(kernel, kinds, constants=None, warps=4) -> None:
+    places = {
+        (place,): constants[name] for place, name in enumerate(kernel.arg_names) if name in (constants or {})
+    }
+    source = ASTSource(kernel, kinds | dict.fromkeys(constants or {}, "constexpr"), places)
+    made = compiled(source, target=GPUTarget("cuda", CAPABILITY, 32), options={"num_warps": warps})
+    assert made.asm["cubin"] and made.metadata.shared < 96 * 1024, made.metadata.name
+    print(made.metadata.name, spilled(made.asm["ptx"]))
+
+
+def stage(kernel, warps=4, **constants) -> None:
+    kinds = {name: "i32" if name in INTEGERS else KINDS.get(name, FLOATS) for name in kernel.arg_names}
+    build(kernel, kinds, constants, warps)
+
+
+def main() -> None:
+    warnings.simplefilter("ignore")
+    for degree, rest in ((0, 0), (3, 15)):
+        shape = {"DEGREE": degree, "REST": rest, "ANTIALIASED": degree == 3}
+        stage(project.project_kernel, **shape, BLOCK=128)
+        stage(project.project_backward_kernel, 2, **shape, BLOCK=64)
+    stage(intersect.count_kernel, BLOCK=128)
+    stage(intersect.emit_kernel, BLOCK=128)
+    for both in (False, True):
+        stage(composite.composite_kernel, WITH_DEPTH=both, BATCH=16, PRECISION="ieee")
+        stage(composite.composite_backward_kernel, 8, WITH_DEPTH=both, WITH_T=both, BATCH=16)
+    image = {"image": FLOATS, "target": "*u8", "planes": FLOATS}
+    sums = {"sums": FLOATS, "size": SIZE}
+    build(loss._moments_across, image | {"size": SIZE, "scale": "fp32"}, warps=16)
+    build(loss._similarity_down, {"planes": FLOATS, "maps": FLOATS, **sums, "each": "fp32"}, warps=16)
+    build(loss._maps_across, {"maps": FLOATS, "planes": FLOATS, "size": SIZE}, warps=16)
+    last = {**image, "gradient": FLOATS, **sums, "numbers": ("fp32", "fp32", "fp32")}
+    build(loss._gradient_down, last, warps=16)
+    build(loss._gradient_down, last, {"planes": None}, warps=16)
+    build(loss._add, {"sums": FLOATS, "count": "i32", "total": FLOATS})
+    arrays = dict.fromkeys(("parameter", "m", "v", "gradient"), FLOATS)
+    build(adam._adam, {**arrays, "count": "i32", "numbers": ("fp32",) * 8})
+
+
+if __name__ == "__main__":
+    main()
