@@ -6,7 +6,7 @@ Random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: rende
 Adam. Milliseconds per stage are the kernels' own, from torch's profiler, over 20 iterations; how often the host waits
 is counted too. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. Then the
 gradients' error and the time with each precision of matrix products, against the native kernels in float64; and, where
-gsplat can be imported, the same scene through it: times, and the agreement of images. Needs a GPU.
+gsplat can be imported, the same scene through it: times, and the agreement of images and gradients. Needs a GPU.
 """
 
 from __future__ import annotations
@@ -30,6 +30,9 @@ from gsplat_edu.train.optimizer import Adam
 COUNTS = (100_000, 1_000_000, 3_000_000)
 SIZES = ((1297, 840), (1920, 1080))
 ROUNDS = 20
+FLOATS = 59
+"""Numbers of one Gaussian of SH degree 3."""
+
 SETTINGS = RenderSettings(depth=False, jacobian_limit=1.3)
 STAGES = {
     "project_backward": "reduce and project_backward",
@@ -120,7 +123,24 @@ def stages(count: int, width: int, height: int) -> dict[str, float]:
     torch.cuda.set_sync_debug_mode("default")
     found["waits"] = len(waits) / ROUNDS
     found["peak GiB"] = torch.cuda.max_memory_allocated() / 2**30
-    return found
+    with torch.no_grad():
+        pairs = render(gaussians, cam, settings=SETTINGS, backend="cuda").num_pairs or 0
+    return found | achieved(found, count, pairs)
+
+
+def achieved(found: dict[str, float], count: int, pairs: int) -> dict[str, float]:
+    """Return bandwidths and FLOP rates of stages, to be held against the ceilings.
+
+    Bytes are those that have to move: Adam reads four numbers and writes three per parameter. Operations are counted in
+    the kernels' text: about 25 per pixel and pair forward, 45 backward, an exponential as one.
+    """
+    pixels = 256 * pairs
+    return {
+        "Adam GB/s": 7 * 4 * FLOATS * count / found["Adam"] / 1e6,
+        "project GB/s": (4 * FLOATS + 64) * count / found["project"] / 1e6,
+        "composite TFLOP/s": 25 * pixels / found["composite"] / 1e9,
+        "composite_backward TFLOP/s": 45 * pixels / found["composite_backward"] / 1e9,
+    }
 
 
 def ceilings() -> dict[str, float]:
@@ -177,9 +197,18 @@ def beside_gsplat() -> dict[str, float] | None:
     def ours() -> torch.Tensor:
         return render(gaussians, cam, settings=SETTINGS, backend="cuda").image
 
+    gradients = []
+    for work in (ours, theirs):
+        work().square().sum().backward()
+        gradients.append({name: tensor.grad for name, tensor in gaussians.tensors().items()})
+        for tensor in gaussians.tensors().values():
+            tensor.grad = None
     with torch.no_grad():
         found = {"largest difference of the images": float((ours() - theirs()).abs().max())}
         found |= {"ours, forward ms": milliseconds(ours), "gsplat, forward ms": milliseconds(theirs)}
+    for name, gradient in gradients[0].items():
+        error = (gradient - gradients[1][name]).abs().max() / gradient.abs().max()
+        found[f"largest difference of the gradients, {name}"] = float(error)
     found["ours, forward and backward ms"] = milliseconds(lambda: ours().sum().backward())
     found["gsplat, forward and backward ms"] = milliseconds(lambda: theirs().sum().backward())
     return found
