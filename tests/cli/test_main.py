@@ -51,8 +51,8 @@ def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
         (["--seed", "99999999999999999999999"], "--seed: is 99999999999999999999999"),
         (["--iter", "3"], "unrecognized arguments: --iter 3"),
         (
-            ["--backend", "cuda"],
-            "backend 'cuda': not in this version of gsplat_edu; use auto or one of: cpu, torch",
+            ["--backend", "abacus"],
+            "backend 'abacus': not in this version of gsplat_edu; use auto or one of: cuda, cpu, torch",
         ),
         (["--out", "sphere.jpg"], "--out: 'sphere.jpg' has to end in .png"),
         (["--out", "taken/sphere.png"], "--out: cannot write taken/sphere.png"),
