@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import math
 import inspect
+import math
 import re
 import signal
 from collections.abc import Callable, Iterator
