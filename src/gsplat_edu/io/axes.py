@@ -1,0 +1,46 @@
+"""Between this package's axes and those of formats whose y points up: half a turn about x.
+
+(x, y, z) right, down, forward  <->  (x, -y, -z) right, up, back
+
+Half a turn only changes signs, so that going there and back gives the same bits.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from gsplat_edu.gaussians import Gaussians
+
+POSITION_SIGNS = (1.0, -1.0, -1.0)
+
+QUAT_SIGNS = (1.0, 1.0, -1.0, -1.0)
+"""Of (w, x, y, z): q' = i q i*, i the half turn."""
+
+SH_REST_SIGNS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
+"""Of the coefficients of degrees 1 to 3: what b_i(x, -y, -z) is of b_i(x, y, z)."""
+
+
+def half_turned(gaussians: Gaussians) -> Gaussians:
+    """Turn Gaussians half a turn about x: means, rotations and the directions of their colours.
+
+    Turning twice gives the same bits as not turning.
+
+    Args:
+        gaussians: N Gaussians, raw parameters.
+
+    Returns:
+        N Gaussians in the other axes.
+    """
+
+    def signs(values: tuple[float, ...]) -> torch.Tensor:
+        return torch.tensor(values, dtype=gaussians.means.dtype, device=gaussians.means.device)
+
+    rest = signs(SH_REST_SIGNS[: gaussians.sh_rest.shape[1]])
+    return Gaussians(
+        means=gaussians.means * signs(POSITION_SIGNS),
+        quats=gaussians.quats * signs(QUAT_SIGNS),
+        log_scales=gaussians.log_scales,
+        sh0=gaussians.sh0,
+        sh_rest=gaussians.sh_rest * rest[:, None],
+        logit_opacities=gaussians.logit_opacities,
+    )

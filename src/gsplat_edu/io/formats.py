@@ -1,0 +1,114 @@
+"""Every scene format by the suffix of its files: the one place that knows which there are."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.io.scene import Scene
+
+
+@dataclass(frozen=True)
+class Format:
+    """A scene format.
+
+    Args:
+        suffix: How the names of its files end, in lower case.
+        module: Module of `gsplat_edu.io` with `read(path) -> Scene` and `write(path, scene)`.
+        name: What people call it.
+        readable: Whether `read` is there.
+        lossless: Whether float32 parameters come back to the bit.
+    """
+
+    suffix: str
+    module: str
+    name: str
+    readable: bool = True
+    lossless: bool = False
+
+    def read(self, path: Path) -> Scene:
+        """Read a file of the format; see `read_scene`."""
+        scene: Scene = importlib.import_module(f"gsplat_edu.io.{self.module}").read(path)
+        return scene
+
+    def write(self, path: Path, scene: Scene) -> None:
+        """Write a file of the format; see `write_scene`."""
+        importlib.import_module(f"gsplat_edu.io.{self.module}").write(path, scene)
+
+
+FORMATS = (
+    Format(".compressed.ply", "compressed_ply", "SuperSplat compressed PLY"),
+    Format(".ply", "ply", "Inria PLY", lossless=True),
+    Format(".splat", "splat", "antimatter splat"),
+    Format(".spz", "spz", "Niantic SPZ"),
+    Format(".sog", "sog", "PlayCanvas SOG"),
+    Format(".glb", "glb", "glTF with KHR_gaussian_splatting", readable=False, lossless=True),
+)
+"""A name that ends in two of the suffixes is of the first."""
+
+SOG_META = "meta.json"
+"""File that a SOG in a folder, not in one file, is named by."""
+
+
+def format_of(path: str | Path) -> Format:
+    """Return the format that a file's name says it has.
+
+    Args:
+        path: The file's name; it need not be there. A meta.json is a SOG in its folder.
+
+    Raises:
+        ArgumentError: the name has no suffix of a scene format.
+    """
+    name = Path(path).name.lower()
+    if name == SOG_META:
+        name = ".sog"
+    for candidate in FORMATS:
+        if name.endswith(candidate.suffix):
+            return candidate
+    known = ", ".join(candidate.suffix for candidate in FORMATS)
+    raise ArgumentError(f"{path}: its name ends like no scene format; known are {known}")
+
+
+def read_scene(path: str | Path) -> Scene:
+    """Read a scene of any readable format.
+
+    Args:
+        path: The file; for a SOG in a folder, the folder or its meta.json.
+
+    Returns:
+        The scene, float32, in this package's axes.
+
+    Raises:
+        ArgumentError: the name has no suffix of a scene format, or of one that is only written.
+        SceneFormatError: the file is not what its name says, or damaged.
+        OSError: it cannot be read.
+    """
+    path = Path(path)
+    if path.is_dir() and (path / SOG_META).is_file():
+        path = path / SOG_META
+    found = format_of(path)
+    if not found.readable:
+        raise ArgumentError(f"{path}: {found.name} is written here, not read; give the scene it was made from")
+    scene = found.read(path)
+    if not all(bool(tensor.isfinite().all()) for tensor in scene.gaussians.tensors().values()):
+        bad = int((~scene.gaussians.finite_rows()).sum())
+        raise SceneFormatError(f"{path}: {bad} splats have a NaN or infinite number; export the scene again")
+    return scene
+
+
+def write_scene(path: str | Path, scene: Scene) -> None:
+    """Write a scene in the format that the file's name says; parent folders are made.
+
+    Args:
+        path: The file; for a SOG in a folder, the meta.json in it.
+        scene: The scene, in this package's axes.
+
+    Raises:
+        ArgumentError: the name has no suffix of a scene format, or a parameter is NaN or infinite.
+        OSError: it cannot be written. What stood there before is untouched.
+    """
+    found = format_of(path)
+    scene.gaussians.check_finite()
+    found.write(Path(path), scene)

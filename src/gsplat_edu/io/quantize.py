@@ -1,0 +1,58 @@
+"""What formats of few bits have in common: opacities in a byte, and how much a small file may claim to hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Integer, UInt8
+
+from gsplat_edu.errors import SceneFormatError
+
+OPACITY_EDGE = 0.25 / 255.0
+"""Bytes 0 and 255 stand for opacities this far inside 0 and 1, whose logits are finite: a quarter of a step."""
+
+MAX_EXPANSION = 64
+"""A file is refused that says it holds more than this many times its own size; scenes compress to a half or so."""
+
+SMALL = 1 << 20
+"""Bytes that even the smallest file may claim to hold: tests and toys compress very well."""
+
+
+def byte_to_logit(values: Integer[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+    """Turn opacities stored as bytes into logits, all finite; `logit_to_byte` gives back the same bytes.
+
+    Args:
+        values: 0 to 255.
+
+    Returns:
+        log(o / (1 - o)), o = values / 255 kept `OPACITY_EDGE` from 0 and 1.
+    """
+    opacities = np.clip(values / 255.0, OPACITY_EDGE, 1.0 - OPACITY_EDGE)
+    logits: Float32[np.ndarray, "..."] = np.log(opacities / (1.0 - opacities)).astype(np.float32)
+    return logits
+
+
+def logit_to_byte(logits: Float32[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+    """Turn logits into opacities rounded to bytes: floor(255 sigmoid(logit) + 1/2)."""
+    with np.errstate(over="ignore"):  # exp of a large number: the opacity is 0
+        opacities = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
+    rounded: UInt8[np.ndarray, "..."] = np.floor(255.0 * opacities + 0.5).astype(np.uint8)
+    return rounded
+
+
+def check_expansion(path: Path, claimed: int, stored: int) -> None:
+    """Refuse a file that says it holds far more than it can, before anything is allocated for it.
+
+    Args:
+        path: The file's name, for the message.
+        claimed: Bytes that its contents would take.
+        stored: Bytes that the file has.
+
+    Raises:
+        SceneFormatError: it claims more than `MAX_EXPANSION` times its size, and more than `SMALL`.
+    """
+    if claimed > max(SMALL, MAX_EXPANSION * stored):
+        raise SceneFormatError(
+            f"{path}: says it holds {claimed:,} bytes in a file of {stored:,}; it is damaged, get it again"
+        )
