@@ -3,7 +3,10 @@ import math
 import numpy as np
 import pytest
 
+from scipy.spatial.transform import Rotation
+
 from gsplat_edu import C0, eval_sh, sh_basis
+from gsplat_edu.sh import sh_rotation
 
 SAMPLES = 400_000
 
@@ -74,3 +77,18 @@ def test_colours_are_the_floored_sum(degree):
 def test_leading_axes_are_kept():
     assert sh_basis(directions(6).reshape(2, 3, 3)).shape == (2, 3, 16)
     assert sh_basis((0, 0, 1)).shape == (16,)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_turned_coefficients_are_the_turned_function(degree):
+    """Both sides are sums of some dozen products of numbers of order 1 in float64."""
+    turn = Rotation.random(random_state=degree).as_matrix()
+    M = sh_rotation(degree, turn)
+    count = (degree + 1) ** 2
+    c = np.random.default_rng(1).normal(size=count - 1)
+    dirs = directions(200, seed=2)
+    np.testing.assert_allclose(
+        sh_basis(dirs)[:, 1:count] @ (M @ c), sh_basis(dirs @ turn)[:, 1:count] @ c, atol=1e-13
+    )
+    np.testing.assert_allclose(M @ M.T, np.eye(count - 1), atol=1e-13)
+    np.testing.assert_allclose(sh_rotation(degree, turn.T), M.T, atol=1e-13)

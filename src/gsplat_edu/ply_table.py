@@ -89,10 +89,12 @@ class Header:
     Args:
         format: "ascii", "binary_little_endian" or "binary_big_endian".
         elements: In the order of the file.
+        comments: Words of each comment, in the order of the file.
     """
 
     format: str
     elements: tuple[Element, ...]
+    comments: tuple[tuple[str, ...], ...] = ()
 
 
 def read_elements(path: Path, file: BinaryIO) -> Header:
@@ -121,7 +123,8 @@ def read_elements(path: Path, file: BinaryIO) -> Header:
         raise SceneFormatError(f"{path}: no end_header in {HEADER_LIMIT} lines; the file is damaged")
     if header.format is None:
         raise SceneFormatError(f"{path}: its header names no format; the file is damaged, get it again")
-    return Header(header.format, tuple(Element(n, c, tuple(p)) for n, c, p in header.elements))
+    elements = tuple(Element(n, c, tuple(p)) for n, c, p in header.elements)
+    return Header(header.format, elements, tuple(header.comments))
 
 
 class _HeaderLines:
@@ -130,11 +133,14 @@ class _HeaderLines:
     def __init__(self) -> None:
         self.format: str | None = None
         self.elements: list[tuple[str, int, list[tuple[str, str | None]]]] = []
+        self.comments: list[tuple[str, ...]] = []
 
     def add(self, words: list[str]) -> str | None:
         match words:
-            case [] | ["comment" | "obj_info", *_]:
+            case [] | ["obj_info", *_]:
                 return None
+            case ["comment", *said]:
+                self.comments.append(tuple(said))
             case ["format", name, _] if name in FORMATS and self.format is None:
                 self.format = name
             case ["element", name, count] if count.isdecimal() and name not in [e[0] for e in self.elements]:

@@ -109,3 +109,35 @@ def basis_terms(degree: int, x: Any, y: Any, z: Any) -> list[Any]:  # noqa: ANN4
             -C3[0] * x * (xx - 3.0 * yy),
         ]
     return terms
+
+
+def sh_rotation(degree: int, R: ArrayLike) -> Float64[np.ndarray, "K K"]:
+    """Return what a rotation does to the coefficients of degrees 1 and up: a block per degree.
+
+    sum_k b_k(d) (M c)_k = sum_k b_k(R' d) c_k  for every direction d: the colours turn with the scene.
+
+    A rotated harmonic is a sum of harmonics of its own degree, so that each block is found exactly from as many
+    directions as there are unknowns and some more.
+
+    Args:
+        degree: Highest degree, 0 to 3.
+        R: (3, 3) rotation.
+
+    Returns:
+        (K, K) matrix, K = (degree + 1)² - 1.
+
+    Raises:
+        ShapeError: R is not of shape (3, 3).
+        ArgumentError: the degree is not 0, 1, 2 or 3.
+    """
+    R = float64_array("R", R, (3, 3))
+    count = num_coefficients(degree)
+    dirs = np.random.default_rng(0).normal(size=(64, 3))  # any that span the harmonics; the same every time
+    dirs /= np.linalg.norm(dirs, axis=1, keepdims=True)
+    still, turned = sh_basis(dirs), sh_basis(dirs @ R)
+    matrix = np.zeros((count - 1, count - 1))
+    for level in range(1, degree + 1):
+        block = slice(level**2, (level + 1) ** 2)
+        inner = slice(block.start - 1, block.stop - 1)
+        matrix[inner, inner] = np.linalg.lstsq(still[:, block], turned[:, block], rcond=None)[0]
+    return matrix

@@ -99,7 +99,7 @@ def test_what_is_none_of_them_is_one_line(info, tmp_path):
     assert "is not there; give a dataset folder" in info(tmp_path / "gone", code=2)
     assert "is no capture" in info(tmp_path, code=2)
     (tmp_path / "a.txt").write_text("hello")
-    assert "a.txt: is not a PLY" in info(tmp_path / "a.txt", code=2)
+    assert "a.txt: its name ends like no scene format" in info(tmp_path / "a.txt", code=2)
 
 
 def test_help_shows_an_example(info, capsys):

@@ -101,9 +101,9 @@ def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["gone"], "gone: is not there; give the folder of a run, or a scene PLY"),
+        (["gone"], "gone: is not there; give the folder of a run, or a scene file"),
         (["."], "is no run (it has no config.json)"),
-        (["BARE", "--dataset"], "--dataset: a PLY comes without cameras"),
+        (["BARE", "--dataset"], "--dataset: a scene file comes without cameras"),
         (["BARE", "--frames", "0"], "--frames: is 0"),
         (["BARE", "--size", "0"], "--size: is 0"),
         (["BARE", "--fps", "-1"], "--fps: is -1"),

@@ -1,4 +1,5 @@
 import os
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,8 @@ import torch
 
 from gsplat_edu.errors import SceneFormatError, ShapeError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.ply import load_ply, save_ply
+from gsplat_edu.io.ply import load_ply, read, save_ply, write
+from gsplat_edu.io.scene import Scene
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
@@ -69,17 +71,18 @@ def test_gradients_and_float64_are_no_obstacle(tmp_path):
     assert len(parse(tmp_path / "a.ply")[1]) == 3
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "scene.ply"
     save_ply(path, random_gaussians(2, 0))
     before = path.read_bytes()
 
-    def disk_full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pathlib.Path.write_bytes", disk_full)
-    with pytest.raises(OSError, match="No space"):
-        save_ply(path, random_gaussians(5, 0))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400, limits[1]))  # the header fits, the rows do not
+    try:
+        with pytest.raises(OSError, match="too large"):
+            save_ply(path, random_gaussians(5, 15))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path], "and nothing beside it"
 
@@ -298,3 +301,26 @@ def test_a_trained_scene_of_somebody_else():
 )
 def test_files_of_the_world_that_are_no_scene(name, says):
     assert says in refused(shared(name))
+
+
+@pytest.mark.parametrize("antialiased", [None, False, True])
+@pytest.mark.parametrize("up", [None, (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
+def test_what_has_no_property_travels_in_comments(tmp_path, antialiased, up):
+    path = tmp_path / "scene.ply"
+    write(path, Scene(random_gaussians(3, 3), antialiased, up))
+    scene = read(path)
+    assert scene.antialiased is antialiased
+    assert scene.up == (None if up is None else pytest.approx(up, abs=1e-15))
+    assert_equal(scene.gaussians, random_gaussians(3, 3))
+
+
+@pytest.mark.parametrize("said", ["up 1 2", "up a b c", "up 0 0 0", "up nan 0 0", "up inf 0 0"])
+def test_a_comment_of_ours_that_is_none_is_refused(tmp_path, said):
+    path = tmp_path / "scene.ply"
+    save_ply(path, random_gaussians(1, 0))
+    data = path.read_bytes().replace(b"element", f"comment gsplat_edu {said}\nelement".encode(), 1)
+    path.write_bytes(data)
+    with pytest.raises(SceneFormatError, match="is no direction"):
+        read(path)
+    path.write_bytes(data.replace(b"comment gsplat_edu", b"comment another"))
+    assert read(path).up is None

@@ -16,12 +16,19 @@ from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.ply import load_ply
+from gsplat_edu.io import ply
+from gsplat_edu.io.formats import SOG_META, format_of, read_scene, stored_bytes
 from gsplat_edu.runs.folder import RunFolder
 
 EXAMPLE = "example: gsplat-edu info captures/plush"
 
 PERCENTILES = (1, 25, 50, 75, 99)
+
+BINS = 40
+"""Bins of a histogram: one character each."""
+
+BLOCKS = " ▁▂▃▄▅▆▇█"
+"""Heights of a bin: the first is for an empty one only."""
 
 HIGHLIGHTS = {
     "data": ("path", "resolution", "test_every", "points"),
@@ -35,15 +42,18 @@ Fact = tuple[str, str]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's argument."""
-    parser.add_argument("path", type=Path, metavar="PATH", help="dataset folder, run folder or scene PLY")
+    parser.add_argument("path", type=Path, metavar="PATH", help="dataset folder, run folder or scene file")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Print one line per fact."""
     path: Path = arguments.path
     if not path.exists():
-        raise ArgumentError(f"{path}: is not there; give a dataset folder, a run folder or a scene PLY")
-    if path.is_file() and path.suffix.lower() != ".json":  # a transforms.json is a dataset
+        raise ArgumentError(f"{path}: is not there; give a dataset folder, a run folder or a scene file")
+    if (path / SOG_META).is_file():
+        path = path / SOG_META
+    # any other .json may be the transforms.json of a dataset
+    if path.is_file() and (path.suffix.lower() != ".json" or path.name.lower() == SOG_META):
         facts = _scene_facts(path)
     elif RunFolder(path).exists():
         facts = _run_facts(RunFolder(path))
@@ -54,14 +64,27 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _scene_facts(path: Path) -> list[Fact]:
-    gaussians = load_ply(path)
-    count, size = len(gaussians), path.stat().st_size
+    found = format_of(path)
+    # what is NaN is told of here; other commands refuse it
+    scene = ply.read(path, finite=False) if found.suffix == ".ply" else read_scene(path)
+    gaussians = scene.gaussians
+    count, size = len(gaussians), stored_bytes(path)
     facts = [
-        ("scene", str(path)),
+        ("scene", f"{path}, {found.name}"),
         ("splats", f"{count:,}, SH degree {gaussians.sh_degree}"),
-        ("file", f"{size:,} bytes" + (f", {size / count:.0f} per splat" if count else "")),
+        ("file", f"{size:,} bytes" + (f", {size / count:.1f} per splat" if count else "")),
     ]
-    return facts + _splat_facts(gaussians) if count else facts
+    if scene.antialiased is not None:
+        facts.append(("render", f"{'with' if scene.antialiased else 'without'} antialiasing"))
+    if scene.up is not None:
+        facts.append(("up", ", ".join(f"{x:.4g}" for x in scene.up)))
+    finite = gaussians.finite_rows()
+    if broken := int((~finite).sum()):
+        facts.append(
+            ("warning", f"{broken:,} of {count:,} splats have a NaN or infinite number: cannot be drawn")
+        )
+        gaussians = gaussians.map(lambda tensor: tensor[finite])
+    return facts + _splat_facts(gaussians) if len(gaussians) else facts
 
 
 def _splat_facts(gaussians: Gaussians) -> list[Fact]:
@@ -73,7 +96,9 @@ def _splat_facts(gaussians: Gaussians) -> list[Fact]:
         ("bounds", _bounds(means)),
         ("", f"of the middle 98 %: {_bounds(inner)}"),
         ("opacity", f"{_percentiles(opacities)}   ({header})"),
+        ("", _histogram(opacities, np.linspace(0.0, 1.0, BINS + 1), "0", "1")),
         ("scale", f"{_percentiles(scales)}   world units"),
+        ("", _log_histogram(scales)),
     ]
     diagonal = float(np.linalg.norm(inner[1] - inner[0]))
     for number, what in (
@@ -163,6 +188,23 @@ def _counted(counter: Counter[str], most: int = 3) -> str:
 def _bounds(points: Float[np.ndarray, "N 3"]) -> str:
     low, high = points.min(axis=0), points.max(axis=0)
     return ", ".join(f"{n} {a:.4g} to {b:.4g}" for n, a, b in zip("xyz", low, high, strict=True))
+
+
+def _log_histogram(values: Float[np.ndarray, "..."]) -> str:
+    """Draw a histogram over the powers of ten that hold the middle 99.8 %; what is beyond counts at the ends."""
+    logs = np.log10(np.maximum(values, np.finfo(np.float64).tiny))
+    low, high = np.percentile(logs, (0.1, 99.9))
+    edges = np.linspace(low, high if high > low else low + 1.0, BINS + 1)
+    return _histogram(
+        np.clip(logs, edges[0], edges[-1]), edges, f"{10 ** edges[0]:.2g}", f"{10 ** edges[-1]:.2g}"
+    )
+
+
+def _histogram(values: Float[np.ndarray, "..."], edges: Float[np.ndarray, " B"], low: str, high: str) -> str:
+    """Draw a histogram as one line of blocks, the highest bin as the full one."""
+    counts, _ = np.histogram(values, edges)
+    heights = np.ceil(counts / max(int(counts.max()), 1) * (len(BLOCKS) - 1)).astype(int)
+    return f"{low} |{''.join(BLOCKS[height] for height in heights)}| {high}"
 
 
 def _percentiles(values: Float[np.ndarray, "..."]) -> str:

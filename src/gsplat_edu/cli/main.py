@@ -14,8 +14,9 @@ COMMANDS = {
     "demo": "learn a sphere from 24 renders of it and judge the result with a held-out camera",
     "train": "turn a folder of posed photos into a scene",
     "eval": "score a run's latest scene on its test and training views, and write metrics, renders and a report",
-    "render": "render a run or a scene PLY: an orbit as a video, or what the dataset's cameras see",
-    "info": "say what a dataset, a run or a scene PLY holds, on one screen",
+    "render": "render a run or a scene file: an orbit as a video, or what the dataset's cameras see",
+    "convert": "write a scene in another format, or as a page that draws it; filter, move, join, and check it",
+    "info": "say what a dataset, a run or a scene file holds, on one screen",
 }
 """Commands and what they do; each is a module `gsplat_edu.cli.NAME` with EXAMPLE, add_arguments and run."""
 

@@ -15,25 +15,27 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.images import write_frames
 from gsplat_edu.evaluate.paths import orbit_of_scene, orbit_path, resized
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.formats import SOG_META, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
+from gsplat_edu.runs.source import file_settings, relative_to
 from gsplat_edu.validation import whole_number
 
 EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"
 
 SCENE_SIZE = 512
-"""px: images of a PLY that came without cameras."""
+"""px: images of a scene that came without cameras."""
 
 RUNS_CAMERAS = ""
 """What --dataset is without a path."""
@@ -58,7 +60,7 @@ class Shot:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("source", type=Path, metavar="RUN|PLY", help="folder of a run, or a scene PLY")
+    parser.add_argument("source", type=Path, metavar="RUN|SCENE", help="folder of a run, or a scene file")
     parser.add_argument(
         "--dataset",
         nargs="?",
@@ -74,13 +76,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
 
     number("--frames", 120, "frames of the orbit (default: 120)")
-    number("--size", None, f"longer side of the images in px (default: the cameras'; {SCENE_SIZE} for a PLY)")
+    number(
+        "--size",
+        None,
+        f"longer side of the images in px (default: the cameras'; {SCENE_SIZE} for a scene file)",
+    )
     number("--fps", 30, "frames per second of a video (default: 30)")
     parser.add_argument(
         "--out",
         type=Path,
         metavar="DIR|X.mp4",
-        help="folder of PNGs, or a video (default: renders/ in the run, out/ for a PLY)",
+        help="folder of PNGs, or a video (default: renders/ in the run, out/ for a scene file)",
     )
     parser.add_argument(
         "--white-background", action="store_true", help="render over white (default: the run's background)"
@@ -100,15 +106,15 @@ def run(arguments: argparse.Namespace) -> None:
     if folder.exists():
         shot = _run_shot(arguments, folder, orbit)
         out = arguments.out or folder.renders / ("orbit.mp4" if orbit else "views")
-    elif arguments.source.is_file():
-        shot = _ply_shot(arguments, orbit)
+    elif arguments.source.is_file() or (arguments.source / SOG_META).is_file():
+        shot = _file_shot(arguments, orbit)
         out = arguments.out or Path("out") / f"{arguments.source.stem}_{'orbit.mp4' if orbit else 'views'}"
     elif arguments.source.exists():
         raise ArgumentError(
-            f"{arguments.source}: is no run (it has no config.json); give a run or a scene PLY"
+            f"{arguments.source}: is no run (it has no config.json); give a run or a scene file"
         )
     else:
-        raise ArgumentError(f"{arguments.source}: is not there; give the folder of a run, or a scene PLY")
+        raise ArgumentError(f"{arguments.source}: is not there; give the folder of a run, or a scene file")
     console = Console(highlight=False, markup=False)
     started = time.perf_counter()
     frames = track(
@@ -131,7 +137,7 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> 
     settings = _settings(render_settings(config), arguments)
     scene, _ = folder.latest_scene()
     if arguments.dataset not in (None, RUNS_CAMERAS):
-        return _dataset_shot(arguments, scene, settings, data_settings(config), orbit)
+        return _dataset_shot(arguments, load_ply(scene), settings, data_settings(config), orbit)
     origin = config.get("origin", ORIGIN)
     gaussians = load_ply(scene, origin)
     cameras = folder.read_cameras(origin)
@@ -141,24 +147,30 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> 
     return _shot(arguments, gaussians, named, settings, orbit)
 
 
-def _ply_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
-    settings = _settings(RenderSettings(), arguments)
+def _file_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
     if arguments.dataset == RUNS_CAMERAS:
         raise ArgumentError(
-            "--dataset: a PLY comes without cameras; give the dataset's folder: --dataset PATH"
+            "--dataset: a scene file comes without cameras; give the dataset's folder: --dataset PATH"
         )
+    scene = read_scene(arguments.source)
+    settings = _settings(file_settings(scene), arguments)
     if arguments.dataset is not None:
-        return _dataset_shot(arguments, arguments.source, settings, DataSettings(), orbit)
-    gaussians = load_ply(arguments.source)
-    cameras = orbit_of_scene(gaussians, arguments.frames, arguments.size or SCENE_SIZE)
-    return Shot(gaussians, cameras, None, settings)
+        return _dataset_shot(arguments, scene.gaussians, settings, DataSettings(), orbit)
+    cameras = orbit_of_scene(
+        scene.gaussians, arguments.frames, arguments.size or SCENE_SIZE, scene.up or WORLD_UP
+    )
+    return Shot(scene.gaussians, cameras, None, settings)
 
 
 def _dataset_shot(
-    arguments: argparse.Namespace, scene: Path, settings: RenderSettings, data: DataSettings, orbit: bool
+    arguments: argparse.Namespace,
+    gaussians: Gaussians,
+    settings: RenderSettings,
+    data: DataSettings,
+    orbit: bool,
 ) -> Shot:
     dataset = load_dataset(arguments.dataset, data)
-    gaussians = load_ply(scene, dataset.origin)  # the frame its cameras stand in
+    gaussians = relative_to(gaussians, dataset.origin)  # the frame its cameras stand in
     named = [(view.name, view.camera) for view in (*dataset.train, *dataset.test)]
     return _shot(arguments, gaussians, named, settings, orbit)
 

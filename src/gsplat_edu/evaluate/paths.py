@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from gsplat_edu.camera import WORLD_UP, Camera, look_at, point_nearest_axes, scaled_intrinsics
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.validation import in_range, whole_number
+from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
 
 Vector = Float64[np.ndarray, "3"]
 
@@ -69,7 +69,7 @@ def orbit_path(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> li
     frames = whole_number("frames", frames, 1)
     depth = in_range("depth", depth, 0.0, open_low=True)
     eyes = np.stack([camera.eye for camera in cameras])
-    up = _common_up(cameras)
+    up = common_up(cameras)
     centre = _point_looked_at(cameras, depth)
     offsets = eyes - centre
     distances = np.linalg.norm(offsets, axis=1)
@@ -86,8 +86,8 @@ def orbit_path(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> li
     return [Camera(look_at(eye, centre, up), eye, *intrinsics) for eye in eyes_on_orbit]
 
 
-def orbit_of_scene(gaussians: Gaussians, frames: int, size: int) -> list[Camera]:
-    """Make a closed orbit around a scene that came without cameras; up is the world's, (0, -1, 0).
+def orbit_of_scene(gaussians: Gaussians, frames: int, size: int, up: ArrayLike = WORLD_UP) -> list[Camera]:
+    """Make a closed orbit around a scene that came without cameras.
 
     The centre is the middle of the box that holds 10 to 90 % of the opacity along each axis. The radius lets the
     sphere that holds 95 % of the opacity, but at most twice as large as the one that holds half, fill a field of
@@ -97,8 +97,10 @@ def orbit_of_scene(gaussians: Gaussians, frames: int, size: int) -> list[Camera]
         gaussians: N Gaussians, at least one.
         frames: Cameras of the orbit, at least one.
         size: Height and width of the images, px.
+        up: (3,) direction that is up in the scene.
 
     Raises:
+        ShapeError: up is not of shape (3,).
         ArgumentError: there are no Gaussians, or frames or size is not a whole number of at least 1.
     """
     if not len(gaussians):
@@ -114,8 +116,9 @@ def orbit_of_scene(gaussians: Gaussians, frames: int, size: int) -> list[Camera]
         extent = 3.0 * float(gaussians.scales.detach().max())
     radius = ORBIT_MARGIN * extent / math.sin(ORBIT_FOV / 2)
     focal = size / 2 / math.tan(ORBIT_FOV / 2)
-    up = np.array(WORLD_UP)
-    eyes = _circle(centre, up, np.array([0.0, 0.0, -1.0]), radius, ORBIT_ELEVATION, frames)
+    up = _unit(float64_array("up", up, (3,)), np.array(WORLD_UP))
+    start = _unit(_level(np.array([0.0, 0.0, -1.0]), up), _level(np.array([1.0, 0.0, 0.0]), up))
+    eyes = _circle(centre, up, start, radius, ORBIT_ELEVATION, frames)
     return [Camera.looking_at(eye, centre, focal, focal, size, size, up) for eye in eyes]
 
 
@@ -136,8 +139,15 @@ def resized(camera: Camera, longest: int) -> Camera:
     return Camera(camera.R, camera.eye, *scaled_intrinsics(*intrinsics, W / camera.W, H / camera.H), H, W)
 
 
-def _common_up(cameras: Sequence[Camera]) -> Vector:
-    """Find the direction that is up for cameras held level; their mean up leans where they look down on one side."""
+def common_up(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
+    """Find the direction that is up for cameras held level; their mean up leans where they look down on one side.
+
+    Args:
+        cameras: At least one.
+
+    Returns:
+        (3,) of length 1.
+    """
     mean = _unit(np.sum([-camera.R[1] for camera in cameras], axis=0), -cameras[0].R[1])
     rights = np.stack([camera.R[0] for camera in cameras])
     values, vectors = np.linalg.eigh(rights.T @ rights / len(cameras))

@@ -6,6 +6,7 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.scene import Scene
 
@@ -20,6 +21,8 @@ class Format:
         name: What people call it.
         readable: Whether `read` is there.
         lossless: Whether float32 parameters come back to the bit.
+        sh_degree: Highest degree of harmonics that it holds.
+        says_antialiased: Whether it has room for that.
     """
 
     suffix: str
@@ -27,6 +30,8 @@ class Format:
     name: str
     readable: bool = True
     lossless: bool = False
+    sh_degree: int = SH_MAX_DEGREE
+    says_antialiased: bool = True
 
     def read(self, path: Path) -> Scene:
         """Read a file of the format; see `read_scene`."""
@@ -41,7 +46,7 @@ class Format:
 FORMATS = (
     Format(".compressed.ply", "compressed_ply", "SuperSplat compressed PLY"),
     Format(".ply", "ply", "Inria PLY", lossless=True),
-    Format(".splat", "splat", "antimatter splat"),
+    Format(".splat", "splat", "antimatter splat", sh_degree=0, says_antialiased=False),
     Format(".spz", "spz", "Niantic SPZ"),
     Format(".sog", "sog", "PlayCanvas SOG"),
     Format(".glb", "glb", "glTF with KHR_gaussian_splatting", readable=False, lossless=True),
@@ -71,6 +76,26 @@ def format_of(path: str | Path) -> Format:
     raise ArgumentError(f"{path}: its name ends like no scene format; known are {known}")
 
 
+def stored_bytes(path: Path) -> int:
+    """Return the bytes that a scene takes on disk; those of its images too where it is a meta.json."""
+    if path.name.lower() != SOG_META:
+        return path.stat().st_size
+    return sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix in (".json", ".webp"))
+
+
+def losses(path: str | Path, scene: Scene) -> list[str]:
+    """Say what of a scene a file of that name cannot hold at all: a sentence each."""
+    found, degree = format_of(path), scene.gaussians.sh_degree
+    said = []
+    if degree > found.sh_degree:
+        said.append(
+            f"{path}: {found.name} holds harmonics up to degree {found.sh_degree}; those up to {degree} are left out"
+        )
+    if scene.antialiased and not found.says_antialiased:
+        said.append(f"{path}: {found.name} cannot say that the scene is to be rendered with antialiasing")
+    return said
+
+
 def read_scene(path: str | Path) -> Scene:
     """Read a scene of any readable format.
 
@@ -90,7 +115,9 @@ def read_scene(path: str | Path) -> Scene:
         path = path / SOG_META
     found = format_of(path)
     if not found.readable:
-        raise ArgumentError(f"{path}: {found.name} is written here, not read; give the scene it was made from")
+        raise ArgumentError(
+            f"{path}: {found.name} is written here, not read; give the scene it was made from"
+        )
     scene = found.read(path)
     if not all(bool(tensor.isfinite().all()) for tensor in scene.gaussians.tensors().values()):
         bad = int((~scene.gaussians.finite_rows()).sum())

@@ -5,7 +5,9 @@ opacities): x y z, nx ny nz (zero), f_dc_0..2, f_rest_* channel by channel, opac
 (w, x, y, z). A scene of SH degree 0 has no f_rest. Axes are those of the scene: nothing is flipped.
 
 Read by the names of the properties: in any order, of any number type, with properties and elements that are not ours
-left aside, binary of either byte order or ASCII.
+left aside, binary of either byte order or ASCII. A file whose splats are packed as SuperSplat packs them is read too.
+
+What the format has no property for stands in comments: see `gsplat_edu.io.ply_comments`.
 
 Source: the point_cloud.ply of Kerbl et al. 2023's code; Turk 1994, "The PLY Polygon File Format".
 """
@@ -23,6 +25,8 @@ from torch import Tensor
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply_comments import comments, read_comments
+from gsplat_edu.io.scene import Scene
 from gsplat_edu.ply_table import Element, read_elements, read_rows
 from gsplat_edu.validation import ArrayLike, float64_array
 
@@ -36,6 +40,27 @@ SH_REST_COUNTS = (0, 9, 24, 45)
 """Numbers of f_rest properties: three channels of the coefficients of degrees 0 to 3."""
 
 ORIGIN = (0.0, 0.0, 0.0)
+
+
+def read(path: Path, finite: bool = True) -> Scene:
+    """Read a scene PLY and what its comments say; see `load_ply`.
+
+    Args:
+        path: The file.
+        finite: Refuse one with NaN or infinite numbers.
+    """
+    with path.open("rb") as file:
+        header = read_elements(path, file)
+    if any("packed_position" in element.names for element in header.elements):
+        from gsplat_edu.io import compressed_ply  # TEMP
+
+        return compressed_ply.read(path)
+    return Scene(_load(path, ORIGIN, finite), *read_comments(path, header.comments))
+
+
+def write(path: Path, scene: Scene) -> None:
+    """Write a scene PLY and the comments; see `save_ply`."""
+    _write(path, scene.gaussians, ORIGIN, comments(scene))
 
 
 def save_ply(path: str | Path, gaussians: Gaussians, origin: ArrayLike = ORIGIN) -> None:
@@ -52,6 +77,10 @@ def save_ply(path: str | Path, gaussians: Gaussians, origin: ArrayLike = ORIGIN)
         OSError: the file cannot be written. What stood there before is untouched.
     """
     gaussians.check_finite()
+    _write(Path(path), gaussians, origin, [])
+
+
+def _write(path: Path, gaussians: Gaussians, origin: ArrayLike, extra: list[str]) -> None:
     shift = float64_array("origin", origin, (3,))
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     count = len(gaussians)
@@ -69,11 +98,12 @@ def save_ply(path: str | Path, gaussians: Gaussians, origin: ArrayLike = ORIGIN)
         (QUATS, tensors["quats"]),
     ]
     names = [name for group, _ in columns for name in group]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    header = ["ply", "format binary_little_endian 1.0", *extra, f"element vertex {count}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
     table = np.concatenate([values for _, values in columns], axis=1, dtype="<f4", casting="same_kind")
-    with written_aside(Path(path)) as aside:
-        aside.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
+    with written_aside(path) as aside, aside.open("wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        file.write(table.data)
 
 
 def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
@@ -92,7 +122,10 @@ def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
         ShapeError: the origin is not of shape (3,).
         OSError: the file cannot be read.
     """
-    path = Path(path)
+    return _load(Path(path), origin, finite=True)
+
+
+def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
     shift = float64_array("origin", origin, (3,))
     with path.open("rb") as file:
         header = read_elements(path, file)
@@ -105,7 +138,8 @@ def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
         over="ignore", invalid="ignore"
     ):  # a double beyond float32 becomes infinite, told of below
         values = structured_to_unstructured(table[columns], dtype=np.float32)
-    _check_finite(path, values, columns)
+    if finite:
+        _check_finite(path, values, columns)
     ends = np.cumsum([len(group) for group in groups])[:-1]
     means, sh0, sh_rest, opacity, scales, quats = np.split(values, ends, axis=1)
     if shift.any():

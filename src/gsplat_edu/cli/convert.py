@@ -1,0 +1,198 @@
+"""`gsplat-edu convert`: a scene in another format, filtered, moved or joined, and checked."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from scipy.spatial.transform import Rotation
+
+from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
+from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.runs.source import Source, open_source
+from gsplat_edu.viewer import export
+
+EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
+
+MOVES = "scale=S, rotate=AXIS:DEGREES (x:90), move=X,Y,Z or matrix=FILE (12 or 16 numbers, rows first)"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("sources", type=Path, nargs="+", metavar="IN", help="scene file, or folder of a run")
+    parser.add_argument(
+        "out",
+        type=Path,
+        metavar="OUT",
+        help="file to write: its suffix is the format, .ply .compressed.ply .splat .spz .sog .glb or .html"
+        " (a page that draws the scene); FOLDER/meta.json is a SOG in a folder",
+    )
+    parser.add_argument("--merge", action="store_true", help="join several IN into one scene")
+    parser.add_argument(
+        "--sh-degree",
+        type=whole_number_text,
+        default=SH_MAX_DEGREE,
+        metavar="N",
+        help="highest degree of harmonics to keep (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--min-opacity", type=float, default=0.0, metavar="A", help="leave out splats of lower opacity"
+    )
+    parser.add_argument(
+        "--crop",
+        type=_numbers(6),
+        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        help="keep splats whose centre lies in the box, in the coordinates of IN; --crop=-1,... where it"
+        " begins with a minus",
+    )
+    parser.add_argument(
+        "--transform",
+        action="append",
+        default=[],
+        metavar="KIND=VALUE",
+        help=f"move the scene, after --crop; {MOVES}; several are done in their order",
+    )
+    parser.add_argument(
+        "--verify",
+        action="store_true",
+        help=f"read OUT again and compare renders of both, from {export.VIEWS} of the run's cameras or an orbit",
+    )
+    add_backend(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Convert, say what was written, and check it where that was asked for."""
+    keep = Filter(arguments.min_opacity, arguments.crop, arguments.sh_degree)
+    move = functools.reduce(lambda done, text: _similarity(text).after(done), arguments.transform, IDENTITY)
+    backend = resolve_backend(arguments.backend) if arguments.verify else ""
+    export.check_target("OUT", arguments.out)
+    if len(arguments.sources) > 1 and not arguments.merge:
+        raise ArgumentError(
+            "IN: are several; add --merge to join them into one scene, or convert one at a time"
+        )
+    console = Console(highlight=False, markup=False)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=16),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+        steps = bar.add_task("reading", total=len(arguments.sources) + 1)
+        sources = []
+        for path in arguments.sources:
+            bar.update(steps, description=f"reading {path}")
+            sources.append(_edited(open_source(path), keep, move))
+            bar.advance(steps)
+        source = _joined(sources)
+        say = functools.partial(console.print, soft_wrap=True)
+        for note in (*_origins(sources), *export.losses(arguments.out, source.scene)):
+            say(note)
+        bar.update(steps, description=f"writing {arguments.out}")
+        export.write(arguments.out, source)
+        bar.advance(steps)
+        count = len(source.scene.gaussians)
+        say(f"wrote {arguments.out}: {count:,} splats, SH degree {source.scene.gaussians.sh_degree}")
+        if arguments.verify:
+            check_and_say([arguments.out], source, backend, bar, say)
+
+
+def check_and_say(
+    paths: Sequence[Path], source: Source, backend: str, bar: Progress, say: Callable[[str], None]
+) -> list[export.Exported]:
+    """Check files against what was written to them; say a line for each."""
+    found = []
+    views = len(source.probes(export.VIEWS, export.SIDE))
+    for path in paths:
+        task = bar.add_task(f"checking {path}", total=views)
+        found.append(export.check(path, source, backend, lambda _, task=task: bar.advance(task)))
+        bar.remove_task(task)
+        say(found[-1].line())
+    return found
+
+
+def _edited(source: Source, keep: Filter, move: Similarity) -> Source:
+    kept = replace(source.scene, gaussians=keep.apply(source.scene.gaussians))
+    if not len(kept.gaussians):
+        raise ArgumentError(
+            f"{source.path}: no splat is left ({len(source.scene.gaussians):,} before); filter less"
+        )
+    if move is IDENTITY:
+        return replace(source, scene=kept)
+    cameras = tuple((name, move.camera(camera)) for name, camera in source.cameras)
+    return replace(source, scene=move.scene(kept), cameras=cameras)
+
+
+def _joined(sources: Sequence[Source]) -> Source:
+    if len(sources) == 1:
+        return sources[0]
+    scene = joined([source.scene for source in sources])
+    cameras = tuple(camera for source in sources for camera in source.cameras)
+    settings = replace(sources[0].settings, antialiased=bool(scene.antialiased))
+    return replace(sources[0], scene=scene, cameras=cameras, settings=settings)
+
+
+def _origins(sources: Sequence[Source]) -> list[str]:
+    """Say which coordinates are not those of the capture; refuse to join what stands in different frames."""
+    origins = {source.origin for source in sources}
+    if len(origins) > 1:
+        raise ArgumentError("IN: were trained around different origins; convert and place them one at a time")
+    origin = origins.pop()
+    if not any(origin):
+        return []
+    where = ", ".join(f"{x:.6g}" for x in origin)
+    return [f"coordinates are written relative to ({where}), the run's origin: float32 holds them better"]
+
+
+def _similarity(text: str) -> Similarity:
+    """Read one --transform."""
+    kind, _, value = text.partition("=")
+    try:
+        match kind:
+            case "scale":
+                return Similarity.of_matrix(np.hstack([float(value) * np.eye(3), np.zeros((3, 1))]))
+            case "move":
+                return Similarity(np.eye(3), 1.0, np.array(_numbers(3)(value)))
+            case "rotate":
+                axis, _, degrees = value.partition(":")
+                turn = (
+                    Rotation.from_euler(axis, float(degrees), degrees=True)
+                    if axis in ("x", "y", "z")
+                    else None
+                )
+                if turn is not None:
+                    return Similarity(turn.as_matrix(), 1.0, np.zeros(3))
+            case "matrix":
+                numbers = Path(value).read_text("utf-8", errors="replace").replace(",", " ").split()
+                if len(numbers) in (12, 16):
+                    return Similarity.of_matrix(np.array(numbers, dtype=np.float64).reshape(-1, 4))
+    except ArgumentError as error:
+        raise ArgumentError(f"--transform: {text}: {error}") from None
+    except (ValueError, argparse.ArgumentTypeError):
+        pass
+    raise ArgumentError(f"--transform: {text!r} cannot be read; give {MOVES}")
+
+
+def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    """Return a reader of so many finite numbers with commas between them."""
+
+    def read(text: str) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != count or not np.isfinite(numbers).all():
+            raise argparse.ArgumentTypeError(f"{text!r} is not {count} numbers with commas between them")
+        return numbers
+
+    return read

@@ -1,0 +1,179 @@
+"""What can be done to a scene between two files: filter, cut, move, join."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.sh import num_coefficients, sh_rotation
+from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
+
+SHEAR = 1e-5
+"""Largest entry of A A' / s² - I that a similarity may have: room for matrices that were typed with six digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """Turning, scaling and moving: x' = s R x + t.
+
+    Args:
+        R: (3, 3) rotation.
+        s: Scale, above 0.
+        t: (3,) translation, world units of the result.
+    """
+
+    R: Float64[np.ndarray, "3 3"]
+    s: float
+    t: Float64[np.ndarray, "3"]
+
+    @classmethod
+    def of_matrix(cls, matrix: ArrayLike) -> Similarity:
+        """Take a matrix (3, 4) or (4, 4) apart: (s R | t).
+
+        Raises:
+            ShapeError: it has another shape.
+            ArgumentError: it mirrors, shears, scales its axes differently, or its last row is not 0 0 0 1.
+        """
+        given = np.asarray(matrix, dtype=np.float64)
+        M = float64_array("matrix", given, (4, 4) if given.shape == (4, 4) else (3, 4))
+        if len(M) == 4 and not np.array_equal(M[3], (0.0, 0.0, 0.0, 1.0)):
+            raise ArgumentError("matrix: its last row is not 0 0 0 1; rows come first")
+        A = M[:3, :3]
+        determinant = float(np.linalg.det(A))
+        if determinant <= 0.0:
+            what = "mirrors" if determinant < 0.0 else "is singular"
+            raise ArgumentError(
+                f"matrix: {what}; Gaussians can be turned, scaled alike in x, y, z, and moved"
+            )
+        s = determinant ** (1.0 / 3.0)
+        if np.abs(A @ A.T / s**2 - np.eye(3)).max() > SHEAR:
+            raise ArgumentError(
+                "matrix: shears or scales its axes differently; Gaussians can be turned, scaled alike in x, y, z,"
+                " and moved"
+            )
+        return cls(A / s, s, M[:3, 3])
+
+    def after(self, first: Similarity) -> Similarity:
+        """Return what this one does to what `first` has done."""
+        return Similarity(self.R @ first.R, self.s * first.s, self.s * self.R @ first.t + self.t)
+
+    def camera(self, camera: Camera) -> Camera:
+        """Return the camera that sees of the moved scene what the given one sees of the scene."""
+        eye = self.s * self.R @ camera.eye + self.t
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.H, camera.W)
+        return Camera(camera.R @ self.R.T, eye, *intrinsics)
+
+    def scene(self, scene: Scene) -> Scene:
+        """Move a scene: means, rotations, scales, the colours' directions, and what is up.
+
+        Returns:
+            The scene, its Gaussians computed in float64 and rounded to their dtype.
+        """
+        gaussians = scene.gaussians
+        dtype, degree = gaussians.means.dtype, gaussians.sh_degree
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values)).to(gaussians.means.device)
+
+        means = self.s * gaussians.means.double() @ tensor(self.R.T) + tensor(self.t)
+        turn = Rotation.from_matrix(self.R).as_quat(scalar_first=True)
+        rest = torch.einsum("jk,nkc->njc", tensor(sh_rotation(degree, self.R)), gaussians.sh_rest.double())
+        moved = Gaussians(
+            means=means.to(dtype),
+            quats=(gaussians.quats.double() @ tensor(_left_product(turn)).mT).to(dtype),
+            log_scales=(gaussians.log_scales.double() + float(np.log(self.s))).to(dtype),
+            sh0=gaussians.sh0,
+            sh_rest=rest.to(dtype),
+            logit_opacities=gaussians.logit_opacities,
+        )
+        x, y, z = self.R @ np.asarray(scene.up) if scene.up is not None else (0.0, 0.0, 0.0)
+        return replace(
+            scene, gaussians=moved, up=None if scene.up is None else (float(x), float(y), float(z))
+        )
+
+
+IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Which Gaussians of a scene stay, and how much of their colour.
+
+    Args:
+        min_opacity: Smallest opacity that stays, 0 to 1.
+        box: Corners (x0, y0, z0, x1, y1, z1) between which means stay, world units; None for everywhere.
+        sh_degree: Highest degree that stays.
+
+    Raises:
+        ArgumentError: a value is outside its range, or a corner is not below the other.
+    """
+
+    min_opacity: float = 0.0
+    box: tuple[float, ...] | None = None
+    sh_degree: int = SH_MAX_DEGREE
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        in_range("min_opacity", self.min_opacity, 0.0, 1.0)
+        whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE)
+        if self.box is not None:
+            low, high = np.split(float64_array("box", self.box, (6,)), 2)
+            if not np.all(low < high):
+                raise ArgumentError("box: x0, y0, z0 have to be below x1, y1, z1")
+
+    def apply(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians that stay, in their order."""
+        stays = gaussians.opacities >= self.min_opacity
+        if self.box is not None:
+            low, high = torch.tensor(self.box, dtype=torch.float64).to(gaussians.means.device).chunk(2)
+            means = gaussians.means.double()
+            stays &= ((means >= low) & (means <= high)).all(dim=1)
+        kept = gaussians if bool(stays.all()) else gaussians.map(lambda tensor: tensor[stays])
+        most = num_coefficients(self.sh_degree) - 1
+        return replace(kept, sh_rest=kept.sh_rest[:, :most].contiguous())
+
+
+def joined(scenes: Sequence[Scene]) -> Scene:
+    """Join scenes in the order given; those of a lower SH degree get zeros.
+
+    Args:
+        scenes: At least one.
+
+    Returns:
+        One scene; what they do not agree on is not known of it.
+
+    Raises:
+        ArgumentError: some were trained for antialiased renders and some not, so that no render suits all.
+    """
+    said = {scene.antialiased for scene in scenes} - {None}
+    if len(said) > 1:
+        raise ArgumentError(
+            "scenes: some were trained with antialiasing and some without: no render suits both; train them alike"
+        )
+    most = max(scene.gaussians.sh_rest.shape[1] for scene in scenes)
+    parts = []
+    for scene in scenes:
+        missing = most - scene.gaussians.sh_rest.shape[1]
+        rest = torch.nn.functional.pad(scene.gaussians.sh_rest, (0, 0, 0, missing))
+        parts.append(replace(scene.gaussians, sh_rest=rest))
+    ups = {scene.up for scene in scenes}
+    return Scene(
+        Gaussians.concatenated(parts), said.pop() if said else None, ups.pop() if len(ups) == 1 else None
+    )
+
+
+def _left_product(q: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "4 4"]:
+    """Return the matrix L with L p = q p, the product of quaternions (w, x, y, z)."""
+    w, x, y, z = q
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

@@ -1,0 +1,133 @@
+"""A scene to show or to convert: a file or a run, with the cameras and the settings that belong to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from gsplat_edu.camera import WORLD_UP, Camera
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.paths import common_up, orbit_of_scene, resized
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.formats import SOG_META, read_scene
+from gsplat_edu.io.ply import ORIGIN, load_ply
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.folder import RunFolder, render_settings
+from gsplat_edu.validation import ArrayLike, float64_array
+
+SCENE_LEVELS = 3
+"""Folders between a run and its scenes: RUN/point_cloud/iteration_N/point_cloud.ply."""
+
+CAPTURE_JACOBIAN_LIMIT = 1.3
+"""How scenes that come without settings are rendered: captures are trained so, here and by Kerbl et al.'s code."""
+
+NamedCamera = tuple[str, Camera]
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A scene and what belongs to it.
+
+    Args:
+        path: The scene's file.
+        scene: The scene.
+        cameras: Name and camera of each view of its capture, in the same frame; none where they are not known.
+        settings: How it is to be rendered.
+        origin: What was subtracted from the coordinates of the file and its cameras: that of the run, where its
+            capture lies far from zero.
+    """
+
+    path: Path
+    scene: Scene
+    cameras: tuple[NamedCamera, ...]
+    settings: RenderSettings
+    origin: tuple[float, float, float] = ORIGIN
+
+    def probes(self, most: int, longest: int) -> list[NamedCamera]:
+        """Choose cameras to look at the scene from: its own, evenly over the list, or an orbit.
+
+        Args:
+            most: Number of cameras at most.
+            longest: Longer side of their images at most, px; that of an orbit's.
+
+        Raises:
+            ArgumentError: there are no cameras, and no Gaussians that an orbit could look at.
+        """
+        if not self.cameras:
+            orbit = orbit_of_scene(self.scene.gaussians, most, longest)
+            return [(f"orbit {i}", camera) for i, camera in enumerate(orbit)]
+        count = min(most, len(self.cameras))
+        chosen = [self.cameras[i * len(self.cameras) // count] for i in range(count)]
+        return [(name, resized(c, longest) if max(c.W, c.H) > longest else c) for name, c in chosen]
+
+
+def open_source(path: str | Path) -> Source:
+    """Read a scene of any readable format, or a run's latest one.
+
+    A scene in a run's folder gets the run's cameras and settings. Others have no cameras, and are rendered as the
+    file says, or as captures are.
+
+    Args:
+        path: Scene file, folder of a SOG, or folder of a run.
+
+    Raises:
+        ArgumentError: there is nothing that could be a scene.
+        SceneFormatError: the scene is damaged.
+        CheckpointError: the run is damaged, or has no scene yet.
+        OSError: a file cannot be read.
+    """
+    path = Path(path)
+    if path.is_dir() and not (path / SOG_META).is_file():
+        folder = RunFolder(path)
+        if not folder.exists():
+            raise ArgumentError(
+                f"{path}: is no run (it has no config.json); give a scene file or the folder of a run"
+            )
+        return _of_run(folder, folder.latest_scene()[0])
+    if not path.exists():
+        raise ArgumentError(f"{path}: is not there; give a scene file or the folder of a run")
+    above = path.absolute().parents
+    if path.name == "point_cloud.ply" and len(above) >= SCENE_LEVELS and above[1].name == "point_cloud":
+        folder = RunFolder(above[SCENE_LEVELS - 1])
+        if folder.exists():
+            return _of_run(folder, path)
+    scene = read_scene(path)
+    return Source(path, scene, (), file_settings(scene))
+
+
+def file_settings(scene: Scene) -> RenderSettings:
+    """Return how a scene is rendered that came as a file: as the file says, and as captures are."""
+    return RenderSettings(
+        antialiased=bool(scene.antialiased), jacobian_limit=CAPTURE_JACOBIAN_LIMIT, depth=False
+    )
+
+
+def relative_to(gaussians: Gaussians, origin: ArrayLike) -> Gaussians:
+    """Return Gaussians with (3,) `origin` subtracted from their means, in float64."""
+    shift = torch.from_numpy(float64_array("origin", origin, (3,)))
+    if not shift.any():
+        return gaussians
+    means = gaussians.means
+    return replace(gaussians, means=(means.double() - shift.to(means.device)).to(means.dtype))
+
+
+def _of_run(folder: RunFolder, path: Path) -> Source:
+    config = folder.read_config()
+    settings = replace(render_settings(config), depth=False)
+    x, y, z = float64_array("config.json: origin", config.get("origin", ORIGIN), (3,)).tolist()
+    gaussians = load_ply(path, (x, y, z))
+    cameras: tuple[NamedCamera, ...] = ()
+    if folder.cameras.is_file():
+        cameras = tuple((name, camera) for name, _, camera in folder.read_cameras((x, y, z)))
+    scene = Scene(gaussians, settings.antialiased, scene_up([camera for _, camera in cameras]))
+    return Source(path, scene, cameras, settings, (x, y, z))
+
+
+def scene_up(cameras: Sequence[Camera]) -> tuple[float, float, float]:
+    """Return what is up for the cameras of a capture; the world's up, (0, -1, 0), where there are none."""
+    x, y, z = common_up(cameras) if cameras else WORLD_UP
+    return float(x), float(y), float(z)

@@ -1,0 +1,89 @@
+"""Damaged scene files: whatever the damage, a scene of finite numbers or one line, and memory stays small."""
+
+import os
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+from scene_files import READABLE, small_file
+
+from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.io.formats import read_scene
+
+FILES = int(os.environ.get("GSPLAT_EDU_FUZZ", "200"))
+"""Mutated files per reader."""
+
+MOST_MEMORY = 24 << 20
+"""Bytes: files here have at most 32 KiB; their allowance is 1 MiB of contents, and float32 copies of those."""
+
+
+def mutated(data, rng):
+    """Damage some bytes: flipped bits, other numbers, pieces that are cut out, doubled, zeroed or cut off."""
+    damaged = bytearray(data)
+    for _ in range(int(rng.integers(1, 5))):
+        # half of the damage goes where headers are
+        reach = len(damaged) if rng.random() < 0.5 else min(len(damaged), 400)
+        if reach < 2:
+            break
+        at = int(rng.integers(0, reach))
+        span = min(int(rng.integers(1, 65)), len(damaged) - at)
+        match int(rng.integers(0, 7)):
+            case 0:
+                damaged[at] ^= 1 << int(rng.integers(0, 8))
+            case 1:
+                damaged[at] = int(rng.integers(0, 256))
+            case 2:
+                damaged[at : at + 4] = rng.choice(
+                    [b"\xff" * 4, b"\0" * 4, b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f"]
+                )
+            case 3:
+                del damaged[at : at + span]
+            case 4:
+                damaged[at:at] = damaged[at : at + span]
+            case 5:
+                damaged[at : at + span] = rng.bytes(span)
+            case 6:
+                del damaged[at:]
+    return bytes(damaged)
+
+
+def check(path):
+    tracemalloc.start()
+    try:
+        scene = read_scene(path)
+    except SceneFormatError as error:
+        message = str(error)
+        assert str(path) in message and "\n" not in message
+    else:
+        assert bool(scene.gaussians.finite_rows().all())
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < MOST_MEMORY, f"{peak:,} bytes"
+
+
+@pytest.mark.parametrize("suffix", [found.suffix for found in READABLE])
+def test_damaged_files(tmp_path, suffix):
+    data = small_file(tmp_path, suffix).read_bytes()
+    path = tmp_path / f"damaged{suffix}"
+    for seed in range(FILES):
+        path.write_bytes(mutated(data, np.random.default_rng(seed)))
+        check(path)
+
+
+def test_damage_inside_a_sog(tmp_path):
+    """A zip has checksums: damage to its parts is put in before they are zipped."""
+    parts = {}
+    with zipfile.ZipFile(small_file(tmp_path, ".sog")) as bundle:
+        for name in bundle.namelist():
+            parts[name] = bundle.read(name)
+    path = tmp_path / "damaged.sog"
+    names = sorted(parts)
+    for seed in range(FILES):
+        rng = np.random.default_rng(seed)
+        victim = names[int(rng.integers(0, len(names)))] if rng.random() < 0.5 else "meta.json"
+        with zipfile.ZipFile(path, "w") as bundle:
+            for name, content in parts.items():
+                bundle.writestr(name, mutated(content, rng) if name == victim else content)
+        check(path)

@@ -1,0 +1,125 @@
+"""What every reader does with files that are not what their names say."""
+
+import tracemalloc
+
+import pytest
+import torch
+from scene_files import READABLE, random_scene, small_file
+
+from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.io.formats import FORMATS, format_of, read_scene, write_scene
+
+SLACK = 8 << 20
+"""Bytes that a reader may use for a file however small: imports, buffers and the toys' allowance."""
+
+TIMES = 100
+"""A reader may allocate this many times the file's size: 64 for what is compressed, and a copy in float32."""
+
+readable = pytest.mark.parametrize("suffix", [found.suffix for found in READABLE])
+
+
+def refused(path):
+    with pytest.raises(SceneFormatError) as caught:
+        read_scene(path)
+    message = str(caught.value)
+    assert str(path) in message and "\n" not in message and len(message) < 400
+    return message
+
+
+@readable
+def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
+    path = small_file(tmp_path, suffix)
+    data = path.read_bytes()
+    odd = 7 if suffix == ".splat" else 0  # it has no header: cut between two splats it is a smaller scene
+    for end in range(0, len(data), 64):
+        if end + odd < len(data) and end + odd > 0:
+            path.write_bytes(data[: end + odd])
+            refused(path)
+
+
+@readable
+def test_a_git_lfs_pointer_is_called_one(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 123\n")
+    assert "git lfs pull" in refused(path)
+
+
+@readable
+def test_other_files_are_refused(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    for content in (
+        b"<!DOCTYPE html><html>not found</html>",
+        b"\x89PNG\r\n\x1a\n" + bytes(99),
+        b"\x00" * 33,
+        b"x",
+    ):
+        path.write_bytes(content)
+        refused(path)
+
+
+@readable
+def test_files_of_other_formats_are_refused(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    for other in READABLE:
+        if other.suffix != suffix and {other.suffix, suffix} != {".ply", ".compressed.ply"}:
+            content = small_file(tmp_path, other.suffix).read_bytes()
+            path.write_bytes(content + b"\0" * (1 if suffix == ".splat" and len(content) % 32 == 0 else 0))
+            refused(path)
+
+
+@readable
+def test_a_missing_file_stays_an_oserror(tmp_path, suffix):
+    with pytest.raises(OSError, match="No such file"):
+        read_scene(tmp_path / f"gone{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".splat"])
+def test_numbers_that_are_none_are_refused(tmp_path, suffix):
+    path = small_file(tmp_path, suffix)
+    data = bytearray(path.read_bytes())
+    start = data.index(b"end_header\n") + 11 if suffix == ".ply" else 0
+    for bits in (b"\x00\x00\xc0\x7f", b"\x00\x00\x80\xff"):  # NaN and -inf
+        data[start : start + 4] = bits
+        path.write_bytes(data)
+        refused(path)
+
+
+@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+def test_nothing_is_written_of_a_scene_that_is_not_finite(tmp_path, suffix):
+    scene = random_scene(5)
+    scene.gaussians.log_scales[3, 1] = torch.nan
+    with pytest.raises(ArgumentError, match="log_scales"):
+        write_scene(tmp_path / f"a{suffix}", scene)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_without_a_format_are_refused(tmp_path):
+    for name in ("scene", "scene.obj", "scene.ply.gz", ".."):
+        with pytest.raises(ArgumentError, match=r"known are \.compressed\.ply, \.ply"):
+            format_of(tmp_path / name)
+    assert format_of("A.Compressed.PLY").module == "compressed_ply"
+    assert format_of("folder/meta.json").module == "sog"
+
+
+@readable
+def test_memory_stays_a_small_multiple_of_the_file(tmp_path, suffix):
+    """The counts a file claims are raised to 2^31 - 1 wherever they stand, as text or as 32 bits."""
+    path = small_file(tmp_path, suffix)
+    data, claims = path.read_bytes(), 0
+    for count in (b"40", (40).to_bytes(4, "little")):
+        most = b"2147483647" if count == b"40" else (2**31 - 1).to_bytes(4, "little")
+        at = data.find(count)
+        while at >= 0:
+            claims += 1
+            path.write_bytes(data[:at] + most + data[at + len(count) :])
+            tracemalloc.start()
+            try:
+                read_scene(path)
+            except SceneFormatError:
+                pass
+            finally:
+                peak = tracemalloc.get_traced_memory()[1]
+                tracemalloc.stop()
+            assert peak < SLACK + TIMES * len(data)
+            at = data.find(count, at + 1)
+    assert claims or suffix == ".splat", "it says somewhere how many splats it holds"
