@@ -2,11 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 
+from gsplat_edu.camera import Camera
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import FORMATS, SOG_META, write_scene
+from gsplat_edu.io.ply import save_ply
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.views import View
+
+RUN_UP = np.array([0.0, -0.6, 0.8])
 
 READABLE = [found for found in FORMATS if found.readable]
 
@@ -42,3 +49,23 @@ def small_folder(folder: Path) -> Path:
     path = folder / "small" / SOG_META
     write_scene(path, random_scene(40, 3))
     return path
+
+
+def make_run(
+    path: Path, origin: tuple[float, float, float] = (0.0, 0.0, 0.0), count: int = 5
+) -> tuple[RunFolder, Gaussians, list[Camera]]:
+    """A run whose cameras look at the origin from a ring around RUN_UP; its scene, and the cameras in their order."""
+    folder = RunFolder(path)
+    side = np.array([1.0, 0.0, 0.0])
+    views = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        eye = 3.0 * (np.cos(angle) * side + np.sin(angle) * np.cross(RUN_UP, side)) + RUN_UP
+        camera = Camera.looking_at(eye, (0, 0, 0), 50.0, 55.0, 40, 60, RUN_UP)
+        views.append(View(camera, np.zeros((40, 60, 3), np.uint8), name=f"{angle:.2f}.jpg"))
+    folder.write_config(
+        {"render": {"antialiased": True, "background": [1.0, 0.5, 0.0]}, "origin": list(origin)}
+    )
+    folder.write_cameras(views[1:], views[:1], origin)
+    scene = random_scene(30)
+    save_ply(folder.scene(7), scene.gaussians, origin)
+    return folder, scene.gaussians, [view.camera for view in views[1:] + views[:1]]

@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu import C0, eval_sh, sh_basis

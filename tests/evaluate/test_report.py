@@ -141,3 +141,21 @@ def test_a_drawing_stands_in_a_page_and_is_repeatable():
     log = [{"iteration": i, "loss": 1.0 / (i + 1)} for i in range(5000)]
     first, second = (svg_element(run_curves_figure(log)) for _ in range(2))
     assert first == second and first.startswith("<svg") and len(first) < 100_000
+
+
+def test_exports_are_told_with_their_figures(tmp_path):
+    entry = {
+        "path": "a/<b>.spz",
+        "num_bytes": 123456,
+        "psnr": 51.234,
+        "worst_psnr": 40.5,
+        "worst_view": "7.png",
+        "num_views": 8,
+    }
+    write_report(tmp_path / "report.html", Report("title", {"exports": [entry, {"path": "bare.html"}]}))
+    page = Page(tmp_path / "report.html")
+    for words in ("Exports", "a/<b>.spz", "51.23", "40.50", "7.png", "123456", "bare.html"):
+        assert words in page.text, words
+    for nothing in ([], None, ["text"], "text"):
+        write_report(tmp_path / "report.html", Report("title", {"exports": nothing}))
+        assert "Exports" not in Page(tmp_path / "report.html").text

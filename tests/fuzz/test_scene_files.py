@@ -6,10 +6,10 @@ import zipfile
 
 import numpy as np
 import pytest
-from scene_files import READABLE, small_file
 
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.io.formats import read_scene
+from scene_files import READABLE, small_file
 
 FILES = int(os.environ.get("GSPLAT_EDU_FUZZ", "200"))
 """Mutated files per reader."""

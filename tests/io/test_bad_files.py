@@ -4,10 +4,10 @@ import tracemalloc
 
 import pytest
 import torch
-from scene_files import READABLE, random_scene, small_file
 
 from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.formats import FORMATS, format_of, read_scene, write_scene
+from scene_files import READABLE, random_scene, small_file
 
 SLACK = 8 << 20
 """Bytes that a reader may use for a file however small: imports, buffers and the toys' allowance."""

@@ -1,11 +1,11 @@
 from dataclasses import replace
 
-import native_scenes
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import native_scenes
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.io.axes import half_turned
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined

@@ -72,7 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Convert, say what was written, and check it where that was asked for."""
     keep = Filter(arguments.min_opacity, arguments.crop, arguments.sh_degree)
-    move = functools.reduce(lambda done, text: _similarity(text).after(done), arguments.transform, IDENTITY)
+    move = IDENTITY
+    for text in arguments.transform:
+        move = _similarity(text).after(move)
     backend = resolve_backend(arguments.backend) if arguments.verify else ""
     export.check_target("OUT", arguments.out)
     if len(arguments.sources) > 1 and not arguments.merge:

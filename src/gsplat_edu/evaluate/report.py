@@ -98,7 +98,7 @@ class Report:
     Args:
         title: Its heading.
         metrics: As metrics.json has them: "test" and "train" by `gsplat_edu.evaluate.metrics.summarize`, and
-            single numbers beside them.
+            single numbers beside them, and "exports", files in other formats.
         log: Lines of the log: `iteration`, and any of loss, psnr (of an evaluation), num_gaussians, ms.
         config: What decided the run.
         scores: Scores of the test views.
@@ -132,6 +132,7 @@ def write_report(path: Path, report: Report) -> None:
         _headline(report.metrics),
         _section("Curves", svg_element(curves) if curves else ""),
         _views(report.scores, report.pictures),
+        _exports(report.metrics.get("exports")),
         _section("Notes", _list(report.notes)),
         _section("Configuration", _facts(_flat(report.config))),
         _section("Machine", _facts(report.machine)),
@@ -167,6 +168,22 @@ def _headline(metrics: Mapping[str, Any]) -> str:
         "SSIM has a Gaussian window of 11 taps, sigma 1.5."
     )
     return _section("Result", f'{table if rows else ""}<p class="quiet">{how}</p>\n{_facts(singles)}')
+
+
+def _exports(exports: object) -> str:
+    """Tell of files in other formats: size, and how their renders compare with those of the scene."""
+    if not isinstance(exports, list) or not all(isinstance(entry, Mapping) for entry in exports):
+        return ""
+    rows = []
+    for entry in exports:
+        cells = [_score("psnr", entry.get("psnr")), _score("psnr", entry.get("worst_psnr"))]
+        cells += [html.escape(_plain(entry.get(key))) for key in ("worst_view", "num_views", "num_bytes")]
+        rows.append(f"<tr><th>{html.escape(str(entry.get('path')))}</th>{_numbers(cells)}</tr>")
+    titles = ("PSNR (dB)", "lowest (dB)", "view of the lowest", "views", "bytes")
+    head = "".join(f'<th class="n">{title}</th>' for title in titles)
+    how = "Each file was read again, and its renders compared with those of the trained scene; equal ones have 100 dB."
+    table = f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>\n"
+    return _section("Exports", f'{table}<p class="quiet">{how}</p>\n' if rows else "")
 
 
 def _numbers(cells: Sequence[str]) -> str:

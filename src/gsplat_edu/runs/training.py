@@ -28,6 +28,7 @@ from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_ru
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint
 from gsplat_edu.runs.log import LogWriter
+from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_seconds, save_checkpoint
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event
@@ -111,6 +112,10 @@ class RunOptions:
             "backend": self.backend,
             "machine": machine_facts(),
         }
+
+
+Export = Callable[[Source], list[dict[str, Any]]]
+"""Writes a scene elsewhere too, and says what it wrote: "path", "psnr" and more of each file."""
 
 
 class CaptureRun:
@@ -274,23 +279,28 @@ class CaptureRun:
         """Write a checkpoint; see `gsplat_edu.train.checkpoint.save_checkpoint`."""
         return save_checkpoint(self.folder.checkpoints, self.trainer, self._elapsed())
 
-    def finish(self, progress: Progress | None = None) -> Evaluation:
-        """Write the scene, and judge it by test and training views.
+    def finish(self, progress: Progress | None = None, export: Export | None = None) -> Evaluation:
+        """Write the scene, in other formats too where `export` is there, and judge it by test and training views.
 
         Args:
             progress: Told of every view that was scored.
+            export: Given the written scene; what it returns goes into metrics.json and the report, as "exports".
         """
         trainer, dataset = self.trainer, self.dataset
         gaussians = trainer.gaussians.map(lambda tensor: tensor[trainer.gaussians.finite_rows()])
         if lost := len(trainer.gaussians) - len(gaussians):
             self._say(f"{lost} Gaussians are NaN or infinite, and are left out of the scene")
-        save_ply(self.folder.scene(trainer.iteration), gaussians, dataset.origin)
+        path = self.folder.scene(trainer.iteration)
+        save_ply(path, gaussians, dataset.origin)
+        facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
+        if export is not None:
+            facts["exports"] = export(open_source(path))
         return evaluate_run(
             self.folder,
             Judged(dataset.test, dataset.train, self.options.config.background, dataset.notes),
             gaussians,
             self.options.renderer,
-            {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)},
+            facts,
             progress,
         )
 

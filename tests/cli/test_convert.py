@@ -1,0 +1,130 @@
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.cli.main import main
+from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.io.formats import FORMATS, read_scene, write_scene
+from gsplat_edu.render.api import render
+from gsplat_edu.runs.source import open_source
+from gsplat_edu.viewer.export import read_back
+from scene_files import make_run, random_scene
+
+SUFFIXES = [found.suffix for found in FORMATS] + [".html"]
+
+
+@pytest.fixture
+def convert(capsys):
+    def call(*words, code=0):
+        assert main(["convert", *map(str, words)]) == code
+        printed = capsys.readouterr()
+        if code:
+            assert printed.err.count("\n") == 1 and "Traceback" not in printed.err
+        return printed.err if code else printed.out
+
+    return call
+
+
+@pytest.fixture
+def plain(tmp_path):
+    write_scene(tmp_path / "in.ply", random_scene(300))
+    return tmp_path / "in.ply"
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_format_is_written_and_verified_from_the_runs_cameras(convert, tmp_path, suffix):
+    folder, *_ = make_run(tmp_path / "run")
+    out = tmp_path / f"new/out{suffix}"
+    said = convert(folder.path, out, "--verify")
+    assert f"wrote {out}: 30 splats, SH degree 3" in said
+    figures = re.search(r"PSNR ([\d.]+) dB over 5 views, worst ([\d.]+) \((.*)\.jpg\); ([\d,]+) bytes", said)
+    assert int(figures[4].replace(",", "")) == out.stat().st_size
+
+    # the line is right: rendered here again
+    source, written = open_source(folder.path), read_back(out)
+    with torch.no_grad():
+        scores = [
+            psnr(
+                *(
+                    render(scene.gaussians, camera, settings=source.settings).image.clamp(0, 1)
+                    for scene in (written, source.scene)
+                )
+            )
+            for _, camera in source.cameras
+        ]
+    assert float(figures[1]) == pytest.approx(np.mean(scores), abs=0.006)
+    assert float(figures[2]) == pytest.approx(min(scores), abs=0.006)
+    assert np.mean(scores) > (15 if suffix == ".splat" else 35), "a wrong axis or sign is far below"
+    if suffix == ".ply":
+        assert float(figures[1]) == 100.0
+
+
+def test_what_a_format_cannot_hold_is_said(convert, tmp_path):
+    folder, *_ = make_run(tmp_path / "run")
+    said = convert(folder.path, tmp_path / "a.splat")
+    assert "holds harmonics up to degree 0; those up to 3 are left out" in said
+    assert "cannot say that the scene is to be rendered with antialiasing" in said
+    assert "left out" not in convert(folder.path, tmp_path / "a.ply")
+
+
+def test_filters_and_moves_are_done_in_their_order(convert, plain, tmp_path):
+    before = read_scene(plain).gaussians
+    matrix = tmp_path / "m.txt"
+    matrix.write_text("1 0 0 0\n0 0 -1 0\n0 1 0 0.5\n")
+    convert(
+        *(plain, tmp_path / "out.ply", "--crop=-0.5,-1,-1,1,1,1", "--min-opacity", 0.3, "--sh-degree", 1),
+        *("--transform", "scale=2", "--transform", f"matrix={matrix}", "--transform", "move=1,0,0"),
+    )
+    after = read_scene(tmp_path / "out.ply").gaussians
+    means = before.means.double().numpy()
+    stays = (
+        (means >= (-0.5, -1, -1)).all(axis=1) & (means <= 1).all(axis=1) & (before.opacities >= 0.3).numpy()
+    )
+    x, y, z = 2 * means[stays].T
+    np.testing.assert_allclose(after.means, np.stack([x + 1, -z, y + 0.5], axis=1), atol=1e-6)
+    assert after.sh_degree == 1 and 0 < stays.sum() < 300
+    convert(plain, tmp_path / "turned.ply", "--transform", "rotate=x:180")
+    np.testing.assert_allclose(
+        read_scene(tmp_path / "turned.ply").gaussians.means, means * (1, -1, -1), atol=1e-6
+    )
+
+
+def test_scenes_are_joined_on_request(convert, plain, tmp_path):
+    assert "add --merge" in convert(plain, plain, tmp_path / "out.ply", code=2)
+    convert(plain, plain, tmp_path / "out.ply", "--merge")
+    assert len(read_scene(tmp_path / "out.ply").gaussians) == 600
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["gone.ply", "out.ply"], "gone.ply: is not there"),
+        (["IN", "out.obj"], "known are .compressed.ply, .ply, .splat, .spz, .sog, .glb, .html"),
+        (["IN", "."], "ends like no scene format"),
+        (["IN", "IN/out.ply"], "choose another place"),
+        (["IN", "out.ply", "--crop", "1,2,3"], "is not 6 numbers"),
+        (["IN", "out.ply", "--crop", "0,0,0,1,1,nan"], "is not 6 numbers"),
+        (["IN", "out.ply", "--crop", "0,0,0,1,1,-1"], "have to be below"),
+        (["IN", "out.ply", "--crop", "90,90,90,91,91,91"], "no splat is left (300 before)"),
+        (["IN", "out.ply", "--min-opacity", "2"], "min_opacity"),
+        (["IN", "out.ply", "--sh-degree", "4"], "sh_degree"),
+        (["IN", "out.ply", "--transform", "shear=2"], "'shear=2' cannot be read"),
+        (["IN", "out.ply", "--transform", "scale=-1"], "mirrors"),
+        (["IN", "out.ply", "--transform", "scale=0"], "singular"),
+        (["IN", "out.ply", "--transform", "rotate=w:90"], "cannot be read"),
+        (["IN", "out.ply", "--transform", "move=1,2"], "cannot be read"),
+        (["IN", "out.ply", "--transform", "matrix=gone.txt"], "gone.txt"),
+        (["IN", "out.glb", "--verify", "--backend", "abacus"], "abacus"),
+    ],
+)
+def test_mistakes_are_one_line_and_nothing_is_written(convert, plain, tmp_path, monkeypatch, words, says):
+    monkeypatch.chdir(tmp_path)
+    assert says in convert(*(word.replace("IN", "in.ply") for word in words), code=2)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
+
+
+def test_a_scene_may_replace_itself(convert, plain):
+    convert(plain, plain, "--sh-degree", 0)
+    assert read_scene(plain).gaussians.sh_degree == 0
