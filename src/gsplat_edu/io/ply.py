@@ -25,6 +25,7 @@ from torch import Tensor
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io import compressed_ply
 from gsplat_edu.io.ply_comments import comments, read_comments
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.ply_table import Element, read_elements, read_rows
@@ -52,8 +53,6 @@ def read(path: Path, finite: bool = True) -> Scene:
     with path.open("rb") as file:
         header = read_elements(path, file)
     if any("packed_position" in element.names for element in header.elements):
-        from gsplat_edu.io import compressed_ply  # TEMP
-
         return compressed_ply.read(path)
     return Scene(_load(path, ORIGIN, finite), *read_comments(path, header.comments))
 

@@ -1,0 +1,332 @@
+"""SuperSplat's compressed PLY: 16 bytes a splat, and a byte per SH coefficient of degree 1 and up.
+
+Splats come in chunks of 256. Element `chunk` has the smallest and the largest position, log-scale and colour of each
+chunk (older files: no colour), float32. Element `vertex` says where between them a splat is, from the highest bit down:
+
+    packed_position  x 11, y 10, z 11 bits
+    packed_rotation  which of (w, x, y, z) is the largest 2; the other three in their order 10 each, ± sqrt(1/2)
+    packed_scale     logarithms of the scales: 11, 10, 11
+    packed_color     red, green, blue 8 each: C0 f_dc + 1/2, from 0 to 1 where the chunk has no colours; opacity 8
+
+Element `sh`, where there is one, has bytes f_rest_*, channel by channel: 9, 24 or 45. Byte b is (b + 1/2) / 32 - 4, the
+middle of its step, but 0 is -4 and 255 is 4. No byte is zero: a coefficient of 0 comes back as 1/64.
+
+Axes are those of the scene: nothing is flipped. What the format has no property for stands in comments: see
+`ply_comments`.
+
+Source: the reader and the writer of PlayCanvas' splat-transform (MIT licence); the reader of the PlayCanvas engine,
+which takes 8 b / 255 - 4 for SH bytes: up to half a step away, 1/64.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64, UInt8, UInt32
+from numpy.lib.recfunctions import structured_to_unstructured
+
+from gsplat_edu.constants import C0, SH_OFFSET
+from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.files import written_aside
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply_comments import comments, read_comments
+from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.ply_table import Element, Header, read_elements, read_rows
+from gsplat_edu.validation import first_index
+
+CHUNK = 256
+"""Splats of a chunk; the last one may have fewer."""
+
+POSITION_BOUNDS = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
+SCALE_BOUNDS = ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z")
+COLOR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+SH_COUNTS = (9, 24, 45)
+"""Bytes of `sh`: three channels of the coefficients of degrees 1 to 3."""
+
+MAX_LOG_SCALE = 20.0
+"""Logarithms of scales are written within ± this, as PlayCanvas does: 2e-9 to 5e8 world units."""
+
+SETTLED = 0.9
+"""A scene is written in its own order where this share of its splats is in the chunk that sorting would choose."""
+
+_STEPS_11_10_11 = np.array((2047.0, 1023.0, 2047.0))
+_ROOT_HALF = np.sqrt(0.5)
+_OTHERS = np.array(((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)))
+"""By the index of a quaternion's largest component: the other three."""
+
+_SH_VALUES = ((np.arange(256) + 0.5) / 32.0 - 4.0).astype(np.float32)
+_SH_VALUES[[0, 255]] = -4.0, 4.0
+
+
+def read(path: Path) -> Scene:
+    """Read a compressed PLY, with chunks of 12 or 18 properties, of any SH degree.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The scene, float32, in the order of the file; opacities are kept off 0 and 1.
+
+    Raises:
+        SceneFormatError: not a compressed PLY, or damaged: truncated, or with bounds that are NaN or infinite.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        header = read_elements(path, file)
+        chunk, vertex, sh = _elements(path, header)
+        body = file.tell()
+        chunks, splats = _rows(path, file, header, chunk, body), _rows(path, file, header, vertex, body)
+        sh_rows = None if sh is None else _rows(path, file, header, sh, body)
+    words = splats["packed_color"]
+    colors = np.stack([words >> 24, words >> 16 & 255, words >> 8 & 255], axis=1) / 255.0
+    if COLOR_BOUNDS[0] in chunk.names:
+        colors = _between(_bounds(path, chunks, COLOR_BOUNDS), colors)
+    means = _between(_bounds(path, chunks, POSITION_BOUNDS), _unpacked(splats["packed_position"]))
+    log_scales = _between(_bounds(path, chunks, SCALE_BOUNDS), _unpacked(splats["packed_scale"]))
+    with np.errstate(over="ignore"):  # damaged bounds of colours: `read_scene` tells of what is infinite
+        sh0 = ((colors - SH_OFFSET) / C0).astype(np.float32)
+    gaussians = Gaussians(
+        means=torch.from_numpy(means.astype(np.float32)),
+        quats=torch.from_numpy(_unpacked_rotations(splats["packed_rotation"])),
+        log_scales=torch.from_numpy(log_scales.astype(np.float32)),
+        sh0=torch.from_numpy(sh0[:, None, :]),
+        sh_rest=torch.from_numpy(_sh_rest(sh_rows, len(splats))),
+        logit_opacities=torch.from_numpy(byte_to_logit(words & 255)),
+    )
+    return Scene(gaussians, *read_comments(path, header.comments))
+
+
+def write(path: Path, scene: Scene) -> None:
+    """Write a compressed PLY with chunks of 18 properties and SH of the scene's degree.
+
+    The order of the splats changes: they are sorted along a Morton curve through their means, as PlayCanvas does, so
+    that those of a chunk are near one another. Where most are in the right chunk already, as those of a scene read from
+    such a file are, the order stays, and what was rounded once is not rounded again.
+
+    Args:
+        path: The file; parent folders are made.
+        scene: Its quaternions are normalised, its log-scales clamped to ± `MAX_LOG_SCALE`, its SH coefficients of
+            degree 1 and up to ±4.
+
+    Raises:
+        ArgumentError: a parameter is NaN or infinite in float32, or a quaternion has zero length.
+        OSError: it cannot be written. What stood there before is untouched.
+    """
+    gaussians = scene.gaussians.map(torch.Tensor.float)
+    gaussians.check_finite()
+    order = _order(gaussians.means.numpy(force=True))
+    tensors = {name: tensor.numpy(force=True)[order] for name, tensor in gaussians.tensors().items()}
+    colors = (tensors["sh0"][:, 0].astype(np.float64) * C0 + SH_OFFSET).astype(np.float32)
+    log_scales = np.clip(tensors["log_scales"], -MAX_LOG_SCALE, MAX_LOG_SCALE)
+    position_bounds, positions = _within_chunks(tensors["means"], _STEPS_11_10_11)
+    scale_bounds, scales = _within_chunks(log_scales, _STEPS_11_10_11)
+    color_bounds, rgb = _within_chunks(colors, np.full(3, 255.0))
+    alpha = logit_to_byte(tensors["logit_opacities"]).astype(np.uint32)
+    words = (
+        positions @ np.array((1 << 21, 1 << 11, 1), dtype=np.uint32),
+        _packed_rotations(unit_quats(tensors["quats"])),
+        scales @ np.array((1 << 21, 1 << 11, 1), dtype=np.uint32),
+        rgb @ np.array((1 << 24, 1 << 16, 1 << 8), dtype=np.uint32) | alpha,
+    )
+    bounds = np.concatenate([position_bounds, scale_bounds, color_bounds], axis=1, dtype="<f4")
+    sh = _sh_bytes(tensors["sh_rest"])
+    with written_aside(path) as aside, aside.open("wb") as file:
+        file.write(_header(scene, len(order), len(bounds), sh.shape[1]))
+        file.write(bounds.tobytes())
+        file.write(np.stack(words, axis=1).astype("<u4").tobytes())
+        file.write(sh.tobytes())
+
+
+def unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
+    """Normalise quaternions of any length but zero.
+
+    Raises:
+        ArgumentError: one has zero length.
+    """
+    lengths = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
+    if not lengths.all():
+        raise ArgumentError(
+            f"quats{first_index(lengths[:, 0] == 0)}: has zero length, so it is no rotation; remove the splat"
+        )
+    units: Float64[np.ndarray, "N 4"] = quats / lengths
+    return units
+
+
+def _elements(path: Path, header: Header) -> tuple[Element, Element, Element | None]:
+    """Return `chunk`, `vertex` and `sh` if they are what they have to be."""
+    by_name = {element.name: element for element in header.elements}
+    there = {name: by_name[name].names if name in by_name else () for name in ("vertex", "chunk")}
+    colors = COLOR_BOUNDS if COLOR_BOUNDS[0] in there["chunk"] else ()
+    for name, properties in (("vertex", PACKED), ("chunk", (*POSITION_BOUNDS, *SCALE_BOUNDS, *colors))):
+        if missing := [other for other in properties if other not in there[name]]:
+            raise SceneFormatError(
+                f"{path}: is not a compressed splat PLY: {name} lacks {', '.join(missing)}; give another file, or name"
+                " an uncompressed scene .ply"
+            )
+    chunk, vertex, sh = by_name["chunk"], by_name["vertex"], by_name.get("sh")
+    if header.format == "ascii":
+        raise SceneFormatError(f"{path}: is a compressed splat PLY in ASCII; export it as a binary one")
+    kinds = dict(vertex.properties)
+    if wrong := [name for name in PACKED if kinds[name] != "u4"]:
+        raise SceneFormatError(f"{path}: {', '.join(wrong)} is not of type uint; export the scene again")
+    if chunk.count != -(-vertex.count // CHUNK):
+        raise SceneFormatError(
+            f"{path}: has {chunk.count} chunks of {CHUNK} for {vertex.count} splats; the file is damaged, get it again"
+        )
+    if sh is not None:
+        _check_sh(path, sh, vertex.count)
+    return chunk, vertex, sh
+
+
+def _check_sh(path: Path, sh: Element, count: int) -> None:
+    found = {name: kind for name, kind in sh.properties if name.startswith("f_rest_")}
+    counts = ", ".join(str(number) for number in SH_COUNTS)
+    if len(found) not in SH_COUNTS or set(found) != {f"f_rest_{i}" for i in range(len(found))}:
+        raise SceneFormatError(
+            f"{path}: sh has {len(found)} properties f_rest_*, but SH degrees 1-3 have {counts}, counted from 0"
+        )
+    if set(found.values()) != {"u1"}:
+        raise SceneFormatError(
+            f"{path}: sh has properties f_rest_* that are not uchar; export the scene again"
+        )
+    if sh.count != count:
+        raise SceneFormatError(
+            f"{path}: has SH coefficients of {sh.count} splats, but {count} splats; the file is damaged, get it again"
+        )
+
+
+def _rows(
+    path: Path, file: BinaryIO, header: Header, wanted: Element, body: int
+) -> np.ndarray[Any, np.dtype[Any]]:
+    file.seek(body)
+    return read_rows(path, file, header, wanted)
+
+
+def _bounds(path: Path, rows: np.ndarray, names: tuple[str, ...]) -> Float64[np.ndarray, "C 6"]:
+    """Return bounds of all chunks: three smallest values, then three largest ones."""
+    bounds = structured_to_unstructured(rows[list(names)], dtype=np.float64)
+    fine = np.abs(bounds) <= np.finfo(np.float32).max  # false for NaN
+    if not fine.all():
+        row, column = np.argwhere(~fine)[0]
+        raise SceneFormatError(
+            f"{path}: chunk {row}: {names[column]} is {bounds[row, column]}; the file is damaged, get it again"
+        )
+    return bounds
+
+
+def _between(bounds: Float64[np.ndarray, "C 6"], t: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    """Go from each chunk's smallest (t = 0) to its largest values (t = 1), both met exactly."""
+    low, high = np.split(_of_splats(bounds, len(t)), 2, axis=1)
+    values: Float64[np.ndarray, "N 3"] = low * (1.0 - t) + high * t
+    return values
+
+
+def _of_splats(of_chunks: Float64[np.ndarray, "C W"], count: int) -> Float64[np.ndarray, "N W"]:
+    return np.repeat(of_chunks, CHUNK, axis=0)[:count]
+
+
+def _within_chunks(
+    values: Float32[np.ndarray, "N 3"], steps: Float64[np.ndarray, "3"]
+) -> tuple[Float32[np.ndarray, "C 6"], UInt32[np.ndarray, "N 3"]]:
+    """Return bounds of chunks, and where between them values are, rounded to the nearest of so many steps."""
+    starts = np.arange(0, len(values), CHUNK)
+    low, high = (extreme.reduceat(values, starts, axis=0) for extreme in (np.minimum, np.maximum))
+    extents = high.astype(np.float64) - low
+    per_extent = steps / np.where(extents > 0.0, extents, 1.0)
+    places = (values - _of_splats(low.astype(np.float64), len(values))) * _of_splats(per_extent, len(values))
+    return np.concatenate([low, high], axis=1), np.floor(places + 0.5).astype(np.uint32)
+
+
+def _unpacked(words: UInt32[np.ndarray, " N"]) -> Float64[np.ndarray, "N 3"]:
+    places = np.stack([words >> 21, words >> 11 & 1023, words & 2047], axis=1)
+    t: Float64[np.ndarray, "N 3"] = places / _STEPS_11_10_11
+    return t
+
+
+def _unpacked_rotations(words: UInt32[np.ndarray, " N"]) -> Float32[np.ndarray, "N 4"]:
+    largest = (words >> 30).astype(np.int64)
+    codes = np.stack([words >> 20 & 1023, words >> 10 & 1023, words & 1023], axis=1)
+    others = (codes / 1023.0 - 0.5) / _ROOT_HALF
+    rest = np.maximum(1.0 - np.square(others).sum(axis=1), 0.0)  # below 0 where no unit quaternion was packed
+    quats = np.empty((len(words), 4))
+    np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
+    np.put_along_axis(quats, largest[:, None], np.sqrt(rest)[:, None], axis=1)
+    return quats.astype(np.float32)
+
+
+def _packed_rotations(units: Float64[np.ndarray, "N 4"]) -> UInt32[np.ndarray, " N"]:
+    largest = np.abs(units).argmax(axis=1)
+    others = np.take_along_axis(units, _OTHERS[largest], axis=1)
+    positive = np.take_along_axis(units, largest[:, None], axis=1) >= 0.0
+    codes = np.floor((np.where(positive, others, -others) * _ROOT_HALF + 0.5) * 1023.0 + 0.5)
+    shifts = np.array((1 << 20, 1 << 10, 1), dtype=np.uint32)
+    words: UInt32[np.ndarray, " N"] = np.clip(codes, 0, 1023).astype(np.uint32) @ shifts
+    words |= largest.astype(np.uint32) << 30
+    return words
+
+
+def _sh_rest(rows: np.ndarray | None, count: int) -> Float32[np.ndarray, "N K 3"]:
+    if rows is None:
+        return np.zeros((count, 0, 3), dtype=np.float32)
+    number = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
+    codes = structured_to_unstructured(rows[[f"f_rest_{i}" for i in range(number)]])
+    codes = np.ascontiguousarray(np.moveaxis(codes.reshape(count, 3, number // 3), 1, 2))
+    sh_rest: Float32[np.ndarray, "N K 3"] = _SH_VALUES[codes]
+    return sh_rest
+
+
+def _sh_bytes(sh_rest: Float32[np.ndarray, "N K 3"]) -> UInt8[np.ndarray, "N P"]:
+    steps = np.floor(np.clip(sh_rest, -4.0, 4.0) * 32.0)  # exact in float32: 32 is a power of two
+    codes = (np.minimum(steps, 127.0) + 128.0).astype(np.uint8)
+    channel_major: UInt8[np.ndarray, "N P"] = np.moveaxis(codes, 2, 1).reshape(len(codes), 3 * codes.shape[1])
+    return channel_major
+
+
+def _header(scene: Scene, splats: int, chunks: int, sh: int) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", *comments(scene), f"element chunk {chunks}"]
+    lines += [f"property float {name}" for name in (*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS)]
+    lines += [f"element vertex {splats}"] + [f"property uint {name}" for name in PACKED]
+    if sh:
+        lines += [f"element sh {splats}"] + [f"property uchar f_rest_{i}" for i in range(sh)]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def _order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """Return the order to write splats in."""
+    order, own = _morton_order(means), np.arange(len(means))
+    settled = np.count_nonzero(order // CHUNK == own // CHUNK)
+    return own if settled >= SETTLED * len(means) else order
+
+
+def _morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """Return the order along a Morton curve of 1024 cells an axis; cells of more than a chunk are sorted within."""
+    order = np.arange(len(means))
+    if len(means) <= 1:
+        return order
+    low = means.min(axis=0).astype(np.float64)
+    extents = means.max(axis=0) - low
+    if not extents.any():
+        return order
+    cells = np.minimum((means - low) * (1024.0 / np.where(extents > 0.0, extents, np.inf)), 1023.0)
+    codes = _spread(cells.astype(np.uint32)) @ np.array((1, 2, 4), dtype=np.uint32)
+    order = np.argsort(codes, kind="stable")
+    ends = np.append(np.flatnonzero(np.diff(codes[order])) + 1, len(order))
+    starts = np.append(0, ends[:-1])
+    for crowded in np.flatnonzero(ends - starts > CHUNK):
+        cell = order[starts[crowded] : ends[crowded]]
+        cell[:] = cell[_morton_order(means[cell])]
+    return order
+
+
+def _spread(values: UInt32[np.ndarray, "N 3"]) -> UInt32[np.ndarray, "N 3"]:
+    """Put two zero bits before each of ten bits."""
+    spread = np.zeros_like(values)
+    for bit in range(10):
+        spread |= (values >> bit & 1) << 3 * bit
+    return spread

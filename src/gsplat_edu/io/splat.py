@@ -1,0 +1,135 @@
+"""antimatter's .splat: 32 bytes a splat, nothing else in the file.
+
+Position 3 float32, scales 3 float32 (not their logarithms), red, green, blue and opacity a byte each, quaternion
+(w, x, y, z) a byte each: 128 q + 128. Little-endian. Colours are those of SH degree 0, C0 f_dc + 1/2 from 0 to 1; there
+is no room for higher degrees. A file has no header and no count: one without bytes is a scene without splats.
+
+Axes are those of the scene: nothing is flipped.
+
+Source: convert.py and main.js of antimatter15/splat (MIT licence).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64
+
+from gsplat_edu.constants import C0, SH_OFFSET
+from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.files import written_aside
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.compressed_ply import unit_quats
+from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.ply_table import LFS_POINTER
+
+SPLAT = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+MIN_SCALE, MAX_SCALE = (float(x) for x in (np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max))
+"""Scales are kept within what float32 has above zero, so that their logarithms are finite."""
+
+
+def read(path: Path) -> Scene:
+    """Read a .splat.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The scene, float32, SH degree 0, in the order of the file. A scale of 0 becomes `MIN_SCALE`, opacities are kept
+        off 0 and 1, and a quaternion of zeros is no rotation, as in antimatter's viewer: (1, 0, 0, 0).
+
+    Raises:
+        SceneFormatError: the size is not a multiple of 32 bytes, a position is NaN or infinite, or a scale is that or
+            negative.
+        OSError: it cannot be read.
+    """
+    stored = path.read_bytes()
+    if stored.startswith(LFS_POINTER):
+        raise SceneFormatError(
+            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
+        )
+    if stored.startswith(b"ply"):
+        raise SceneFormatError(f"{path}: is a PLY, not a .splat; name it .ply")
+    if left := len(stored) % SPLAT.itemsize:
+        raise SceneFormatError(
+            f"{path}: is {len(stored)} bytes, {left} more than whole splats of {SPLAT.itemsize}; it is truncated or no"
+            " .splat, get it again"
+        )
+    splats = np.frombuffer(stored, dtype=SPLAT)
+    _check(path, splats)
+    quats = (splats["quat"].astype(np.float32) - 128.0) / 128.0
+    quats[~quats.any(axis=1)] = (1.0, 0.0, 0.0, 0.0)
+    colors = splats["rgba"][:, None, :3] / 255.0
+    gaussians = Gaussians(
+        means=torch.from_numpy(splats["position"].astype(np.float32)),
+        quats=torch.from_numpy(quats),
+        log_scales=torch.from_numpy(
+            np.log(np.maximum(splats["scales"].astype(np.float64), MIN_SCALE)).astype(np.float32)
+        ),
+        sh0=torch.from_numpy(((colors - SH_OFFSET) / C0).astype(np.float32)),
+        sh_rest=torch.zeros(len(splats), 0, 3),
+        logit_opacities=torch.from_numpy(byte_to_logit(splats["rgba"][:, 3])),
+    )
+    return Scene(gaussians)
+
+
+def write(path: Path, scene: Scene) -> None:
+    """Write a .splat; SH coefficients of degree 1 and up are left out.
+
+    The order of the splats changes: largest opacity times volume first, as antimatter's converter writes them, so that
+    a viewer that has only the beginning of the file shows what matters. Both are taken as the file holds them; ties
+    keep their order.
+
+    Args:
+        path: The file; parent folders are made.
+        scene: Its quaternions are normalised, its scales clamped to `MIN_SCALE` and `MAX_SCALE`, its colours to 0 to 1.
+
+    Raises:
+        ArgumentError: a parameter is NaN or infinite in float32, or a quaternion has zero length.
+        OSError: it cannot be written. What stood there before is untouched.
+    """
+    gaussians = scene.gaussians.map(torch.Tensor.float)
+    gaussians.check_finite()
+    tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
+    splats = np.empty(len(gaussians), dtype=SPLAT)
+    splats["position"] = tensors["means"]
+    splats["scales"] = _scales(tensors["log_scales"])
+    splats["rgba"][:, :3] = _rounded((tensors["sh0"][:, 0].astype(np.float64) * C0 + SH_OFFSET) * 255.0)
+    splats["rgba"][:, 3] = logit_to_byte(tensors["logit_opacities"])
+    splats["quat"] = _rounded(unit_quats(tensors["quats"]) * 128.0 + 128.0)
+    with written_aside(path) as aside:
+        aside.write_bytes(splats[_order(splats)].tobytes())
+
+
+def _check(path: Path, splats: np.ndarray) -> None:
+    scales = splats["scales"]
+    for what, right in (
+        ("position that is NaN or infinite", np.isfinite(splats["position"])),
+        ("scale that is NaN, infinite or negative", np.isfinite(scales) & (scales >= 0.0)),
+    ):
+        if not right.all():
+            bad = np.flatnonzero(~right.all(axis=1))
+            raise SceneFormatError(
+                f"{path}: splat {bad[0]} has a {what} ({len(bad)} such splats in all); it is damaged or no .splat, get"
+                " it again"
+            )
+
+
+def _scales(log_scales: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    low, high = np.log((MIN_SCALE, MAX_SCALE))
+    scales: Float64[np.ndarray, "N 3"] = np.exp(np.clip(log_scales.astype(np.float64), low, high))
+    return scales.astype(np.float32)
+
+
+def _rounded(values: Float64[np.ndarray, "N C"]) -> Float64[np.ndarray, "N C"]:
+    """Round to the nearest byte."""
+    return np.clip(np.floor(values + 0.5), 0.0, 255.0)
+
+
+def _order(splats: np.ndarray) -> Int64[np.ndarray, " N"]:
+    importance = splats["rgba"][:, 3] * np.prod(splats["scales"], axis=1, dtype=np.float64)
+    return np.argsort(-importance, kind="stable")
