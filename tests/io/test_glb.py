@@ -1,0 +1,175 @@
+"""Binary glTF, read back by its layout: twelve bytes, a chunk of JSON, a chunk of numbers."""
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians, cov3d_t
+from gsplat_edu.io import glb
+from gsplat_edu.io.axes import half_turned
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.sh import eval_sh
+
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+PREFIX = "KHR_gaussian_splatting:"
+
+
+def random_gaussians(count, rest):
+    generator = torch.Generator().manual_seed(count + rest)
+    shapes = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "log_scales": (count, 3),
+        "sh0": (count, 1, 3),
+        "sh_rest": (count, rest, 3),
+        "logit_opacities": (count,),
+    }
+    return Gaussians(**{name: 2 * torch.randn(*shape, generator=generator) for name, shape in shapes.items()})
+
+
+def parse(path):
+    """Take a file apart as a viewer does; every offset has to be where it is said."""
+    data = path.read_bytes()
+    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON" and size % 4 == 0
+    text = data[20 : 20 + size]
+    document = json.loads(text)
+    assert text.rstrip(b" ").endswith(b"}"), "padded with spaces"
+    if 20 + size == len(data):
+        return document, {}
+    start = 28 + size
+    length, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert kind == b"BIN\0" and length % 4 == 0 and start + length == len(data)
+    assert document["buffers"] == [{"byteLength": length}]
+    return document, attributes(document, data[start:])
+
+
+def attributes(document, body):
+    arrays, end = {}, 0
+    (primitive,) = document["meshes"][0]["primitives"]
+    for name, index in primitive["attributes"].items():
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = WIDTHS[accessor["type"]]
+        assert accessor["componentType"] == 5126 and view["target"] == 34962
+        assert view["buffer"] == 0 and view["byteOffset"] == end and "byteStride" not in view
+        assert view["byteLength"] == 4 * width * accessor["count"]
+        end += view["byteLength"]
+        numbers = np.frombuffer(body[view["byteOffset"] : end], "<f4")
+        arrays[name] = numbers.reshape(accessor["count"], width)
+    assert end == len(body)
+    return arrays
+
+
+@pytest.mark.parametrize("count", [1, 2, 1000])
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+def test_what_is_stored_decodes_to_the_parameters(tmp_path, rest, count):
+    g = random_gaussians(count, rest)
+    glb.write(tmp_path / "new" / "a.glb", Scene(g))
+    arrays = parse(tmp_path / "new" / "a.glb")[1]
+    x, y, z = g.means.numpy().T
+    np.testing.assert_array_equal(arrays["POSITION"], np.stack([x, -y, -z], axis=1))
+    # one rounding to float32, 2^-24 of the number, and a bit for NumPy's and torch's own
+    scales, opacities = torch.exp(g.log_scales.double()), torch.sigmoid(g.logit_opacities.double())
+    np.testing.assert_allclose(arrays[PREFIX + "SCALE"], scales.numpy(), rtol=2**-23)
+    np.testing.assert_allclose(arrays[PREFIX + "OPACITY"][:, 0], opacities.numpy(), rtol=2**-23)
+    stored = torch.tensor(arrays[PREFIX + "ROTATION"]).double()
+    np.testing.assert_allclose(stored.norm(dim=1).numpy(), 1.0, rtol=1e-6)
+    degrees = {0: 0, 3: 1, 8: 2, 15: 3}[rest]
+    names = [f"{PREFIX}SH_DEGREE_{d}_COEF_{n}" for d in range(degrees + 1) for n in range(2 * d + 1)]
+    assert set(arrays) == {"POSITION", *(PREFIX + name for name in ("ROTATION", "SCALE", "OPACITY")), *names}
+
+    # The ellipsoids, and the colours seen along a direction, are the scene's half a turn about x away.
+    H = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    covariances = cov3d_t(g.log_scales.double(), g.quats.double())
+    turned = cov3d_t(torch.log(torch.tensor(arrays[PREFIX + "SCALE"]).double()), stored[:, [3, 0, 1, 2]])
+    largest = covariances.abs().amax(dim=(1, 2), keepdim=True)
+    assert float(((turned - H @ covariances @ H) / largest).abs().max()) <= 1e-6
+    direction = np.array([0.36, 0.48, 0.8])
+    harmonics = np.stack([arrays[name] for name in names], axis=1).astype(np.float64)
+    ours = eval_sh(degrees, g.sh.double().numpy(), np.tile(direction, (count, 1)))
+    theirs = eval_sh(degrees, harmonics, np.tile(direction * (1, -1, -1), (count, 1)))
+    np.testing.assert_allclose(theirs, ours, atol=1e-12)
+
+
+def test_the_document_is_what_the_extension_asks_for(tmp_path):
+    glb.write(tmp_path / "a.glb", Scene(random_gaussians(9, 3)))
+    document, arrays = parse(tmp_path / "a.glb")
+    assert document["asset"] == {"version": "2.0", "generator": "gsplat-edu"}
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert "extensionsRequired" not in document
+    assert document["scenes"][document["scene"]] == {"nodes": [0]}
+    assert document["nodes"] == [{"mesh": 0}], "no transformation: not every viewer turns harmonics along"
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0
+    assert primitive["extensions"]["KHR_gaussian_splatting"] == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    accessor = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(np.float32(accessor["min"]), arrays["POSITION"].min(axis=0))
+    np.testing.assert_array_equal(np.float32(accessor["max"]), arrays["POSITION"].max(axis=0))
+
+
+@pytest.mark.parametrize(
+    ("facts", "extras"),
+    [
+        ({"antialiased": False}, {"antialiased": False}),
+        ({"antialiased": True, "up": (0.0, -1.0, 0.0)}, {"antialiased": True, "up": [0.0, 1.0, 0.0]}),
+        ({"up": (0.6, 0.0, 0.8)}, {"up": [0.6, 0.0, -0.8]}),
+    ],
+)
+@pytest.mark.parametrize("count", [0, 3])
+def test_facts_of_the_scene_are_extras(tmp_path, count, facts, extras):
+    glb.write(tmp_path / "a.glb", Scene(random_gaussians(count, 0), **facts))
+    read = parse(tmp_path / "a.glb")[0]["asset"]["extras"]
+    assert json.dumps(read) == json.dumps(extras), "and no -0.0"
+
+
+def test_nothing_is_a_file_without_a_mesh(tmp_path):
+    glb.write(tmp_path / "a.glb", Scene(random_gaussians(0, 15)))
+    document, arrays = parse(tmp_path / "a.glb")
+    assert not arrays and not {"meshes", "accessors", "bufferViews", "buffers"} & set(document)
+
+
+def test_the_same_scene_is_the_same_bytes(tmp_path):
+    g = random_gaussians(50, 8)
+    glb.write(tmp_path / "a.glb", Scene(g, antialiased=True))
+    glb.write(tmp_path / "b.glb", Scene(half_turned(half_turned(g)).trainable(), antialiased=True))
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+
+
+def test_extremes_stay_numbers(tmp_path):
+    g = random_gaussians(3, 0).map(torch.Tensor.double)
+    g.log_scales[:] = torch.tensor([[-800.0], [800.0], [0.0]])
+    g.logit_opacities[:] = torch.tensor([-800.0, 800.0, 0.0])
+    glb.write(tmp_path / "a.glb", Scene(replace(g, quats=g.quats * torch.tensor([[1e-38], [1e30], [1.0]]))))
+    arrays = parse(tmp_path / "a.glb")[1]
+    assert all(np.isfinite(array).all() for array in arrays.values())
+    assert arrays[PREFIX + "SCALE"][:, 0].tolist() == [0.0, np.exp(np.float32(88.0)), 1.0]
+    assert arrays[PREFIX + "OPACITY"][:, 0].tolist() == [0.0, 1.0, 0.5]
+    np.testing.assert_allclose(np.linalg.norm(arrays[PREFIX + "ROTATION"], axis=1), 1.0, rtol=1e-6)
+
+
+def test_what_gltf_cannot_hold_is_refused_and_the_old_file_stays(tmp_path):
+    path = tmp_path / "a.glb"
+    g = random_gaussians(3, 0)
+    glb.write(path, Scene(g))
+    before = path.read_bytes()
+    far = g.map(torch.Tensor.double)
+    far.means[1] = 1e300
+    for scene, says in (
+        (Scene(replace(g, quats=torch.zeros(3, 4))), r"quats\[0\]: has zero length"),
+        (Scene(far), r"means\[1, 0\]: is NaN or infinite"),
+    ):
+        with pytest.raises(ArgumentError, match=says):
+            glb.write(path, scene)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
