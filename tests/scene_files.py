@@ -15,8 +15,6 @@ from gsplat_edu.views import View
 
 RUN_UP = np.array([0.0, -0.6, 0.8])
 
-READABLE = [found for found in FORMATS if found.readable]
-
 
 def random_scene(count: int, rest: int = 15, seed: int = 0) -> Scene:
     """Random Gaussians of sizes, opacities and colours as scenes have them."""

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.io.formats import read_scene
-from scene_files import READABLE, small_file
+from gsplat_edu.io.formats import FORMATS, read_scene
+from scene_files import small_file
 
 FILES = int(os.environ.get("GSPLAT_EDU_FUZZ", "200"))
 """Mutated files per reader."""
@@ -63,7 +63,7 @@ def check(path):
     assert peak < MOST_MEMORY, f"{peak:,} bytes"
 
 
-@pytest.mark.parametrize("suffix", [found.suffix for found in READABLE])
+@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 def test_damaged_files(tmp_path, suffix):
     data = small_file(tmp_path, suffix).read_bytes()
     path = tmp_path / f"damaged{suffix}"

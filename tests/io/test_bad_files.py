@@ -7,7 +7,7 @@ import torch
 
 from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.formats import FORMATS, format_of, read_scene, write_scene
-from scene_files import READABLE, random_scene, small_file
+from scene_files import random_scene, small_file
 
 SLACK = 8 << 20
 """Bytes that a reader may use for a file however small: imports, buffers and the toys' allowance."""
@@ -15,7 +15,7 @@ SLACK = 8 << 20
 TIMES = 100
 """A reader may allocate this many times the file's size: 64 for what is compressed, and a copy in float32."""
 
-readable = pytest.mark.parametrize("suffix", [found.suffix for found in READABLE])
+every_format = pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 
 
 def refused(path):
@@ -26,7 +26,7 @@ def refused(path):
     return message
 
 
-@readable
+@every_format
 def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
     path = small_file(tmp_path, suffix)
     data = path.read_bytes()
@@ -37,14 +37,14 @@ def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
             refused(path)
 
 
-@readable
+@every_format
 def test_a_git_lfs_pointer_is_called_one(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 123\n")
     assert "git lfs pull" in refused(path)
 
 
-@readable
+@every_format
 def test_other_files_are_refused(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     for content in (
@@ -57,17 +57,17 @@ def test_other_files_are_refused(tmp_path, suffix):
         refused(path)
 
 
-@readable
+@every_format
 def test_files_of_other_formats_are_refused(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
-    for other in READABLE:
+    for other in FORMATS:
         if other.suffix != suffix and {other.suffix, suffix} != {".ply", ".compressed.ply"}:
             content = small_file(tmp_path, other.suffix).read_bytes()
             path.write_bytes(content + b"\0" * (1 if suffix == ".splat" and len(content) % 32 == 0 else 0))
             refused(path)
 
 
-@readable
+@every_format
 def test_a_missing_file_stays_an_oserror(tmp_path, suffix):
     with pytest.raises(OSError, match="No such file"):
         read_scene(tmp_path / f"gone{suffix}")
@@ -101,7 +101,7 @@ def test_names_without_a_format_are_refused(tmp_path):
     assert format_of("folder/meta.json").module == "sog"
 
 
-@readable
+@every_format
 def test_memory_stays_a_small_multiple_of_the_file(tmp_path, suffix):
     """The counts a file claims are raised to 2^31 - 1 wherever they stand, as text or as 32 bits."""
     path = small_file(tmp_path, suffix)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.gaussians import Gaussians, cov3d_t
 from gsplat_edu.io import glb
 from gsplat_edu.io.axes import half_turned
@@ -173,3 +173,83 @@ def test_what_gltf_cannot_hold_is_refused_and_the_old_file_stays(tmp_path):
         with pytest.raises(ArgumentError, match=says):
             glb.write(path, scene)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("count", [0, 1, 100])
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+def test_what_was_written_is_read(tmp_path, count, rest):
+    g = random_gaussians(count, rest)
+    glb.write(tmp_path / "a.glb", Scene(g, True, (0.6, -0.8, 0.0)))
+    scene = glb.read(tmp_path / "a.glb")
+    assert scene.antialiased is True and scene.up == pytest.approx((0.6, -0.8, 0.0))
+    back = scene.gaussians
+    assert back.sh_degree == (g.sh_degree if count else 0), "a file without splats says no degree"
+    if not count:
+        return
+    assert torch.equal(back.means, g.means) and torch.equal(back.sh, g.sh)
+    torch.testing.assert_close(back.quats, g.quats / g.quats.norm(dim=1, keepdim=True), rtol=0, atol=2e-7)
+    # the scale is rounded to float32, 6e-8 of it, and its logarithm to float32, at most 7 here
+    torch.testing.assert_close(back.log_scales, g.log_scales, rtol=1e-7, atol=6e-7)
+    # opacities are 6e-8 apart at most; of a logit that is d / (o (1 - o))
+    slack = 6e-8 / (g.opacities * (1 - g.opacities)) + 1e-6
+    assert bool(((back.logit_opacities - g.logit_opacities).abs() < slack).all())
+
+
+def test_opacities_of_nought_and_one_stay_finite(tmp_path):
+    g = replace(random_gaussians(2, 0), logit_opacities=torch.tensor([400.0, -400.0]))
+    glb.write(tmp_path / "a.glb", Scene(g))
+    logits = glb.read(tmp_path / "a.glb").gaussians.logit_opacities
+    assert 16 < logits[0] < 17 and -17 < logits[1] < -16
+
+
+def edited(path, change):
+    """Write a glTF again with its JSON changed."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size :]
+    path.write_bytes(
+        struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda d: d["nodes"][0].update(rotation=[1, 0, 0, 0]), "a node's transform"),
+        (lambda d: d["accessors"][1].update(componentType=5121), "other numbers than float32"),
+        (lambda d: d["accessors"][1].update(count=10**15), "beyond its end"),
+        (lambda d: d["accessors"][1].update(count=7.0), "beyond its end"),
+        (lambda d: d["accessors"][1].update(count=4), "different numbers of splats"),
+        (lambda d: d["bufferViews"][1].update(byteStride=32), "interleaves"),
+        (lambda d: d["bufferViews"][1].update(byteOffset=-4), "beyond its end"),
+        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SCALE"), "without KHR"),
+        (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SH_DEGREE_0_COEF_0"),
+            "colour",
+        ),
+        (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SH_DEGREE_1_COEF_2"),
+            "without KHR",
+        ),
+        (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no splats"),
+        (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives"),
+        (lambda d: d["asset"].update(extras={"antialiased": "yes"}), "antialiased is"),
+        (lambda d: d["asset"].update(extras={"up": [0, 0, 0]}), "no direction"),
+        (lambda d: d["asset"].update(extras={"up": [0, 0]}), "does not describe"),
+        (lambda d: d.pop("asset"), "does not describe"),
+        (lambda d: d.update(accessors="none"), "does not describe"),
+    ],
+)
+def test_what_is_stored_otherwise_is_refused(tmp_path, change, says):
+    path = tmp_path / "a.glb"
+    glb.write(path, Scene(random_gaussians(5, 3)))
+    edited(path, lambda document: None)
+    assert len(glb.read(path).gaussians) == 5, "editing alone does no harm"
+    edited(path, change)
+    with pytest.raises(SceneFormatError, match=says) as caught:
+        glb.read(path)
+    assert str(path) in str(caught.value)

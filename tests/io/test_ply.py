@@ -324,3 +324,20 @@ def test_a_comment_of_ours_that_is_none_is_refused(tmp_path, said):
         read(path)
     path.write_bytes(data.replace(b"comment gsplat_edu", b"comment another"))
     assert read(path).up is None
+
+
+def test_infinite_logits_are_opaque_or_not_there(tmp_path):
+    """Programs that keep opacities in a byte write the logits of 0 and 1."""
+    path = tmp_path / "scene.ply"
+    save_ply(path, random_gaussians(3, 0))
+    data = bytearray(path.read_bytes())
+    rows = np.frombuffer(data, "<f4", offset=data.index(b"end_header\n") + 11).reshape(3, 17)
+    rows[:2, 9] = np.inf, -np.inf
+    path.write_bytes(data)
+    gaussians = load_ply(path)
+    assert gaussians.opacities[:2].tolist() == [1.0, pytest.approx(0.0, abs=1e-30)]
+    assert gaussians.logit_opacities[2] == random_gaussians(3, 0).logit_opacities[2]
+    rows[2, 9] = np.nan
+    path.write_bytes(data)
+    with pytest.raises(SceneFormatError, match="vertex 2: opacity is nan"):
+        load_ply(path)

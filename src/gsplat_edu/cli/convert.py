@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.metrics import ImageScore
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
@@ -117,10 +118,14 @@ def check_and_say(
     views = len(source.probes(export.VIEWS, export.SIDE))
     for path in paths:
         task = bar.add_task(f"checking {path}", total=views)
-        found.append(export.check(path, source, backend, lambda _, task=task: bar.advance(task)))
+        found.append(export.check(path, source, backend, functools.partial(_advance, bar, task)))
         bar.remove_task(task)
         say(found[-1].line())
     return found
+
+
+def _advance(bar: Progress, task: TaskID, score: ImageScore) -> None:
+    bar.advance(task)
 
 
 def _edited(source: Source, keep: Filter, move: Similarity) -> Source:

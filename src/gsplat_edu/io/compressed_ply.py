@@ -29,14 +29,13 @@ from jaxtyping import Float32, Float64, Int64, UInt8, UInt32
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from gsplat_edu.constants import C0, SH_OFFSET
-from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply_comments import comments, read_comments
-from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte
+from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.ply_table import Element, Header, read_elements, read_rows
-from gsplat_edu.validation import first_index
 
 CHUNK = 256
 """Splats of a chunk; the last one may have fewer."""
@@ -141,21 +140,6 @@ def write(path: Path, scene: Scene) -> None:
         file.write(bounds.tobytes())
         file.write(np.stack(words, axis=1).astype("<u4").tobytes())
         file.write(sh.tobytes())
-
-
-def unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
-    """Normalise quaternions of any length but zero.
-
-    Raises:
-        ArgumentError: one has zero length.
-    """
-    lengths = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
-    if not lengths.all():
-        raise ArgumentError(
-            f"quats{first_index(lengths[:, 0] == 0)}: has zero length, so it is no rotation; remove the splat"
-        )
-    units: Float64[np.ndarray, "N 4"] = quats / lengths
-    return units
 
 
 def _elements(path: Path, header: Header) -> tuple[Element, Element, Element | None]:

@@ -19,8 +19,6 @@ class Format:
         suffix: How the names of its files end, in lower case.
         module: Module of `gsplat_edu.io` with `read(path) -> Scene` and `write(path, scene)`.
         name: What people call it.
-        readable: Whether `read` is there.
-        lossless: Whether float32 parameters come back to the bit.
         sh_degree: Highest degree of harmonics that it holds.
         says_antialiased: Whether it has room for that.
     """
@@ -28,8 +26,6 @@ class Format:
     suffix: str
     module: str
     name: str
-    readable: bool = True
-    lossless: bool = False
     sh_degree: int = SH_MAX_DEGREE
     says_antialiased: bool = True
 
@@ -45,11 +41,11 @@ class Format:
 
 FORMATS = (
     Format(".compressed.ply", "compressed_ply", "SuperSplat compressed PLY"),
-    Format(".ply", "ply", "Inria PLY", lossless=True),
+    Format(".ply", "ply", "Inria PLY"),
     Format(".splat", "splat", "antimatter splat", sh_degree=0, says_antialiased=False),
     Format(".spz", "spz", "Niantic SPZ"),
     Format(".sog", "sog", "PlayCanvas SOG"),
-    Format(".glb", "glb", "glTF with KHR_gaussian_splatting", readable=False, lossless=True),
+    Format(".glb", "glb", "glTF with KHR_gaussian_splatting"),
 )
 """A name that ends in two of the suffixes is of the first."""
 
@@ -97,7 +93,7 @@ def losses(path: str | Path, scene: Scene) -> list[str]:
 
 
 def read_scene(path: str | Path) -> Scene:
-    """Read a scene of any readable format.
+    """Read a scene of any format.
 
     Args:
         path: The file; for a SOG in a folder, the folder or its meta.json.
@@ -106,7 +102,7 @@ def read_scene(path: str | Path) -> Scene:
         The scene, float32, in this package's axes.
 
     Raises:
-        ArgumentError: the name has no suffix of a scene format, or of one that is only written.
+        ArgumentError: the name has no suffix of a scene format.
         SceneFormatError: the file is not what its name says, or damaged.
         OSError: it cannot be read.
     """
@@ -114,10 +110,6 @@ def read_scene(path: str | Path) -> Scene:
     if path.is_dir() and (path / SOG_META).is_file():
         path = path / SOG_META
     found = format_of(path)
-    if not found.readable:
-        raise ArgumentError(
-            f"{path}: {found.name} is written here, not read; give the scene it was made from"
-        )
     scene = found.read(path)
     if not all(bool(tensor.isfinite().all()) for tensor in scene.gaussians.tensors().values()):
         bad = int((~scene.gaussians.finite_rows()).sum())

@@ -1,6 +1,6 @@
 """Binary glTF 2.0 with KHR_gaussian_splatting: the scene as points of a mesh, which viewers of glTF know how to draw.
 
-Written, not read. Everything is float32. What is stored are activated values: scales, not their logarithms, opacities,
+Everything is float32. What is stored are activated values: scales, not their logarithms, opacities,
 not their logits, quaternions (x, y, z, w) of length 1; each is right to float32, but what a logit above 17 or a
 quaternion's length was is lost. Scales above e^88, about where float32 ends, are clamped. Coefficients have glTF's
 signs, which are ours, one attribute each. What is known of the scene besides is in the asset's extras, up as glTF has
@@ -11,6 +11,9 @@ a camera looking along our z, then faces glTF's +z, which glTF calls the front. 
 turned, not the node: viewers do not all turn harmonics along with it. Some programs turn about z instead; their
 files differ from ours by half a turn about y.
 
+Read is what is stored in the same plain way, by whomever: one mesh primitive with the extension, its attributes float32
+and tightly packed in the file's own buffer, no transform on its node. Anything else is refused and named.
+
 Source: Khronos, "glTF 2.0 Specification" and extension KHR_gaussian_splatting, where scales are linear; drafts before
 April 2026 had logarithms.
 """
@@ -20,18 +23,20 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
+from gsplat_edu.io.quantize import unit_quats
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.io.spz_values import unit_quats
+from gsplat_edu.ply_table import LFS_POINTER
 
 EXTENSION = "KHR_gaussian_splatting"
 
@@ -52,6 +57,15 @@ LARGEST_LOG_SCALE = 88.0
 
 LARGEST_FILE = (1 << 32) - 1
 """Bytes: the file's length is written in 32 bits."""
+
+
+MOST_JSON = 1 << 20
+"""Bytes of JSON that are parsed: a description of splats takes a few thousand."""
+
+OPAQUE = 2.0**-24
+"""Opacities are kept this far from 0 and 1, half a float32 step at 1: their logits are finite."""
+
+TRANSFORMS = ("matrix", "rotation", "scale", "translation")
 
 
 def write(path: Path, scene: Scene) -> None:
@@ -149,3 +163,133 @@ def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]
         "bufferViews": views,
         "buffers": [{"byteLength": start}],
     }
+
+
+def read(path: Path) -> Scene:
+    """Read a binary glTF; see `gsplat_edu.io.formats.read_scene`."""
+    data = path.read_bytes()
+    document, body = _chunks(path, data)
+    try:
+        return _scene(path, document, body)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
+        _refuse(path, "its JSON does not describe splats as glTF does")
+
+
+def _refuse(path: Path, fault: str) -> NoReturn:
+    raise SceneFormatError(f"{path}: {fault}; export it again")
+
+
+def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview]:
+    """Return the JSON and the buffer."""
+    if data.startswith(LFS_POINTER):
+        raise SceneFormatError(
+            f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
+        )
+    if len(data) < FILE_HEADER.size + CHUNK_HEADER.size or not data.startswith(b"glTF"):
+        _refuse(path, "is not a binary glTF")
+    _, version, length = FILE_HEADER.unpack_from(data)
+    if version != 2 or length != len(data):
+        _refuse(path, f"is version {version} of {length:,} bytes, where {len(data):,} of version 2 should be")
+    size, kind = CHUNK_HEADER.unpack_from(data, FILE_HEADER.size)
+    start = FILE_HEADER.size + CHUNK_HEADER.size
+    if kind != b"JSON" or size > min(len(data) - start, MOST_JSON):
+        _refuse(path, "does not begin with its JSON")
+    try:
+        document = json.loads(data[start : start + size])
+    except (ValueError, RecursionError):
+        _refuse(path, "has JSON that cannot be read")
+    if not isinstance(document, dict):
+        _refuse(path, "has JSON that is no object")
+    start += size
+    if start == len(data):
+        return document, memoryview(b"")
+    if start + CHUNK_HEADER.size > len(data):
+        _refuse(path, "ends inside its second chunk")
+    size, kind = CHUNK_HEADER.unpack_from(data, start)
+    start += CHUNK_HEADER.size
+    if kind != b"BIN\0" or start + size != len(data):
+        _refuse(path, "has a second chunk that is not its buffer")
+    return document, memoryview(data)[start:]
+
+
+def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
+    extras = document["asset"].get("extras", {})
+    antialiased, up = extras.get("antialiased"), extras.get("up")
+    if antialiased not in (None, True, False):
+        _refuse(path, f"says antialiased is {antialiased!r}"[:80])
+    if up is not None:
+        x, y, z = (float(sign) * float(value) for sign, value in zip(POSITION_SIGNS, up, strict=True))
+        if not np.isfinite([x, y, z]).all() or not any((x, y, z)):
+            _refuse(path, "has an up that is no direction")
+        up = (x, y, z)
+    found = [
+        primitive
+        for mesh in document.get("meshes", [])
+        for primitive in mesh["primitives"]
+        if EXTENSION in primitive.get("extensions", {})
+    ]
+    if not found and (body or document.get("meshes")):
+        _refuse(path, f"has no splats: no primitive with {EXTENSION}")
+    if len(found) > 1:
+        _refuse(path, f"has {len(found)} primitives of splats, where one is read")
+    if any(name in node for node in document.get("nodes", []) for name in TRANSFORMS):
+        _refuse(path, "moves its splats by a node's transform, which has to be applied to them first")
+    attributes = found[0]["attributes"] if found else {}
+    arrays = {
+        name: _array(path, document, body, index) for name, index in attributes.items() if index is not None
+    }
+    return Scene(half_turned(_gaussians(path, arrays)), antialiased, up)
+
+
+def _array(path: Path, document: dict[str, Any], body: memoryview, index: int) -> Float32[np.ndarray, "N C"]:
+    """Return the numbers of an accessor."""
+    accessor = document["accessors"][index]
+    view = document["bufferViews"][accessor["bufferView"]]
+    widths = [width for width, name in TYPES.items() if name == accessor["type"]]
+    if accessor["componentType"] != FLOAT or not widths or "sparse" in accessor:
+        _refuse(path, f"has attributes of other numbers than float32 (accessor {index})")
+    count, size = accessor["count"], 4 * widths[0]
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    if view.get("byteStride", size) != size or view.get("buffer", 0) != 0:
+        _refuse(path, f"interleaves its attributes, or has them in another file (accessor {index})")
+    if not (
+        type(count) is type(start) is int and count >= 0 and 0 <= start <= start + count * size <= len(body)
+    ):
+        _refuse(path, f"has an attribute that reaches beyond its end (accessor {index})")
+    return np.frombuffer(body, "<f4", count * widths[0], start).reshape(count, widths[0])
+
+
+def _gaussians(path: Path, arrays: dict[str, Float32[np.ndarray, "N C"]]) -> Gaussians:
+    """Return the Gaussians in glTF's axes."""
+    degree = -1
+    while degree < SH_MAX_DEGREE and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in arrays:
+        degree += 1
+    harmonics = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{k}" for d in range(degree + 1) for k in range(2 * d + 1)]
+    names = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")), *harmonics]
+    widths = [3, 4, 3, 1, *[3] * len(harmonics)]
+    if not arrays:
+        arrays = {name: np.empty((0, width), np.float32) for name, width in zip(names, widths, strict=True)}
+    elif not harmonics:
+        _refuse(path, "has splats without colour")
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        _refuse(path, f"has splats without {missing[0]}")
+    values = [arrays[name] for name in names]
+    count = len(values[0])
+    if [value.shape for value in values] != [(count, width) for width in widths]:
+        _refuse(path, "has attributes of different numbers of splats")
+    means, quats, scales, opacities = (value.astype(np.float64) for value in values[:4])
+    if not ((scales >= 0).all() and ((opacities >= 0) & (opacities <= 1)).all()):
+        _refuse(path, "has a negative scale or an opacity outside 0 to 1")
+    tiny = np.finfo(np.float32).smallest_subnormal
+    inside = np.clip(opacities[:, 0], OPAQUE, 1.0 - OPAQUE)
+    sh = np.stack(values[4:], axis=1) if harmonics else np.empty((count, 1, 3))
+    tensors = (
+        means,
+        quats[:, [3, 0, 1, 2]],
+        np.log(np.maximum(scales, tiny)),
+        sh[:, :1],
+        sh[:, 1:],
+        np.log(inside / (1.0 - inside)),
+    )
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in tensors))

@@ -5,7 +5,7 @@ opacities): x y z, nx ny nz (zero), f_dc_0..2, f_rest_* channel by channel, opac
 (w, x, y, z). A scene of SH degree 0 has no f_rest. Axes are those of the scene: nothing is flipped.
 
 Read by the names of the properties: in any order, of any number type, with properties and elements that are not ours
-left aside, binary of either byte order or ASCII. A file whose splats are packed as SuperSplat packs them is read too.
+left aside, binary of either byte order or ASCII. An infinite logit of an opacity is opaque, or not there. A file whose splats are packed as SuperSplat packs them is read too.
 
 What the format has no property for stands in comments: see `gsplat_edu.io.ply_comments`.
 
@@ -41,6 +41,9 @@ SH_REST_COUNTS = (0, 9, 24, 45)
 """Numbers of f_rest properties: three channels of the coefficients of degrees 0 to 3."""
 
 ORIGIN = (0.0, 0.0, 0.0)
+
+LARGEST_LOGIT = 100.0
+"""What an infinite logit is read as: opacity 1 (or 0) to float32. Programs that keep opacities in bytes write them."""
 
 
 def read(path: Path, finite: bool = True) -> Scene:
@@ -117,7 +120,7 @@ def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
         back to the bit where the origin is zero.
 
     Raises:
-        SceneFormatError: not a PLY, or a PLY of something else, or damaged: truncated, NaN, infinite.
+        SceneFormatError: not a PLY, or a PLY of something else, or damaged: truncated, NaN, infinite (but for logits).
         ShapeError: the origin is not of shape (3,).
         OSError: the file cannot be read.
     """
@@ -137,6 +140,8 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
         over="ignore", invalid="ignore"
     ):  # a double beyond float32 becomes infinite, told of below
         values = structured_to_unstructured(table[columns], dtype=np.float32)
+    opacity = values[:, columns.index(OPACITY[0])]
+    np.copyto(opacity, np.copysign(LARGEST_LOGIT, opacity), where=np.isinf(opacity))
     if finite:
         _check_finite(path, values, columns)
     ends = np.cumsum([len(group) for group in groups])[:-1]

@@ -1,13 +1,14 @@
-"""What formats of few bits have in common: opacities in a byte, and how much a small file may claim to hold."""
+"""What formats have in common: opacities in a byte, unit quaternions, and how much a small file may claim to hold."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Integer, UInt8
+from jaxtyping import Float, Float32, Float64, Integer, UInt8
 
-from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.validation import first_index
 
 OPACITY_EDGE = 0.25 / 255.0
 """Bytes 0 and 255 stand for opacities this far inside 0 and 1, whose logits are finite: a quarter of a step."""
@@ -39,6 +40,22 @@ def logit_to_byte(logits: Float32[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."
         opacities = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
     rounded: UInt8[np.ndarray, "..."] = np.floor(255.0 * opacities + 0.5).astype(np.uint8)
     return rounded
+
+
+def unit_quats(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
+    """Normalise quaternions of any length but zero.
+
+    Raises:
+        ArgumentError: one has zero length.
+    """
+    largest = np.abs(quats.astype(np.float64)).max(axis=1, keepdims=True, initial=0.0)
+    if not largest.all():
+        raise ArgumentError(
+            f"quats{first_index(largest[:, 0] == 0)}: has zero length, so it is no rotation; remove the splat"
+        )
+    scaled = quats / largest  # first, so that the norm neither over- nor underflows
+    units: Float64[np.ndarray, "N 4"] = scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
+    return units
 
 
 def check_expansion(path: Path, claimed: int, stored: int) -> None:

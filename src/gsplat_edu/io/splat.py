@@ -21,8 +21,7 @@ from gsplat_edu.constants import C0, SH_OFFSET
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.compressed_ply import unit_quats
-from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte
+from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.ply_table import LFS_POINTER
 

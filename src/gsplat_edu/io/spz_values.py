@@ -16,11 +16,10 @@ Source: load-spz.cc and the README of Niantic's spz library.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64, UInt8
+from jaxtyping import Float, Float32, Int64, UInt8
 
 from gsplat_edu.constants import SH_MAX_DEGREE
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import first_index
+from gsplat_edu.io.quantize import unit_quats
 
 MAX_FRACTIONAL_BITS = 24
 """Niantic's library refuses more."""
@@ -108,20 +107,6 @@ def write_smallest_three(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "
         ((largest << 30) | fields.sum(axis=1, keepdims=True)).astype("<u4").view(np.uint8)
     )
     return packed
-
-
-def unit_quats(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
-    """Return quaternions of length 1.
-
-    Raises:
-        ArgumentError: one has zero length.
-    """
-    largest = np.abs(quats.astype(np.float64)).max(axis=1, keepdims=True)
-    if not largest.all():
-        raise ArgumentError(f"quats{first_index(largest[:, 0] == 0)}: has zero length; remove that Gaussian")
-    scaled = quats / largest  # first, so that the norm neither over- nor underflows
-    unit: Float64[np.ndarray, "N 4"] = scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
-    return unit
 
 
 def read_colors(data: UInt8[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 1 3"]:

@@ -1,0 +1,148 @@
+"""Fixtures: scenes to look at, and a real browser that has no network."""
+
+import base64
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.viewer import page
+
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+PIXELS = """async (camera) => {
+  const { pixels } = await viewer.setCamera(camera);
+  const bytes = new Uint8Array(pixels.buffer);
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(text);
+}"""
+
+
+def described(camera):
+    """The camera as the page takes it."""
+    numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "H", "W")}
+    return {"R": camera.R.tolist(), "eye": camera.eye.tolist(), **numbers}
+
+
+class Visit:
+    """A page that somebody has opened; what went wrong in it is remembered."""
+
+    def __init__(self, tab):
+        self.tab = tab
+        self.complaints = []
+        self.requests = []
+        tab.on("console", lambda message: self.complaints.append(f"{message.type}: {message.text}"))
+        tab.on("pageerror", lambda error: self.complaints.append(str(error)))
+        tab.on("request", lambda request: self.requests.append(request.url))
+
+    def open(self, path):
+        self.tab.goto(path.as_uri())
+        return self
+
+    def ready(self):
+        self.tab.wait_for_selector("#message", state="hidden")
+        return self
+
+    def message(self, text):
+        """Wait for a message."""
+        self.tab.wait_for_selector(f"#message:has-text('{text}')")
+
+    def camera(self):
+        """The camera of the screen."""
+        found = self.tab.evaluate("viewer.camera()")
+        found.pop("name", None)
+        return Camera(**found)
+
+    def picture(self, camera):
+        """(H, W, 3) float32 as the page draws it."""
+        encoded = self.tab.evaluate(PIXELS, described(camera))
+        return np.frombuffer(base64.b64decode(encoded), "<f4").reshape(camera.H, camera.W, 3)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed")
+    with playwright.sync_playwright() as driver:
+        launched = driver.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield launched
+        launched.close()
+
+
+@pytest.fixture
+def visit(browser):
+    """Make tabs without a network; nothing may complain in them, and nothing may be fetched from anywhere."""
+    contexts, visits = [], []
+
+    def make(width=320, height=200, **options):
+        context = browser.new_context(viewport={"width": width, "height": height}, **options)
+        contexts.append(context)
+        context.set_offline(True)
+        visits.append(Visit(context.new_page()))
+        return visits[-1]
+
+    yield make
+    for context in contexts:
+        context.close()
+    for one in visits:
+        assert one.complaints == []
+        assert [url for url in one.requests if not url.startswith(("file:", "blob:", "data:"))] == []
+
+
+@pytest.fixture
+def show(visit, tmp_path):
+    """Write a page and open it."""
+
+    def make(gaussians, views=(), settings=None, **options):
+        path = tmp_path / "scene.html"
+        page.write(path, Scene(gaussians), views, settings)
+        return visit(**options).open(path).ready()
+
+    return make
+
+
+@pytest.fixture
+def random_gaussians():
+    """Make n random Gaussians around zero that store so many coefficients beyond the first."""
+
+    def make(n, rest=15, seed=0):
+        generator = torch.Generator().manual_seed(seed)
+
+        def normal(*shape):
+            return torch.randn(*shape, generator=generator)
+
+        return Gaussians(
+            means=0.6 * normal(n, 3),
+            quats=normal(n, 4),
+            log_scales=0.7 * normal(n, 3) - 3.2,
+            sh0=normal(n, 1, 3),
+            sh_rest=0.3 * normal(n, rest, 3),
+            logit_opacities=2.0 * normal(n),
+        )
+
+    return make
+
+
+@pytest.fixture
+def camera():
+    """A camera whose image is not square and whose principal point is not its middle."""
+    eye = (0.4, -0.6, -2.2)
+    return Camera(look_at(eye, (0.1, 0.0, 0.0)), eye, fx=230.0, fy=250.0, cx=150.3, cy=108.6, H=200, W=320)
+
+
+@pytest.fixture
+def three_views(camera):
+    """Named cameras around zero, of different sizes."""
+    named = [("first", camera)]
+    for name, eye, width in (("second", (2.0, -0.5, 0.3), 200), ("third <b>", (-1.0, -0.4, 2.0), 240)):
+        named.append(
+            (name, Camera(look_at(eye, (0.0, 0.0, 0.0)), eye, 180.0, 180.0, width / 2, 80.0, 160, width))
+        )
+    return named

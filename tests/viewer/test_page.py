@@ -1,0 +1,291 @@
+"""The file of a page: what is in it, and what comes back from it."""
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.viewer import page, page_data
+
+NASTY = 'a </script><script>alert(1)</script> {{facts}} "&" äöü 兎 🐕'
+
+
+class Elements(HTMLParser):
+    """The elements of a page with their attributes and texts, as a browser takes the file apart."""
+
+    def __init__(self, document):
+        super().__init__()
+        self.found = []
+        self.feed(document.decode("utf-8"))
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs), []))
+
+    def handle_data(self, data):
+        if self.found:
+            self.found[-1][2].append(data)
+
+    def texts(self, tag, **attributes):
+        return [
+            "".join(text)
+            for name, given, text in self.found
+            if name == tag and all(given.get(key) == value for key, value in attributes.items())
+        ]
+
+
+def facts_of(document):
+    (text,) = Elements(document).texts("script", id="facts")
+    return json.loads(text)
+
+
+def test_the_same_scene_gives_the_same_bytes(tmp_path, random_gaussians, three_views):
+    scene = Scene(random_gaussians(50), True, (0.0, 0.0, 1.0))
+    page.write(tmp_path / "new" / "a.html", scene, three_views)
+    again = page.html(Scene(random_gaussians(50), True, (0.0, 0.0, 1.0)), three_views, title="a")
+    assert (tmp_path / "new" / "a.html").read_bytes() == again
+
+
+@pytest.mark.parametrize("count", [0, 1, 9])
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+def test_a_scene_comes_back_within_the_steps_of_its_numbers(tmp_path, random_gaussians, count, rest):
+    gaussians = random_gaussians(count, rest)
+    page.write(tmp_path / "a.html", Scene(gaussians, None, None))
+    scene = page.read(tmp_path / "a.html")
+    assert (scene.antialiased, scene.up) == (None, None)
+    given, found = gaussians.tensors(), scene.gaussians.tensors()
+    assert all(tensor.dtype == torch.float32 and tensor.is_contiguous() for tensor in found.values())
+    for name in ("means", "log_scales"):
+        assert torch.equal(given[name], found[name])
+    unit = given["quats"] / given["quats"].norm(dim=1, keepdim=True)
+    # half a step of 1/32767, and float32's rounding of numbers up to 1
+    np.testing.assert_allclose(found["quats"], unit, rtol=0, atol=0.5 / 32767 + 2e-7)
+    for name in ("sh0", "sh_rest", "logit_opacities"):
+        # half floats have 11 bits: half a step is 2^-11 of the number, or 2^-25 where it is smaller than 2^-14
+        np.testing.assert_allclose(found[name], given[name], rtol=2**-11, atol=2**-25)
+
+
+@pytest.mark.parametrize("antialiased", [None, False, True])
+@pytest.mark.parametrize("up", [None, (0.6, 0.0, -0.8)])
+def test_what_else_the_scene_knows_comes_back(tmp_path, random_gaussians, antialiased, up):
+    page.write(tmp_path / "a.html", Scene(random_gaussians(2), antialiased, up))
+    scene = page.read(tmp_path / "a.html")
+    assert (scene.antialiased, scene.up) == (antialiased, up)
+
+
+def test_settings_left_out_are_those_of_a_scene_file(random_gaussians):
+    facts = facts_of(page.html(Scene(random_gaussians(2), True)))
+    assert facts["settings"] == {
+        "background": [0, 0, 0],
+        "sh_degree": 3,
+        "antialiased": True,
+        "jacobian_limit": 1.3,
+    }
+    chosen = RenderSettings(background=(1.0, 0.5, 0.0), sh_degree=2, jacobian_limit=None)
+    facts = facts_of(page.html(Scene(random_gaussians(2), True), settings=chosen))
+    assert facts["settings"] == {
+        "background": [1, 0.5, 0],
+        "sh_degree": 2,
+        "antialiased": False,
+        "jacobian_limit": None,
+    }
+
+
+def test_numbers_no_format_of_16_bits_holds(tmp_path):
+    gaussians = Gaussians(
+        means=torch.tensor([[1e300, -1e300, 0.0], [1.0, 2.0, 3.0]], dtype=torch.float64),
+        quats=torch.tensor([[0.0, 0, 0, 0], [1e-300, 1e-300, 0, 0]], dtype=torch.float64),
+        log_scales=torch.zeros(2, 3, dtype=torch.float64),
+        sh0=torch.full((2, 1, 3), 1e6, dtype=torch.float64),
+        sh_rest=torch.zeros(2, 0, 3, dtype=torch.float64),
+        logit_opacities=torch.tensor([1e9, -1e9], dtype=torch.float64),
+    ).trainable()
+    page.write(tmp_path / "a.html", Scene(gaussians))
+    found = page.read(tmp_path / "a.html").gaussians
+    assert torch.equal(found.quats[0], torch.zeros(4)), "no rotation: the page leaves it out, as the kernels do"
+    # half a step of 1/32767 of a component
+    np.testing.assert_allclose(found.quats[1], [0.5**0.5, 0.5**0.5, 0, 0], atol=0.5 / 32767 + 2e-7)
+    assert found.logit_opacities.tolist() == [65504, -65504] and float(found.sh0.max()) == 65504
+    assert float(found.means.abs().max()) == np.finfo(np.float32).max
+
+
+def test_what_is_not_finite_is_refused(tmp_path, random_gaussians):
+    gaussians = random_gaussians(3)
+    gaussians.means[1, 2] = float("nan")
+    with pytest.raises(ArgumentError, match="means"):
+        page.write(tmp_path / "a.html", Scene(gaussians))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_are_text_and_nothing_else(tmp_path, random_gaussians, camera):
+    document = page.html(Scene(random_gaussians(3)), [(NASTY, camera)], title=NASTY)
+    elements = Elements(document)
+    plain = Elements(page.html(Scene(random_gaussians(3)), [("a", camera)], title="a"))
+    assert [tag for tag, *_ in elements.found] == [tag for tag, *_ in plain.found]
+    assert elements.texts("title") == [NASTY]
+    facts = facts_of(document)
+    assert (facts["title"], facts["cameras"][0]["name"]) == (NASTY, NASTY)
+    (tmp_path / "a.html").write_bytes(document)
+    assert len(page.read(tmp_path / "a.html").gaussians) == 3
+
+
+def test_a_file_name_that_is_no_text(tmp_path, random_gaussians):
+    page.write(tmp_path / "a\udcff.html", Scene(random_gaussians(3)))
+    assert len(page.read(tmp_path / "a\udcff.html").gaussians) == 3
+
+
+def test_nothing_is_fetched_from_elsewhere(random_gaussians, three_views):
+    document = page.html(Scene(random_gaussians(3)), three_views)
+    elements = Elements(document)
+    for _, attributes, _ in elements.found:
+        assert not {"src", "href", "srcset", "action", "data"} & set(attributes)
+    text = document.decode()
+    assert not re.search(r"https?:|//[a-z]+\.|@import|url\(|import\(|fetch\(|eval\(|innerHTML", text)
+    (policy,) = [
+        attributes["content"]
+        for tag, attributes, _ in elements.found
+        if attributes.get("http-equiv") == "Content-Security-Policy"
+    ]
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    assert (rules["default-src"], rules["worker-src"]) == ("'none'", "blob:")
+
+    def hashes(texts):
+        digests = [hashlib.sha256(text.encode()).digest() for text in texts]
+        return [f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests]
+
+    assert rules["script-src"].split() == hashes(elements.texts("script", type=None))
+    assert rules["style-src"].split() == hashes(elements.texts("style"))
+
+
+def test_splats_go_into_pieces_that_read_joins(tmp_path, monkeypatch, random_gaussians):
+    monkeypatch.setattr(page, "PIECE", 300)
+    gaussians = random_gaussians(20)
+    page.write(tmp_path / "a.html", Scene(gaussians))
+    pieces = Elements((tmp_path / "a.html").read_bytes()).texts("script", **{"class": "splats"})
+    assert len(pieces) > 5
+    joined = gzip.decompress(b"".join(base64.b64decode(piece.strip()) for piece in pieces))
+    assert len(joined) == page_data.size(20, 3)
+    assert torch.equal(page.read(tmp_path / "a.html").gaussians.means, gaussians.means)
+
+
+def refused(path):
+    with pytest.raises(SceneFormatError) as caught:
+        page.read(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    return message
+
+
+@pytest.fixture
+def whole(random_gaussians):
+    return page.html(Scene(random_gaussians(9)))
+
+
+def test_every_cut_is_told(tmp_path, whole):
+    path = tmp_path / "a.html"
+    splats = whole.index(page.SPLATS_OPEN)
+    last = whole.index(page.CLOSE, splats)
+    for length in [*range(0, splats, 997), *range(splats, last, 41), last - 4, last - 1]:
+        path.write_bytes(whole[:length])
+        refused(path)
+
+
+def test_every_changed_byte_of_the_splats_is_told(tmp_path, whole):
+    path = tmp_path / "a.html"
+    begin = whole.index(page.SPLATS_OPEN) + len(page.SPLATS_OPEN)
+    end = whole.index(page.CLOSE, begin)
+    # the gzip header's first 10 bytes say nothing of the contents, beyond the first 4 of them
+    for at in [0, 3, *range(20, end - begin - 3, 13)]:
+        changed = bytearray(whole)
+        changed[begin + at] = ord("A") if changed[begin + at] != ord("A") else ord("B")
+        path.write_bytes(changed)
+        assert "splats are" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (b'<script type="application/json" id="facts">', b"<p>", "is no page of this package"),
+        (b'"format":"gsplat-edu page"', b'"format":"another page"', "its facts are damaged"),
+        (b'"format":"gsplat-edu page"', b'"format"', "its facts are damaged"),
+        (b'{"format"', b"[" * 100_000, "its facts are damaged"),
+        (b'"version":1', b'"version":7', "is a page of version 7"),
+        (b'"count":9', b'"count":-9', "its fact 'count' is missing or wrong"),
+        (b'"count":9', b'"count":true', "its fact 'count' is missing or wrong"),
+        (b'"count":9', b'"number":9', "its fact 'count' is missing or wrong"),
+        (b'"count":9', b'"count":8', "splats are cut off or damaged"),
+        (b'"count":9', b'"count":10', "splats are cut off or damaged"),
+        (b'"count":9', b'"count":9000000000', "says it holds"),
+        (b'"count":9', b'"count":' + b"9" * 5000, "its facts are damaged"),
+        (b'"sh_degree":3', b'"sh_degree":4', "its fact 'sh_degree' is missing or wrong"),
+        (b'"antialiased":null', b'"antialiased":1', "its fact 'antialiased' is missing or wrong"),
+        (b'"up":null', b'"up":[0,0,0]', "its fact 'up' is missing or wrong"),
+        (b'"up":null', b'"up":[0,0,NaN]', "its fact 'up' is missing or wrong"),
+        (b'"up":null', b'"up":[0,0,1' + b"0" * 400 + b"]", "its fact 'up' is missing or wrong"),
+    ],
+)
+def test_damage_is_named(tmp_path, whole, old, new, says):
+    path = tmp_path / "a.html"
+    assert old in whole
+    path.write_bytes(whole.replace(old, new, 1))
+    assert says in refused(path)
+
+
+def test_what_is_no_page(tmp_path):
+    path = tmp_path / "a.html"
+    for content in (b"", b"<!DOCTYPE html><p>hello</p>", bytes(range(256)) * 40):
+        path.write_bytes(content)
+        assert "is no page of this package" in refused(path)
+    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    assert "is a Git LFS pointer" in refused(path)
+    with pytest.raises(FileNotFoundError):
+        page.read(tmp_path / "none.html")
+
+
+def test_numbers_that_are_not_finite_are_counted(tmp_path, whole):
+    begin = whole.index(page.SPLATS_OPEN) + len(page.SPLATS_OPEN)
+    end = whole.index(page.CLOSE, begin)
+    data = bytearray(gzip.decompress(base64.b64decode(whole[begin:end])))
+    data[12:16] = np.float32(np.nan).tobytes()
+    path = tmp_path / "a.html"
+    path.write_bytes(whole[:begin] + base64.b64encode(gzip.compress(data)) + whole[end:])
+    assert "1 splats have a NaN or infinite number" in refused(path)
+
+
+def test_a_bomb_is_not_inflated(tmp_path, whole):
+    begin = whole.index(page.SPLATS_OPEN) + len(page.SPLATS_OPEN)
+    end = whole.index(page.CLOSE, begin)
+    path = tmp_path / "a.html"
+    path.write_bytes(whole[:begin] + base64.b64encode(gzip.compress(bytes(50_000_000))) + whole[end:])
+    assert "splats are cut off or damaged" in refused(path)
+
+
+@pytest.mark.parametrize("gaussians", [0, 1, 40])
+@pytest.mark.parametrize("up", [None, (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+def test_the_start_looks_at_the_scene_with_up_upwards(random_gaussians, gaussians, up):
+    start = facts_of(page.html(Scene(random_gaussians(gaussians), up=up)))["start"]
+    assert start["up"] == list(up or (0, -1, 0))
+    R, eye = np.array(start["camera"]["R"]), np.array(start["camera"]["eye"])
+    if gaussians:
+        assert -R[1] @ start["up"] > 0.9  # an orbit stands 15 degrees above the horizon
+    x, y, z = R @ (np.array(start["pivot"]) - eye)
+    assert z > 0 and abs(x) < 1e-6 * z and abs(y) < 1e-6 * z
+
+
+def test_the_start_is_the_first_camera(random_gaussians, three_views, camera):
+    facts = facts_of(page.html(Scene(random_gaussians(30)), three_views))
+    assert facts["start"]["camera"] == {k: v for k, v in facts["cameras"][0].items() if k != "name"}
+    assert facts["start"]["camera"]["eye"] == camera.eye.tolist()
+    assert [one["name"] for one in facts["cameras"]] == [name for name, _ in three_views]
+    # the cameras look at points at most 0.1 apart
+    assert np.abs(facts["start"]["pivot"]).max() < 0.2
