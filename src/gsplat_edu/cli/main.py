@@ -16,6 +16,7 @@ COMMANDS = {
     "eval": "score a run's latest scene on its test and training views, and write metrics, renders and a report",
     "render": "render a run or a scene file: an orbit as a video, or what the dataset's cameras see",
     "convert": "write a scene in another format, or as a page that draws it; filter, move, join, and check it",
+    "view": "show a scene or a run in the browser",
     "info": "say what a dataset, a run or a scene file holds, on one screen",
 }
 """Commands and what they do; each is a module `gsplat_edu.cli.NAME` with EXAMPLE, add_arguments and run."""

@@ -5,7 +5,8 @@ opacities): x y z, nx ny nz (zero), f_dc_0..2, f_rest_* channel by channel, opac
 (w, x, y, z). A scene of SH degree 0 has no f_rest. Axes are those of the scene: nothing is flipped.
 
 Read by the names of the properties: in any order, of any number type, with properties and elements that are not ours
-left aside, binary of either byte order or ASCII. An infinite logit of an opacity is opaque, or not there. A file whose splats are packed as SuperSplat packs them is read too.
+left aside, binary of either byte order or ASCII. A logit that is infinite is an opacity of 0 or 1. A file whose splats
+are packed as SuperSplat packs them is read too.
 
 What the format has no property for stands in comments: see `gsplat_edu.io.ply_comments`.
 
