@@ -137,10 +137,7 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
         groups = (MEANS, SH0, _rest_names(rest), OPACITY, SCALES, QUATS)
         columns = [name for group in groups for name in group]
         table = read_rows(path, file, header, vertex)
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # a double beyond float32 becomes infinite, told of below
-        values = structured_to_unstructured(table[columns], dtype=np.float32)
+    values = _floats(table, columns)
     opacity = values[:, columns.index(OPACITY[0])]
     np.copyto(opacity, np.copysign(LARGEST_LOGIT, opacity), where=np.isinf(opacity))
     if finite:
@@ -157,6 +154,20 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
         sh_rest=_tensor(np.moveaxis(sh_rest.reshape(len(values), 3, rest // 3), 1, 2)),
         logit_opacities=_tensor(opacity[:, 0]),
     )
+
+
+def _floats(table: np.ndarray, columns: list[str]) -> Float32[np.ndarray, "N P"]:
+    """Return columns of a table as float32."""
+    names, native = list(table.dtype.names or ()), np.dtype(np.float32)
+    if all(
+        table.dtype[name] == native for name in names
+    ):  # as most files are: one copy, of all columns at once
+        places = [names.index(name) for name in columns]
+        return np.take(table.view(native).reshape(len(table), len(names)), places, axis=1)
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # a double beyond float32 becomes infinite, told of later
+        return structured_to_unstructured(table[columns], dtype=np.float32)
 
 
 def _rest_names(count: int) -> tuple[str, ...]:
