@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.cli.exporting import check_and_say
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.metrics import ImageScore
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
@@ -104,28 +104,10 @@ def run(arguments: argparse.Namespace) -> None:
         bar.update(steps, description=f"writing {arguments.out}")
         export.write(arguments.out, source)
         bar.advance(steps)
-        count = len(source.scene.gaussians)
-        say(f"wrote {arguments.out}: {count:,} splats, SH degree {source.scene.gaussians.sh_degree}")
+        count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
+        say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}")
         if arguments.verify:
-            check_and_say([arguments.out], source, backend, bar, say)
-
-
-def check_and_say(
-    paths: Sequence[Path], source: Source, backend: str, bar: Progress, say: Callable[[str], None]
-) -> list[export.Exported]:
-    """Check files against what was written to them; say a line for each."""
-    found = []
-    views = len(source.probes(export.VIEWS, export.SIDE))
-    for path in paths:
-        task = bar.add_task(f"checking {path}", total=views)
-        found.append(export.check(path, source, backend, functools.partial(_advance, bar, task)))
-        bar.remove_task(task)
-        say(found[-1].line())
-    return found
-
-
-def _advance(bar: Progress, task: TaskID, score: ImageScore) -> None:
-    bar.advance(task)
+            check_and_say(arguments.out, source, backend, bar, say)
 
 
 def _edited(source: Source, keep: Filter, move: Similarity) -> Source:

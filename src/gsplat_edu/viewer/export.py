@@ -102,6 +102,12 @@ def losses(path: Path, scene: Scene) -> list[str]:
     return [] if path.suffix.lower() == PAGE else formats.losses(path, scene)
 
 
+def kept_degree(path: Path, scene: Scene) -> int:
+    """Return the highest degree of harmonics of a scene that a file of that name holds."""
+    degree = scene.gaussians.sh_degree
+    return degree if path.suffix.lower() == PAGE else min(degree, format_of(path).sh_degree)
+
+
 def read_back(path: Path) -> Scene:
     """Read what `write` wrote.
 

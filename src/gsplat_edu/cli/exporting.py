@@ -1,0 +1,42 @@
+"""What `convert` and `train` share: writing scenes in other formats, and saying what the files show."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress, TaskID
+
+from gsplat_edu.evaluate.metrics import ImageScore
+from gsplat_edu.runs.source import Source
+from gsplat_edu.viewer import export
+
+
+def check_and_say(
+    path: Path, source: Source, backend: str, bar: Progress, say: Callable[[str], None]
+) -> export.Exported:
+    """Check a file against what was written to it, and say what came out in a line."""
+    task = bar.add_task(f"checking {path}", total=len(source.probes(export.VIEWS, export.SIDE)))
+    found = export.check(path, source, backend, functools.partial(_advance, bar, task))
+    bar.remove_task(task)
+    say(found.line())
+    return found
+
+
+def export_all(
+    paths: Sequence[Path], bar: Progress, backend: str, say: Callable[[str], None], source: Source
+) -> list[dict[str, Any]]:
+    """Write a scene to every path, check each, and return what metrics.json holds of them."""
+    written = []
+    for path in paths:
+        for note in export.losses(path, source.scene):
+            say(note)
+        export.write(path, source)
+        written.append(check_and_say(path, source, backend, bar, say).document())
+    return written
+
+
+def _advance(bar: Progress, task: TaskID, score: ImageScore) -> None:
+    bar.advance(task)
