@@ -50,7 +50,7 @@ class Visit:
 
     def message(self, text):
         """Wait for a message."""
-        self.tab.wait_for_selector(f"#message:has-text('{text}')")
+        self.tab.wait_for_selector(f'#message:has-text("{text}")')
 
     def camera(self):
         """The camera of the screen."""

@@ -186,7 +186,7 @@ def _counted(counter: Counter[str], most: int = 3) -> str:
 
 
 def _bounds(points: Float[np.ndarray, "N 3"]) -> str:
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = points.min(axis=0) + 0.0, points.max(axis=0) + 0.0  # no -0
     return ", ".join(f"{n} {a:.4g} to {b:.4g}" for n, a, b in zip("xyz", low, high, strict=True))
 
 

@@ -1,0 +1,284 @@
+"""A scene as one HTML file that draws it in any browser with WebGL2, from disk and without a network.
+
+The file holds, in this order: our style, shaders and scripts (`viewer/web`), the facts of the scene as JSON, and the
+splats (`viewer/page_data.py`), gzip'ed and in base64, cut into elements that a browser can take one after another. Its
+Content-Security-Policy allows these scripts by their hashes and nothing from elsewhere.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import html as html_text
+import json
+import math
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu import constants
+from gsplat_edu.camera import Camera
+from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.files import written_aside
+from gsplat_edu.io.quantize import check_expansion
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.source import NamedCamera, file_settings
+from gsplat_edu.viewer import page_data
+from gsplat_edu.viewer.page_start import start_of
+
+FORMAT = "gsplat-edu page"
+VERSION = 1
+
+SCRIPTS = ("scene.js", "camera.js", "draw.js", "sorter.js", "controls.js", "panel.js", "main.js")
+"""Scripts of the page, in the order in which they are loaded: they share one scope."""
+
+SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
+
+SHADER_CONSTANTS = (
+    "DILATION",
+    "ALPHA_MIN",
+    "ALPHA_MAX",
+    "Z_NEAR",
+    "COLOR_LIMIT",
+    "DET_FLOOR",
+    "SH_OFFSET",
+    "C0",
+    "C1",
+    "C2",
+    "C3",
+)
+"""Names of `gsplat_edu.constants` that shaders use."""
+
+FINITE = 3e38
+"""What is larger than this in a shader counts as infinite: float32 ends at 3.4e38."""
+
+PIECE = 12 << 20
+"""Bytes of compressed splats in an element, a multiple of 3 so that the base64 of one goes on in the next."""
+
+FACTS_OPEN, SPLATS_OPEN, CLOSE = (
+    b'<script type="application/json" id="facts">',
+    b'<script type="application/octet-stream;base64" class="splats">',
+    b"</script>",
+)
+
+
+def write(
+    path: Path, scene: Scene, views: Sequence[NamedCamera] = (), settings: RenderSettings | None = None
+) -> None:
+    """Write the page; the file's name without its suffix is the title.
+
+    Args:
+        path: The file; parent folders are made.
+        scene: The scene; it may be empty.
+        views: Name and camera of each place to look from; the page begins at the first one.
+        settings: How to draw; as scene files are drawn where None (`gsplat_edu.runs.source.file_settings`).
+
+    Raises:
+        ArgumentError: a parameter is NaN or infinite.
+        OSError: the file cannot be written. What stood there before is untouched.
+    """
+    pieces = _pieces(path.stem, scene, views, settings)
+    with written_aside(path) as aside, aside.open("wb") as file:
+        file.writelines(pieces)
+
+
+def html(
+    scene: Scene,
+    views: Sequence[NamedCamera] = (),
+    settings: RenderSettings | None = None,
+    title: str = "scene",
+) -> bytes:
+    """Return the page as `write` writes it.
+
+    Args:
+        scene: As for `write`.
+        views: As for `write`.
+        settings: As for `write`.
+        title: What stands above the picture.
+
+    Raises:
+        ArgumentError: a parameter is NaN or infinite.
+    """
+    return b"".join(_pieces(title, scene, views, settings))
+
+
+def read(path: Path) -> Scene:
+    """Read the scene back that a page draws: positions and scales to the bit, the rest as the page has it.
+
+    Args:
+        path: The file.
+
+    Raises:
+        SceneFormatError: it is no page of ours, or damaged.
+        OSError: it cannot be read.
+    """
+    data = path.read_bytes()
+    if data.startswith(b"version https://git-lfs"):
+        raise SceneFormatError(f"{path}: is a Git LFS pointer, not a page; fetch it with: git lfs pull")
+    facts = _read_facts(path, data)
+    count, sh_degree = facts["count"], facts["sh_degree"]
+    claimed = page_data.size(count, sh_degree)
+    check_expansion(path, claimed, len(data))
+    splats = _inflated(path, data, claimed)
+    up = facts["up"]
+    return Scene(
+        page_data.unpacked(path, splats, count, sh_degree),
+        facts["antialiased"],
+        None if up is None else tuple(up),
+    )
+
+
+def _pieces(
+    title: str, scene: Scene, views: Sequence[NamedCamera], settings: RenderSettings | None
+) -> Iterator[bytes]:
+    """Yield the file, so that its parts need not be in memory together."""
+    scene.gaussians.check_finite()
+    facts = _facts(title, scene, views, settings or file_settings(scene))
+    head, tail = _web("index.html").split("{{splats}}\n")
+    yield _filled(head, title, facts).encode("utf-8", errors="replace")  # a file's name may be no text at all
+    compressed = memoryview(gzip.compress(page_data.packed(scene.gaussians), 6, mtime=0))
+    for begin in range(0, len(compressed), PIECE):
+        yield SPLATS_OPEN + base64.b64encode(compressed[begin : begin + PIECE]) + CLOSE + b"\n"
+    yield tail.encode("utf-8")
+
+
+def _facts(
+    title: str, scene: Scene, views: Sequence[NamedCamera], settings: RenderSettings
+) -> dict[str, Any]:
+    start = start_of(scene, [camera for _, camera in views])
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "title": title,
+        "count": len(scene.gaussians),
+        "sh_degree": scene.gaussians.sh_degree,
+        "antialiased": scene.antialiased,
+        "up": None if scene.up is None else [float(x) for x in scene.up],
+        "settings": {
+            "background": [float(x) for x in settings.background],
+            "sh_degree": int(settings.sh_degree),
+            "antialiased": bool(settings.antialiased),
+            "jacobian_limit": None if settings.jacobian_limit is None else float(settings.jacobian_limit),
+        },
+        "near": constants.Z_NEAR,
+        "start": {
+            "camera": _camera(start.camera),
+            "pivot": start.pivot.tolist(),
+            "up": start.up.tolist(),
+        },
+        "cameras": [{"name": name, **_camera(camera)} for name, camera in views],
+    }
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "H", "W")}
+    return {"R": camera.R.tolist(), "eye": camera.eye.tolist(), **numbers}
+
+
+def _filled(template: str, title: str, facts: dict[str, Any]) -> str:
+    """Fill in what stands before the splats."""
+    style = _web("style.css")
+    scripts = [_web(name) for name in SCRIPTS]
+    texts = {
+        "title": html_text.escape(title),
+        "policy": f"default-src 'none'; script-src {' '.join(map(_hash, scripts))}; style-src {_hash(style)};"
+        " worker-src blob:; base-uri 'none'; form-action 'none'",
+        "style": style,
+        # "<" as an escape: no text in JSON can end the element that it stands in
+        "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        "shaders": "\n".join(_text_element(name, _shader(name)) for name in SHADERS),
+        "worker": _text_element("sort-worker", _web("sort_worker.js")),
+        "scripts": "\n".join(f"<script>{script}</script>" for script in scripts),
+    }
+    # one pass over the template alone: what looks like a name inside a text stays as it is
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], template)
+
+
+def _text_element(name: str, text: str) -> str:
+    return f'<script type="text/plain" id="{name}">{text}</script>'
+
+
+def _web(name: str) -> str:
+    return (files("gsplat_edu.viewer") / "web" / name).read_text("utf-8")
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _shader(name: str) -> str:
+    """Return a shader of ours, with the renderer's constants in front."""
+    lines = ["#version 300 es", "precision highp float;", f"const float FINITE = {FINITE!r};"]
+    for constant in SHADER_CONSTANTS:
+        value = getattr(constants, constant)
+        if isinstance(value, tuple):
+            kind = f"float[{len(value)}]"
+            lines.append(f"const {kind} {constant} = {kind}({', '.join(map(repr, value))});")
+        else:
+            lines.append(f"const float {constant} = {value!r};")
+    return "\n".join([*lines, _web(f"{name}.glsl")])
+
+
+def _read_facts(path: Path, data: bytes) -> dict[str, Any]:
+    """Return the facts of a page, those that `read` uses checked."""
+    begin = data.find(FACTS_OPEN) + len(FACTS_OPEN)
+    end = data.find(CLOSE, begin)
+    if begin < len(FACTS_OPEN) or end < 0:
+        raise SceneFormatError(f"{path}: is no page of this package, or cut off; export the page again")
+    try:
+        facts = json.loads(data[begin:end])
+    except (ValueError, RecursionError):
+        facts = None
+    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+        raise SceneFormatError(f"{path}: its facts are damaged; export the page again")
+    if facts.get("version") != VERSION:
+        raise SceneFormatError(
+            f"{path}: is a page of version {facts.get('version')!r}, read is {VERSION}; export it again"
+        )
+    count, degree, antialiased, up = (
+        facts.get(name, "missing") for name in ("count", "sh_degree", "antialiased", "up")
+    )
+    for name, fits in {
+        "count": type(count) is int and count >= 0,
+        "sh_degree": type(degree) is int and 0 <= degree <= constants.SH_MAX_DEGREE,
+        "antialiased": antialiased is None or isinstance(antialiased, bool),
+        "up": up is None or _is_direction(up),
+    }.items():
+        if not fits:
+            raise SceneFormatError(f"{path}: its fact '{name}' is missing or wrong; export the page again")
+    return facts
+
+
+def _is_direction(value: object) -> bool:
+    if not (isinstance(value, list) and len(value) == 3 and all(type(x) in (int, float) for x in value)):
+        return False
+    return all(abs(x) <= 1.001 for x in value) and abs(math.hypot(*value) - 1.0) < 1e-3
+
+
+def _inflated(path: Path, data: bytes, size: int) -> bytes:
+    """Return the splats' bytes: exactly so many, or an error."""
+    inflater = zlib.decompressobj(wbits=31)
+    pieces = []
+    room = size + 1  # one more than there may be, so that more is noticed; and zlib takes 0 for no limit
+    begin = data.find(SPLATS_OPEN)
+    try:
+        while begin >= 0:
+            begin += len(SPLATS_OPEN)
+            end = data.find(CLOSE, begin)
+            packed = base64.b64decode(memoryview(data)[begin : end if end >= 0 else len(data)], validate=True)
+            while packed and room:
+                piece = inflater.decompress(packed, room)
+                pieces.append(piece)
+                room -= len(piece)
+                packed = inflater.unconsumed_tail
+            begin = data.find(SPLATS_OPEN, begin)
+    except (zlib.error, ValueError):  # binascii's error is a ValueError
+        raise SceneFormatError(f"{path}: its splats are damaged; export the page again") from None
+    if room != 1 or not inflater.eof:
+        raise SceneFormatError(f"{path}: its splats are cut off or damaged; export the page again")
+    return b"".join(pieces)

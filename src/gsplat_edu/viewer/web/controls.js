@@ -1,0 +1,120 @@
+// Mouse, fingers and keys move the view.
+"use strict";
+
+const TURN = Math.PI; // radians for a drag across the shorter side of the window
+const WHEEL = 0.0015; // logarithm of the distance per pixel of scrolling
+const LINE = 16; // pixels, where a wheel counts in lines
+const PINCH = 8; // a pinch on a touchpad comes as a slow wheel with Ctrl
+const PACE = 0.5; // of the start's distance, per second
+const HURRY = 4; // with Shift
+
+// Along (right, down, forward).
+const STEPS = {
+  KeyW: [0, 0, 1],
+  KeyS: [0, 0, -1],
+  KeyA: [-1, 0, 0],
+  KeyD: [1, 0, 0],
+  KeyQ: [0, 1, 0],
+  KeyE: [0, -1, 0],
+};
+
+class Controls {
+  // actions: moved() after every move, awake() where a held key is about to move, shown() for the camera on the screen,
+  // and what keys ask for: fly(), reset(), help(), step(by).
+  constructor(canvas, view, actions) {
+    Object.assign(this, { canvas, view, actions, flying: false, pointers: new Map(), held: new Set(), hurried: false });
+    canvas.addEventListener("pointerdown", (event) => this.press(event));
+    canvas.addEventListener("pointermove", (event) => this.drag(event));
+    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => this.release(event));
+    canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    addEventListener("keydown", (event) => this.keyDown(event));
+    addEventListener("keyup", (event) => this.keyUp(event));
+    addEventListener("blur", () => this.held.clear()); // nobody tells a page of keys let go elsewhere
+  }
+
+  press(event) {
+    this.canvas.focus();
+    this.canvas.setPointerCapture(event.pointerId);
+    const pans = event.button !== 0 || event.shiftKey;
+    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, pans });
+    event.preventDefault();
+  }
+
+  release(event) {
+    this.pointers.delete(event.pointerId);
+  }
+
+  drag(event) {
+    const pointer = this.pointers.get(event.pointerId);
+    if (!pointer) return;
+    const before = this.grip();
+    [pointer.x, pointer.y] = [event.clientX, event.clientY];
+    const after = this.grip();
+    const [dx, dy] = [after.x - before.x, after.y - before.y];
+    if (this.pointers.size > 1 || pointer.pans) this.pan(dx, dy);
+    else this.turn(dx, dy);
+    if (before.span && after.span) this.zoom(before.span / after.span);
+    this.actions.moved();
+  }
+
+  // Middle of the fingers, and how far apart two are.
+  grip() {
+    const [a, b = a] = this.pointers.values();
+    return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, span: Math.hypot(a.x - b.x, a.y - b.y) };
+  }
+
+  turn(dx, dy) {
+    const angle = TURN / Math.min(this.canvas.clientWidth, this.canvas.clientHeight);
+    if (this.flying) this.view.look(dx * angle, dy * angle);
+    else this.view.orbit(dx * angle, dy * angle);
+  }
+
+  pan(dx, dy) {
+    const dense = this.canvas.width / this.canvas.clientWidth;
+    this.view.pan(dx * dense, dy * dense, this.actions.shown());
+  }
+
+  wheel(event) {
+    event.preventDefault();
+    const units = [1, LINE, this.canvas.clientHeight][event.deltaMode] * (event.ctrlKey ? PINCH : 1);
+    this.zoom(Math.exp(WHEEL * units * event.deltaY));
+    this.actions.moved();
+  }
+
+  // Whoever flies is not held back by the point ahead.
+  zoom(factor) {
+    if (this.flying) this.view.move([0, 0, (1 - factor) * this.view.distance]);
+    else this.view.zoom(factor);
+  }
+
+  keyDown(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+    this.hurried = event.shiftKey;
+    const action = {
+      f: () => this.actions.fly(),
+      r: () => this.actions.reset(),
+      h: () => this.actions.help(),
+      arrowleft: () => this.actions.step(-1),
+      arrowright: () => this.actions.step(1),
+    }[event.key.toLowerCase()];
+    if (event.code in STEPS) {
+      this.held.add(event.code);
+      this.actions.awake();
+    } else if (action) action();
+    else return;
+    event.preventDefault();
+  }
+
+  keyUp(event) {
+    this.hurried = event.shiftKey;
+    this.held.delete(event.code);
+  }
+
+  // Moves as the held keys say; returns whether there are any.
+  advance(seconds) {
+    const length = PACE * this.view.pace * seconds * (this.hurried ? HURRY : 1);
+    for (const code of this.held) this.view.move(STEPS[code].map((step) => step * length));
+    return this.held.size > 0;
+  }
+}

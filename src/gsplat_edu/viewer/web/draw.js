@@ -1,0 +1,180 @@
+// Drawing with WebGL2: the splats, far to near, into an image of half floats, and that image onto the canvas.
+//
+// Eight bits are too few to blend a hundred faint splats into: each rounding would show. The renderer may stop where
+// less than 1e-4 of the light is left; here nothing stops, which nobody can see.
+"use strict";
+
+class Renderer {
+  constructor(canvas, splats, facts) {
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+    if (!gl) throw new Error("This page needs WebGL2, which this browser lacks or has switched off.");
+    if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
+      throw new Error("This page needs images of half floats, which this graphics processor cannot draw into.");
+    }
+    this.gl = gl;
+    this.facts = facts;
+    this.count = 0;
+    this.program = linked(gl, "splat");
+    this.screen = linked(gl, "screen");
+    this.textureWidth = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.textures = layout(facts).map((part) => this.uploaded(part, splats[part.name]));
+    this.image = null;
+    this.framebuffer = gl.createFramebuffer();
+    this.setUpOrder();
+    if (gl.getError() !== gl.NO_ERROR) throw new Error("This scene does not fit into the graphics processor's memory.");
+    gl.disable(gl.DITHER);
+  }
+
+  // Puts an array into a texture, row by row.
+  uploaded({ channels, texels, type }, values) {
+    const gl = this.gl;
+    const [stored, format, kind] = {
+      [`${Float32Array.name}3`]: [gl.RGB32F, gl.RGB, gl.FLOAT],
+      [`${Int16Array.name}4`]: [gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT],
+      [`${Uint16Array.name}3`]: [gl.RGB16F, gl.RGB, gl.HALF_FLOAT],
+      [`${Uint16Array.name}1`]: [gl.R16F, gl.RED, gl.HALF_FLOAT],
+    }[`${type.name}${channels}`];
+    const width = this.textureWidth;
+    const used = this.facts.count * texels;
+    const height = Math.max(1, Math.ceil(used / width));
+    if (height > width) throw new Error("This scene has more splats than this graphics processor's textures can hold.");
+    const texture = nearestTexture(gl);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, stored, width, height);
+    const full = Math.floor(used / width);
+    const rest = used % width;
+    const split = full * width * channels;
+    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, full, format, kind, values.subarray(0, split));
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, kind, values.subarray(split));
+    return texture;
+  }
+
+  // The order is an attribute that advances by one per splat.
+  setUpOrder() {
+    const gl = this.gl;
+    this.vertices = gl.createVertexArray();
+    this.orderBuffer = gl.createBuffer();
+    gl.bindVertexArray(this.vertices);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.facts.count, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    gl.bindVertexArray(null);
+  }
+
+  setOrder(order) {
+    const gl = this.gl;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
+    this.count = order.length;
+  }
+
+  // Makes the image that is drawn into, where its size has changed.
+  resize(width, height) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    if (this.image && this.width === width && this.height === height) return;
+    gl.deleteTexture(this.image);
+    this.image = nearestTexture(gl);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.image, 0);
+    [this.width, this.height] = [width, height];
+  }
+
+  // Draws the splats in the order that was set: image = alpha colour + (1 - alpha) image, at first the background.
+  draw(camera, settings) {
+    const gl = this.gl;
+    this.resize(camera.W, camera.H);
+    gl.viewport(0, 0, camera.W, camera.H);
+    gl.clearBufferfv(gl.COLOR, 0, [...settings.background, 1]);
+    gl.useProgram(this.program);
+    this.setUniforms(camera, settings);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this.vertices);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.bindVertexArray(null);
+  }
+
+  setUniforms(camera, settings) {
+    const gl = this.gl;
+    const place = (name) => gl.getUniformLocation(this.program, name);
+    layout(this.facts).forEach(({ name }, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, this.textures[unit]);
+      gl.uniform1i(place(name), unit);
+    });
+    const { low, high } = ratioBounds(camera, settings.jacobian_limit);
+    gl.uniform1i(place("texture_width"), this.textureWidth);
+    gl.uniform1i(place("coefficients"), (this.facts.sh_degree + 1) ** 2);
+    gl.uniform1i(place("degree"), Math.min(settings.sh_degree, this.facts.sh_degree));
+    gl.uniform1i(place("antialiased"), settings.antialiased ? 1 : 0);
+    gl.uniformMatrix3fv(place("R"), true, camera.R.flat());
+    gl.uniform3fv(place("eye"), camera.eye);
+    gl.uniform2f(place("focal"), camera.fx, camera.fy);
+    gl.uniform2f(place("middle"), camera.cx, camera.cy);
+    gl.uniform2f(place("size"), camera.W, camera.H);
+    gl.uniform2fv(place("ratio_low"), low);
+    gl.uniform2fv(place("ratio_high"), high);
+  }
+
+  // Copies the image onto the canvas.
+  show() {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.disable(gl.BLEND);
+    gl.useProgram(this.screen);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.image);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Gives the image as float32, RGB, first row on top.
+  pixels() {
+    const gl = this.gl;
+    const { width, height } = this;
+    const rgba = new Float32Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, rgba);
+    const rgb = new Float32Array(3 * width * height);
+    for (let y = 0, to = 0; y < height; ++y) {
+      for (let from = 4 * width * (height - 1 - y); to < 3 * width * (y + 1); from += 4, to += 3) {
+        rgb.set(rgba.subarray(from, from + 3), to);
+      }
+    }
+    return rgb;
+  }
+}
+
+function nearestTexture(gl) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  for (const [name, value] of [
+    [gl.TEXTURE_MIN_FILTER, gl.NEAREST],
+    [gl.TEXTURE_MAG_FILTER, gl.NEAREST],
+    [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE],
+    [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
+  ]) {
+    gl.texParameteri(gl.TEXTURE_2D, name, value);
+  }
+  return texture;
+}
+
+function linked(gl, name) {
+  const program = gl.createProgram();
+  for (const [stage, type] of [
+    ["vert", gl.VERTEX_SHADER],
+    ["frag", gl.FRAGMENT_SHADER],
+  ]) {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, document.getElementById(`${name}.${stage}`).textContent.trim());
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+    const log = gl.getShaderInfoLog(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`${name}.${stage}: ${log}`);
+  }
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(`${name}: ${gl.getProgramInfoLog(program)}`);
+  return program;
+}

@@ -1,0 +1,74 @@
+// What stands around the picture: facts, buttons, the capture's cameras, messages.
+"use strict";
+
+const element = (id) => document.getElementById(id);
+
+function say(text) {
+  element("message").textContent = text;
+  element("message").hidden = !text;
+}
+
+class Panel {
+  // actions: fly(), reset(), goTo(index), degree(value).
+  constructor(facts, actions) {
+    this.facts = facts;
+    const splats = facts.count === 1 ? "1 splat" : `${facts.count.toLocaleString("en")} splats`;
+    element("count").textContent = splats;
+    element("fly").addEventListener("click", () => actions.fly());
+    element("reset").addEventListener("click", () => actions.reset());
+    element("help-button").addEventListener("click", () => this.help());
+    this.fillDegrees(actions);
+    this.fillCameras(actions);
+    this.atRest();
+  }
+
+  fillDegrees(actions) {
+    const select = element("degree");
+    for (let degree = 0; degree <= this.facts.sh_degree; ++degree) select.add(new Option(degree, degree));
+    select.value = Math.min(this.facts.settings.sh_degree, this.facts.sh_degree);
+    select.addEventListener("change", () => {
+      actions.degree(Number(select.value));
+      select.blur(); // it would keep the keys to itself
+    });
+  }
+
+  fillCameras(actions) {
+    const { cameras } = this.facts;
+    element("cameras").hidden = cameras.length === 0;
+    element("cameras").querySelector("summary").textContent = `cameras (${cameras.length})`;
+    this.buttons = cameras.map(({ name }, index) => {
+      const button = document.createElement("button");
+      button.textContent = name;
+      button.addEventListener("click", () => actions.goTo(index));
+      return button;
+    });
+    const items = this.buttons.map((button) => {
+      const item = document.createElement("li");
+      item.append(button);
+      return item;
+    });
+    element("cameras").querySelector("ol").append(...items);
+  }
+
+  // Marks the camera that is shown; none where the view has been moved away from it.
+  mark(index) {
+    this.buttons.forEach((button, i) => button.setAttribute("aria-current", i === index));
+    this.buttons[index]?.scrollIntoView({ block: "nearest" });
+  }
+
+  flying(on) {
+    element("fly").setAttribute("aria-pressed", on);
+  }
+
+  help() {
+    element("help").hidden = !element("help").hidden;
+  }
+
+  rate(framesPerSecond) {
+    element("rate").textContent = `${framesPerSecond.toFixed(0)} frames/s`;
+  }
+
+  atRest() {
+    element("rate").textContent = "at rest";
+  }
+}

@@ -1,0 +1,66 @@
+// The scene as this file holds it: what page.py wrote, and nothing else, decides what is read here.
+"use strict";
+
+const FACTS = JSON.parse(document.getElementById("facts").textContent);
+
+// Arrays of the blob, in its order; `page_data.py` lists the same.
+function layout(facts) {
+  const coefficients = (facts.sh_degree + 1) ** 2;
+  return [
+    { name: "means", type: Float32Array, channels: 3, texels: 1 },
+    { name: "log_scales", type: Float32Array, channels: 3, texels: 1 },
+    { name: "quats", type: Int16Array, channels: 4, texels: 1 },
+    { name: "sh", type: Uint16Array, channels: 3, texels: coefficients }, // float16
+    { name: "logit_opacities", type: Uint16Array, channels: 1, texels: 1 }, // float16
+  ];
+}
+
+// Give the splats as typed arrays by name. The text is taken out of the page piece by piece, so that it and the
+// numbers are not in memory together.
+async function unpackSplats(facts) {
+  const parts = layout(facts).map((part) => ({ ...part, length: facts.count * part.channels * part.texels }));
+  const total = parts.reduce((sum, part) => sum + part.length * part.type.BYTES_PER_ELEMENT, 0);
+  const bytes = await inflated(document.querySelectorAll("script.splats"), total);
+  const arrays = {};
+  let begin = 0;
+  for (const { name, type, length } of parts) {
+    arrays[name] = new type(bytes.buffer, begin, length);
+    begin += arrays[name].byteLength;
+  }
+  return arrays;
+}
+
+async function inflated(elements, total) {
+  if (typeof DecompressionStream === "undefined") {
+    throw new Error("This browser cannot unpack the scene: it lacks DecompressionStream; use a newer one.");
+  }
+  const waiting = [...elements];
+  const packed = new ReadableStream({
+    pull(controller) {
+      const element = waiting.shift();
+      if (!element) return controller.close();
+      controller.enqueue(decoded(element.textContent));
+      element.remove();
+    },
+  });
+  const bytes = new Uint8Array(total);
+  let filled = 0;
+  try {
+    const reader = packed.pipeThrough(new DecompressionStream("gzip")).getReader();
+    for (let { done, value } = await reader.read(); !done; { done, value } = await reader.read()) {
+      bytes.set(value, filled);
+      filled += value.length;
+    }
+  } catch {
+    filled = -1; // what is wrong with it is of no use to whoever reads the message
+  }
+  if (filled !== total) throw new Error("The scene in this file is damaged; get the file again.");
+  return bytes;
+}
+
+function decoded(base64) {
+  const text = atob(base64);
+  const bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; ++i) bytes[i] = text.charCodeAt(i);
+  return bytes;
+}

@@ -1,0 +1,53 @@
+// Sorts splats by camera depth of the mean, far to near, in a thread of its own.
+//
+// A positive float32 orders as its bits do, so two counting sorts of 16 bits each, the lower first, give the exact
+// order. Among equal depths the last one comes first: drawn one over the other, this is the renderer's order near to
+// far.
+"use strict";
+
+let means, near, keys, byLow;
+
+self.onmessage = ({ data }) => {
+  if (data.means) {
+    ({ means, near } = data);
+    keys = new Uint32Array(means.length / 3);
+    byLow = new Uint32Array(means.length / 3);
+    return;
+  }
+  const order = new Uint32Array(data.order);
+  const count = sort(data.axis, data.eye, order);
+  self.postMessage({ order: order.buffer, count }, [order.buffer]);
+};
+
+// Fills the first entries of `order` and returns how many splats lie in front of the camera.
+function sort(axis, eye, order) {
+  const low = new Uint32Array(65536);
+  const high = new Uint32Array(65536);
+  const depths = new Float32Array(keys.buffer);
+  const [ax, ay, az] = axis;
+  const [ex, ey, ez] = eye;
+  let count = 0;
+  for (let i = 0, k = 0; i < keys.length; ++i, k += 3) {
+    const depth = ax * (means[k] - ex) + ay * (means[k + 1] - ey) + az * (means[k + 2] - ez);
+    depths[i] = depth > near ? depth : 0;
+    if (depths[i] === 0) continue;
+    ++low[keys[i] & 65535];
+    ++high[keys[i] >>> 16];
+    ++count;
+  }
+  startsOf(low);
+  startsOf(high);
+  for (let i = 0; i < keys.length; ++i) if (keys[i] !== 0) byLow[low[keys[i] & 65535]++] = i;
+  for (let j = 0; j < count; ++j) order[count - 1 - high[keys[byLow[j]] >>> 16]++] = byLow[j];
+  return count;
+}
+
+// Turns counts into where each bucket begins.
+function startsOf(counts) {
+  let sum = 0;
+  for (let b = 0; b < counts.length; ++b) {
+    const here = counts[b];
+    counts[b] = sum;
+    sum += here;
+  }
+}

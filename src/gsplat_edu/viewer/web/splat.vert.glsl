@@ -1,0 +1,123 @@
+// One splat as a quad: projection, extent and colour as in native/project.cpp.
+//
+//     Sigma2d = J W Sigma W' J' + 0.3 I,   u = fx x/z + cx,   colour = max(0, sum_i b_i sh_i + 0.5)
+
+precision highp float;
+
+// A parameter per texture, a splat per texel; for sh a coefficient per texel.
+uniform highp sampler2D means;
+uniform highp sampler2D log_scales;
+uniform highp isampler2D quats;
+uniform highp sampler2D logit_opacities;
+uniform highp sampler2D sh;
+uniform int texture_width;
+uniform int coefficients;  // that are stored
+uniform int degree;        // that is drawn
+
+uniform mat3 R;  // world to camera
+uniform vec3 eye;
+uniform vec2 focal;
+uniform vec2 middle;
+uniform vec2 size;
+uniform vec2 ratio_low;  // bounds of x/z and y/z in the Jacobian
+uniform vec2 ratio_high;
+uniform bool antialiased;
+
+layout(location = 0) in uint splat;
+
+flat out vec2 mean2d;  // px
+flat out vec3 conic;   // (A, B, C) of A dx² + 2 B dx dy + C dy²
+flat out vec4 paint;   // colour and opacity
+
+// The rasteriser places corners on a grid of 1/16 px or finer: no pixel of the rim may fall out by that. What is
+// outside the ellipse is discarded anyway.
+const float SLACK = 0.125;
+
+ivec2 texel(int i) {
+    return ivec2(i % texture_width, i / texture_width);
+}
+
+mat3 rotation(vec4 q) {
+    float w = q.x, x = q.y, y = q.z, z = q.w;
+    return mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+                2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+                2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));  // columns
+}
+
+vec3 coefficient(int k) {
+    return texelFetch(sh, texel(int(splat) * coefficients + k), 0).rgb;
+}
+
+vec3 color(vec3 d) {
+    vec3 sum = C0 * coefficient(0) + SH_OFFSET;
+    if (degree < 1) return sum;
+    float x = d.x, y = d.y, z = d.z;
+    sum += C1 * (-y * coefficient(1) + z * coefficient(2) - x * coefficient(3));
+    if (degree < 2) return sum;
+    float xx = x * x, yy = y * y, zz = z * z;
+    sum += C2[0] * (x * y * coefficient(4) - y * z * coefficient(5) - x * z * coefficient(7));
+    sum += C2[1] * (2.0 * zz - xx - yy) * coefficient(6) + C2[2] * (xx - yy) * coefficient(8);
+    if (degree < 3) return sum;
+    sum -= C3[0] * (y * (3.0 * xx - yy) * coefficient(9) + x * (xx - 3.0 * yy) * coefficient(15));
+    sum += C3[1] * x * y * z * coefficient(10) + C3[4] * z * (xx - yy) * coefficient(14);
+    sum -= C3[2] * (4.0 * zz - xx - yy) * (y * coefficient(11) + x * coefficient(13));
+    return sum + C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(12);
+}
+
+// Half the width of the ellipse d' Sigma2d^-1 d = level across a direction.
+float reach(vec2 direction, float a, float b, float c, float level) {
+    vec2 squares = direction * direction;
+    float variance = a * squares.x + 2.0 * b * direction.x * direction.y + c * squares.y;
+    return sqrt(level * variance) + SLACK;
+}
+
+void main() {
+    gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside, where nothing is to be drawn
+    ivec2 place = texel(int(splat));
+    vec3 offset = texelFetch(means, place, 0).xyz - eye;
+    vec3 p = R * offset;
+    if (!(p.z > Z_NEAR)) return;
+
+    vec4 q = vec4(texelFetch(quats, place, 0));
+    float length2 = dot(q, q);
+    if (length2 == 0.0) return;
+    mat3 RS = rotation(q / sqrt(length2));
+    vec3 scales = exp(texelFetch(log_scales, place, 0).xyz);
+    RS[0] *= scales.x, RS[1] *= scales.y, RS[2] *= scales.z;
+
+    vec2 ratio = clamp(p.xy / p.z, ratio_low, ratio_high);
+    mat3 W = transpose(R);  // its columns are the camera's axes
+    vec3 row0 = focal.x / p.z * (W[0] - ratio.x * W[2]) * RS;  // rows of J W R S
+    vec3 row1 = focal.y / p.z * (W[1] - ratio.y * W[2]) * RS;
+    float a0 = dot(row0, row0), b = dot(row0, row1), c0 = dot(row1, row1);
+    vec3 normal = cross(row0, row1);
+    float det0 = dot(normal, normal);  // a0 c0 - b², without the cancellation
+    float a = a0 + DILATION, c = c0 + DILATION;
+    float det = det0 + DILATION * (a0 + c0) + DILATION * DILATION;
+
+    float opacity = 1.0 / (1.0 + exp(-texelFetch(logit_opacities, place, 0).r));
+    if (antialiased) opacity *= sqrt(max(det0, DET_FLOOR) / det);
+    if (!(opacity >= ALPHA_MIN && a * c + det < FINITE)) return;
+
+    mean2d = focal * p.xy / p.z + middle;
+    float level = 2.0 * log(opacity / ALPHA_MIN);
+    vec2 half_box = sqrt(level * vec2(a, c));
+    if (any(lessThan(mean2d + half_box, vec2(-1.0))) || any(greaterThan(mean2d - half_box, size))) return;
+
+    vec3 seen = color(offset / sqrt(dot(offset, offset)));
+    if (!(all(lessThanEqual(abs(seen), vec3(COLOR_LIMIT))))) return;
+    paint = vec4(max(seen, 0.0), opacity);
+    conic = vec3(c, -b, a) / det;
+
+    // Along the ellipse's long axis the quad is tightest. Any direction gives one that holds the ellipse, so that
+    // this one need not be exact.
+    float root = sqrt(0.25 * (a - c) * (a - c) + b * b);
+    vec2 axis = a > c ? vec2(0.5 * (a - c) + root, b) : vec2(b, 0.5 * (c - a) + root);
+    axis = root > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
+    vec2 across = vec2(-axis.y, axis.x);
+    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+    vec2 pixel = mean2d + corner.x * reach(axis, a, b, c, level) * axis;
+    pixel += corner.y * reach(across, a, b, c, level) * across;
+    vec2 device = 2.0 * (pixel + 0.5) / size - 1.0;  // pixel (0, 0) has its centre half a pixel inside the corner
+    gl_Position = vec4(device.x, -device.y, 0.0, 1.0);
+}
