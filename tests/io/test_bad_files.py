@@ -73,12 +73,13 @@ def test_a_missing_file_stays_an_oserror(tmp_path, suffix):
         read_scene(tmp_path / f"gone{suffix}")
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".splat"])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat", ".glb"])
 def test_numbers_that_are_none_are_refused(tmp_path, suffix):
     path = small_file(tmp_path, suffix)
     data = bytearray(path.read_bytes())
-    start = data.index(b"end_header\n") + 11 if suffix == ".ply" else 0
-    for bits in (b"\x00\x00\xc0\x7f", b"\x00\x00\x80\xff"):  # NaN and -inf
+    before = {".splat": b"", ".glb": b"BIN\0"}.get(suffix, b"end_header\n")
+    start = data.index(before) + len(before)
+    for bits in (b"\x00\x00\xc0\x7f", b"\x01\x00\x80\x7f", b"\x00\x00\x80\xff"):  # NaN, signalling, -inf
         data[start : start + 4] = bits
         path.write_bytes(data)
         refused(path)

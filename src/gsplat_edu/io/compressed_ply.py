@@ -194,7 +194,8 @@ def _rows(
 
 def _bounds(path: Path, rows: np.ndarray, names: tuple[str, ...]) -> Float64[np.ndarray, "C 6"]:
     """Return bounds of all chunks: three smallest values, then three largest ones."""
-    bounds = structured_to_unstructured(rows[list(names)], dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # NaN, told of below
+        bounds = structured_to_unstructured(rows[list(names)], dtype=np.float64)
     fine = np.abs(bounds) <= np.finfo(np.float32).max  # false for NaN
     if not fine.all():
         row, column = np.argwhere(~fine)[0]

@@ -256,7 +256,10 @@ def _array(path: Path, document: dict[str, Any], body: memoryview, index: int) -
         type(count) is type(start) is int and count >= 0 and 0 <= start <= start + count * size <= len(body)
     ):
         _refuse(path, f"has an attribute that reaches beyond its end (accessor {index})")
-    return np.frombuffer(body, "<f4", count * widths[0], start).reshape(count, widths[0])
+    numbers = np.frombuffer(body, "<f4", count * widths[0], start)
+    if not np.isfinite(numbers).all():
+        _refuse(path, f"has NaN or infinite numbers (accessor {index})")
+    return numbers.reshape(count, widths[0])
 
 
 def _gaussians(path: Path, arrays: dict[str, Float32[np.ndarray, "N C"]]) -> Gaussians:
