@@ -7,7 +7,7 @@ import torch
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.formats import FORMATS, SOG_META, write_scene
+from gsplat_edu.io.formats import SOG_META, write_scene
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.runs.folder import RunFolder

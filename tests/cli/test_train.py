@@ -181,3 +181,35 @@ def test_one_photo_is_enough(tmp_path):
     )
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["train"]["num_images"] == 1 and metrics["test"]["num_images"] == 0
+
+
+def test_a_scene_is_exported_and_what_the_files_show_is_reported(tmp_path, capsys):
+    write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=40))
+    files = [tmp_path / "out" / "scene.spz", tmp_path / "scene.html"]
+    words = [
+        "train",
+        tmp_path / "capture",
+        "--out",
+        tmp_path / "run",
+        "--iterations",
+        "5",
+        "--export",
+        *files,
+    ]
+    assert main([str(word) for word in words]) == 0
+    said = capsys.readouterr().out
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert [entry["path"] for entry in metrics["exports"]] == [str(path) for path in files]
+    for entry, path in zip(metrics["exports"], files, strict=True):
+        assert entry["psnr"] > 30 and entry["num_views"] == 6 and entry["num_bytes"] == path.stat().st_size
+        assert f"{path}: PSNR {entry['psnr']:.2f} dB over 6 views" in said
+        assert str(path) in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_an_export_that_cannot_be_written_is_found_out_before_the_training(tmp_path, capsys):
+    write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=40))
+    words = ["train", tmp_path / "capture", "--out", tmp_path / "run", "--export", tmp_path / "scene.obj"]
+    assert main([str(word) for word in words]) == 2
+    said = capsys.readouterr().err
+    assert "--export: " in said and "known are" in said and said.count("\n") == 1
+    assert not (tmp_path / "run").exists()

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import functools
+import importlib
 import inspect
 import math
 import re
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from rich.console import Console
@@ -18,14 +21,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.eval import score_lines
+from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.data.dataset import DataSettings
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.train.config import ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
 from gsplat_edu.train.events import Event, StepEvent
-from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.train.trainer import Callback, Trainer
+from gsplat_edu.viewer.export import check_target
+from gsplat_edu.viewer.serve import exposure
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
 
@@ -47,6 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="RUN", required=True, help="folder of the run")
     parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint in RUN")
     _add_budget(parser.add_argument_group("budget"))
+    _add_view(parser.add_argument_group("live view"))
     _add_data(parser.add_argument_group("photos"))
     group = parser.add_argument_group("recipe, see docs/RECIPE.md; defaults are those of 30,000 iterations")
     behind = group.add_mutually_exclusive_group()
@@ -90,7 +98,33 @@ def _add_budget(group: argparse._ArgumentGroup) -> None:
         metavar="TIME",
         help="end training after, for example, 90s, 20m or 2h",
     )
+    group.add_argument(
+        "--export",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="write the scene in other formats too, as `gsplat-edu convert --verify` does: scene.spz scene.html ...",
+    )
     add_backend(group)
+
+
+def _add_view(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--view",
+        action="store_true",
+        help="show the training in the browser while it runs, with pause and single step; it takes at most a fifth of"
+        " the time and changes no bit. Afterwards the scene is shown until the last browser is closed, or Ctrl-C",
+    )
+    group.add_argument(
+        "--view-host", metavar="ADDRESS", help="where to listen (default: 127.0.0.1, for this computer only)"
+    )
+    group.add_argument(
+        "--view-port",
+        type=whole_number_text,
+        metavar="N",
+        help="port, 0 for any that is free (default: 8080)",
+    )
 
 
 def _add_data(group: argparse._ArgumentGroup) -> None:
@@ -200,16 +234,27 @@ def run(arguments: argparse.Namespace) -> None:
     def say(sentence: str) -> None:
         console.print(sentence, soft_wrap=True)
 
-    with interruptible() as interrupted:
+    live = _live(arguments)
+    for path in arguments.export:
+        check_target("--export", path)
+    with interruptible() as interrupted, ExitStack() as closing:
         capture = CaptureRun(options_from(arguments), say)
         if capture.finished:
             return
+        view = None
+        if live is not None:
+            host, port = arguments.view_host or live.LOOPBACK, arguments.view_port
+            view = live.LiveView(capture, interrupted, host, live.PORT if port is None else port)
+            closing.enter_context(view)
+            say(f"live view: {view.url}")
+            if warning := exposure(host, "sees the training and can pause it"):
+                say(warning)
         with _bar(console, "{task.fields[state]}") as bar:
-            _train(capture, bar, interrupted)
-        trainer, folder = capture.trainer, capture.folder.path
+            _train(capture, bar, interrupted, [] if view is None else [view.show])
         if interrupted():
             raise KeyboardInterrupt(
-                f"interrupted after {trainer.iteration} iterations; the same command with --resume goes on from there"
+                f"interrupted after {capture.trainer.iteration} iterations;"
+                " the same command with --resume goes on from there"
             )
         with _bar(console, "") as bar:
             task = bar.add_task("judging", total=len(capture.dataset.test) + len(capture.dataset.train))
@@ -220,8 +265,24 @@ def run(arguments: argparse.Namespace) -> None:
                         "interrupted while judging; the scene is written, --resume judges it again"
                     )
                 bar.advance(task)
+                if view is not None:
+                    view.look("judging")
 
-            result = capture.finish(scored)
+            backend = capture.options.backend
+            result = capture.finish(
+                scored,
+                functools.partial(export_all, arguments.export, bar, backend, say)
+                if arguments.export
+                else None,
+            )
+        _report(capture, result, say)
+        if view is not None and view.watched:
+            say("the live view stays until its last browser is closed, or Ctrl-C")
+            view.stay()
+
+
+def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None]) -> None:
+    trainer = capture.trainer
     rate = f"{1e3 * capture.seconds / max(trainer.iteration, 1):.1f} ms/iter"
     say(
         f"{trainer.iteration} iterations in {capture.seconds:.1f} s -> {rate}, {len(trainer.gaussians)} Gaussians"
@@ -229,13 +290,30 @@ def run(arguments: argparse.Namespace) -> None:
     for line in score_lines(result.test, result.train):
         say(line)
     say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
-    if trainer.iteration < trainer.config.iterations:
-        say(
-            f"the time limit ended it before {trainer.config.iterations}; --resume with a longer one goes on: {folder}"
-        )
+    if (planned := trainer.config.iterations) > trainer.iteration:
+        folder = capture.folder.path
+        say(f"the time limit ended it before {planned}; --resume with a longer one goes on: {folder}")
 
 
-def _train(capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool]) -> None:
+def _live(arguments: argparse.Namespace) -> ModuleType | None:
+    """Import the live view where it is asked for: it needs viser, which is optional."""
+    if not arguments.view:
+        for flag, value in (("--view-host", arguments.view_host), ("--view-port", arguments.view_port)):
+            if value is not None:
+                raise ArgumentError(f"{flag}: is looked at with --view only; add that, or leave it out")
+        return None
+    try:
+        return importlib.import_module("gsplat_edu.viewer.live")
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("gsplat_edu"):
+            raise
+        how = "pip install -c constraints.txt 'gsplat-edu[viewer]'"
+        raise ArgumentError(f"--view: {error.name} is not installed; {how}, or leave it out") from None
+
+
+def _train(
+    capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool], callbacks: Sequence[Callback]
+) -> None:
     iterations = capture.options.config.iterations
     photos = bar.add_task("photos", total=None, state="")
     task = bar.add_task("training", total=iterations, state="", visible=False)
@@ -257,7 +335,7 @@ def _train(capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool]) 
             raise KeyboardInterrupt("interrupted while reading photos; nothing was begun")
         bar.update(photos, completed=done, total=total)
 
-    trainer = capture.start(loaded, [show])
+    trainer = capture.start(loaded, [show, *callbacks])
     bar.remove_task(photos)
     bar.reset(task, total=iterations, completed=trainer.iteration, visible=True)
     capture.train(interrupted)
