@@ -1,0 +1,265 @@
+"""What the meta.json of a SOG says, checked.
+
+Source: PlayCanvas' specification of SOG, section 2.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.io.sog_palette import CODEBOOK, MOST_ENTRIES
+from gsplat_edu.io.sog_values import LARGEST_LOG, Range
+
+VERSION = 2
+
+MOST_SPLATS = 1 << 26
+"""Splats of a scene that are believed and written: 67 million, in images of 8192 x 8192 pixels."""
+
+COEFFICIENTS = {1: 3, 2: 8, 3: 15}
+"""Coefficients per channel above degree 0, by degree; the specification says bands."""
+
+GENERATOR = "gsplat-edu"
+
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}", re.ASCII)
+"""A file's name that leads nowhere else: no slash, no drive, no leading dot."""
+
+LARGEST_FLOAT = float(str(np.finfo(np.float32).max))
+"""Largest float32 in its fewest digits: a little more than itself, and read as it."""
+
+MEANS, QUATS = ("means_l.webp", "means_u.webp"), ("quats.webp",)
+SCALES, SH0 = ("scales.webp",), ("sh0.webp",)
+SHN = ("shN_centroids.webp", "shN_labels.webp")
+"""Names under which images are written; others may be read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Harmonics:
+    """What is said of the palette of harmonics.
+
+    Args:
+        entries: Entries of the palette.
+        degree: Highest degree, 1 to 3.
+        codebook: (256,) what the bytes of the palette stand for.
+        files: Names of the images of entries and of labels.
+    """
+
+    entries: int
+    degree: int
+    codebook: Float32[np.ndarray, "256"]
+    files: tuple[str, ...] = SHN
+
+    @property
+    def coefficients(self) -> int:
+        """Coefficients per channel."""
+        return COEFFICIENTS[self.degree]
+
+
+@dataclass(frozen=True, eq=False)
+class Meta:
+    """What a meta.json says.
+
+    Args:
+        count: Splats.
+        span: Lowest and highest logarithm of each coordinate.
+        scales: (256,) logarithms of scales that bytes stand for.
+        sh0: (256,) coefficients of degree 0 that bytes stand for.
+        harmonics: The palette; None for a scene of degree 0.
+        antialiased: Whether the scene was trained with antialiasing; None where it is not said.
+        up: Direction that is up, of length 1; None where it is not said.
+        means: Names of the images of low and of high bytes.
+        quats: Name of the image of rotations.
+        log_scales: Name of the image of scales.
+        colors: Name of the image of coefficients of degree 0 and opacities.
+    """
+
+    count: int
+    span: Range
+    scales: Float32[np.ndarray, "256"]
+    sh0: Float32[np.ndarray, "256"]
+    harmonics: Harmonics | None
+    antialiased: bool | None
+    up: tuple[float, float, float] | None
+    means: tuple[str, ...] = MEANS
+    quats: tuple[str, ...] = QUATS
+    log_scales: tuple[str, ...] = SCALES
+    colors: tuple[str, ...] = SH0
+
+    @property
+    def splat_images(self) -> tuple[str, ...]:
+        """Names of the images that have a pixel for each splat; labels of harmonics last."""
+        labels = self.harmonics.files[1:] if self.harmonics else ()
+        return (*self.means, *self.quats, *self.log_scales, *self.colors, *labels)
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Names of all images."""
+        return (*self.splat_images, *(self.harmonics.files[:1] if self.harmonics else ()))
+
+    def scene_bytes(self) -> int:
+        """Return the bytes that the scene takes in float32."""
+        coefficients = self.harmonics.coefficients if self.harmonics else 0
+        return 4 * self.count * (14 + 3 * coefficients)
+
+
+def to_json(meta: Meta) -> bytes:
+    """Write a meta.json: the same bytes for the same scene.
+
+    Numbers of codebooks have the fewest digits from which the same float32 is read. The direction that is up stands
+    in asset.extras.up, where other readers do not look.
+    """
+    asset: dict[str, object] = {"generator": GENERATOR}
+    if meta.up is not None:
+        asset["extras"] = {"up": list(meta.up)}
+    document: dict[str, object] = {"version": VERSION, "asset": asset, "count": meta.count}
+    if meta.antialiased is not None:
+        document["antialias"] = meta.antialiased
+    low, high = meta.span
+    document["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": meta.means}
+    document["scales"] = {"codebook": _short(meta.scales), "files": meta.log_scales}
+    document["quats"] = {"files": meta.quats}
+    document["sh0"] = {"codebook": _short(meta.sh0), "files": meta.colors}
+    if meta.harmonics:
+        document["shN"] = {
+            "count": meta.harmonics.entries,
+            "bands": meta.harmonics.degree,
+            "codebook": _short(meta.harmonics.codebook),
+            "files": meta.harmonics.files,
+        }
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
+
+
+def _short(codebook: Float32[np.ndarray, "256"]) -> list[float]:
+    return [float(str(entry)) for entry in codebook]
+
+
+def from_json(path: Path, data: bytes) -> Meta:
+    """Read a meta.json.
+
+    Args:
+        path: Name of the scene, for messages.
+        data: The file's bytes.
+
+    Raises:
+        SceneFormatError: it is no meta.json of version 2, or says what cannot be.
+    """
+    try:
+        document = json.loads(data, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deep" if isinstance(error, RecursionError) else str(error).splitlines()[0][:80]
+        raise SceneFormatError(f"{path}: its metadata is no JSON ({reason}); get the file again") from None
+    if not isinstance(document, dict):
+        _refuse(path, "no object")
+    version = document.get("version")
+    if version is None and _at(document, "means.shape") is not None:
+        version = 1  # which did not name itself
+    if isinstance(version, bool) or version != VERSION:
+        said = f"version {version}" if type(version) is int and 0 < version < 1000 else "no version"
+        raise SceneFormatError(f"{path}: is SOG of {said}, but version 2 is read; export it as version 2")
+    return _checked(path, document)
+
+
+def _checked(path: Path, document: dict[str, object]) -> Meta:
+    antialiased = document.get("antialias")
+    if not (antialiased is None or isinstance(antialiased, bool)):
+        _refuse(path, "antialias, which is neither true nor false")
+    keys = ("means.mins", "means.maxs")
+    low, high = (_numbers(path, key, _at(document, key), 3, LARGEST_LOG) for key in keys)
+    harmonics = None
+    if document.get("shN") is not None:
+        harmonics = Harmonics(
+            entries=_whole(path, document, "shN.count", 1, MOST_ENTRIES),
+            degree=_whole(path, document, "shN.bands", min(COEFFICIENTS), max(COEFFICIENTS)),
+            codebook=_codebook(path, document, "shN.codebook"),
+            files=_files(path, document, "shN.files", len(SHN)),
+        )
+    return Meta(
+        count=_whole(path, document, "count", 0, MOST_SPLATS),
+        span=(low, high),
+        scales=_codebook(path, document, "scales.codebook"),
+        sh0=_codebook(path, document, "sh0.codebook"),
+        harmonics=harmonics,
+        antialiased=antialiased,
+        up=_up(document),
+        means=_files(path, document, "means.files", len(MEANS)),
+        quats=_files(path, document, "quats.files", len(QUATS)),
+        log_scales=_files(path, document, "scales.files", len(SCALES)),
+        colors=_files(path, document, "sh0.files", len(SH0)),
+    )
+
+
+def _refuse(path: Path, what: str) -> NoReturn:
+    raise SceneFormatError(f"{path}: its metadata has {what}; it is damaged, get the file again")
+
+
+def _no_number(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no number of JSON")
+
+
+def _at(document: object, key: str) -> object:
+    """Return what stands under a dotted key; None where nothing does."""
+    for part in key.split("."):
+        document = document.get(part) if isinstance(document, dict) else None
+    return document
+
+
+def _is_number(value: object, largest: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
+
+
+def _numbers(
+    path: Path, key: str, found: object, length: int, largest: float
+) -> Float64[np.ndarray, " length"]:
+    if not isinstance(found, list) or len(found) != length:
+        _refuse(path, f"no {length} numbers in {key}")
+    for index, value in enumerate(found):
+        if not _is_number(value, largest):
+            _refuse(path, f"no number, or one out of range, in {key}[{index}]")
+    return np.array(found, dtype=np.float64)
+
+
+def _codebook(path: Path, document: dict[str, object], key: str) -> Float32[np.ndarray, "256"]:
+    """Read a codebook. Some were written of scenes with infinite numbers and start with null: it goes on downwards."""
+    found = _at(document, key)
+    lacks_first = isinstance(found, list) and len(found) == CODEBOOK and found[0] is None
+    if isinstance(found, list) and lacks_first:
+        found = [found[1], *found[1:]]
+    entries = _numbers(path, key, found, CODEBOOK, LARGEST_FLOAT)
+    if lacks_first:
+        step = (entries[-1] - entries[1]) / (CODEBOOK - 1)
+        entries[0] = np.clip(entries[1] - step, -LARGEST_FLOAT, LARGEST_FLOAT)
+    return entries.astype(np.float32)
+
+
+def _whole(path: Path, document: dict[str, object], key: str, low: int, high: int) -> int:
+    found = _at(document, key)
+    if not isinstance(found, int) or isinstance(found, bool) or not low <= found <= high:
+        _refuse(path, f"no whole number from {low} to {high} in {key}")
+    return found
+
+
+def _files(path: Path, document: dict[str, object], key: str, length: int) -> tuple[str, ...]:
+    found = _at(document, key)
+    if not isinstance(found, list) or len(found) != length:
+        _refuse(path, f"no {length} file names in {key}")
+    for name in found:
+        if not isinstance(name, str) or not NAME.fullmatch(name):
+            _refuse(path, f"in {key} something that is no plain file name")
+    return tuple(found)
+
+
+def _up(document: dict[str, object]) -> tuple[float, float, float] | None:
+    """Read the direction that we keep in asset.extras.up; None where somebody else keeps something else there."""
+    found = _at(document, "asset.extras.up")
+    if not (isinstance(found, list) and len(found) == 3 and all(_is_number(v, LARGEST_FLOAT) for v in found)):
+        return None
+    length = float(np.linalg.norm(np.array(found, dtype=np.float64)))
+    x, y, z = found
+    return (x / length, y / length, z / length) if length > 0 else None

@@ -1,0 +1,95 @@
+"""The numbers of a SOG that have no codebook, to bytes and back.
+
+    position   v = sign(x) log(1 + |x|); 65535 (v - low) / (high - low), 16 bits a coordinate in two bytes
+    rotation   the three smaller of (w, x, y, z), 255 (q / sqrt 2 + 1/2), and 252 + the number of the largest
+
+Source: PlayCanvas' specification of SOG, sections 3.1 and 3.2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8, UInt16, UInt64
+
+STEPS = 65_535
+"""Steps of a coordinate between the lowest and the highest."""
+
+FIRST_TAG = 252
+"""Alpha of a rotation whose w is the largest component."""
+
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Components (w, x, y, z) that are stored, by the number of the one that is not."""
+
+LARGEST_LOG = float(np.log1p(np.finfo(np.float32).max)) + 1e-9
+"""Logarithm of the largest position that float32 has, and less than it takes to be rounded to infinity more."""
+
+Range = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]
+"""Lowest and highest logarithm of each coordinate."""
+
+
+def positions_to_steps(means: Float32[np.ndarray, "N 3"]) -> tuple[UInt16[np.ndarray, "N 3"], Range]:
+    """Round positions to the steps between the lowest and the highest of each coordinate.
+
+    Args:
+        means: N positions, world units.
+
+    Returns:
+        The steps, and the range they are of; zeros where there are no positions.
+    """
+    logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+    low, high = (logs.min(axis=0), logs.max(axis=0)) if len(logs) else (np.zeros(3), np.zeros(3))
+    width = np.where(high > low, high - low, 1.0)
+    steps = np.floor(STEPS * (logs - low) / width + 0.5).astype(np.uint16)
+    return steps, (low, high)
+
+
+def steps_to_positions(steps: UInt16[np.ndarray, "N 3"], span: Range) -> Float32[np.ndarray, "N 3"]:
+    """Turn steps of a range, whose ends are within +-`LARGEST_LOG`, into positions, world units."""
+    low, high = span
+    logs = low + (high - low) * (steps / STEPS)
+    return (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
+
+
+def morton_order(steps: UInt16[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """Order positions along a curve that keeps neighbours together: their bits taken in turn from z, y and x.
+
+    Args:
+        steps: N positions in steps.
+
+    Returns:
+        Their numbers in that order; equal positions stay in theirs.
+    """
+    spread = steps.astype(np.uint64)
+    for shift, mask in (
+        (16, 0x0000FF0000FF),
+        (8, 0x00F00F00F00F),
+        (4, 0x0C30C30C30C3),
+        (2, 0x249249249249),
+    ):
+        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
+    codes: UInt64[np.ndarray, " N"] = (
+        spread[:, 0] | spread[:, 1] << np.uint64(1) | spread[:, 2] << np.uint64(2)
+    )
+    return np.argsort(codes, kind="stable")
+
+
+def quats_to_pixels(quats: Float32[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:
+    """Turn quaternions (w, x, y, z) of any length but zero into pixels."""
+    scaled = quats.astype(np.float64)  # whose squares neither over- nor underflow
+    unit = scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
+    largest = np.abs(unit).argmax(axis=1)[:, None]
+    unit *= np.where(np.take_along_axis(unit, largest, axis=1) < 0, -1.0, 1.0)
+    small = np.take_along_axis(unit, OTHERS[largest[:, 0]], axis=1)
+    stored = np.floor(255.0 * (small / np.sqrt(2.0) + 0.5) + 0.5)
+    return np.concatenate([stored, FIRST_TAG + largest], axis=1).astype(np.uint8)
+
+
+def pixels_to_quats(pixels: UInt8[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
+    """Turn pixels, whose alpha is 252 to 255, into quaternions (w, x, y, z), the largest component positive."""
+    small = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
+    largest = pixels[:, 3:].astype(np.int64) - FIRST_TAG
+    quats = np.empty((len(pixels), 4))
+    np.put_along_axis(quats, OTHERS[largest[:, 0]], small, axis=1)
+    rest = np.sqrt(np.maximum(0.0, 1.0 - (small**2).sum(axis=1, keepdims=True)))
+    np.put_along_axis(quats, largest, rest, axis=1)
+    return quats.astype(np.float32)

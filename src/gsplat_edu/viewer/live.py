@@ -1,0 +1,400 @@
+"""A training watched in the browser while it runs: renders of the Gaussians as they are, from the browser's camera.
+
+viser serves its client and a WebSocket from threads of its own. They only note what browsers say. The thread that
+trains reads it between two steps, where nothing else touches the Gaussians, and renders there; rendering changes
+nothing, so the training has the bits of one that nobody watches.
+
+viser opens one TCP port, for the files of its client and the WebSocket. Its tunnel to a public server is closed here,
+and pages from elsewhere, which a browser would let connect, are turned away.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import queue
+import re
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+import rich
+import torch
+import viser
+import websockets.asyncio.server
+from jaxtyping import Float, Float64
+
+from gsplat_edu.camera import Camera, point_nearest_axes
+from gsplat_edu.errors import ArgumentError, SplatError
+from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.evaluate.paths import PARALLEL, common_up
+from gsplat_edu.gaussian_math import quat_to_R
+from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.validation import ArrayLike, in_range, whole_number
+from gsplat_edu.viewer.serve import LOCAL_NAME, LOOPBACK, free_port, is_loopback, url_of
+
+PORT = 8080
+
+NAMES = ("--view-host", "--view-port")
+"""What the user calls host and port."""
+
+SHARE = 0.2
+"""Largest share of the time that is spent on browsers while a training runs."""
+
+WIDTHS = (160, 1920)
+"""px: narrowest and widest image that the browser can ask for; it is never wider than the browser's own."""
+
+START_WIDTH = 800
+"""px: width of the image at first."""
+
+MOVING = 0.4
+"""Part of the width that is rendered while the camera moves."""
+
+SETTLED = 0.3
+"""Seconds without a move after which the camera stands still."""
+
+STILL_EVERY = 0.2
+"""Seconds between two images for a camera that stands still, while the training changes what it sees."""
+
+FIGURES_EVERY = 0.5
+"""Seconds between two looks at loss and PSNR."""
+
+POLL = 0.03
+"""Seconds between two looks at the browsers while the training is paused."""
+
+GRACE = 5.0
+"""Seconds after which a browser that went away is not expected back: a page that is loaded again takes one or two."""
+
+JPEG_QUALITY = 85
+
+MOST_ASPECT = 4.0
+"""A browser's image is at most this many times wider than high, or higher than wide."""
+
+WIDEST_FOV = math.radians(170.0)
+
+
+def browser_camera(
+    wxyz: ArrayLike, position: ArrayLike, fov: float, canvas: tuple[int, int], width: int
+) -> Camera:
+    """Turn viser's camera into ours. Both look along +z with y down, so only the direction of the rotation differs.
+
+    Args:
+        wxyz: (4,) quaternion of the camera-to-world rotation.
+        position: (3,) camera centre, world units.
+        fov: Vertical field of view, radians.
+        canvas: Width and height of the browser's image, px.
+        width: Width of the image to render, px; at most the browser's.
+
+    Returns:
+        A camera whose image, stretched over the browser's, shows the same view to the pixel.
+
+    Raises:
+        ArgumentError: the browser sent numbers that are no camera.
+    """
+    columns, rows = whole_number("width", canvas[0], 1), whole_number("height", canvas[1], 1)
+    aspect = in_range("aspect", columns / rows, 1 / MOST_ASPECT, MOST_ASPECT)
+    tangent = math.tan(in_range("fov", fov, 0.0, WIDEST_FOV, open_low=True) / 2)
+    W = min(whole_number("width", width, 1), columns)
+    H = max(1, round(W / aspect))
+    fx, fy = W / 2 / (tangent * aspect), H / 2 / tangent  # pixels are not quite square where H was rounded
+    return Camera(quat_to_R(wxyz).T, position, fx, fy, (W - 1) / 2, (H - 1) / 2, H, W)
+
+
+@dataclass
+class _Browser:
+    """A browser and what it was sent: camera's time stamp, width and iteration of its image, and when that was."""
+
+    handle: viser.ClientHandle
+    stamp: float
+    moved_at: float = -math.inf
+    drawn: tuple[float, int, int] | None = None
+    drawn_at: float = -math.inf
+
+
+class LiveView:
+    """Shows a training to browsers, and lets them pause it.
+
+    Args:
+        capture: The run; its dataset is there, its trainer need not be.
+        stop: Says whether the program is asked to end.
+        host: Address to listen at.
+        port: Port; 0 for any that is free.
+
+    Raises:
+        ArgumentError: the address is none of this computer's, or the port is taken or out of range.
+
+    Attributes:
+        url: Where a browser finds the view.
+    """
+
+    def __init__(
+        self, capture: CaptureRun, stop: Callable[[], bool], host: str = LOOPBACK, port: int = PORT
+    ) -> None:
+        self._capture, self._stop = capture, stop
+        self._render = capture.options.renderer
+        self._trainer: Trainer | None = None
+        self._event: StepEvent | None = None
+        self._browsers: dict[int, _Browser] = {}
+        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._left = math.inf  # iterations until the training holds
+        self._free_at = self._figures_at = -math.inf
+        self._seen_at = -math.inf
+        self._said = ""
+        with ExitStack() as closing:
+            self._server = _server(host, port, closing)
+            self.url = url_of(host, self._server.get_port())
+            self._set_scene()
+            self._add_panel()
+            self._closing = closing.pop_all()
+
+    def __enter__(self) -> LiveView:
+        """Return the view itself; it has been listening since it was made."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the server and every connection."""
+        self._closing.close()
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser is connected, or may be about to come back."""
+        now = time.perf_counter()
+        self._look_around(now)
+        return now - self._seen_at <= GRACE
+
+    def show(self, trainer: Trainer, event: Event) -> None:
+        """Serve the browsers after a step, in the trainer's thread; wait here while the training is paused.
+
+        A callback of the trainer. Takes at most `SHARE` of the time, and microseconds where no browser is connected.
+        """
+        if not isinstance(event, StepEvent):
+            return
+        self._trainer, self._event = trainer, event
+        self._left = max(self._left - 1, 0)
+        with self._capture.clock_stopped():
+            self.look()
+            if self._left == 0:
+                self._hold()
+
+    def look(self, state: str = "training") -> None:
+        """Serve the browsers once, if it is their turn.
+
+        Args:
+            state: What the program does meanwhile, for the panel.
+        """
+        while not self._commands.empty():
+            self._commands.get()()
+        now = time.perf_counter()
+        self._look_around(now)
+        if not self._browsers or now < self._free_at:
+            return
+        if now - self._figures_at >= FIGURES_EVERY:
+            self._figures_at = now
+            self._say(state)
+        self._draw(now)
+        self._free_at = now + (time.perf_counter() - now) / SHARE
+
+    def stay(self) -> None:
+        """Show the finished scene until no browser is connected any more, or the program is asked to end."""
+        self._left = math.inf
+        self._pause.disabled = self._step.disabled = True
+        self._wait("finished", lambda: False)
+
+    def _hold(self) -> None:
+        """Wait until the training is to go on: a step, a resume, no browser left, or the end of the program."""
+        self._pause.label = "Resume"
+        self._wait("paused", lambda: self._left > 0)
+        if self._left == 0:  # nobody is there who could resume it
+            self._left = math.inf
+        if self._left == math.inf:
+            self._pause.label = "Pause"
+
+    def _wait(self, state: str, over: Callable[[], bool]) -> None:
+        """Draw for whoever looks until something is over, the program is to end, or no browser is left."""
+        self._say(state)
+        while not (over() or self._stop()):
+            if not self.watched:
+                return
+            self._draw(time.perf_counter())
+            try:
+                self._commands.get(timeout=POLL)()
+            except queue.Empty:
+                continue
+
+    def _look_around(self, now: float) -> None:
+        """Note which browsers are there, and whose camera has moved."""
+        handles = self._server.get_clients()
+        for gone in self._browsers.keys() - handles.keys():
+            del self._browsers[gone]
+        for number, handle in handles.items():
+            stamp = handle.camera.update_timestamp
+            if number not in self._browsers:
+                self._browsers[number] = _Browser(handle, stamp)
+            elif stamp != self._browsers[number].stamp:
+                self._browsers[number].stamp, self._browsers[number].moved_at = stamp, now
+        if handles:
+            self._seen_at = now
+
+    def _draw(self, now: float) -> None:
+        """Send one image, to the browser that has waited longest of those that need one."""
+        if self._trainer is None:
+            return
+        due = [browser for browser in self._browsers.values() if self._is_due(browser, now)]
+        if not due:
+            return
+        browser = min(due, key=lambda candidate: candidate.drawn_at)
+        browser.drawn, browser.drawn_at = self._wanted(browser, now), now
+        seen, width = browser.handle.camera, browser.drawn[1]
+        try:
+            canvas = (seen.image_width, seen.image_height)
+            camera = browser_camera(seen.wxyz, seen.position, seen.fov, canvas, width)
+            with torch.no_grad():
+                image = self._render(self._trainer.gaussians, camera).image
+        except (SplatError, MemoryError, torch.OutOfMemoryError):
+            return  # no camera, or none that can be drawn: the training goes on, and the next one may be
+        levels = torch.nan_to_num(image).clamp(0.0, 1.0) * 255.0 + 0.5
+        with warnings.catch_warnings():  # viser warns where the browser has just gone
+            warnings.simplefilter("ignore")
+            browser.handle.scene.set_background_image(
+                levels.to(torch.uint8).numpy(force=True), format="jpeg", jpeg_quality=JPEG_QUALITY
+            )
+        browser.handle.flush()
+
+    def _wanted(self, browser: _Browser, now: float) -> tuple[float, int, int]:
+        """Return which image a browser should have: its camera's stamp, width and iteration."""
+        width = min(max(int(self._width.value), WIDTHS[0]), WIDTHS[1], browser.handle.camera.image_width)
+        if now - browser.moved_at < SETTLED:
+            width = round(MOVING * width)
+        return browser.stamp, width, 0 if self._trainer is None else self._trainer.iteration
+
+    def _is_due(self, browser: _Browser, now: float) -> bool:
+        wanted = self._wanted(browser, now)
+        if browser.drawn is None or wanted[:2] != browser.drawn[:2]:
+            return True
+        return wanted != browser.drawn and now - browser.drawn_at >= STILL_EVERY
+
+    def _say(self, state: str) -> None:
+        """Show the figures of the last step."""
+        lines = [f"**{state}**"]
+        if self._event is not None and self._trainer is not None:
+            total = self._trainer.config.iterations
+            lines += [
+                f"iteration {self._trainer.iteration:,} of {total:,}",
+                f"{len(self._trainer.gaussians):,} Gaussians",
+                f"loss {self._event.loss:.4f}",
+            ]
+            if self._trainer.last is not None:
+                lines.append(f"PSNR {_psnr(self._trainer):.2f} dB, of the last photo")
+        said = "  \n".join(lines)  # two spaces end a line in Markdown
+        if said != self._said:
+            self._said = self._figures.content = said
+
+    def _set_scene(self) -> None:
+        cameras = [view.camera for view in self._capture.dataset.train]
+        first, start = cameras[0], self._server.initial_camera
+        self._server.scene.set_up_direction(common_up(cameras))
+        start.position = first.eye
+        start.look_at = _subject(cameras, self._capture.dataset.points)
+        start.fov = 2.0 * math.atan(first.H / 2 / first.fy)
+
+    def _add_panel(self) -> None:
+        gui = self._server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        gui.set_panel_label("gsplat-edu train")
+        self._figures = gui.add_markdown("reading photos")
+        self._pause, self._step = gui.add_button("Pause"), gui.add_button("Step")
+        low, high = WIDTHS
+        self._width = gui.add_slider("Width, px", low, high, step=20, initial_value=START_WIDTH)
+        self._pause.on_click(lambda event: self._commands.put(self._toggle))
+        self._step.on_click(lambda event: self._commands.put(self._step_once))
+
+    def _toggle(self) -> None:
+        self._left = 0 if self._left == math.inf else math.inf
+
+    def _step_once(self) -> None:
+        self._left = 2
+
+
+class _Server(viser.ViserServer):
+    """viser without its tunnel, which any browser could ask for: it shows the view to the internet."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse."""
+        return None
+
+
+def _server(host: str, port: int, closing: ExitStack) -> viser.ViserServer:
+    """Start viser's server; `closing` gets what ends it.
+
+    viser takes the next free port where one is taken, and waits for ever for one that cannot be had.
+    """
+    wanted = free_port(host, port, NAMES)
+    closing.enter_context(_silence())
+    with _only_pages_from(host):
+        server = _Server(host=host, port=wanted, label="gsplat-edu", verbose=False)
+    closing.callback(server.stop)
+    if server.get_port() != wanted:
+        raise ArgumentError(
+            f"{NAMES[1]}: {wanted} was taken this moment; give another, or 0 for any that is free"
+        )
+    return server
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep what viser prints through rich's own console, and what its WebSockets log, off the terminal."""
+    console, logger = rich.get_console(), logging.getLogger("websockets")
+    before = console.quiet, logger.level
+    console.quiet = True
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        console.quiet = before[0]
+        logger.setLevel(before[1])
+
+
+@contextmanager
+def _only_pages_from(host: str) -> Iterator[None]:
+    """Let the server that is started meanwhile refuse WebSockets of pages that are not its own.
+
+    Browsers let any page connect to any server, and viser does not ask where one comes from. Where others can reach the
+    server, its own pages may have any name, and all are let in.
+    """
+    serve = websockets.asyncio.server.serve
+    if is_loopback(host):
+        own = re.compile(f"http://{LOCAL_NAME}", re.IGNORECASE)
+        limited = functools.partial(serve, origins=[own])
+        websockets.asyncio.server.serve = limited  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def _subject(cameras: Sequence[Camera], points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "3"]:
+    """Return the point on the first camera's axis that orbits go around: as far away as what all cameras look at."""
+    first = cameras[0]
+    centre = point_nearest_axes(cameras, PARALLEL)
+    depths = first.world_to_cam(points)[:, 2] if centre is None else first.world_to_cam(centre[None])[:, 2]
+    ahead = depths[depths > 0]
+    subject: Float64[np.ndarray, "3"] = (
+        first.eye + (float(np.median(ahead)) if ahead.size else 1.0) * first.R[2]
+    )
+    return subject
+
+
+def _psnr(trainer: Trainer) -> float:
+    try:
+        return math.nan if trainer.last is None else psnr(*trainer.last)
+    except SplatError:  # an image that is not finite has none
+        return math.nan

@@ -1,0 +1,192 @@
+"""`gsplat-edu view`: a real server in a process of its own, asked by real requests."""
+
+import dataclasses
+import os
+import re
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+
+import pytest
+
+import gsplat_edu.cli.main as command_line
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.io.formats import write_scene
+from gsplat_edu.io.ply import save_ply
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.source import open_source
+from gsplat_edu.viewer import page
+from splats import splats_on
+
+COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
+PATIENCE = 60.0
+ORIGIN = (512.0, -64.0, 8.0)
+ORANGE = (1.0, 0.5, 0.0)
+
+own_process = pytest.mark.own_process
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run whose coordinates were moved and whose background is orange; and its scene alone, as a .splat."""
+    root = tmp_path_factory.mktemp("made")
+    views, points, colors = procedural_capture(size=48, count=6)
+    gaussians = splats_on(points, colors)
+    folder = RunFolder(root / "egg & spoon")
+    settings = RenderSettings(background=ORANGE, antialiased=True, jacobian_limit=1.3)
+    folder.write_config({"render": dataclasses.asdict(settings), "origin": list(ORIGIN), "data": {}})
+    save_ply(folder.scene(30), gaussians, ORIGIN)
+    folder.write_cameras(views[:4], views[4:], ORIGIN)
+    write_scene(root / "bare.splat", Scene(gaussians))
+    return folder, root / "bare.splat"
+
+
+@contextmanager
+def viewing(*words, ends_with=signal.SIGINT):
+    """Run the command; yield what it printed up to the URL, and the URL. It has to end well when it is told to."""
+    command = [*COMMAND, *map(str, words)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        printed = ""
+        deadline = time.monotonic() + PATIENCE
+        while not (found := re.search(r"(http://\S+/)   \(Ctrl-C ends it\)\n", printed)):
+            assert select.select([process.stdout], [], [], deadline - time.monotonic())[0], (
+                f"only {printed!r}"
+            )
+            piece = os.read(process.stdout.fileno(), 1 << 16)
+            assert piece, process.stderr.read()
+            printed += piece.decode()
+        yield printed, found[1]
+        process.send_signal(ends_with)
+        rest, complaints = process.communicate(timeout=PATIENCE)
+        assert (process.returncode, rest, complaints) == (0, b"ended\n", b"")
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def fetched(url):
+    with urllib.request.urlopen(url, timeout=PATIENCE) as answer:
+        return answer.read()
+
+
+@own_process
+def test_a_run_is_shown_with_its_cameras_and_settings_until_ctrl_c(made):
+    folder, _ = made
+    with viewing(folder.path, "--port", "0", "--no-open") as (printed, url):
+        source = open_source(folder.path)
+        assert len(source.cameras) == 6 and source.settings.background == ORANGE
+        assert fetched(url) == page.html(source.scene, source.cameras, source.settings, "egg & spoon")
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            fetched(f"{url}config.json")
+        assert refused.value.code == 404
+        refused.value.close()
+    scene = folder.scene(30)
+    assert re.fullmatch(
+        rf"{re.escape(str(scene))}: 200 Gaussians, 6 cameras, [\d,]+ bytes", printed.splitlines()[0]
+    )
+    assert url.startswith("http://127.0.0.1:")
+
+
+@own_process
+def test_a_scene_of_another_format_has_no_cameras(made):
+    _, bare = made
+    with viewing(bare, "--port", "0", "--host", "0.0.0.0", "--no-open") as (printed, url):
+        source = open_source(bare)
+        assert fetched(url) == page.html(source.scene, (), source.settings, "bare.splat")
+    first, warning, _ = printed.splitlines()
+    assert "200 Gaussians, " in first and "cameras" not in first
+    assert warning.startswith("warning: listening at 0.0.0.0: whoever can reach this computer sees the scene")
+
+
+@pytest.mark.skipif(shutil.which("sh") is None or sys.platform == "win32", reason="needs sh and a terminal")
+@own_process
+def test_a_person_at_a_screen_has_the_browser_opened(made, tmp_path):
+    import pty
+
+    _, bare = made
+    noted = tmp_path / "opened"
+    script = tmp_path / "browser"
+    script.write_text(f'#!/bin/sh\necho "$1" > {noted}.part && mv {noted}.part {noted}\n')
+    script.chmod(0o755)
+
+    def opened(*words, **environment):
+        """Say which URL was opened before the command was interrupted, which is when it had time to."""
+        noted.unlink(missing_ok=True)
+        ours, theirs = pty.openpty()
+        command = [*COMMAND, str(bare), "--port", "0", *words]
+        quiet = {"BROWSER": str(script), "DISPLAY": ":99", "WAYLAND_DISPLAY": ""}
+        process = subprocess.Popen(
+            command, stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, **quiet, **environment}
+        )
+        os.close(theirs)
+        try:
+            printed, deadline = b"", time.monotonic() + PATIENCE
+            while b"Ctrl-C ends it" not in printed:
+                assert select.select([ours], [], [], deadline - time.monotonic())[0], printed
+                printed += os.read(ours, 1 << 16)
+            until = time.monotonic() + (PATIENCE if not words and not environment else 1.0)
+            while not noted.exists() and time.monotonic() < until:
+                time.sleep(0.02)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(PATIENCE) == 0
+        finally:
+            process.kill()
+            process.wait()
+            os.close(ours)
+        url = re.search(rb"http://\S+", printed)[0].decode()
+        return noted.exists() and noted.read_text().strip() == url
+
+    assert opened()
+    assert not opened("--no-open")
+    assert not opened(DISPLAY="")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["nowhere"], "nowhere: is not there; give a scene file or the folder of a run"),
+        (["empty"], "empty: is no run (it has no config.json)"),
+        (["notes.txt"], "notes.txt: its name ends like no scene format"),
+        (["cut.ply"], "cut.ply: "),
+        (["unfinished"], "unfinished: holds no scene"),
+        (["nowhere", "--port", "70000"], "--port: is 70000"),
+        (["nowhere", "--port", "many"], "argument --port: 'many' is not a whole number"),
+        (["nowhere", "--host", "no such host"], "--host: 'no such host' is no address"),
+    ],
+)
+@pytest.mark.usefixtures("as_shipped")
+def test_what_cannot_be_shown_costs_one_line(tmp_path, monkeypatch, capsys, words, says):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.txt").write_text("notes")
+    (tmp_path / "cut.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement ver")
+    RunFolder(tmp_path / "unfinished").write_config({"render": {}})
+    default = [] if "--port" in words else ["--port", "0"]
+    try:
+        code = command_line.main(["view", *words, *default])
+    except SystemExit as stop:  # what argparse refuses
+        code = stop.code
+    said = capsys.readouterr()
+    assert code == 2 and said.out == ""
+    assert said.err.startswith(f"gsplat-edu view: {says}") and said.err.count("\n") == 1
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_a_port_that_is_taken_costs_one_line_before_the_scene_is_read(capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen(1)
+        port = taken.getsockname()[1]
+        assert command_line.main(["view", "nowhere", "--port", str(port)]) == 2
+    says = f"gsplat-edu view: --port: {port} is taken on 127.0.0.1; give another, or 0 for any that is free\n"
+    assert capsys.readouterr().err == says

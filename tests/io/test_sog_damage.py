@@ -1,0 +1,400 @@
+import contextlib
+import io
+import json
+import tracemalloc
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.io import sog
+from scene_files import random_scene
+
+COUNT = 40
+
+
+@pytest.fixture(scope="module")
+def contents(tmp_path_factory):
+    """The files of a small scene by their names."""
+    path = tmp_path_factory.mktemp("sog") / "meta.json"
+    sog.write(path, random_scene(COUNT, 3))
+    return {file.name: file.read_bytes() for file in sorted(path.parent.iterdir())}
+
+
+def refused(path):
+    with pytest.raises(SceneFormatError) as caught:
+        sog.read(path)
+    message = str(caught.value)
+    assert str(path.parent) in message and "\n" not in message and len(message) < 300
+    return message
+
+
+def peak_of(read, path):
+    tracemalloc.start()
+    try:
+        read(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def zipped(path, contents, method=zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", method) as bundle:
+        for name, data in contents.items():
+            bundle.writestr(name, data)
+    return path
+
+
+def in_folder(folder, contents):
+    folder.mkdir(exist_ok=True)
+    for name, data in contents.items():
+        (folder / name).write_bytes(data)
+    return folder / "meta.json"
+
+
+def with_meta(contents, change):
+    """The same files with a changed meta.json."""
+    meta = json.loads(contents["meta.json"])
+    change(meta)
+    return contents | {"meta.json": json.dumps(meta).encode()}
+
+
+def pixels_of(data):
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGBA")).copy()
+
+
+def webp(pixels, **options):
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "WEBP", **({"lossless": True, "exact": True} | options))
+    return file.getvalue()
+
+
+def test_every_cut_of_a_bundle_is_told(tmp_path, contents):
+    path = zipped(tmp_path / "a.sog", contents)
+    whole = path.read_bytes()
+    assert len(whole) < 16 * 1024 and len(sog.read(path).gaussians) == COUNT
+    for length in range(0, len(whole), 64):
+        path.write_bytes(whole[:length])
+        refused(path)
+
+
+def test_every_cut_of_a_file_in_a_folder_is_told(tmp_path, contents):
+    path = in_folder(tmp_path / "a", contents)
+    for name, data in contents.items():
+        for length in range(0, len(data), 64):
+            (path.parent / name).write_bytes(data[:length])
+            refused(path)
+        (path.parent / name).write_bytes(data)
+    sog.read(path)
+
+
+def test_changed_bytes_are_told_or_read(tmp_path, contents):
+    """A file may be damaged such that it is whole; nothing but a SceneFormatError may come of the others."""
+    path = in_folder(tmp_path / "a", contents)
+    bundle = zipped(tmp_path / "a.sog", contents)
+    rng = np.random.default_rng(0)
+    outcomes = {"read": 0, "refused": 0}
+    for place, where in [(path.parent / name, path) for name in contents] + [(bundle, bundle)]:
+        whole = place.read_bytes()
+        for _ in range(60):
+            data = bytearray(whole)
+            for at in rng.integers(0, len(whole), rng.integers(1, 4)):
+                data[at] = rng.integers(256)
+            place.write_bytes(data)
+            try:
+                assert all(bool(t.isfinite().all()) for t in sog.read(where).gaussians.tensors().values())
+                outcomes["read"] += 1
+            except SceneFormatError as error:
+                assert "\n" not in str(error)
+                outcomes["refused"] += 1
+        place.write_bytes(whole)
+    assert min(outcomes.values()) > 20, outcomes
+
+
+def test_deflated_zips_are_read(tmp_path, contents):
+    a = sog.read(zipped(tmp_path / "a.sog", contents, zipfile.ZIP_DEFLATED)).gaussians
+    b = sog.read(in_folder(tmp_path / "b", contents)).gaussians
+    assert all(bool((t == b.tensors()[name]).all()) for name, t in a.tensors().items())
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_other_methods_of_zip_are_refused(tmp_path, contents, method):
+    said = refused(zipped(tmp_path / "a.sog", contents, method))
+    assert "meta.json is neither stored nor deflated; zip it again" in said
+
+
+def test_bombs_do_not_go_off(tmp_path, contents):
+    """300 MB of zeros in 300 kB, told as such; and told as 100 bytes in both of the zip's headers."""
+    path = zipped(tmp_path / "a.sog", contents | {"quats.webp": bytes(300 << 20)}, zipfile.ZIP_DEFLATED)
+    bomb = path.read_bytes()
+
+    def said(path):
+        messages.append(refused(path))
+
+    messages = []
+    assert peak_of(said, path) < 16 << 20
+    assert "says it holds 314,572,800 bytes in a file of" in messages[0]
+
+    path.write_bytes(bomb.replace((300 << 20).to_bytes(4, "little"), (100).to_bytes(4, "little")))
+    assert peak_of(said, path) < 16 << 20
+    assert "quats.webp in it is damaged" in messages[1]
+
+
+def test_of_two_files_of_one_name_the_last_is_read(tmp_path, contents):
+    path = zipped(tmp_path / "a.sog", contents | {"quats.webp": b"not an image"})
+    with zipfile.ZipFile(path, "a") as bundle, pytest.warns(UserWarning, match="Duplicate name"):
+        bundle.writestr("quats.webp", contents["quats.webp"])
+    assert len(sog.read(path).gaussians) == COUNT
+
+
+def test_odd_fields_of_a_zips_directory_are_no_warning(tmp_path, contents):
+    """An empty Unicode path, of which newer versions of Python warn."""
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(path, "w") as bundle:
+        for name, data in contents.items():
+            entry = zipfile.ZipInfo(name)
+            entry.extra = b"\x75\x70\x05\x00\x01" + zlib.crc32(name.encode()).to_bytes(4, "little")
+            bundle.writestr(entry, data)
+    with contextlib.suppress(SceneFormatError):  # some versions do not read it
+        assert len(sog.read(path).gaussians) == COUNT
+
+
+@pytest.mark.parametrize(
+    "name", ["meta.json", "means_u.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp"]
+)
+def test_missing_files_are_named(tmp_path, contents, name):
+    rest = {other: data for other, data in contents.items() if other != name}
+    assert f"{name} is missing" in refused(zipped(tmp_path / "a.sog", rest))
+    path = in_folder(tmp_path / "a", rest)
+    if name == "meta.json":
+        with pytest.raises(FileNotFoundError, match=r"meta\.json"):
+            sog.read(path)
+    else:
+        assert f"{name} is missing" in refused(path)
+
+
+def test_what_is_no_sog_is_called_so(tmp_path, contents):
+    path = tmp_path / "a.sog"
+    for data in (b"", b"ply\nformat", bytes(100), contents["sh0.webp"]):
+        path.write_bytes(data)
+        assert "is no zip" in refused(path)
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
+    path.write_bytes(pointer)
+    assert "git lfs pull" in refused(path)
+    folder = in_folder(tmp_path / "a", contents | {"quats.webp": pointer})
+    said = refused(folder)
+    assert "quats.webp: is a Git LFS pointer" in said
+
+
+def _set(dotted, value):
+    def change(meta):
+        *path, last = dotted.split(".")
+        for key in path:
+            meta = meta[int(key)] if isinstance(meta, list) else meta[key]
+        if isinstance(meta, list):
+            meta[int(last)] = value
+        else:
+            meta[last] = value
+
+    return change
+
+
+NUMBERS = ["scales.codebook", "sh0.codebook", "shN.codebook", "means.mins", "means.maxs"]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        *((_set(key, [0.0] * 255), f"numbers in {key}") for key in NUMBERS),
+        *((_set(key, None), f"numbers in {key}") for key in NUMBERS),
+        *(
+            (_set(f"{key}.2", value), f"in {key}[2]")
+            for key in NUMBERS
+            for value in (1e39, None, "1", True, 10**400)
+        ),
+        (_set("means.mins.0", 88.8), "in means.mins[0]"),  # e^88.8 is more than float32 has
+        (_set("means", [1, 2]), "numbers in means.mins"),
+        (_set("version", 3), "is SOG of version 3, but version 2 is read"),
+        (_set("version", "2"), "is SOG of no version"),
+        (_set("version", True), "is SOG of no version"),
+        (_set("version", 10**4000), "is SOG of no version"),
+        (lambda meta: (meta.pop("version"), meta["means"].update(shape=[40, 3])), "is SOG of version 1, but"),
+        *(
+            (_set("count", value), "number from 0 to 67108864 in count")
+            for value in (-1, 1.5, True, None, 2**26 + 1, 10**99)
+        ),
+        (_set("count", 2**26), "says it holds 6,174,015,488 bytes in a file of"),
+        (_set("count", COUNT * 10), "has 8x8 pixels for 400 splats"),
+        (_set("shN.count", 0), "number from 1 to 65536 in shN.count"),
+        (_set("shN.count", 65537), "number from 1 to 65536 in shN.count"),
+        (_set("shN.count", COUNT - 1), "its harmonics are number 39 of 39"),
+        (_set("shN.count", 65), "has 192x1 pixels, but 65 entries of degree 1 take 192x2"),
+        (_set("shN.bands", 4), "number from 1 to 3 in shN.bands"),
+        (_set("shN.bands", 2), "has 192x1 pixels, but 40 entries of degree 2 take 512x1"),
+        (_set("shN", 7), "in shN.count"),
+        (_set("antialias", "yes"), "antialias, which is neither"),
+        (_set("quats.files", []), "no 1 file names in quats.files"),
+        (_set("means.files", "means_l.webp"), "no 2 file names in means.files"),
+        (_set("quats.files.0", "meta.json"), "meta.json is no WebP image"),
+    ],
+)
+def test_what_metadata_cannot_say_is_named(tmp_path, contents, change, says):
+    assert says in refused(zipped(tmp_path / "a.sog", with_meta(contents, change)))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../quats.webp",
+        "/etc/passwd",
+        "a/quats.webp",
+        "..",
+        ".",
+        "",
+        "C:quats.webp",
+        "a\\b",
+        "a\0b",
+        "\ud800",
+        7,
+        "q" * 999,
+    ],
+)
+def test_names_that_lead_elsewhere_are_refused(tmp_path, contents, name):
+    changed = with_meta(contents, _set("quats.files.0", name))
+    for path in (zipped(tmp_path / "a.sog", changed), in_folder(tmp_path / "a", changed)):
+        assert "in quats.files something that is no plain file name" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (b"", "is no JSON"),
+        (b"\xff\xfe\x00", "is no JSON"),
+        (b'{"count": NaN}', "is no JSON (NaN is no number of JSON)"),
+        (b'{"count": -Infinity}', "is no JSON (-Infinity is no number of JSON)"),
+        (b'{"a":' * 200_000, "is no JSON (nested too deep)"),
+        (b"9" * 5000, "is no JSON"),
+        (b"[]", "has no object"),
+        (b"{}", "is SOG of no version"),
+        (b'{"version": 2}', "means.mins"),
+        (b" " * (1 << 21) + b"{}", "its metadata has 2,097,154 bytes"),
+    ],
+)
+def test_metadata_that_is_none_is_refused(tmp_path, contents, text, says):
+    assert says in refused(zipped(tmp_path / "a.sog", contents | {"meta.json": text}))
+
+
+def test_a_number_that_json_has_but_floats_have_not_is_refused(tmp_path, contents):
+    text = contents["meta.json"].replace(b'"mins":[', b'"mins":[1e999,')
+    start, rest = text.split(b'"mins":[')
+    first, second, *others = rest.split(b",")
+    changed = start + b'"mins":[' + b",".join([first, *others])
+    assert b"1e999" in changed and second
+    assert "in means.mins[0]" in refused(zipped(tmp_path / "a.sog", contents | {"meta.json": changed}))
+
+
+def test_codebooks_that_start_with_null_are_read(tmp_path, contents):
+    """Written of scenes with infinite numbers; others go on downwards by the mean step."""
+    entries = np.array(json.loads(contents["meta.json"])["sh0"]["codebook"])
+    pixels = pixels_of(contents["sh0.webp"])
+    pixels[0, 0, 0] = 0
+    changed = with_meta(contents, _set("sh0.codebook.0", None)) | {"sh0.webp": webp(pixels)}
+    read = sog.read(zipped(tmp_path / "a.sog", changed)).gaussians
+    expected = entries[1] - (entries[255] - entries[1]) / 255
+    assert float(read.sh0[0, 0, 0]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_somebody_elses_extras_are_left_alone(tmp_path, contents):
+    for value in ("y", [0, 1], [0, 0, 0], [0, "1", 0], [1e39, 0, 0], None, {"x": 1}):
+        changed = with_meta(contents, _set("asset.extras.up", value))
+        assert sog.read(zipped(tmp_path / "a.sog", changed)).up is None
+    longer = with_meta(contents, _set("asset.extras.up", [0, -3, 4]))
+    assert sog.read(zipped(tmp_path / "a.sog", longer)).up == (0.0, -0.6, 0.8)
+
+
+def test_rotations_of_no_kind_are_refused(tmp_path, contents):
+    pixels = pixels_of(contents["quats.webp"])
+    assert (pixels.reshape(-1, 4)[COUNT:] == 0).all(), "beyond the splats it does not matter"
+    pixels[1, 2, 3] = 251
+    said = refused(zipped(tmp_path / "a.sog", contents | {"quats.webp": webp(pixels)}))
+    assert f"splat {pixels.shape[1] + 2}: its rotation is of a kind that SOG has not" in said
+
+
+def test_images_of_other_sizes_are_refused(tmp_path, contents):
+    pixels = pixels_of(contents["scales.webp"])
+    twice = webp(np.concatenate([pixels, pixels]))
+    said = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": twice}))
+    assert "its images differ in size" in said
+    huge = webp(np.zeros((300, 300, 3), dtype=np.uint8))
+    assert "has 300x300 pixels for 40 splats" in refused(
+        zipped(tmp_path / "b.sog", contents | {"scales.webp": huge})
+    )
+    tall = webp(np.zeros((1025, 192, 3), dtype=np.uint8))
+    said = refused(zipped(tmp_path / "c.sog", contents | {"shN_centroids.webp": tall}))
+    assert "has 192x1025 pixels, but 40 entries" in said
+
+
+@pytest.mark.parametrize("kind", ["lossless", "extended", "lossy"])
+def test_absurd_sizes_are_refused_before_anything_is_decoded(tmp_path, contents, kind):
+    """The largest sizes that the three kinds of header have."""
+    if kind == "lossless":
+        data = bytearray(contents["scales.webp"])
+        assert data[12:16] == b"VP8L"
+        data[21:25] = (2**28 - 1 | int.from_bytes(data[21:25], "little")).to_bytes(4, "little")
+        size = "16384x16384"
+    elif kind == "extended":
+        data = bytearray(webp(pixels_of(contents["quats.webp"]), lossless=False))
+        assert data[12:16] == b"VP8X"
+        data[24:30] = b"\xff" * 6
+        size = "16777216x16777216"
+    else:
+        data = bytearray(webp(pixels_of(contents["scales.webp"])[:, :, :3], lossless=False))
+        assert data[12:16] == b"VP8 "
+        data[26:30] = b"\xff" * 4
+        size = "16383x16383"
+    path = zipped(tmp_path / "a.sog", contents | {"scales.webp": bytes(data)})
+
+    def said(path):
+        assert f"scales.webp has {size} pixels for 40 splats" in refused(path)
+
+    assert peak_of(said, path) < 4 << 20
+
+
+def test_other_images_are_refused(tmp_path, contents):
+    png = io.BytesIO()
+    Image.fromarray(pixels_of(contents["scales.webp"])).save(png, "PNG")
+    said = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": png.getvalue()}))
+    assert "scales.webp is no WebP image" in said
+    broken = contents["scales.webp"][:30] + bytes(len(contents["scales.webp"]) - 30)
+    said = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": broken}))
+    assert "scales.webp is a damaged WebP image" in said
+
+
+def test_lossy_images_are_read(tmp_path, contents):
+    """Opaque ones and, of rotations, ones whose alpha is exact: the decoders' three headers are all known."""
+    lossy = {
+        "means_u.webp": webp(pixels_of(contents["means_u.webp"])[:, :, :3], lossless=False),
+        "quats.webp": webp(pixels_of(contents["quats.webp"]), lossless=False, alpha_quality=100),
+    }
+    exact = sog.read(zipped(tmp_path / "a.sog", contents)).gaussians
+    read = sog.read(zipped(tmp_path / "b.sog", contents | lossy)).gaussians
+    assert not bool((exact.means == read.means).all()) and not bool((exact.quats == read.quats).all())
+    np.testing.assert_array_equal(exact.sh0.numpy(), read.sh0.numpy())
+    assert (exact.quats.argmax(dim=1) == read.quats.abs().argmax(dim=1)).float().mean() > 0.5
+
+
+def test_images_may_be_larger_than_the_scene(tmp_path, contents):
+    """A square with a power of two for its edge, as some write; splats still come row by row."""
+    wide = {}
+    for name, data in contents.items():
+        if name.endswith(".webp") and name != "shN_centroids.webp":
+            flat = pixels_of(data).reshape(-1, 4)[:COUNT]
+            pixels = np.zeros((64 * 64, 4), dtype=np.uint8)
+            pixels[:COUNT] = flat
+            wide[name] = webp(pixels.reshape(64, 64, 4))
+    a = sog.read(zipped(tmp_path / "a.sog", contents)).gaussians
+    b = sog.read(zipped(tmp_path / "b.sog", contents | wide)).gaussians
+    assert all(bool((t == b.tensors()[name]).all()) for name, t in a.tensors().items())

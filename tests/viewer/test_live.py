@@ -1,0 +1,359 @@
+"""The live view: cameras, clients of its WebSocket, and trainings whose bits it does not change."""
+
+import math
+import socket
+import sys
+import threading
+import time
+
+import msgspec
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed")
+import rich
+import websockets.asyncio.server
+from websockets.exceptions import InvalidStatus
+
+from gsplat_edu import quat_to_R
+from gsplat_edu.cli.main import main
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.render.api import render
+from gsplat_edu.train.checkpoint import list_checkpoints
+from gsplat_edu.viewer import live
+from gsplat_edu.viewer.live import browser_camera
+from gsplat_edu.viewer.serve import PageServer
+from live_clients import CANVAS, LEVEL, PATIENCE, POSE, STRATEGIES, Client, Training, training, until
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "egg"
+    write_colmap(folder, *procedural_capture(48, 10, splats=100))
+    return folder
+
+
+def test_a_level_camera_sees_right_and_down_where_they_are():
+    """Half a field of view up and down, and as much more to the sides as the browser is wide."""
+    camera = browser_camera(LEVEL, (1.0, 2.0, 3.0), math.radians(90), (200, 100), 800)
+    assert (camera.W, camera.H) == (200, 100), "no more pixels than the browser has"
+    u, v, z = camera.project(camera.world_to_cam([[1 + 2 * 5.0, 2 + 5.0, 3 + 5.0], [1 - 10.0, 2 - 5.0, 8.0]]))
+    np.testing.assert_allclose(u, [199.5, -0.5], atol=1e-9)  # the outer edges of the first and last pixels
+    np.testing.assert_allclose(v, [99.5, -0.5], atol=1e-9)
+    np.testing.assert_allclose(z, 5.0)
+
+
+def test_a_turned_camera_looks_along_the_third_axis_of_its_rotation():
+    wxyz = (0.5, -0.1, 0.7, 0.2)
+    camera = browser_camera(wxyz, (0, 0, 0), 1.0, CANVAS, 60)
+    np.testing.assert_allclose(camera.world_to_cam(4.0 * quat_to_R(wxyz)[:, 2]), [0, 0, 4.0], atol=1e-12)
+    np.testing.assert_allclose(camera.world_to_cam(quat_to_R(wxyz)[:, 1]), [0, 1.0, 0], atol=1e-12)
+
+
+def test_fewer_pixels_show_the_same_view():
+    wide = browser_camera(LEVEL, (0, 0, 0), 0.7, (1000, 333), 1000)
+    small = browser_camera(LEVEL, (0, 0, 0), 0.7, (1000, 333), 101)
+    assert (small.W, small.H) == (101, 34)
+    for point in ([0.3, 0.1, 1.0], [-0.5, -0.2, 2.0]):
+        (u, v, _), (a, b, _) = wide.project(point), small.project(point)
+        np.testing.assert_allclose(((u + 0.5) / 1000, (v + 0.5) / 333), ((a + 0.5) / 101, (b + 0.5) / 34))
+
+
+BAD_CAMERAS = (
+    {"wxyz": (0.0, 0.0, 0.0, 0.0)},
+    {"wxyz": (math.nan, 0.0, 0.0, 1.0)},
+    {"position": (math.inf, 0.0, 0.0)},
+    {"fov": 0.0},
+    {"fov": -1.0},
+    {"fov": math.pi},
+    {"fov": math.nan},
+    {"image_height": 0},
+    {"image_width": -5},
+    {"image_width": 1, "image_height": 10**9},
+    {"image_width": 10**9, "image_height": 1},
+)
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize("changes", BAD_CAMERAS)
+def test_what_is_no_camera_is_refused(changes):
+    pose = {**POSE, **changes}
+    canvas = (pose["image_width"], pose["image_height"])
+    with pytest.raises(ArgumentError):
+        browser_camera(pose["wxyz"], pose["position"], pose["fov"], canvas, 800)
+
+
+def test_a_picture_is_our_own_render_from_the_clients_camera(capture, tmp_path):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
+        client.move()
+        client.press("Pause")
+        assert client.paused_at() == made.iteration
+        for turn in (LEVEL, (0.99, 0.05, -0.1, 0.03)):
+            client.move(wxyz=turn)
+            picture = client.picture(width=120)  # a narrower one is drawn while the camera moves
+            camera = browser_camera(turn, POSE["position"], POSE["fov"], CANVAS, 120)
+            truth = render(
+                made.run.trainer.gaussians, camera, settings=made.run.options.render_settings
+            ).image
+            # JPEG of quality 85 is off by some three levels: 38 dB and more; another camera is far below
+            assert psnr(picture / 255.0, truth.detach().clamp(0, 1).numpy()) > 32
+            assert picture.std() > 20, "there is something to see"
+
+
+def test_while_the_camera_moves_pictures_are_smaller(capture, tmp_path):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
+        client.move()
+        client.press("Pause")
+        client.paused_at()
+        until(lambda: client.listened().pictures, "a picture of the camera at rest")
+        client.pictures.clear()
+        client.move(position=(0.0, 0.0, -4.0))
+        widths = until(
+            lambda: len(client.listened().pictures) >= 2 and [p.shape for p in client.pictures], "two"
+        )
+        assert widths == [(32, 48, 3), (80, 120, 3)], "0.4 of the width first"
+        time.sleep(2 * live.STILL_EVERY)
+        assert len(client.listened().pictures) == 2, "paused and at rest, there is nothing to draw"
+
+
+def test_pause_step_and_resume(capture, tmp_path):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
+        client.move()
+        client.press("Pause")
+        held = client.paused_at()
+        assert made.iteration == held
+        for k in range(1, 4):
+            client.press("Step")
+            until(lambda k=k: client.listened().paused_at() == held + k, "one more iteration")
+            time.sleep(3 * live.POLL)
+            assert made.iteration == held + k, "exactly one"
+        client.press("Resume")
+        until(lambda: made.iteration > held + 50, "many more iterations")
+        client.says(r"\*\*training\*\*")
+        assert "Pause" in client.listened().buttons
+
+
+def test_step_pauses_a_running_training(capture, tmp_path):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
+        client.move()
+        client.press("Step")
+        assert client.paused_at() == made.iteration > 0
+
+
+def test_a_paused_training_that_nobody_watches_goes_on(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "GRACE", 0.2)
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made:
+        with Client(made.view) as client:
+            client.move()
+            client.press("Pause")
+            held = client.paused_at()
+        until(lambda: made.iteration > held + 20, "more iterations")
+        with Client(made.view) as another:
+            another.move()
+            another.press("Pause")  # and so says the button
+            another.paused_at()
+
+
+def test_the_end_of_the_program_ends_a_pause(capture, tmp_path):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
+        client.move()
+        client.press("Pause")
+        held = client.paused_at()
+        made.stopped.set()
+        made.ended()
+        assert made.iteration == held
+        (checkpoint,) = list_checkpoints(made.run.folder.checkpoints)[-1:]
+        assert checkpoint.stem == f"iteration_{held}", "what was trained is saved"
+
+
+def test_a_pause_is_not_counted_as_training(capture, tmp_path):
+    with training(capture, tmp_path / "run", "--iterations", "200") as made, Client(made.view) as client:
+        began = time.perf_counter()
+        client.move()
+        client.press("Step")
+        client.paused_at()
+        time.sleep(2.0)
+        client.press("Resume")
+        made.ended()
+        assert made.run.seconds < time.perf_counter() - began - 1.9
+
+
+def trained(out, capture, *words, watch=None):
+    """Return all of a checkpoint but its clock, and the scene's bytes, of a training that `watch` was let at."""
+    with training(capture, out, "--iterations", "400", "--random-background", *words) as made:
+        if watch is not None:
+            watch(made)
+        made.ended()
+        tensors, numbers = made.run.trainer.state()
+        made.run.finish(lambda split, score: made.view.look("judging"))
+    scene = out / "point_cloud" / "iteration_400" / "point_cloud.ply"
+    bits = {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+    return bits, repr(numbers), scene.read_bytes()
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_a_training_has_the_same_bits_whoever_watches_it(capture, tmp_path, strategy):
+    """Alone; and with two cameras that move all the time, pauses and steps."""
+    seen = []
+
+    def watch(made):
+        with Client(made.view) as one, Client(made.view) as two:
+            one.move()
+            one.press("Step")
+            for k in range(12):
+                held = one.paused_at()
+                one.press("Step")
+                until(lambda held=held: one.listened().paused_at() > held, "a step")
+                two.move(position=(0.05 * k, 0.0, -3.0), wxyz=(1.0, 0.0, 0.02 * k, 0.0), image_width=300)
+            one.press("Resume")
+            while made.thread.is_alive():
+                for client in (one, two):
+                    client.move(position=(0.3 * math.sin(len(seen)), 0.0, -3.0))
+                    seen.extend(client.listened().pictures)
+                    client.pictures.clear()
+
+    words = STRATEGIES[strategy]
+    alone = trained(tmp_path / "alone", capture, *words)
+    assert trained(tmp_path / "watched", capture, *words, watch=watch) == alone
+    assert len(seen) > 20, "it was watched"
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_clients_that_send_nonsense_end_nothing(capture, tmp_path, capfd):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made:
+        for nonsense in (b"", b"\xff", msgspec.msgpack.encode({"type": "None"}), msgspec.msgpack.encode(7)):
+            with Client(made.view) as client:
+                client.socket.send(nonsense)
+        with Client(made.view) as client:
+            for changes in BAD_CAMERAS:
+                client.move(**changes)
+                before = made.iteration
+                until(lambda before=before: made.iteration > before + 5, "more iterations")
+            client.move()
+            assert client.picture().shape[2] == 3, "a camera that is one is drawn again"
+            slider = made.view._width._impl.uuid
+            for width in (10**12, -1):
+                client.send("GuiUpdateMessage", uuid=slider, updates={"value": width})
+                assert client.picture().shape[1] <= 120
+    assert capfd.readouterr() == ("", ""), "the terminal stays clean"
+
+
+def test_nobody_opens_a_tunnel(capture, tmp_path, capfd):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
+        client.move()
+        client.send("ShareUrlRequest")
+        client.picture()
+        client.picture()
+        assert client.shared == [] and made.view._server._share_tunnel is None
+        assert made.view._server.request_share_url() is None
+
+
+@pytest.mark.parametrize("origin", ["http://example.org", "http://localhost.example.org:80", "null", None])
+def test_pages_from_elsewhere_are_turned_away(capture, tmp_path, origin):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made:
+        with pytest.raises(InvalidStatus, match="403"):
+            Client(made.view, origin)
+        for own in ("http://localhost:9999", "http://127.0.0.1", made.view.url.rstrip("/")):
+            with Client(made.view, own) as client:
+                client.move()
+                client.picture()
+
+
+def new_threads(before):
+    """Return the threads that were not there before, but for the trainer's own that reads photos."""
+    return {thread for thread in set(threading.enumerate()) - before if not thread.name.startswith("photo")}
+
+
+def test_everything_is_closed_and_put_back(capture, tmp_path, capfd):
+    threads, serve = set(threading.enumerate()), websockets.asyncio.server.serve
+    with training(capture, tmp_path / "run", "--iterations", "30") as made:
+        assert websockets.asyncio.server.serve is serve
+        port = made.view._server.get_port()
+        with Client(made.view) as client:
+            client.move()
+            made.ended()
+    assert not rich.get_console().quiet
+    assert capfd.readouterr() == ("", ""), "viser's banner stays off the terminal"
+    until(lambda: new_threads(threads) == set(), "the end of its threads")
+    with PageServer(b"", port=port):
+        pass
+
+
+def test_everything_is_closed_after_an_error(capture, tmp_path):
+    threads = set(threading.enumerate())
+    made = Training(capture, tmp_path / "run", "--iterations", "30")
+    with pytest.raises(RuntimeError), made.view:
+        raise RuntimeError
+    until(lambda: new_threads(threads) == set(), "the end of its threads")
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--view-port", "8080"], "--view-port: is looked at with --view only"),
+        (["--view-host", "0.0.0.0"], "--view-host: is looked at with --view only"),
+        (
+            ["--view", "--view-port", "TAKEN"],
+            "--view-port: TAKEN is taken on 127.0.0.1; give another, or 0 for",
+        ),
+        (
+            ["--view", "--view-port", "70000"],
+            "--view-port: is 70000, but has to be a whole number from 0 to 65535",
+        ),
+        (
+            ["--view", "--view-port", "0", "--view-host", "no such host"],
+            "--view-host: 'no such host' is no address",
+        ),
+        (
+            ["--view", "--view-port", "0", "--view-host", "203.0.113.1"],
+            "--view-host: cannot listen at 203.0.113.1",
+        ),
+    ],
+)
+def test_a_view_that_cannot_be_had_costs_one_line_and_nothing_is_begun(
+    capture, tmp_path, capsys, words, says
+):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen(1)
+        port = str(taken.getsockname()[1])
+        words = [port if word == "TAKEN" else word for word in words]
+        assert main(["train", str(capture), "--out", str(tmp_path / "run"), *words]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"gsplat-edu train: {says.replace('TAKEN', port)}") and said.count("\n") == 1
+    assert not (tmp_path / "run").exists() and not rich.get_console().quiet
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_without_viser_one_line_says_how_to_get_it(capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.delitem(sys.modules, "gsplat_edu.viewer.live")
+    assert main(["train", str(capture), "--out", str(tmp_path / "run"), "--view"]) == 2
+    said = capsys.readouterr().err
+    assert "--view: viser is not installed; pip install" in said and "gsplat-edu[viewer]" in said
+    assert said.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+def test_the_finished_scene_is_shown_until_the_last_browser_goes(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "GRACE", 0.3)
+    with training(capture, tmp_path / "run", "--iterations", "300") as made:
+        with Client(made.view) as client:
+            client.move()
+            until(lambda: made.view.watched, "somebody who looks")
+            made.ended()
+            assert made.view.watched
+            staying = threading.Thread(target=made.view.stay)
+            staying.start()
+            client.says(r"\*\*finished\*\*\s+iteration 300 of 300")
+            client.move(position=(0.0, 0.0, -4.0))
+            assert client.picture(width=120).std() > 10, "and can be looked at from everywhere"
+            assert staying.is_alive()
+        staying.join(PATIENCE)
+        assert not staying.is_alive() and not made.view.watched
+        began = time.monotonic()
+        made.view.stay()
+        assert time.monotonic() - began < 5, "nobody is there: it does not stay"

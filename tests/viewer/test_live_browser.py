@@ -1,0 +1,214 @@
+"""The live view from outside: the whole command, a real browser, Ctrl-C."""
+
+import io
+import math
+import re
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+from safetensors import safe_open
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+from gsplat_edu import quat_to_R
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.train.checkpoint import list_checkpoints
+from gsplat_edu.viewer.live import browser_camera
+from live_clients import GROWING, PATIENCE, STRATEGIES, Client, Training, training, until
+
+COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "egg"
+    write_colmap(folder, *procedural_capture(48, 10, splats=100))
+    return folder
+
+
+class Tab:
+    """A real browser that looks at a training; what it complains of and asks for is remembered."""
+
+    def __init__(self, browser, url):
+        self.complaints, self.asked = [], []
+        self.page = browser.new_page(viewport={"width": 700, "height": 500})
+        self.page.set_default_timeout(1e3 * PATIENCE)
+        self.page.on("console", self._note)
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.on("websocket", lambda socket: self.asked.append(socket.url.replace("ws:", "http:")))
+        self.page.goto(url)
+
+    def _note(self, message):
+        if message.type == "error":
+            self.complaints.append(message.text)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.page.close()
+
+    def press(self, label):
+        self.page.get_by_role("button", name=label, exact=True).click()
+
+    def says(self, pattern):
+        """Wait for words in the panel; return the number among them."""
+        self.page.get_by_text(re.compile(pattern)).first.wait_for()
+        found = re.search(pattern, self.page.inner_text("body"))
+        return found and int(found[1].replace(",", ""))
+
+    def picture(self):
+        """(H, W, 3) what it shows, but for the panel on the right and the notice on the left."""
+        shown = Image.open(io.BytesIO(self.page.screenshot()))
+        return np.asarray(shown.convert("RGB"), dtype=float)[150:, :350]
+
+
+def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path, browser):
+    """Three balls of viser's, drawn by the browser itself, against `browser_camera`: axes, signs, centre, scale."""
+    window, where = 700, {0: (120, 220, 2.5), 1: (310, 420, 3.2), 2: (560, 330, 4.0)}  # column, row, depth
+    with (
+        training(capture, tmp_path / "run", "--iterations", "100000") as made,
+        Tab(browser, made.view.url) as tab,
+    ):
+        tab.says(r"iteration ([\d,]+) of")
+        made.stopped.set()
+        made.ended()  # the server is there still, and nobody draws any more
+        (client,) = made.view._server.get_clients().values()
+        seen, start = client.camera, made.run.dataset.train[0].camera
+        until(lambda: np.allclose(seen.position, start.eye, atol=1e-6), "the first training view")
+        # the cameras are level, so that the browser's up is theirs
+        np.testing.assert_allclose(quat_to_R(seen.wxyz).T, start.R, atol=1e-3)
+        np.testing.assert_allclose(seen.fov, 2 * math.atan(start.H / 2 / start.fy), atol=1e-6)
+        canvas = (seen.image_width, seen.image_height)
+        camera = browser_camera(seen.wxyz, seen.position, seen.fov, canvas, 10**6)
+        scale = window / camera.W  # the browser may draw fewer pixels than its window has
+        for channel, (column, row, z) in where.items():
+            u, v = (column + 0.5) / scale - 0.5, (row + 0.5) / scale - 0.5
+            place = camera.eye + camera.R.T @ (
+                z * np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1])
+            )
+            color = tuple(np.eye(3)[channel])
+            client.scene.add_icosphere(f"/ball{channel}", 0.03, color=color, position=tuple(place))
+        client.scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
+
+        def middle(channel):
+            """Column and row of the middle of what is of one colour, beside the panel and the notice."""
+            shown = np.asarray(Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB"), dtype=float)[
+                150:
+            ]
+            ball = shown[..., channel] > 40 + 1.5 * np.delete(shown, channel, axis=2).max(axis=2)
+            ball[:100, 350:] = False
+            return None if ball.sum() < 20 else np.argwhere(ball).mean(axis=0)[::-1] + np.array([0, 150])
+
+        for channel, (column, row, _) in where.items():
+            until(lambda channel=channel: middle(channel) is not None, "the ball")
+            # light from above moves the middle of what counts as coloured by a part of the radius, 6 to 9 px
+            np.testing.assert_allclose(middle(channel), (column, row), atol=3)
+    assert tab.complaints == []
+
+
+@contextmanager
+def commanded(capture, out, *words):
+    """Run the command with a view in a process of its own; yield the process and the URL it printed."""
+    command = [*COMMAND, "train", str(capture), "--out", str(out), "--view", "--view-port", "0", *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        watchdog = threading.Timer(5 * PATIENCE, process.kill)  # so that no pipe is read for ever
+        watchdog.start()
+        while not (
+            found := re.fullmatch(r"live view: (http://127\.0\.0\.1:\d+/)\n", process.stdout.readline())
+        ):
+            assert process.poll() is None, process.stderr.read()
+        yield process, found[1]
+    finally:
+        watchdog.cancel()
+        process.kill()
+        process.communicate()
+
+
+def bits(path):
+    """Return what a checkpoint holds but its clock: tensors, and what is not a tensor."""
+    with safe_open(path, framework="np") as file:
+        tensors = {name: file.get_tensor(name).tobytes() for name in sorted(file.keys())}
+        return tensors, file.metadata()["state"]
+
+
+@pytest.mark.own_process
+def test_a_person_watches_pauses_steps_and_ends_a_training(capture, tmp_path, browser):
+    """The whole of it: command, browser, Ctrl-C; and the bits of a training without a view."""
+    out, words = tmp_path / "run", ["--iterations", "100000", *GROWING, *STRATEGIES["adc"]]
+    with commanded(capture, out, *words) as (process, url), Tab(browser, url) as tab:
+        tab.says(r"iteration ([\d,]+) of 100,000")
+        until(lambda: tab.picture().std() > 20, "a picture")
+        tab.press("Pause")
+        held = tab.says(r"paused\s+iteration ([\d,]+) of")
+        for k in (1, 2):
+            tab.press("Step")
+            until(lambda k=k: tab.says(r"paused\s+iteration ([\d,]+) of") == held + k, "one more iteration")
+        before = tab.picture()
+        tab.page.mouse.move(200, 400)
+        tab.page.mouse.down()
+        tab.page.mouse.move(330, 380, steps=5)
+        tab.page.mouse.up()
+        until(lambda: np.abs(tab.picture() - before).mean() > 10, "the scene from another side")
+        tab.press("Resume")
+        until(lambda: (tab.says(r"iteration ([\d,]+) of") or 0) > held + 50, "many more iterations")
+        tab.press("Pause")
+        held = tab.says(r"paused\s+iteration ([\d,]+) of")
+        process.send_signal(signal.SIGINT)
+        printed, complaints = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 130
+        assert f"interrupted after {held} iterations" in complaints and complaints.count("\n") == 1
+        assert "viser" not in printed and "Websocket" not in printed
+        errors = [text for text in tab.complaints if "WebSocket" not in text]  # the server is gone by now
+        assert errors == []
+        assert [one for one in tab.asked if not one.startswith((url, f"blob:{url}"))] == [], (
+            "it asks nobody else"
+        )
+    alone = Training(capture, tmp_path / "alone", *words)
+    with alone.view:
+        alone.run.start()
+    alone.run.train(lambda: alone.run.trainer.iteration == held)
+    watched, unwatched = (list_checkpoints(one / "checkpoints")[-1] for one in (out, tmp_path / "alone"))
+    assert watched.name == unwatched.name == f"iteration_{held}.safetensors"
+    assert bits(watched) == bits(unwatched)
+
+
+@pytest.mark.own_process
+def test_after_the_training_the_view_stays_until_ctrl_c_and_all_is_well(capture, tmp_path):
+    words = ["--iterations", "3000", *GROWING, *STRATEGIES["adc"]]
+    with commanded(capture, tmp_path / "run", *words) as (process, url):
+        with Client(SimpleNamespace(url=url)) as client:
+            client.move()
+            client.says(r"\*\*finished\*\*\s+iteration 3,000 of 3,000")
+            assert (tmp_path / "run" / "metrics.json").exists() and process.poll() is None
+            process.send_signal(signal.SIGINT)
+            printed, complaints = process.communicate(timeout=PATIENCE)
+        assert (process.returncode, complaints) == (0, "")
+        assert printed.endswith("the live view stays until its last browser is closed, or Ctrl-C\n")
+
+
+@pytest.mark.own_process
+def test_without_a_view_viser_is_not_imported(capture, tmp_path):
+    code = "import sys; from gsplat_edu.cli.main import main; main(sys.argv[1:]); sys.exit('viser' in sys.modules)"
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "train",
+        str(capture),
+        "--out",
+        str(tmp_path / "run"),
+        "--iterations",
+        "2",
+    ]
+    subprocess.run(command, check=True, timeout=PATIENCE, capture_output=True)

@@ -1,0 +1,249 @@
+"""The page's server, asked by real sockets: one page, nothing else, and only by who may."""
+
+import http.client
+import io
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.viewer import page
+from gsplat_edu.viewer.serve import PageServer, exposure, free_port, is_loopback, url_of
+
+PAGE = b"<!doctype html><title>page</title>" + bytes(range(256)) * 8192  # two MB: more than one write
+NAMES = ("--host", "--port")
+ORANGE = (1.0, 0.5, 0.0)
+PATIENCE = 60.0
+
+
+@pytest.fixture
+def server():
+    with PageServer(PAGE) as made:
+        thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield made
+        made.shutdown()
+        thread.join(10)
+
+
+def ask(server, method="GET", path="/", **headers):
+    """Return status, headers and body of the answer to one request."""
+    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
+    try:
+        connection.putrequest(method, path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            if value is not None:
+                connection.putheader(name, value)
+        connection.endheaders()
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+    finally:
+        connection.close()
+
+
+def ask_raw(server, request):
+    """Return all that comes back for bytes that need not be HTTP."""
+    with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+        connection.sendall(request)
+        connection.shutdown(socket.SHUT_WR)
+        answer = b""
+        while piece := connection.recv(1 << 16):
+            answer += piece
+    return answer
+
+
+def test_the_page_comes_as_it_is(server):
+    status, headers, body = ask(server)
+    assert (status, body) == (200, PAGE)
+    assert headers["Content-Type"] == "text/html; charset=utf-8"
+    assert headers["Content-Length"] == str(len(PAGE))
+    assert headers["Cache-Control"] == "no-store"
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert "Python" not in headers["Server"]
+
+
+def test_head_has_the_headers_alone(server):
+    status, headers, body = ask(server, "HEAD")
+    assert (status, body) == (200, b"")
+    assert headers["Content-Length"] == str(len(PAGE))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/index.html",
+        "/favicon.ico",
+        "/?page",
+        "/.",
+        "*",
+        "/../../../../etc/passwd",
+        "/..%2f..%2f..%2fetc/passwd",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/..\\..\\etc\\passwd",
+        "//etc/passwd",
+        "/etc/passwd",
+        "file:///etc/passwd",
+        "http://127.0.0.1/",
+        "/" + "a" * 60_000,
+    ],
+)
+def test_nothing_else_is_there(server, path):
+    answer = ask_raw(server, f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+    assert answer.split(b" ", 2)[1] in (b"404", b"400") and b"root:" not in answer and PAGE[:40] not in answer
+
+
+def test_nothing_is_listed_or_found_beside_the_program(server, tmp_path, monkeypatch):
+    (tmp_path / "secret.txt").write_text("secret")
+    monkeypatch.chdir(tmp_path)
+    assert ask(server, path="/secret.txt")[0] == 404
+
+
+@pytest.mark.parametrize(
+    "method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "FROBNICATE"]
+)
+def test_other_methods_are_not_allowed(server, method):
+    status, headers, body = ask(server, method)
+    assert (status, headers["Allow"], body) == (405, "GET, HEAD", b"405 Method Not Allowed\n")
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost", "LOCALHOST:80", "127.0.0.1", "127.0.0.1:9999", "127.1.2.3", "[::1]", "[::1]:8080"]
+)
+def test_names_of_this_computer_are_answered(server, host):
+    assert ask(server, Host=host)[0] == 200
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "example.org",
+        "example.org:8080",
+        "localhost.example.org",
+        "127.0.0.1.example.org",
+        "127.0.0.1@example.org",
+        "127.0.0.1 example.org",
+        "192.168.0.7",
+        "",
+        None,
+    ],
+)
+def test_other_names_are_turned_away(server, host):
+    """A page from elsewhere may have its own name point at 127.0.0.1."""
+    status, _, body = ask(server, Host=host)
+    assert (status, body) == (403, b"403 Forbidden\n")
+    assert ask(server, "HEAD", Host=host)[0] == 403
+
+
+def test_two_names_are_turned_away(server):
+    answer = ask_raw(server, b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: example.org\r\n\r\n")
+    assert answer.startswith(b"HTTP/1.0 403")
+
+
+@pytest.mark.parametrize(
+    "request_", [b"", b"\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x00\xa5\x01\x00", b"GET /", b"\0" * 70_000]
+)
+def test_what_is_no_request_hurts_nobody(server, capsys, request_):
+    ask_raw(server, request_)
+    assert ask(server)[2] == PAGE
+    assert capsys.readouterr() == ("", ""), "the terminal stays clean"
+
+
+def test_a_browser_that_goes_away_in_the_middle_hurts_nobody(server, capsys):
+    for _ in range(3):
+        with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+            connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert connection.recv(100).startswith(b"HTTP/1.0 200")
+    assert ask(server)[2] == PAGE
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_browser_draws_the_page_without_complaint(server, browser, random_gaussians):
+    server.page = page.html(Scene(random_gaussians(300)), settings=RenderSettings(background=ORANGE))
+    complaints, urls = [], []
+    tab = browser.new_page(viewport={"width": 320, "height": 240})
+    tab.on("console", lambda message: complaints.append(message.text))
+    tab.on("pageerror", lambda error: complaints.append(str(error)))
+    tab.on("request", lambda request: urls.append(request.url))
+    tab.goto(server.url, timeout=1e3 * PATIENCE)
+    tab.wait_for_selector("#message", state="hidden", timeout=1e3 * PATIENCE)
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        picture = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), dtype=float)
+        orange = np.abs(picture - 255.0 * np.array(ORANGE)).max(axis=2) < 3
+        if 0.1 < orange.mean() < 0.95 and picture[~orange].std() > 20:
+            break
+        assert time.monotonic() < deadline, "the scene before its background never came"
+    tab.close()
+    assert complaints == []
+    assert [one for one in urls if not one.startswith((server.url, "blob:", "data:"))] == []
+
+
+def test_bound_to_every_address_any_name_will_do():
+    with PageServer(PAGE, "0.0.0.0") as open_to_all:
+        thread = threading.Thread(target=open_to_all.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        assert ask(open_to_all, Host="my-desktop.lan")[2] == PAGE
+        open_to_all.shutdown()
+        thread.join(10)
+    assert open_to_all.url == f"http://127.0.0.1:{open_to_all.server_port}/"
+
+
+def test_by_default_only_this_computer_can_connect():
+    with PageServer(PAGE) as server:
+        assert server.server_address[0] == "127.0.0.1"
+        assert server.url == f"http://127.0.0.1:{server.server_port}/"
+
+
+def test_a_port_that_is_taken_is_named():
+    with PageServer(PAGE) as first:
+        port = first.server_port
+        says = f"^--port: {port} is taken on 127.0.0.1; give another, or 0 for any that is free$"
+        with pytest.raises(ArgumentError, match=says):
+            PageServer(PAGE, port=port)
+        with pytest.raises(ArgumentError, match=says):
+            free_port("127.0.0.1", port, NAMES)
+    assert free_port("127.0.0.1", port, NAMES) == port, "closed is closed"
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "says"),
+    [
+        ("127.0.0.1", 70_000, "--port: is 70000, but has to be a whole number from 0 to 65535"),
+        ("127.0.0.1", -1, "--port: is -1"),
+        ("no such host", 0, "--host: 'no such host' is no address"),
+        ("a" * 300, 0, "--host: '"),
+        ("", 0, "--host: '' is no address"),
+        ("203.0.113.1", 0, "--host: cannot listen at 203.0.113.1"),  # documentation's: nobody has it
+    ],
+)
+def test_an_address_that_cannot_be_had_costs_one_line(host, port, says):
+    for ask_for in (lambda: PageServer(PAGE, host, port), lambda: free_port(host, port, NAMES)):
+        with pytest.raises(ArgumentError) as caught:
+            ask_for()
+        assert str(caught.value).startswith(says) and "\n" not in str(caught.value)
+
+
+def test_a_free_port_is_free():
+    port = free_port("127.0.0.1", 0, NAMES)
+    with PageServer(PAGE, port=port) as server:
+        assert server.server_port == port
+
+
+def test_who_is_warned():
+    for host in ("127.0.0.1", "127.3.2.1", "localhost", "::1"):
+        assert is_loopback(host) and exposure(host, "sees it") is None
+    for host in ("0.0.0.0", "::", "192.168.0.7", "example.org"):
+        said = exposure(host, "sees it")
+        assert said.startswith(f"warning: listening at {host}: whoever can reach") and "\n" not in said
+
+
+def test_urls():
+    assert url_of("::1", 80) == "http://[::1]:80/"
+    assert url_of("::", 80) == "http://[::1]:80/"
+    assert url_of("localhost", 81) == "http://localhost:81/"
