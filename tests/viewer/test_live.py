@@ -235,7 +235,7 @@ def test_clients_that_send_nonsense_end_nothing(capture, tmp_path, capfd):
             client.move()
             assert client.picture().shape[2] == 3, "a camera that is one is drawn again"
             slider = made.view._width._impl.uuid
-            for width in (10**12, -1):
+            for width in (10**12, -1, math.inf, math.nan):
                 client.send("GuiUpdateMessage", uuid=slider, updates={"value": width})
                 assert client.picture().shape[1] <= 120
     assert capfd.readouterr() == ("", ""), "the terminal stays clean"

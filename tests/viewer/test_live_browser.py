@@ -185,7 +185,7 @@ def test_a_person_watches_pauses_steps_and_ends_a_training(capture, tmp_path, br
 
 @pytest.mark.own_process
 def test_after_the_training_the_view_stays_until_ctrl_c_and_all_is_well(capture, tmp_path):
-    words = ["--iterations", "3000", *GROWING, *STRATEGIES["adc"]]
+    words = ["--iterations", "3000", "--view-host", "0.0.0.0", *GROWING, *STRATEGIES["adc"]]
     with commanded(capture, tmp_path / "run", *words) as (process, url):
         with Client(SimpleNamespace(url=url)) as client:
             client.move()
@@ -194,6 +194,9 @@ def test_after_the_training_the_view_stays_until_ctrl_c_and_all_is_well(capture,
             process.send_signal(signal.SIGINT)
             printed, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, complaints) == (0, "")
+        assert printed.startswith(
+            "warning: listening at 0.0.0.0: whoever can reach this computer sees the training"
+        )
         assert printed.endswith("the live view stays until its last browser is closed, or Ctrl-C\n")
 
 

@@ -259,7 +259,7 @@ class LiveView:
             camera = browser_camera(seen.wxyz, seen.position, seen.fov, canvas, width)
             with torch.no_grad():
                 image = self._render(self._trainer.gaussians, camera).image
-        except (SplatError, MemoryError, torch.OutOfMemoryError):
+        except (SplatError, MemoryError, torch.cuda.OutOfMemoryError):
             return  # no camera, or none that can be drawn: the training goes on, and the next one may be
         levels = torch.nan_to_num(image).clamp(0.0, 1.0) * 255.0 + 0.5
         with warnings.catch_warnings():  # viser warns where the browser has just gone
@@ -271,7 +271,8 @@ class LiveView:
 
     def _wanted(self, browser: _Browser, now: float) -> tuple[float, int, int]:
         """Return which image a browser should have: its camera's stamp, width and iteration."""
-        width = min(max(int(self._width.value), WIDTHS[0]), WIDTHS[1], browser.handle.camera.image_width)
+        asked = int(min(WIDTHS[1], max(WIDTHS[0], self._width.value)))  # in this order NaN is the narrowest
+        width = min(asked, browser.handle.camera.image_width)
         if now - browser.moved_at < SETTLED:
             width = round(MOVING * width)
         return browser.stamp, width, 0 if self._trainer is None else self._trainer.iteration
@@ -321,7 +322,7 @@ class LiveView:
         self._left = 0 if self._left == math.inf else math.inf
 
     def _step_once(self) -> None:
-        self._left = 2
+        self._left = 1
 
 
 class _Server(viser.ViserServer):
