@@ -17,6 +17,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.sh import num_coefficients, sh_rotation
+from gsplat_edu.threads import one_thread
 from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
 
 SHEAR = 1e-5
@@ -86,12 +87,16 @@ class Similarity:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values)).to(gaussians.means.device)
 
-        means = self.s * gaussians.means.double() @ tensor(self.R.T) + tensor(self.t)
         turn = Rotation.from_matrix(self.R).as_quat(scalar_first=True)
-        rest = torch.einsum("jk,nkc->njc", tensor(sh_rotation(degree, self.R)), gaussians.sh_rest.double())
+        with one_thread():  # the bits of a product may depend on how many there are
+            means = self.s * gaussians.means.double() @ tensor(self.R.T) + tensor(self.t)
+            rest = torch.einsum(
+                "jk,nkc->njc", tensor(sh_rotation(degree, self.R)), gaussians.sh_rest.double()
+            )
+            quats = gaussians.quats.double() @ tensor(_left_product(turn)).mT
         moved = Gaussians(
             means=means.to(dtype),
-            quats=(gaussians.quats.double() @ tensor(_left_product(turn)).mT).to(dtype),
+            quats=quats.to(dtype),
             log_scales=(gaussians.log_scales.double() + float(np.log(self.s))).to(dtype),
             sh0=gaussians.sh0,
             sh_rest=rest.to(dtype),

@@ -3,15 +3,18 @@
 A codebook starts with entries as dense as the cube root of the values' density, which is best where there are many
 entries (Panter and Dite 1951), and is mended by Lloyd's steps on the sorted values. A palette is clustered twice: the
 vectors into cells, then those of each cell into entries, which start at its vectors that are heavy and far from its
-middle. A million vectors take seconds so, and nothing is random: the numbers are the same to the bit for one number of
-BLAS threads. Values that are few enough are kept as they are.
+middle. A million vectors take seconds so, and nothing is random or depends on the number of threads. Values that are
+few enough are kept as they are.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy.sparse import csr_matrix
+
+from gsplat_edu.threads import one_thread
 
 CODEBOOK = 256
 """Entries of a codebook: a byte chooses one."""
@@ -195,10 +198,12 @@ def _nearest(
     squares = (entries * entries).sum(axis=1)
     labels = np.empty(len(points), dtype=np.int64)
     rows = max(1, AT_ONCE // len(entries))
-    for begin in range(0, len(points), rows):
-        distances = points[begin : begin + rows] @ (-2.0 * entries.T)
-        distances += squares
-        labels[begin : begin + rows] = distances.argmin(axis=1)
+    across = torch.from_numpy(np.ascontiguousarray(-2.0 * entries.T))
+    with one_thread():  # the bits of a product would depend on how many there are
+        for begin in range(0, len(points), rows):
+            distances = (torch.from_numpy(points[begin : begin + rows]) @ across).numpy()
+            distances += squares
+            labels[begin : begin + rows] = distances.argmin(axis=1)
     return labels
 
 

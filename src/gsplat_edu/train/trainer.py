@@ -17,13 +17,13 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import photo_loss
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.threads import one_thread
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.feed import ViewFeed
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import means_rate, sh_degree
-from gsplat_edu.train.threads import one_thread
 from gsplat_edu.views import Photo, View
 
 

@@ -1,7 +1,8 @@
 """Torch on one thread, where its answer would depend on how many there are.
 
 Torch cuts an elementwise operation into one piece per thread and computes the last few numbers of each piece by
-another routine than the others: a sigmoid of 100,001 numbers has other bits on two threads than on one.
+another routine than the others: a sigmoid of 100,001 numbers has other bits on two threads than on one. A product of
+matrices is cut up likewise, by torch and by NumPy; torch's can be told.
 """
 
 from __future__ import annotations

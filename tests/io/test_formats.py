@@ -1,0 +1,53 @@
+import pytest
+import torch
+
+from gsplat_edu.io.edit import Similarity
+from gsplat_edu.io.formats import FORMATS, losses, read_scene, stored_bytes, write_scene
+from scene_files import random_scene
+
+
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+def test_bytes_do_not_depend_on_threads(tmp_path, threads, suffix):
+    """40,000 splats: torch divides what is longer than 32,768 numbers."""
+    move = Similarity.of_matrix([[0, 0, 1, 0.1], [1, 0, 0, 0.2], [0, 1, 0, 0.3]])
+    written = []
+    for count in (1, 2):
+        threads(count)
+        path = tmp_path / f"{count}{suffix}"
+        write_scene(path, move.scene(random_scene(40_000, rest=3)))
+        written.append(path.read_bytes())
+    assert written[0] == written[1]
+
+
+@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+def test_reading_what_was_written_and_writing_it_again_gives_the_same_scene(tmp_path, suffix):
+    write_scene(tmp_path / f"1{suffix}", random_scene(300))
+    first = read_scene(tmp_path / f"1{suffix}")
+    write_scene(tmp_path / f"2{suffix}", first)
+    again = read_scene(tmp_path / f"2{suffix}")
+    assert (again.antialiased, again.up) == (first.antialiased, first.up)
+    order = [torch.from_numpy(scene.gaussians.means.numpy()).sum(dim=1).argsort() for scene in (first, again)]
+    a, b = (scene.gaussians.means[rows] for scene, rows in zip((first, again), order, strict=True))
+    # a second rounding to the same steps: at most one of the coarsest, 11 bits of a chunk's 8 units
+    assert (a - b).abs().max() < 8 / 2**11
+
+
+def test_what_a_format_leaves_out_is_said(tmp_path):
+    scene = random_scene(3)
+    assert losses("a.ply", scene) == []
+    assert "up to degree 0; those up to 3 are left out" in losses("a.splat", scene)[0]
+
+
+def test_a_sog_in_a_folder_is_named_by_either(tmp_path):
+    path = tmp_path / "scene" / "meta.json"
+    write_scene(path, random_scene(30))
+    for name in (path, path.parent):
+        assert len(read_scene(name).gaussians) == 30
+    assert stored_bytes(path) == sum(file.stat().st_size for file in path.parent.iterdir())
