@@ -1,0 +1,133 @@
+"""`gsplat-edu doctor`: what is wrong with a capture before training, or with a run after it, and what to do."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.doctor.after import Trained, examine_run, view_lines
+from gsplat_edu.doctor.before import examine
+from gsplat_edu.doctor.finding import Diagnosis, advice_lines, diagnosis_lines, table_lines
+from gsplat_edu.doctor.residuals import residuals
+from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.io.ply import load_ply
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import device_of, resolve_backend
+from gsplat_edu.runs.dataset import run_dataset
+from gsplat_edu.runs.folder import RunFolder, render_settings
+from gsplat_edu.train.config import RECIPE_ITERATIONS, recipe
+
+EXAMPLE = "example: gsplat-edu doctor captures/plush"
+
+EXIT_HOPELESS = 1
+"""Exit code where training would be pointless."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.add_argument(
+        "path", type=Path, metavar="PATH", help="a capture before training, or the folder of a run after it"
+    )
+    before = parser.add_argument_group("before training")
+    before.add_argument(
+        "--no-forecast", action="store_true", help="do not say what a training would take on this machine"
+    )
+    before.add_argument(
+        "--iterations",
+        type=whole_number_text,
+        metavar="N",
+        default=RECIPE_ITERATIONS,
+        help=f"steps of the training that is forecast (default: {RECIPE_ITERATIONS})",
+    )
+    before.add_argument(
+        "--resolution",
+        type=float,
+        metavar="R",
+        help="of that training: a factor below 32, or the longest side in px",
+    )
+    after = parser.add_argument_group("after training")
+    after.add_argument(
+        "--dataset",
+        type=Path,
+        metavar="PATH",
+        help="the dataset's folder, where it is not where the run had it",
+    )
+    after.add_argument(
+        "--all-views", action="store_true", help="list the PSNR of every view, the worst first"
+    )
+    add_backend(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Examine, and print one screen that ends with what to do.
+
+    Raises:
+        SystemExit: with 1, where training would be pointless.
+    """
+    path: Path = arguments.path
+    if not path.exists():
+        raise ArgumentError(f"{path}: is not there; give a dataset folder or a run folder")
+    console = Console(highlight=False, markup=False)
+    if RunFolder(path).exists():
+        diagnosis, lines = _after(arguments, console)
+    else:
+        diagnosis, lines = _before(arguments, console)
+    console.print(*diagnosis_lines(diagnosis), *lines, *advice_lines(diagnosis), sep="\n", soft_wrap=True)
+    if diagnosis.hopeless:
+        raise SystemExit(EXIT_HOPELESS)
+
+
+def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
+    settings, config = DataSettings(resolution=arguments.resolution), recipe(arguments.iterations)
+    backend = resolve_backend(arguments.backend)
+    with _bar(console) as bar:
+        task = bar.add_task("photos", total=None)
+        survey = prepare(arguments.path, lambda done, total: bar.update(task, completed=done, total=total))
+        bar.add_task("comparing", total=None)
+        diagnosis = examine(survey)
+    if arguments.no_forecast or diagnosis.hopeless:
+        return diagnosis, ()
+    from gsplat_edu.doctor.forecast import forecast  # it measures this machine, which takes a moment
+
+    try:
+        said = forecast(load_dataset(arguments.path, settings), config, backend=backend).lines()
+    except DatasetError as error:
+        said = [f"none, for training would end here: {error}"]
+    return diagnosis, table_lines(zip(("forecast", *[""] * len(said)), said, strict=False))
+
+
+def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
+    backend = resolve_backend(arguments.backend)
+    folder = RunFolder(arguments.path)
+    config = folder.read_config()
+    settings = dataclasses.replace(render_settings(config), depth=True)
+    scene, reached = folder.latest_scene()
+    dataset = run_dataset(config, arguments.dataset)
+    gaussians = load_ply(scene, dataset.origin).to(device_of(backend))  # the frame its cameras stand in
+    renderer = functools.partial(render, settings=settings, backend=backend)
+    with _bar(console) as bar:
+        task = bar.add_task("views", total=len(dataset.train) + len(dataset.test))
+        train, test = (
+            residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task))
+            for views in (dataset.train, dataset.test)
+        )
+    extent = scene_extent([view.camera for view in dataset.train])
+    section = config.get("train")
+    planned = section.get("iterations") if isinstance(section, dict) else None
+    planned = planned if isinstance(planned, int) else None
+    trained = Trained(folder.path, gaussians, extent, train, test, reached, planned)
+    return examine_run(trained), view_lines(trained) if arguments.all_views else ()
+
+
+def _bar(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)

@@ -1,0 +1,100 @@
+"""The doctor before training: all checks of a capture, and what they say together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+from gsplat_edu.doctor.cameras import (
+    check_away,
+    check_coverage,
+    check_intrinsics,
+    check_parallax,
+    check_sizes,
+)
+from gsplat_edu.doctor.cloud import check_cloud
+from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable, is_missing
+from gsplat_edu.doctor.finding import Diagnosis, Finding
+from gsplat_edu.doctor.looks import check_blur, check_exposure, check_twins
+from gsplat_edu.doctor.survey import Survey
+
+Check = Callable[[Survey], list[Finding]]
+
+OF_FILES: tuple[tuple[str, Check], ...] = (
+    ("enough photos", check_usable),
+    ("files", check_readable),
+)
+"""Checks that need no photo, the most harmful faults first."""
+
+OF_VIEWS: tuple[tuple[str, Check], ...] = (
+    ("parallax", check_parallax),
+    ("intrinsics", check_intrinsics),
+    ("sizes", check_sizes),
+    ("viewing directions", check_away),
+    ("sharpness", check_blur),
+    ("exposure", check_exposure),
+    ("coverage", check_coverage),
+    ("duplicates", check_twins),
+    ("cloud", check_cloud),
+)
+"""Checks that compare views: there have to be two."""
+
+OF_LISTS: tuple[tuple[str, Check], ...] = (
+    ("poses", check_poses),
+    ("missing photos", check_missing),
+)
+"""Checks of what is not there; most captures do without."""
+
+
+def examine(survey: Survey) -> Diagnosis:
+    """Run all checks on a capture.
+
+    Args:
+        survey: The capture, prepared.
+    """
+    checks = [*OF_FILES, *(OF_VIEWS if len(survey.shots) > 1 else ()), *OF_LISTS]
+    findings, fine = list[Finding](), list[str]()
+    for name, check in checks:
+        found = check(survey)
+        findings += found
+        if not found:
+            fine.append(name)
+    return Diagnosis(_facts(survey), tuple(findings), tuple(fine), _otherwise(survey))
+
+
+def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
+    sizes = Counter(f"{shot.size[0]}x{shot.size[1]}" for shot in survey.shots)
+    kinds = ", ".join(
+        size if n == len(survey.shots) else f"{n} of {size}" for size, n in sizes.most_common(2)
+    )
+    photos = f"{len(survey.shots)} photos" + (
+        f" of {kinds}" if len(sizes) == 1 else f", {kinds}" if sizes else ""
+    )
+    cloud = f"{len(survey.points):,} points" if len(survey.points) else "no points"
+    facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
+    if len(survey.shots) > 1:
+        facts.append(("cameras", _stand(survey)))
+    return (*facts, *(("", note) for note in survey.notes if not is_missing(note)))
+
+
+def _stand(survey: Survey) -> str:
+    geometry = survey.geometry
+    said = {
+        "inward": "look at something in their middle",
+        "outward": "look outwards",
+        "forward": "look one way",
+        "free": "look here and there",
+    }[geometry.arrangement]
+    return f"{said}; {geometry.depth:.3g} world units from what they see"
+
+
+def _otherwise(survey: Survey) -> tuple[str, ...]:
+    """Return advice for captures with little to mend."""
+    train = f"train: gsplat-edu train {survey.path} --out RUN"
+    short = "a first run of --iterations 3000 tells in minutes whether the poses are right"
+    cloud = (
+        ()
+        if len(survey.points)
+        else ("start points help: add those of structure from motion with --points X.ply",)
+    )
+    return (train, *cloud, short, "judge the run afterwards: gsplat-edu doctor RUN")

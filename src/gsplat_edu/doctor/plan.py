@@ -1,0 +1,403 @@
+"""Settings that keep a training within a limit of memory or time, chosen before it starts.
+
+What the user gave stays; the rest follows from the forecast: size of the photos, how many of them are kept, the most
+Gaussians, and the iterations. The chosen numbers are printed, and stand in config.json: given as options they train the
+same bits again, though another plan may come out differently, since it looks at a clock.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.doctor.costs import LATER, Facts, Footprint, Measurements, wanted_gaussians
+from gsplat_edu.doctor.forecast import Forecast, predict, spelled_bytes, spelled_seconds
+from gsplat_edu.doctor.probe import probe, process_age, resident_bytes
+from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.runs.training import RunOptions
+from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
+
+PLANNED = ("iterations", *MILESTONES, "max_gaussians", "resolution", "image_memory")
+"""Settings that a plan may choose; `given` lists those of them that the user did."""
+
+FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
+"""What photos may be made smaller by."""
+
+SMALLEST_SIDE = 64
+"""px: no photo is made smaller than this."""
+
+LEAST_GAUSSIANS = 1_000
+
+DENSITY = 0.05
+"""Gaussians per pixel below which smaller photos are the better use of memory; snowmiku97 ends with 0.2."""
+
+MEMORY_SHARE = 0.95
+"""Of a limit of memory that is planned with."""
+
+LEAST_ITERATIONS = 50
+
+WORTHWHILE_ITERATIONS = 1_500
+"""Photos are made smaller until this many fit into a limit of time, down to `WORTHWHILE_PIXELS`."""
+
+WORTHWHILE_PIXELS = 100_000
+
+TIME_SHARE = 0.9
+"""Of a limit of time that the schedule is planned for; what is left over is trained at the schedule's end."""
+
+GUARD = 1.5
+"""adc: the cap over the number of Gaussians expected, so that a scene that asks for more does not eat the time."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a run may take.
+
+    Args:
+        memory: Bytes at its peak, as the system counts the process; None for any.
+        seconds: From the start of the command to its end; None for any.
+    """
+
+    memory: int | None = None
+    seconds: float | None = None
+
+    def __str__(self) -> str:
+        """Return the options that say so."""
+        memory = [] if self.memory is None else [f"--max-memory {spelled_bytes(self.memory)}"]
+        seconds = [] if self.seconds is None else [f"--time-limit {spelled_seconds(self.seconds)}"]
+        return " and ".join(memory + seconds)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was chosen.
+
+    Args:
+        options: The run with the chosen numbers.
+        by_time: Whether the iterations were chosen; `gsplat_edu.doctor.pace.Pace` then uses up what time is left.
+        forecast: What it is expected to take; None where nothing had to be chosen.
+        sentences: What the user wants to know of it.
+    """
+
+    options: RunOptions
+    by_time: bool = False
+    forecast: Forecast | None = None
+    sentences: tuple[str, ...] = ()
+
+    @property
+    def resolution(self) -> float | None:
+        """As in `DataSettings`."""
+        return self.options.data_settings.resolution
+
+    @property
+    def image_memory(self) -> int:
+        """Bytes, as in `DataSettings`."""
+        return self.options.data_settings.image_memory
+
+    @property
+    def max_gaussians(self) -> int | None:
+        """As in `TrainConfig`."""
+        return self.options.config.max_gaussians
+
+    @property
+    def iterations(self) -> int:
+        """As in `TrainConfig`."""
+        return self.options.config.iterations
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a plan is made from.
+
+    Args:
+        options: The run as it would be without limits.
+        limits: The limits.
+        given: Names of `PLANNED` that the user gave.
+        rescale: Whether milestones that are not given stretch with the iterations.
+        facts: The capture at the size that the user gave, or of its files.
+        factors: What its photos may be made smaller by, rising.
+    """
+
+    options: RunOptions
+    limits: Limits
+    given: frozenset[str]
+    rescale: bool
+    facts: Facts
+    factors: tuple[float, ...] = (1.0,)
+
+    @property
+    def by_time(self) -> bool:
+        """Whether the iterations are to be chosen."""
+        return self.limits.seconds is not None and "iterations" not in self.given
+
+    def config(self, iterations: int, factor: float, cap: int | None) -> TrainConfig:
+        """Return the recipe of that many iterations, with a cap no higher than the time is planned for.
+
+        Args:
+            iterations: The length.
+            factor: What photos are made smaller by.
+            cap: The most Gaussians that memory has room for; None for any.
+        """
+        config = self.options.config
+        if "iterations" not in self.given:
+            fresh = recipe(iterations, rescale=self.rescale)
+            stretched = {name: getattr(fresh, name) for name in MILESTONES if name not in self.given}
+            config = dataclasses.replace(config, iterations=iterations, **stretched)
+        if "max_gaussians" in self.given:
+            return config
+        caps = [] if cap is None else [_rounded(cap)]
+        if config.strategy == "mcmc" or (self.by_time and config.strategy == "adc"):
+            wanted = wanted_gaussians(config, self.facts.points, self.facts.smaller(factor).pixels)
+            caps.append(wanted if config.strategy == "mcmc" else _rounded(math.ceil(GUARD * wanted)))
+        return dataclasses.replace(config, max_gaussians=min(caps) if caps else None)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """What memory leaves room for."""
+
+    factor: float
+    image_memory: int
+    cap: int | None
+
+
+def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, rescale: bool = True) -> Plan:
+    """Choose what the user did not give so that the limits hold. It takes a few seconds, for a probe.
+
+    Nothing is chosen where there is no limit of memory, and either none of time or the iterations are given: then
+    the training is cut short at the limit. A run that is resumed goes on with the numbers of its config.json.
+
+    Args:
+        options: The run as it would be without limits.
+        limits: The limits.
+        given: Names of `PLANNED` that the user gave.
+        rescale: Whether milestones that are not given stretch with the iterations.
+
+    Raises:
+        ArgumentError: the least settings are beyond a limit; says what would do. Or the backend is the dense one.
+        DatasetError: the capture cannot be read.
+        CheckpointError: the config.json of a run to resume is damaged.
+    """
+    if options.resume and options.folder.exists():
+        return Plan(taken_up(options, given))
+    if limits.memory is None and (limits.seconds is None or "iterations" in given):
+        return Plan(options)
+    if options.backend == "torch":
+        raise ArgumentError(f"{limits}: cannot be planned for --backend torch; take cpu or cuda")
+    settings = options.data_settings
+    chosen = {"resolution": settings.resolution, "max_gaussians": options.config.max_gaussians}
+    fixed = frozenset(given) | {name for name, value in chosen.items() if value is not None}
+    files = load_dataset(options.data, dataclasses.replace(settings, resolution=None), points=options.points)
+    dataset = files
+    if settings.resolution is not None:
+        dataset = load_dataset(options.data, settings, points=options.points)
+    factors: tuple[float, ...] = (1.0,)
+    if "resolution" not in fixed:
+        side = min(min(view.camera.W, view.camera.H) for view in (*files.train, *files.test))
+        factors += tuple(factor for factor in FACTORS if factor > 1 and side / factor >= SMALLEST_SIDE)
+    request = Request(options, limits, fixed, rescale, Facts.of(dataset, files), factors)
+    # How many tiles a start covers is not known yet: 16 for each of its Gaussians is more than most do.
+    length = options.config.iterations
+    first = _within_memory(request, resident_bytes() + LATER, 16 * len(dataset.points), length, factors)
+    reduced = dataclasses.replace(settings, resolution=_resolution(request, first.factor), image_memory=0)
+    dataset = load_dataset(options.data, reduced, points=options.points)
+    measured = probe(dataset, request.config(length, first.factor, first.cap), options.backend)
+    probed = tuple(factor for factor in factors if factor >= first.factor)
+    return choose(dataclasses.replace(request, factors=probed), measured, process_age())
+
+
+def choose(request: Request, measured: Measurements, spent: float) -> Plan:
+    """Choose by arithmetic.
+
+    Args:
+        request: What the user wants.
+        measured: What this machine needs, measured with photos as large as the first of the factors makes them.
+        spent: Seconds since the command began.
+
+    Raises:
+        ArgumentError: the least settings are beyond a limit; says what would do.
+    """
+    length, factors = request.options.config.iterations, request.factors
+    process, pairs = measured.process, measured.pairs
+    choice = _within_memory(request, process, pairs, length, factors)
+    if request.by_time:
+        # Twice: fewer iterations ask for fewer Gaussians, and leave room for more photos.
+        for _ in range(2):
+            length, factor = _within_time(request, measured, choice, spent)
+            factors = tuple(f for f in request.factors if f >= factor)
+            choice = _within_memory(request, process, pairs, length, factors)
+    config = request.config(length, choice.factor, choice.cap)
+    settings = dataclasses.replace(
+        request.options.data_settings,
+        resolution=_resolution(request, choice.factor),
+        image_memory=choice.image_memory,
+    )
+    options = dataclasses.replace(request.options, config=config, data_settings=settings)
+    if request.by_time:
+        options = dataclasses.replace(options, time_limit=None)
+    facts = request.facts.smaller(choice.factor)
+    found = Plan(options, request.by_time, _predicted(request, measured, choice, config))
+    at_cap = Footprint(facts, process, pairs, config.sh_degree).peak(
+        found.max_gaussians or 0, found.image_memory
+    )
+    return dataclasses.replace(found, sentences=_sentences(request, found, at_cap))
+
+
+def _within_memory(
+    request: Request, process: int, pairs: int, iterations: int, factors: tuple[float, ...]
+) -> _Choice:
+    """Choose size and number of the photos, and a cap: the largest photos for which enough Gaussians have room."""
+    settings, limit = request.options.data_settings, request.limits.memory
+    if limit is None:
+        return _Choice(factors[0], settings.image_memory, None)
+    aim, least = int(MEMORY_SHARE * limit), 0
+    for factor in factors:
+        facts = request.facts.smaller(factor)
+        footprint = Footprint(facts, process, pairs, request.options.config.sh_degree)
+        config = request.config(iterations, factor, None)
+        wanted = wanted_gaussians(config, facts.points, facts.pixels)
+        if config.strategy == "none":
+            wanted = facts.points
+        wanted = min(wanted, config.max_gaussians or wanted)
+        enough = min(wanted, max(LEAST_GAUSSIANS, round(DENSITY * facts.pixels)))
+        if "max_gaussians" in request.given:
+            enough = wanted = config.max_gaussians or wanted
+        elif factor == factors[-1]:
+            enough = min(wanted, LEAST_GAUSSIANS)
+        kept = settings.image_memory if "image_memory" in request.given else 0
+        least = footprint.peak(enough, kept)
+        if least > aim:
+            continue
+        if "image_memory" not in request.given:
+            kept = _photos_kept(footprint, aim, enough, wanted)
+        return _Choice(factor, kept, footprint.most_gaussians(aim, kept))
+    needed = math.ceil(least / MEMORY_SHARE / 2**20)
+    raise ArgumentError(
+        f"--max-memory {spelled_bytes(limit)}: is too little for this capture and these options; "
+        f"{needed}MiB would do"
+    )
+
+
+def _photos_kept(footprint: Footprint, aim: int, enough: int, wanted: int) -> int:
+    """Choose how many bytes of photos are kept: all if they fit, else half of what Gaussians could have, or more."""
+    photos = footprint.facts.photo_bytes
+    if footprint.peak(wanted, photos) <= aim:
+        return photos
+    half, spare = (aim - footprint.peak(0, 0)) // 2, aim - footprint.peak(wanted, 0)
+    room = aim - footprint.peak(enough, 0)
+    return max(min(photos, max(half, spare), room), 0) // 2**20 * 2**20
+
+
+def _within_time(
+    request: Request, measured: Measurements, choice: _Choice, spent: float
+) -> tuple[int, float]:
+    """Choose iterations, and smaller photos where few would fit."""
+    limit = request.limits.seconds or 0.0
+    found, least = 0, math.inf
+
+    def takes(iterations: int, choice: _Choice) -> float:
+        config = request.config(iterations, choice.factor, choice.cap)
+        return spent + _predicted(request, measured, choice, config).total / TIME_SHARE
+
+    for factor in (f for f in request.factors if f >= choice.factor):
+        smaller = dataclasses.replace(choice, factor=factor)
+        least = takes(LEAST_ITERATIONS, smaller)
+        low, high = LEAST_ITERATIONS - 1, RECIPE_ITERATIONS + 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if takes(middle, smaller) <= limit else (low, middle)
+        found, choice = low, smaller
+        pixels = request.facts.smaller(factor).pixels
+        if found >= WORTHWHILE_ITERATIONS or pixels < 2 * WORTHWHILE_PIXELS:
+            break
+    if found < LEAST_ITERATIONS:
+        raise ArgumentError(
+            f"--time-limit {spelled_seconds(limit)}: is too short: starting, reading and judging leave no time to "
+            f"train; give at least {spelled_seconds(5 * math.ceil(least / 5))}"
+        )
+    return _rounded(found), choice.factor
+
+
+def _predicted(request: Request, measured: Measurements, choice: _Choice, config: TrainConfig) -> Forecast:
+    facts, options = request.facts.smaller(choice.factor), request.options
+    return predict(facts, measured, config, choice.image_memory, options.eval_every, options.save_every)
+
+
+def _resolution(request: Request, factor: float) -> float | None:
+    return request.options.data_settings.resolution if factor == 1.0 else factor
+
+
+def _rounded(count: int) -> int:
+    """Round down to two digits, or three where they begin with a 1: numbers that can be read and typed."""
+    digits = 3 if str(count).startswith("1") else 2
+    step = int(10 ** max(len(str(count)) - digits, 0))
+    return count // step * step
+
+
+def _sentences(request: Request, plan: Plan, at_cap: int) -> tuple[str, ...]:
+    found, cap = plan.forecast, plan.max_gaussians
+    chosen = flags(plan.options, request.given, photos=request.limits.memory is not None)
+    sentences = [f"{request.limits}: chosen {chosen or 'nothing, all was given'}"]
+    if found is not None:
+        sentences += [f"forecast: {line}" for line in found.lines()]
+        if cap is not None and cap > found.gaussians[1]:
+            sentences.append(f"with all of {cap:,} Gaussians: up to {spelled_bytes(at_cap)}")
+    return tuple(sentences)
+
+
+def flags(options: RunOptions, given: Collection[str] = (), *, photos: bool = False) -> str:
+    """Write numbers that a plan chose as options of the command line: they train the same again.
+
+    Args:
+        options: The run.
+        given: Names that the user gave anyway.
+        photos: Name the memory for photos too, which no result depends on.
+    """
+    config, settings = options.config, options.data_settings
+    words = []
+    if "resolution" not in given and settings.resolution is not None:
+        words.append(f"--resolution {settings.resolution:g}")
+    if photos and "image_memory" not in given:
+        words.append(f"--image-memory {-(-settings.image_memory // 2**20)}MiB")
+    if "max_gaussians" not in given and config.max_gaussians is not None:
+        words.append(f"--max-gaussians {config.max_gaussians}")
+    if "iterations" not in given:
+        words.append(f"--iterations {config.iterations}")
+        stretched = recipe(config.iterations)
+        idle = {name for key, names in ONLY_FOR.items() if key != config.strategy for name in names}
+        words += [
+            f"--{name.replace('_', '-')} {getattr(config, name)}"
+            for name in MILESTONES
+            if name not in {*given, *idle} and getattr(config, name) != getattr(stretched, name)
+        ]
+    return " ".join(words)
+
+
+def taken_up(options: RunOptions, given: Collection[str]) -> RunOptions:
+    """Return the options of a run to resume, with the numbers of its config.json where the user gave none.
+
+    Args:
+        options: As the command line has them.
+        given: Names of `PLANNED` that the user gave.
+
+    Raises:
+        CheckpointError: config.json is damaged.
+    """
+    stored = options.folder.read_config()
+    sections = [stored.get(name) for name in ("train", "data")]
+    if not all(isinstance(section, dict) for section in sections):
+        raise CheckpointError(f"{options.folder.config}: lacks the section train or data; mend the file")
+    train, data = (
+        {name: section[name] for name in PLANNED if name in section and name not in given}  # type: ignore[index,operator]
+        for section in sections
+    )
+    try:
+        return dataclasses.replace(
+            options,
+            config=dataclasses.replace(options.config, **train),
+            data_settings=dataclasses.replace(options.data_settings, **data),
+        )
+    except ArgumentError as error:
+        raise CheckpointError(f"{options.folder.config}: {error}; mend the file") from None

@@ -1,0 +1,246 @@
+"""A few seconds of training, measured and thrown away: what this machine needs for a step, at this moment."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+import functools
+import math
+import os
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from gsplat_edu.camera import Camera, scaled_intrinsics
+from gsplat_edu.data.dataset import Dataset, scene_extent
+from gsplat_edu.doctor.costs import Measurements, Speed, expected_counts
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.images import save_png, side_by_side
+from gsplat_edu.evaluate.metrics import ImageScore, score_views
+from gsplat_edu.evaluate.report import Picture
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import device_of
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.density.surgery import split_children
+from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.views import View
+
+Bytes = UInt8[np.ndarray, "H W 3"]
+
+PROBE_STEPS = 9
+PROBE_SECONDS = 1.5
+"""A probe ends after this many steps, or after this long, but not before its third step; the first is not counted."""
+
+GROWN = (125_000, 250_000)
+"""Gaussians that the probe grows the start to, at most: by several doublings, and by the first."""
+
+
+def process_age() -> float:
+    """Return the seconds since this process began, where the system tells; else since Python's clock did."""
+    try:
+        fields = Path("/proc/self/stat").read_text("ascii", errors="replace").rpartition(")")[2].split()
+        up = float(Path("/proc/uptime").read_text("ascii").split()[0])
+        return max(up - int(fields[19]) / os.sysconf("SC_CLK_TCK"), 0.0)
+    except (OSError, ValueError, IndexError):
+        return time.process_time()
+
+
+def resident_bytes() -> int:
+    """Return the memory this process holds now; where the system does not tell, the most it has held."""
+    try:
+        for line in Path("/proc/self/status").read_text("ascii", errors="replace").splitlines():
+            if line.startswith("VmRSS:"):
+                return 1024 * int(line.split()[1])
+    except OSError:
+        pass
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else 1024 * most
+
+
+def give_back() -> None:
+    """Hand freed memory back to the system, where the C library can: it keeps what it may need again."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library than GNU's
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measurements:
+    """Train for a few seconds and throw the result away: at the start, with more Gaussians, and on small views.
+
+    More Gaussians are the start's, split until there are about as many as the run will have (or enough to see what one
+    costs), more opaque, as trained ones are. A start that is large itself is compared with half of it. Times are this
+    moment's: no two probes are alike.
+
+    Args:
+        dataset: The capture; a few of its photos are read.
+        config: The run; its cap is kept.
+        backend: The rendering backend, by its own name.
+
+    Raises:
+        ArgumentError: the backend is the dense one, which takes minutes for an iteration of a capture.
+        DatasetError: a photo cannot be read.
+    """
+    if backend == "torch":
+        raise ArgumentError("backend: torch is too slow to be measured on a capture; take cpu or cuda")
+    resident, views = resident_bytes(), _spread(dataset.train, 4)
+    reading, photos = [], []
+    for view in views:
+        began = time.perf_counter()
+        photo = view.read()
+        reading.append(time.perf_counter() - began)
+        photos.append(View(view.camera, photo.image, alpha=photo.alpha, mask=photo.mask, name=view.name))
+    cloud = dataset.points, dataset.colors
+    start = from_points(*cloud, config)
+    pixels = sum(view.camera.W * view.camera.H for view in dataset.train) / len(dataset.train)
+    wanted = int(expected_counts(config, len(start), pixels)[-1])
+    grown = _grown(from_points(*cloud, dataclasses.replace(config, strategy="adc")), wanted)
+    if len(grown) == len(start) > 1:
+        start = start.map(lambda tensor: tensor[::2])
+    trial = functools.partial(_trial, config=config, backend=backend)
+    extent = scene_extent([view.camera for view in dataset.train])
+    steps, pairs = trial(start, photos, extent)
+    more, _ = trial(grown, photos, extent)
+    here = float(np.mean([view.camera.W * view.camera.H for view in photos]))
+    table = [(len(start), here, _median(steps)), (len(grown), here, _median(more))]
+    small = [_halved(view) for view in photos]
+    if min(min(view.camera.W, view.camera.H) for view in small) >= 32:
+        fewer, _ = trial(start, small, extent)
+        table.append((len(start), float(np.mean([v.camera.W * v.camera.H for v in small])), _median(fewer)))
+    score, picture = judging_seconds(grown, photos[:2], config, backend)
+    del start, grown, small, photos
+    give_back()
+    return Measurements(
+        backend=backend,
+        speed=Speed.fitted(table),
+        read=_median(reading),
+        score=score,
+        picture=picture,
+        pairs=pairs,
+        resident=resident,
+        settled=resident_bytes(),
+        noise=math.sqrt(max(steps) / min(steps)),
+    )
+
+
+def _grown(start: Gaussians, wanted: int) -> Gaussians:
+    """Split every Gaussian until there are about as many as wanted; their area in the image stays what it was."""
+    generator = torch.Generator().manual_seed(0)
+    most = GROWN[1]
+    while 2 * len(start) <= min(most, 1.5 * wanted):
+        parts = [split_children(start, math.sqrt(2.0), generator) for _ in range(2)]
+        start, most = Gaussians.concatenated(parts), GROWN[0]
+    half = torch.zeros_like(start.logit_opacities)
+    return Gaussians(**(start.tensors() | {"logit_opacities": half}))
+
+
+def _trial(
+    gaussians: Gaussians, views: Sequence[View], extent: float, config: TrainConfig, backend: str
+) -> tuple[list[float], int]:
+    """Take a few steps; return the seconds of each but the first, and the most pairs that a view had."""
+    pairs, moments = [0], list[float]()
+
+    def counting(gaussians: Gaussians, camera: Camera, *, settings: RenderSettings) -> RenderOutput:
+        output = render(gaussians, camera, settings=settings, backend=backend)
+        pairs.append(output.num_pairs or 0)
+        return output
+
+    def note(trainer: Trainer, event: Event) -> None:
+        if isinstance(event, StepEvent):
+            if backend == "cuda" and torch.cuda.is_available():
+                torch.cuda.synchronize()
+            moments.append(time.perf_counter())
+
+    plain = dataclasses.replace(
+        config,
+        iterations=PROBE_STEPS,
+        sh_every=0,
+        densify_start=PROBE_STEPS,
+        densify_stop=PROBE_STEPS + 1,
+        reset_every=0,
+        max_gaussians=max(len(gaussians), config.max_gaussians or 0),
+    )
+    placed = gaussians.to(device_of(backend))
+    density = make_strategy(plain, extent, placed)
+    trainer = Trainer(placed, views, plain, render=counting, extent=extent, density=density, callbacks=[note])
+    trainer.run(_until(moments))
+    return np.diff(moments).tolist(), max(pairs)
+
+
+def _until(moments: Sequence[float]) -> Callable[[], bool]:
+    return lambda: len(moments) >= 3 and moments[-1] - moments[0] > PROBE_SECONDS
+
+
+def _halved(view: View) -> View:
+    """Return a view of half the size; which pixels it keeps does not matter here."""
+    camera, photo = view.camera, view.read()
+    image, alpha, mask = (
+        None if plane is None else np.ascontiguousarray(plane[::2, ::2])
+        for plane in (photo.image, photo.alpha, photo.mask)
+    )
+    H, W = -(-camera.H // 2), -(-camera.W // 2)
+    intrinsics = scaled_intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, W / camera.W, H / camera.H)
+    assert image is not None  # a photo has one
+    return View(Camera(camera.R, camera.eye, *intrinsics, H, W), image, alpha=alpha, mask=mask)
+
+
+def judging_seconds(
+    gaussians: Gaussians, views: Sequence[View], config: TrainConfig, backend: str
+) -> tuple[float, float]:
+    """Score views as the end of a run does.
+
+    Args:
+        gaussians: The scene; not changed.
+        views: Views to score, at least one; the fastest counts.
+        config: How to render.
+        backend: The rendering backend, by its own name.
+
+    Returns:
+        Seconds of scoring a view, and of writing the pictures of a test view, both for each of its pixels.
+    """
+    settings = RenderSettings(
+        config.background,
+        config.sh_degree,
+        config.antialiased,
+        depth=False,
+        jacobian_limit=config.jacobian_limit,
+    )
+    placed = gaussians.to(device_of(backend))
+    renderer = functools.partial(render, settings=settings, backend=backend)
+    drawing = list[float]()
+
+    def draw(view: View, score: ImageScore, image: Bytes, truth: Bytes) -> None:
+        began = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            save_png(Path(folder) / "probe.png", side_by_side([image, truth]))
+        Picture.of(view.name, image, truth)
+        drawing.append((time.perf_counter() - began) / (view.camera.W * view.camera.H))
+
+    scoring = list[float]()
+    for view in views:
+        began = time.perf_counter()
+        score_views(placed, [view], renderer, config.background, draw)
+        scoring.append((time.perf_counter() - began) / (view.camera.W * view.camera.H))
+    if not drawing:  # masks leave nothing of these views
+        return min(scoring), 0.0
+    return max(min(scoring) - min(drawing), 0.0), min(drawing)
+
+
+def _spread(views: Sequence[View], most: int) -> list[View]:
+    count = min(len(views), most)
+    return [views[i * len(views) // count] for i in range(count)]
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values))

@@ -1,0 +1,119 @@
+"""A trained scene looked at from its cameras: how well each photo is explained, and what hangs in front of the lens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from gsplat_edu.evaluate.metrics import Renderer, psnr
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.validation import ArrayLike
+from gsplat_edu.views import View
+
+SOLID = 0.5
+"""Share of a pixel's light that splats have to stop for it to have a depth."""
+
+NEAR = 0.1
+"""Splats nearer than this share of a view's median depth hang in front of the lens: what was photographed does not."""
+
+VEIL = 0.2
+"""Opacity of the near splats from which a pixel is covered: colours behind shift by a fifth."""
+
+GAMMA = 2.2
+"""Bytes are about light to the power of 1 / 2.2."""
+
+DARK, BRIGHT = 8.0 / 255.0, 247.0 / 255.0
+"""Values outside of which a colour is told to be cut off."""
+
+Progress = Callable[[int, int], None]
+"""Is told how many views are done, and how many there are."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How far a scene is from one photo.
+
+    Args:
+        name: What the capture calls the view.
+        psnr: dB.
+        stops: How much brighter the photo is than the render, median over pixels; negative where it is darker.
+        veiled: Share of the pixels that splats close to the camera cover.
+    """
+
+    name: str
+    psnr: float
+    stops: float
+    veiled: float
+
+
+def residuals(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    render: Renderer,
+    background: ArrayLike,
+    progress: Callable[[], None] = lambda: None,
+) -> list[Residual]:
+    """Render views and compare them with their photos.
+
+    Args:
+        gaussians: The scene, in the frame of the cameras.
+        views: Cameras and photos. A view in which no pixel counts is left out.
+        render: Renders Gaussians from a camera, with depth, over `background`.
+        background: (3,) what photos that are not opaque are put over.
+        progress: Is told of every view.
+
+    Returns:
+        In the order of the views.
+
+    Raises:
+        DatasetError: a photo cannot be read.
+    """
+    found = []
+    for view in views:
+        photo = view.read()
+        if photo.mask is None or photo.mask.any():
+            with torch.no_grad():
+                output = render(gaussians, view.camera)
+                veiled = _veiled(gaussians, view, output, render)
+            truth = photo.over(background)
+            pixels = truth / 255.0 if truth.dtype == np.uint8 else np.asarray(truth, dtype=np.float64)
+            stops = _stops(pixels, output.image.double().numpy(force=True), photo.mask)
+            found.append(Residual(view.name, psnr(output.image, truth, photo.mask), stops, veiled))
+        progress()
+    return found
+
+
+def _veiled(gaussians: Gaussians, view: View, output: RenderOutput, render: Renderer) -> float:
+    """Return the share of a view that splats much nearer than the rest of it cover."""
+    if output.depth is None:
+        return 0.0
+    stopped = 1.0 - output.transmittance
+    solid = stopped > SOLID
+    if not bool(solid.any()):
+        return 0.0
+    depth = float((output.depth[solid] / stopped[solid]).median())
+    axis = gaussians.means.new_tensor(view.camera.R[2])
+    z = (gaussians.means - gaussians.means.new_tensor(view.camera.eye)) @ axis
+    near = (z > 0) & (z < NEAR * depth)
+    if not bool(near.any()):
+        return 0.0
+    in_front = render(gaussians.map(lambda tensor: tensor[near]), view.camera)
+    return float((in_front.transmittance < 1.0 - VEIL).double().mean())
+
+
+def _stops(
+    photo: Float64[np.ndarray, "H W 3"],
+    image: Float64[np.ndarray, "H W 3"],
+    mask: Bool[np.ndarray, "H W"] | None,
+) -> float:
+    """Return the median of log2(photo / render) in light; 0 where nearly all is cut off."""
+    good = np.all((np.minimum(photo, image) > DARK) & (np.maximum(photo, image) < BRIGHT), axis=2)
+    good = good if mask is None else good & mask
+    if good.mean() < 0.01:
+        return 0.0
+    return float(GAMMA * np.median(np.log2(photo[good] / image[good])))

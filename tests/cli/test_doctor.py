@@ -1,0 +1,200 @@
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsplat_edu.cli.main as command_line
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap, write_transforms
+from gsplat_edu.io.ply import save_ply
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.views import View
+from splats import splats_on
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A clean capture, and what it was written from."""
+    folder = tmp_path_factory.mktemp("made") / "capture"
+    views, points, colors = procedural_capture(64, 24)
+    write_colmap(folder, views, points, colors)
+    return folder, views, points, colors
+
+
+@pytest.fixture
+def doctor(capsys):
+    """Run the command; return its exit code and what it printed, the error line where there is one."""
+
+    def call(*words):
+        try:
+            code = command_line.main(["doctor", *map(str, words)])
+        except SystemExit as end:
+            code = end.code
+        printed = capsys.readouterr()
+        return code, printed.err or printed.out
+
+    return call
+
+
+def test_a_clean_capture_fits_on_a_screen_and_ends_with_advice(doctor, capture):
+    folder, *_ = capture
+    code, said = doctor(folder, "--no-forecast")
+    lines = said.splitlines()
+    assert code == 0 and len(lines) <= 24 and "warning" not in said
+    assert "COLMAP: 24 photos of 64x48; 200 points" in said
+    assert lines[-4] == "what to do:" and lines[-3] == f"  1. train: gsplat-edu train {folder} --out RUN"
+
+
+def test_faults_are_named_and_the_exit_code_stays_0(doctor, capture, tmp_path):
+    _, views, points, colors = capture
+    write_colmap(tmp_path, views, points, colors)
+    (tmp_path / "images" / "view_003.png").write_bytes(b"")
+    (tmp_path / "images" / "view_005.png").unlink()
+    code, said = doctor(tmp_path)
+    assert code == 0
+    assert "unusable: 1 of 23 photos" in said and "view_003.png" in said
+    assert "1 missing image of 24 listed, first view_005.png" in said
+    # a forecast reads the capture as training would, and that refuses it
+    assert (
+        "forecast   none, for training would end here" in said and "view_003.png: cannot be decoded" in said
+    )
+
+
+def test_hopeless_captures_end_with_1(doctor, capture, tmp_path):
+    _, views, points, colors = capture
+    write_transforms(tmp_path / "a", [View(views[0].camera, view.image, name=view.name) for view in views])
+    code, said = doctor(tmp_path / "a")
+    assert code == 1 and "fatal      no parallax: all cameras stand at one place" in said
+    assert "what to do:\n  1. walk while you take the photos" in said and "forecast" not in said
+
+    write_colmap(tmp_path / "b", views, points, colors)
+    for photo in (tmp_path / "b" / "images").iterdir():
+        photo.write_bytes(b"\x89PNG")
+    code, said = doctor(tmp_path / "b")
+    assert code == 1 and "0 of 24 photos can be used" in said
+
+
+def test_bad_input_is_one_line_and_2(doctor, capture, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for words, text in (
+        ([tmp_path / "gone"], "is not there; give a dataset folder or a run folder"),
+        ([tmp_path / "empty"], "is no capture"),
+        ([capture[0], "--resolution", "0.5"], "resolution"),
+        ([capture[0], "--backend", "abacus"], "abacus"),
+    ):
+        code, said = doctor(*words)
+        assert code == 2 and said.count("\n") == 1 and text in said
+
+
+def test_the_forecast_comes_before_the_advice(doctor, capture):
+    code, said = doctor(capture[0], "--iterations", "200")
+    assert code == 0
+    lines = said.splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("forecast"))
+    assert "200 iterations" in said and first < lines.index("what to do:") and len(lines) <= 24
+
+
+@pytest.fixture(scope="module")
+def run(capture, tmp_path_factory):
+    """A run of the capture whose scene is the start points."""
+    folder, _, points, colors = capture
+    made = RunFolder(tmp_path_factory.mktemp("made") / "run")
+    data = {**dataclasses.asdict(DataSettings(test_every=6)), "path": str(folder), "points": None}
+    made.write_config(
+        {
+            "version": "0",
+            "data": data,
+            "train": {"iterations": 70},
+            "render": dataclasses.asdict(RenderSettings(depth=False)),
+            "origin": [0.0, 0.0, 0.0],
+            "backend": "cpu",
+        }
+    )
+    save_ply(made.scene(30), splats_on(points, colors))
+    dataset = load_dataset(folder, DataSettings(test_every=6))
+    made.write_cameras(dataset.train, dataset.test)
+    return made
+
+
+def test_a_run_is_judged(doctor, run):
+    code, said = doctor(run.path)
+    lines = said.splitlines()
+    assert code == 0 and len(lines) <= 24 and lines[-4] == "what to do:"
+    assert (
+        "30 iterations, 200 splats" in said and "unfinished: the scene is that of iteration 30 of 70" in said
+    )
+    assert "4 views, PSNR" in said and "20 views, PSNR" in said
+
+    _, said = doctor(run.path, "--all-views")
+    values = [float(line.split()[0]) for line in said.splitlines() if " dB  t" in line]
+    assert len(values) == 24 and values == sorted(values)
+
+
+def test_a_dataset_that_moved_is_named(doctor, run, capture, tmp_path):
+    config = run.read_config()
+    moved = RunFolder(tmp_path / "moved")
+    moved.write_config({**config, "data": {**config["data"], "path": "/gone"}})
+    assert doctor(moved.path)[0] == 2, "there is no scene"
+    moved.scene(5).parent.mkdir(parents=True)
+    moved.scene(5).write_bytes(run.scene(30).read_bytes())
+    code, said = doctor(moved.path)
+    assert code == 2 and "/gone: the run's dataset is no longer there" in said
+    assert doctor(moved.path, "--dataset", capture[0])[0] == 0
+
+
+def real(name):
+    shared = Path(__file__).parents[3] / "shared" / "data"
+    folder = Path(os.environ.get("GSPLAT_EDU_DATA", shared)) / name
+    if not folder.exists():
+        pytest.skip(f"{name} is not on this machine; see GSPLAT_EDU_DATA")
+    return folder
+
+
+def test_snowmiku97(doctor):
+    """Two photos are blurred by motion, and in two the photographer's shadow falls on the toy: seen by eye."""
+    code, said = doctor(real("snowmiku97"), "--no-forecast")
+    blurred, exposure = (
+        "\n".join(x for x in said.splitlines() if f"warning    {n}" in x) for n in ("blur", "expo")
+    )
+    assert code == 0
+    assert "2 of 97" in blurred and "003946" in blurred and "004020" in blurred
+    assert "004028" in exposure and "004027" in exposure
+    assert said.count("warning") == 2
+
+
+def test_fox(doctor):
+    code, said = doctor(real("fox"), "--no-forecast")
+    assert code == 0 and "17 missing images of 67 listed" in said and said.count("warning") == 1
+
+
+def test_truck11(doctor):
+    """Its focal lengths are wrong; with the right ones, about 385 px, the points would all be seen."""
+    code, said = doctor(real("truck11"), "--no-forecast")
+    assert code == 0 and said.count("warning") == 3
+    for words in (
+        "11 photos are few",
+        "fx is 1198 px and fy 501.4",
+        "9.5 % of the points lie in no camera's picture",
+    ):
+        assert words in said, words
+
+
+def test_help_shows_an_example(doctor, capsys):
+    code, said = doctor("--help")
+    assert code == 0 and "example: gsplat-edu doctor " in said
+
+
+def test_points_and_photos_far_from_zero_are_no_obstacle(doctor, capture, tmp_path):
+    """Map coordinates: float64 keeps them, and the checks are the same."""
+    _, views, points, colors = capture
+    away = np.array([431000.0, 5400000.0, 300.0])
+    moved = [
+        View(dataclasses.replace(v.camera, eye=v.camera.eye + away), v.image, name=v.name) for v in views
+    ]
+    write_colmap(tmp_path, moved, points + away, colors)
+    code, said = doctor(tmp_path, "--no-forecast")
+    assert code == 0 and "warning" not in said

@@ -1,0 +1,39 @@
+"""What the tests of the doctor share: a capture written to disk and examined."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from gsplat_edu.data.writers import write_colmap, write_transforms
+from gsplat_edu.doctor.before import examine
+from gsplat_edu.doctor.finding import Diagnosis, Severity
+from gsplat_edu.doctor.survey import prepare
+
+
+@pytest.fixture
+def diagnosed(tmp_path) -> Callable[..., Diagnosis]:
+    """Write views as a capture, COLMAP's where there are points, let `spoil` at its folder, and examine it."""
+
+    def examined(views, points=None, spoil=None) -> Diagnosis:
+        folder = tmp_path / "capture"
+        if points is None:
+            write_transforms(folder, views)
+        else:
+            write_colmap(folder, views, points, np.full((len(points), 3), 0.5))
+        if spoil is not None:
+            spoil(folder)
+        return examine(prepare(folder))
+
+    return examined
+
+
+@pytest.fixture
+def named(diagnosed) -> Callable[..., dict]:
+    """The same, as the images of each finding that is no note, by the finding's name."""
+
+    def warnings(views, points=None, spoil=None) -> dict:
+        findings = diagnosed(views, points, spoil).findings
+        return {f.name: f.images for f in findings if f.severity > Severity.NOTE}
+
+    return warnings

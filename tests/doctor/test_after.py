@@ -1,0 +1,196 @@
+"""Faults of a trained scene, each at three severities: the slight one may pass, the two others are named."""
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.doctor.after import Trained, examine_run, view_lines
+from gsplat_edu.doctor.finding import Severity
+from gsplat_edu.doctor.residuals import residuals
+from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.views import View
+from splats import splats_on
+
+BACKGROUND = (0.2, 0.3, 0.4)
+RENDER = functools.partial(render, settings=RenderSettings(background=BACKGROUND), backend="cpu")
+
+NOISE = 0.02
+"""Standard deviation of the noise of every photo: 34 dB."""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A scene, and noisy photos of it: eight to train on, four to test with."""
+    views, points, colors = procedural_capture(size=48, count=12)
+    gaussians = splats_on(points, colors)
+    photos = [RENDER(gaussians, view.camera).image.double().numpy() for view in views]
+    views = [
+        View(view.camera, noisy(photo, NOISE, i), name=view.name)
+        for i, (view, photo) in enumerate(zip(views, photos, strict=True))
+    ]
+    return gaussians, views
+
+
+def noisy(image, sigma, seed):
+    return np.clip(image + sigma * np.random.default_rng(seed).normal(size=image.shape), 0.0, 1.0)
+
+
+def trained(gaussians, views, **changes):
+    train, test = (residuals(gaussians, part, RENDER, BACKGROUND) for part in (views[4:], views[:4]))
+    run = Trained(Path("runs/a"), gaussians, 3.5, train, test, 7000, 7000)
+    return replace(run, **changes)
+
+
+def warnings(run):
+    return {f.name: f for f in examine_run(run).findings if f.severity > Severity.NOTE}
+
+
+def with_photo(views, i, change):
+    changed = list(views)
+    changed[i] = View(views[i].camera, change(views[i].read().image.astype(np.float64)), name=views[i].name)
+    return changed
+
+
+def test_a_good_run_gets_no_warning(scene):
+    gaussians, views = scene
+    run = trained(gaussians, views)
+    diagnosis = examine_run(run)
+    assert diagnosis.findings == () and not diagnosis.hopeless
+    assert diagnosis.fine == (
+        "length",
+        "training views",
+        "outliers",
+        "test views",
+        "exposure",
+        "floaters",
+        "splats",
+    )
+    assert len(diagnosis.advice) == 3
+
+
+def test_residuals_are_those_of_rendering_and_comparing(scene):
+    gaussians, views = scene
+    told = []
+    found = residuals(gaussians, views[:3], RENDER, BACKGROUND, lambda: told.append(1))
+    assert len(told) == 3
+    for residual, view in zip(found, views, strict=False):
+        assert residual.name == view.name
+        assert residual.psnr == psnr(RENDER(gaussians, view.camera).image, view.image)
+        assert residual.stops == pytest.approx(0.0, abs=0.05) and residual.veiled == 0.0
+    lines = view_lines(trained(gaussians, views))
+    values = [float(line.split()[0]) for line in lines]
+    assert len(lines) == 12 and values == sorted(values)
+    assert sum(" test " in line for line in lines) == 4
+
+
+def test_a_view_without_a_pixel_that_counts_is_left_out(scene):
+    gaussians, views = scene
+    none = View(views[0].camera, views[0].image, mask=np.zeros((36, 48), dtype=bool), name="masked")
+    assert residuals(gaussians, [none], RENDER, BACKGROUND) == []
+
+
+# noise of s adds up with that which is there: 10 log10(1 + s² / 0.02²) = 1, 7 and 14 dB
+@pytest.mark.parametrize(("sigma", "is_named"), [(0.01, False), (0.04, True), (0.1, True)])
+def test_a_photo_the_scene_cannot_explain(scene, sigma, is_named):
+    gaussians, views = scene
+    spoiled = with_photo(views, 6, lambda image: noisy(image, sigma, 99))
+    found = warnings(trained(gaussians, spoiled))
+    names = [text.split(" (")[0] for text in found["unexplained"].images] if "unexplained" in found else []
+    assert names == ([views[6].name] if is_named else [])
+
+
+@pytest.mark.parametrize(("sigma", "is_named"), [(0.01, False), (0.05, True), (0.15, True)])
+def test_test_views_far_below_those_of_training(scene, sigma, is_named):
+    gaussians, views = scene
+    spoiled = views
+    for i in range(4):
+        spoiled = with_photo(spoiled, i, lambda image: noisy(image, sigma, 99))
+    assert ("overfitted" in warnings(trained(gaussians, spoiled))) == is_named
+
+
+@pytest.mark.parametrize(("sigma", "is_named"), [(0.05, False), (0.2, True), (0.4, True)])
+def test_a_scene_that_explains_nothing(scene, sigma, is_named):
+    gaussians, views = scene
+    spoiled = views
+    for i in range(12):
+        spoiled = with_photo(spoiled, i, lambda image: noisy(image, sigma, 99))
+    assert ("poor fit" in warnings(trained(gaussians, spoiled))) == is_named
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("stops", "is_named"), [(0.2, False), (0.8, True), (1.6, True)])
+def test_a_photo_of_another_exposure(scene, stops, sign, is_named):
+    gaussians, views = scene
+    spoiled = with_photo(views, 7, lambda image: np.clip(image * 2.0 ** (sign * stops / 2.2), 0.0, 1.0))
+    run = trained(gaussians, spoiled)
+    assert run.train[3].stops == pytest.approx(sign * stops, abs=0.2)  # bright pixels are cut off
+    found = warnings(run)
+    assert found["exposure"].images[0].startswith(views[7].name) if is_named else "exposure" not in found
+
+
+def in_front(gaussians, camera, share):
+    """Add a splat a twentieth of the way to the scene that covers about so much of a camera's picture."""
+    z = 0.05 * 3.2
+    # covered from an opacity of 0.2 on: 0.9 exp(-r²/2) = 0.2 at r = 1.73 standard deviations
+    pixels = np.sqrt(share * camera.W * camera.H / np.pi) / 1.73
+    added = Gaussians(
+        means=torch.tensor(camera.eye + z * camera.R[2], dtype=torch.float32)[None],
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        log_scales=torch.full((1, 3), float(np.log(pixels * z / camera.fx))),
+        sh0=torch.zeros(1, 1, 3),
+        sh_rest=torch.zeros(1, gaussians.sh_rest.shape[1], 3),
+        logit_opacities=torch.logit(torch.tensor([0.9])),
+    )
+    return Gaussians.concatenated([gaussians, added])
+
+
+@pytest.mark.parametrize(("share", "is_named"), [(0.005, False), (0.1, True), (0.4, True)])
+def test_a_floater_in_front_of_a_camera(scene, share, is_named):
+    gaussians, views = scene
+    run = trained(in_front(gaussians, views[5].camera, share), views)
+    # whole pixels of 1728, and a sphere's projection is a little wider than the disc
+    assert run.train[1].veiled == pytest.approx(share, rel=0.25, abs=0.002)
+    found = warnings(run)
+    assert found["floaters"].images[0].startswith(views[5].name) if is_named else "floaters" not in found
+
+
+@pytest.mark.parametrize(("share", "severity"), [(0.2, None), (0.5, Severity.NOTE), (0.9, Severity.NOTE)])
+def test_splats_that_hardly_show(scene, share, severity):
+    gaussians, views = scene
+    faint = torch.arange(len(gaussians)) < share * len(gaussians)
+    logits = torch.where(faint, torch.tensor(-6.0), gaussians.logit_opacities)
+    diagnosis = examine_run(trained(replace(gaussians, logit_opacities=logits), views))
+    found = [f.severity for f in diagnosis.findings if f.name == "faint splats"]
+    assert found == ([severity] if severity else [])
+
+
+@pytest.mark.parametrize(("share", "is_named"), [(0.005, False), (0.03, True), (0.2, True)])
+def test_splats_larger_than_all(scene, share, is_named):
+    gaussians, views = scene
+    scales = gaussians.log_scales.clone()
+    scales[: round(share * len(gaussians)), 1] = 2.0
+    run = trained(replace(gaussians, log_scales=scales), views)
+    assert ("huge splats" in warnings(run)) == is_named
+
+
+@pytest.mark.parametrize(
+    ("reached", "planned", "is_named"), [(7000, 7000, False), (7000, None, False), (70, 7000, True)]
+)
+def test_a_training_that_did_not_end(scene, reached, planned, is_named):
+    gaussians, views = scene
+    run = trained(gaussians, views, reached=reached, planned=planned)
+    assert ("unfinished" in warnings(run)) == is_named
+
+
+def test_an_empty_scene_is_no_obstacle(scene):
+    gaussians, views = scene
+    empty = gaussians.map(lambda tensor: tensor[:0])
+    assert "splats" in warnings(trained(empty, views))

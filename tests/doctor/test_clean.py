@@ -1,0 +1,53 @@
+"""Clean captures of many kinds get no warning."""
+
+import functools
+
+import pytest
+
+from doctor.rooms import room
+from gsplat_edu.data import procedural
+from gsplat_edu.data.writers import write_blender
+from gsplat_edu.doctor.before import examine
+from gsplat_edu.doctor.finding import Severity
+from gsplat_edu.doctor.survey import prepare
+
+LAYOUTS = ("orbit", "forward", "outward", "walk")
+
+procedural_capture = functools.cache(procedural.procedural_capture)
+
+
+@pytest.mark.parametrize("with_points", [True, False])
+@pytest.mark.parametrize(
+    ("layout", "size", "count", "height"),
+    [(layout, *size) for layout in LAYOUTS for size in ((128, 24, None), (72, 16, 120))]
+    + [("orbit", 96, 36, None)],
+)
+def test_a_clean_room_gets_no_warning(named, layout, size, count, height, with_points):
+    views, points = room(layout, size, count, height)
+    assert named(views, points if with_points else None) == {}
+
+
+@pytest.mark.parametrize("with_points", [True, False])
+@pytest.mark.parametrize(
+    ("size", "count", "height"), [(48, 12, None), (64, 24, None), (80, 36, None), (72, 18, 128)]
+)
+def test_the_procedural_scene_gets_no_warning(named, size, count, height, with_points):
+    views, points, _ = procedural_capture(size, count, height=height)
+    assert named(views, points if with_points else None) == {}
+
+
+def test_nor_does_blenders_layout(tmp_path):
+    views, _, _ = procedural_capture(64, 24)
+    write_blender(tmp_path, views[3:], views[:3])
+    (tmp_path / "test" / "view_000_depth.png").write_bytes((tmp_path / "test" / "view_000.png").read_bytes())
+    diagnosis = examine(prepare(tmp_path))
+    assert [f for f in diagnosis.findings if f.severity > Severity.NOTE] == []
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_how_the_cameras_stand_is_recognised(diagnosed, layout):
+    views, points = room(layout, 128)
+    said = {"orbit": "in their middle", "forward": "one way", "outward": "outwards", "walk": "one way"}[
+        layout
+    ]
+    assert said in dict(diagnosed(views, points).facts)["cameras"]

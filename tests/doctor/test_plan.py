@@ -1,0 +1,342 @@
+"""Plans: what is chosen obeys the limits by the model; and one small run obeys them by what the system counts."""
+
+import dataclasses
+import itertools
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsplat_edu.cli.arguments import bytes_text, seconds_text
+from gsplat_edu.cli.main import build_parser, main
+from gsplat_edu.cli.train import options_from
+from gsplat_edu.data.dataset import DataSettings
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.doctor.costs import Facts, Footprint, Measurements, Speed
+from gsplat_edu.doctor.pace import Pace
+from gsplat_edu.doctor.plan import Limits, Request, choose, flags, plan, taken_up
+from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.training import CaptureRun, RunOptions
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.events import StepEvent
+
+MIB = 2**20
+
+FACTS = Facts(
+    train=84,
+    test=13,
+    points=25_784,
+    pixels=734_580.0,
+    largest=734_580.0,
+    full=734_580.0,
+    photo_bytes=213_762_780,
+    workers=2,
+)
+MEASURED = Measurements(
+    backend="cpu",
+    speed=Speed(fixed=0.002, per_pixel=2e-8, per_gaussian=2.4e-7),
+    read=0.01,
+    score=1.5e-7,
+    picture=3e-7,
+    pairs=250_000,
+    resident=310 * MIB,
+    settled=380 * MIB,
+)
+FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+OPTIONS = RunOptions(Path("capture"), Path("run"), recipe(), DataSettings())
+SPENT = 8.0
+
+
+def request(memory=None, seconds=None, given=(), factors=FACTORS, rescale=True, **changes):
+    settings = {key: changes.pop(key) for key in ("resolution", "image_memory") if key in changes}
+    iterations = changes.pop("iterations", 30_000)
+    options = dataclasses.replace(
+        OPTIONS,
+        config=recipe(iterations, rescale=rescale, **changes),
+        data_settings=DataSettings(**settings),
+    )
+    limits = Limits(None if memory is None else memory * MIB, seconds)
+    return Request(options, limits, frozenset(given), rescale, FACTS, factors)
+
+
+def chosen(*arguments, **options):
+    return choose(request(*arguments, **options), MEASURED, SPENT)
+
+
+def peak(found):
+    """What the model says of a plan with all the Gaussians it allows."""
+    facts = FACTS.smaller(found.resolution or 1.0)
+    footprint = Footprint(facts, MEASURED.process, MEASURED.pairs, found.options.config.sh_degree)
+    return footprint.peak(found.max_gaussians, found.image_memory)
+
+
+@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+def test_memory_holds_for_any_limit_and_more_memory_is_never_worse(strategy):
+    plans = [
+        chosen(limit, strategy=strategy) for limit in (560, 640, 800, 1_024, 1_500, 2_048, 4_096, 16_384)
+    ]
+    limits = (560, 640, 800, 1_024, 1_500, 2_048, 4_096, 16_384)
+    for limit, found in zip(limits, plans, strict=True):
+        assert peak(found) <= limit * MIB, limit
+    sizes = [found.resolution or 1.0 for found in plans]
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] > 1.0 and sizes[-1] == 1.0
+    for less, more in itertools.pairwise(found for found in plans if found.resolution is None):
+        assert more.max_gaussians >= less.max_gaussians and more.image_memory >= less.image_memory
+    assert plans[-1].image_memory == FACTS.photo_bytes, "all photos are kept where there is room"
+    assert all(found.iterations == 30_000 and not found.by_time for found in plans)
+
+
+def test_time_holds_for_any_limit_and_more_time_is_never_worse():
+    limits = (40, 60, 120, 240, 600, 1_800, 7_200, 36_000)
+    plans = [chosen(None, seconds) for seconds in limits]
+    for seconds, found in zip(limits, plans, strict=True):
+        assert found.forecast.total + SPENT <= seconds
+        assert found.by_time and found.options.time_limit is None
+    assert [found.iterations for found in plans] == sorted(found.iterations for found in plans)
+    assert plans[-1].iterations == 30_000, "the recipe has no more"
+    sizes = [found.resolution or 1.0 for found in plans]
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] > 1.0 and sizes[-1] == 1.0
+    # the schedule uses its share of the time: two digits are rounded down by up to 9 %, a cap by as much
+    assert plans[4].forecast.total + SPENT > 0.7 * 600
+
+
+def test_both_limits_hold_together():
+    found = chosen(700, 300.0)
+    assert peak(found) <= 700 * MIB and found.forecast.total + SPENT <= 300
+
+
+def test_the_milestones_stretch_with_the_iterations_that_were_chosen():
+    config = chosen(None, 240.0).options.config
+    stretched = recipe(config.iterations)
+    assert config == dataclasses.replace(stretched, max_gaussians=config.max_gaussians)
+    kept = chosen(None, 240.0, rescale=False).options.config
+    assert kept.densify_stop == 15_000 and kept.iterations < 15_000
+    given = chosen(None, 240.0, given=["densify_stop"], densify_stop=900).options.config
+    assert given.densify_stop == 900 and given.sh_every == recipe(given.iterations).sh_every
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("resolution", 3.0), ("image_memory", 50 * MIB), ("max_gaussians", 60_000), ("iterations", 700)],
+)
+def test_what_the_user_gave_stays(name, value):
+    factors = (1.0,) if name == "resolution" else FACTORS
+    found = chosen(900, 240.0, given=[name], factors=factors, **{name: value})
+    assert getattr(found, name) == value
+    flag = f"--{name.replace('_', '-')}"
+    assert flag not in found.sentences[0], "it was not chosen"
+    assert found.by_time == (name != "iterations")
+
+
+def test_a_cap_that_was_given_has_room_or_is_refused():
+    found = chosen(900, given=["max_gaussians"], max_gaussians=100_000)
+    footprint_holds = peak(found) <= 900 * MIB
+    assert footprint_holds and found.max_gaussians == 100_000
+    with pytest.raises(ArgumentError, match="MiB would do"):
+        chosen(900, given=["max_gaussians"], max_gaussians=5_000_000)
+
+
+@pytest.mark.parametrize("given", [{}, {"max_gaussians": 500_000}, {"image_memory": 200 * MIB}])
+def test_too_little_memory_is_one_line_and_what_it_names_does(given):
+    with pytest.raises(ArgumentError) as refused:
+        chosen(64, given=list(given), **given)
+    said = str(refused.value)
+    assert said.startswith("--max-memory 64 MiB") and "\n" not in said
+    enough = int(said.split("; ")[-1].removesuffix("MiB would do"))
+    assert peak(chosen(enough, given=list(given), **given)) <= enough * MIB
+    with pytest.raises(ArgumentError):
+        chosen(enough - 2, given=list(given), **given)
+
+
+def test_too_little_time_is_one_line_and_what_it_names_does():
+    with pytest.raises(ArgumentError) as refused:
+        chosen(None, 9.0)
+    said = str(refused.value)
+    assert said.startswith("--time-limit 9 s: is too short") and "\n" not in said
+    enough = seconds_text(said.rsplit("at least ", 1)[1].replace(" ", "").replace("min", "m"))
+    assert chosen(None, enough).iterations >= 50
+
+
+def test_the_sentences_name_what_was_chosen():
+    found = chosen(1_024, 240.0)
+    first, *forecast = found.sentences
+    assert first.startswith("--max-memory 1 GiB and --time-limit 4 min 0 s: chosen ")
+    for flag, value in (("--iterations", found.iterations), ("--max-gaussians", found.max_gaussians)):
+        assert f"{flag} {value}" in first
+    assert f"--image-memory {-(-found.image_memory // MIB)}MiB" in first
+    assert any("memory: up to" in line for line in forecast) and all("\n" not in line for line in forecast)
+
+
+def test_the_sentence_given_as_options_is_the_same_run():
+    """What was planned and what its sentence says have one recipe and one size of photos."""
+    found = chosen(700, 240.0)
+    words = found.sentences[0].split("chosen ")[1].split()
+    parsed = build_parser(["train"]).parse_args(["train", "capture", "--out", "run", *words])
+    again = options_from(parsed)
+    assert again.config == found.options.config
+    assert again.data_settings.resolution == found.resolution
+    assert bytes_text(words[words.index("--image-memory") + 1]) >= found.image_memory
+
+
+def test_nothing_is_planned_without_need(tmp_path):
+    """The capture is not there, so looking at it would fail: it is not looked at."""
+    options = dataclasses.replace(OPTIONS, data=tmp_path / "nothing", time_limit=3.0)
+    assert plan(options, Limits()).options is options
+    assert plan(options, Limits(seconds=3.0), ["iterations"]).options is options
+    with pytest.raises(ArgumentError, match="--backend torch"):
+        plan(dataclasses.replace(options, backend="torch"), Limits(memory=2**30))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "egg"
+    write_colmap(folder, *procedural_capture(64, 16))
+    return folder
+
+
+def options(capture, out, iterations=20, **changes):
+    return RunOptions(capture, out, recipe(iterations, **changes), DataSettings(), save_every=0, eval_every=0)
+
+
+def trained(run, callbacks=(), stop=lambda: False):
+    run.start(callbacks=callbacks)
+    run.train(stop)
+    run.finish()
+    return run.folder
+
+
+def test_a_capture_is_planned_from_its_files(capture, tmp_path):
+    """The whole way: read, measure, choose. How fast this machine is decides the numbers, not that they hold."""
+    found = plan(dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), Limits(2**32, 3_600.0))
+    assert found.resolution is None and found.by_time and found.forecast.peak < 2**32
+    assert found.max_gaussians > 200 and 50 <= found.iterations <= 30_000
+
+
+def test_a_resumed_run_takes_the_numbers_of_its_config(capture, tmp_path):
+    begun = dataclasses.replace(
+        options(capture, tmp_path / "run", 20, max_gaussians=333), data_settings=DataSettings(resolution=2)
+    )
+    trained(CaptureRun(begun))
+    plain = dataclasses.replace(begun, config=recipe(), data_settings=DataSettings(), resume=True)
+    again = plan(plain, Limits(2**30, 100.0))
+    assert again.options.config == begun.config and again.resolution == 2 and not again.by_time
+    assert CaptureRun(again.options).finished
+    with pytest.raises(CheckpointError, match="iterations = 20, not 30000"):
+        CaptureRun(taken_up(plain, ["iterations"]))
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize(
+    ("stored", "named"),
+    [
+        ({"data": {}}, "lacks the section train"),
+        ({"train": {}, "data": None}, "lacks the section train or data"),
+        ({"train": {"iterations": "many"}, "data": {}}, "iterations: is 'many'"),
+        ({"train": {}, "data": {"resolution": -1.0}}, "resolution: is -1"),
+    ],
+)
+def test_a_damaged_config_is_one_line(capture, tmp_path, stored, named):
+    resumed = dataclasses.replace(options(capture, tmp_path / "run"), resume=True)
+    resumed.folder.write_config(stored)
+    with pytest.raises(CheckpointError, match="mend the file") as refused:
+        plan(resumed, Limits(memory=2**30))
+    assert named in str(refused.value) and "\n" not in str(refused.value)
+
+
+class Clock:
+    """Ten seconds for every iteration of a run, whatever the machine."""
+
+    def __init__(self, before=0.0):
+        self.iteration, self.before = 0, before
+
+    def __call__(self, trainer=None, event=None):
+        if isinstance(event, StepEvent):
+            self.iteration = trainer.iteration
+        return self.before + 10.0 * self.iteration
+
+
+def paced(run, limit, clock, said=None, **settings):
+    said = [] if said is None else said
+    pace = Pace(run, limit, clock=clock, say=said.append, **settings)
+    return trained(run, [clock, pace], pace.over)
+
+
+def test_training_ends_in_time_to_judge(capture, tmp_path):
+    """600 s less those before training and those to judge, which is the 2.5 s of the report and little more."""
+    run = CaptureRun(options(capture, tmp_path / "run", 100))
+    folder = paced(run, 600.0, Clock(before=100.0))
+    # the first iteration after which less than 10 s and the reserve are left; judging 16 tiny views is not 30 s
+    assert 46 <= folder.read_metrics()["iterations"] <= 50
+    assert folder.read_config()["train"]["iterations"] == 100, "it can be resumed"
+
+
+def test_time_that_is_left_is_used_and_the_numbers_give_the_same_bits(capture, tmp_path):
+    run, said = CaptureRun(options(capture, tmp_path / "run", max_gaussians=400)), list[str]()
+    folder = paced(run, 600.0, Clock(), said, extend=True)
+    total = folder.read_metrics()["iterations"]
+    # 60 would fit without judging; what is left at the end is less than 2.5 % or less than one iteration is worth
+    assert 50 <= total <= 59
+    stored = folder.read_config()["train"]
+    assert stored["iterations"] == total and stored["means_rate_iterations"] == 20, "milestones stay"
+    assert f"--iterations {total}" in said[-1]
+    words = said[-1].split("the same again: ")[1].split()
+    fixed = ["--save-every", "0", "--eval-every", "0"]
+    assert main(["train", str(capture), "--out", str(tmp_path / "again"), *fixed, *words]) == 0
+    scenes = [RunFolder(tmp_path / name).latest_scene()[0].read_bytes() for name in ("run", "again")]
+    assert scenes[0] == scenes[1]
+
+
+def test_a_run_that_was_not_planned_is_not_lengthened(capture, tmp_path):
+    folder = paced(CaptureRun(options(capture, tmp_path / "run")), 600.0, Clock())
+    assert folder.read_metrics()["iterations"] == 20
+
+
+def test_flags_name_milestones_that_iterations_do_not_give():
+    config = dataclasses.replace(recipe(3_400), iterations=4_000)
+    words = flags(dataclasses.replace(OPTIONS, config=config))
+    assert words.startswith("--iterations 4000 --means-rate-iterations 3400 ")
+    assert flags(dataclasses.replace(OPTIONS, config=recipe(4_000))) == "--iterations 4000"
+
+
+RUN = """
+import sys
+from pathlib import Path
+from gsplat_edu.data.dataset import DataSettings
+from gsplat_edu.doctor.plan import Limits, plan
+from gsplat_edu.runs.training import CaptureRun, RunOptions
+from gsplat_edu.train.config import recipe
+config = recipe(150, rescale=False, densify_start=0, densify_every=5, densify_stop=120, grad_threshold=0.0)
+options = RunOptions(Path(sys.argv[1]), Path(sys.argv[2]), config, DataSettings(), save_every=50, eval_every=50)
+chosen = plan(options, Limits(memory=int(sys.argv[3])), ["iterations"])
+run = CaptureRun(chosen.options)
+run.start()
+run.train()
+run.finish()
+"""
+
+MEASURE = """
+import os, sys
+child = os.posix_spawn(sys.executable, [sys.executable, "-c", *sys.argv[1:]], os.environ)
+_, status, usage = os.wait4(child, 0)
+print(usage.ru_maxrss * 1024)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+"""A parent of its own, since Linux counts what the parent held when it started the child."""
+
+
+@pytest.mark.own_process
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ru_maxrss is in KiB on Linux")
+def test_a_training_stays_below_its_limit_as_the_system_counts(capture, tmp_path):
+    """Everything is cloned or split, so the cap that was chosen is reached and the memory is really used."""
+    limit = 560 * MIB
+    words = [sys.executable, "-c", MEASURE, RUN, str(capture), str(tmp_path / "run"), str(limit)]
+    done = subprocess.run(words, check=False, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    folder = RunFolder(tmp_path / "run")
+    cap = json.loads(folder.config.read_text())["train"]["max_gaussians"]
+    assert folder.read_metrics()["num_gaussians"] > 0.9 * cap, "the limit was worth a test"
+    assert int(done.stdout) <= limit
