@@ -12,11 +12,13 @@ from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLinePa
 
 COMMANDS = {
     "demo": "learn a sphere from 24 renders of it and judge the result with a held-out camera",
+    "sfm": "find the poses of photos, or of a video's frames, and write a capture that train reads",
     "train": "turn a folder of posed photos into a scene",
     "eval": "score a run's latest scene on its test and training views, and write metrics, renders and a report",
     "render": "render a run or a scene file: an orbit as a video, or what the dataset's cameras see",
     "convert": "write a scene in another format, or as a page that draws it; filter, move, join, and check it",
     "view": "show a scene or a run in the browser",
+    "doctor": "say what is wrong with a capture before training or with a run after it, and what to do",
     "info": "say what a dataset, a run or a scene file holds, on one screen",
 }
 """Commands and what they do; each is a module `gsplat_edu.cli.NAME` with EXAMPLE, add_arguments and run."""
