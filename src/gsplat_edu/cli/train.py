@@ -5,30 +5,28 @@ from __future__ import annotations
 import argparse
 import functools
 import importlib
-import inspect
 import math
-import re
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields
-from pathlib import Path
+from dataclasses import replace
 from types import ModuleType
-from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.data.dataset import DataSettings
+from gsplat_edu.cli.sfm import stage_bars
+from gsplat_edu.cli.train_options import add_arguments as add_arguments
+from gsplat_edu.cli.train_options import given_from, limits_from, options_from
+from gsplat_edu.doctor.pace import Pace
+from gsplat_edu.doctor.plan import Plan, plan
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
-from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.training import CaptureRun, RunOptions
-from gsplat_edu.train.config import ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
+from gsplat_edu.sfm.reconstruct import SfmOptions, needs_poses, reconstruct
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
@@ -36,195 +34,11 @@ from gsplat_edu.viewer.serve import exposure
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
 
-NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background")
-"""Fields of the recipe that have their options spelled out below; the others are made from `TrainConfig`."""
-
 LINES = 20
 """Lines that tell of the training where there is no terminal to draw a bar on."""
 
 PSNR_EVERY = 20
 """Iterations between two looks at the last view's loss and PSNR, which cost a few milliseconds each."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    parser.add_argument(
-        "data", type=Path, metavar="DATA", help="a capture: COLMAP, transforms.json or Blender"
-    )
-    parser.add_argument("--out", type=Path, metavar="RUN", required=True, help="folder of the run")
-    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint in RUN")
-    _add_budget(parser.add_argument_group("budget"))
-    _add_view(parser.add_argument_group("live view"))
-    _add_data(parser.add_argument_group("photos"))
-    group = parser.add_argument_group("recipe, see docs/RECIPE.md; defaults are those of 30,000 iterations")
-    behind = group.add_mutually_exclusive_group()
-    behind.add_argument(
-        "--white-background", action="store_true", help="white behind everything (default: black)"
-    )
-    behind.add_argument(
-        "--background", type=float, nargs=3, metavar=("R", "G", "B"), help="another colour, 0 to 1"
-    )
-    group.add_argument(
-        "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
-    )
-    meanings = _meanings()
-    for field in fields(TrainConfig):
-        if field.name not in NAMED:
-            _add_field(group, field.name, field.default, meanings[field.name])
-
-
-def _add_budget(group: argparse._ArgumentGroup) -> None:
-    def number(flag: str, text: str, default: int | None = None) -> None:
-        group.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
-
-    number("--iterations", f"steps of training (default: {RECIPE_ITERATIONS})", RECIPE_ITERATIONS)
-    group.add_argument(
-        "--no-rescale",
-        action="store_true",
-        help="keep the schedule of 30,000 iterations whatever --iterations is",
-    )
-    names = ", ".join(STRATEGIES)
-    group.add_argument("--strategy", metavar="NAME", default="adc", help=f"one of {names} (default: adc)")
-    number("--max-gaussians", "cap on the number of Gaussians (default: none; mcmc needs one)")
-    number("--seed", "seed of all that is drawn at random (default: 0)", 0)
-    for flag, what, every in (
-        ("--eval-every", "judgements by the test views", RunOptions.eval_every),
-        ("--save-every", "checkpoints", RunOptions.save_every),
-    ):
-        number(flag, f"iterations between {what}, 0 for none (default: {every})", every)
-    group.add_argument(
-        "--time-limit",
-        type=seconds_text,
-        metavar="TIME",
-        help="end training after, for example, 90s, 20m or 2h",
-    )
-    group.add_argument(
-        "--export",
-        type=Path,
-        nargs="+",
-        default=[],
-        metavar="FILE",
-        help="write the scene in other formats too, as `gsplat-edu convert --verify` does: scene.spz scene.html ...",
-    )
-    add_backend(group)
-
-
-def _add_view(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--view",
-        action="store_true",
-        help="show the training in the browser while it runs, with pause and single step; it takes at most a fifth of"
-        " the time and changes no bit. Afterwards the scene is shown until the last browser is closed, or Ctrl-C",
-    )
-    group.add_argument(
-        "--view-host", metavar="ADDRESS", help="where to listen (default: 127.0.0.1, for this computer only)"
-    )
-    group.add_argument(
-        "--view-port",
-        type=whole_number_text,
-        metavar="N",
-        help="port, 0 for any that is free (default: 8080)",
-    )
-
-
-def _add_data(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--resolution",
-        type=float,
-        metavar="R",
-        help="below 32: divide sizes by it; from 32 on: longest side in px (default: as they are)",
-    )
-    group.add_argument(
-        "--test-every",
-        type=whole_number_text,
-        metavar="N",
-        help="every n-th view by name is for testing, 0 for none (default: the capture's own split, or 8)",
-    )
-    group.add_argument(
-        "--image-memory",
-        type=bytes_text,
-        metavar="SIZE",
-        default=DataSettings.image_memory,
-        help="decoded photos kept in memory, for example 500MB; others are read again (default: 4GiB)",
-    )
-    group.add_argument(
-        "--points", type=Path, metavar="X.ply", help="start from these points, not the capture's"
-    )
-
-
-def _meanings() -> dict[str, str]:
-    """Return what the docstring of `TrainConfig` says of each field."""
-    text = (inspect.getdoc(TrainConfig) or "").partition("Args:")[2].partition("Raises:")[0]
-    entries = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
-    found = {name: " ".join(words.split()).replace("%", "%%") for name, words in entries}
-    return {field.name: found.get(field.name, "") for field in fields(TrainConfig)}
-
-
-def _add_field(group: argparse._ArgumentGroup, name: str, default: object, meaning: str) -> None:
-    flag, text = f"--{name.replace('_', '-')}", f"{meaning} (default: {default})"
-    if isinstance(default, bool):
-        group.add_argument(flag, action="store_true", default=None, help=text)
-    elif isinstance(default, str):
-        group.add_argument(flag, metavar="NAME", help=text)
-    elif isinstance(default, int):
-        group.add_argument(flag, type=whole_number_text, metavar="N", help=text)
-    else:
-        kind = _number_or_none if name == "jacobian_limit" else _number
-        group.add_argument(flag, type=kind, metavar="X", help=text)
-
-
-def _number_or_none(text: str) -> float | str:
-    return text if text == "none" else _number(text)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-
-
-def options_from(arguments: argparse.Namespace) -> RunOptions:
-    """Turn what `add_arguments` parsed into the options of a run.
-
-    Raises:
-        ArgumentError: an option is out of range.
-        BackendUnavailableError: the backend does not run here.
-    """
-    changes: dict[str, Any] = {}
-    for field in fields(TrainConfig):
-        given = getattr(arguments, field.name, None)
-        if given is not None and field.name not in ("iterations", "background"):
-            changes[field.name] = None if field.name == "jacobian_limit" and given == "none" else given
-    if arguments.white_background or arguments.background:
-        changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
-    for strategy, names in ONLY_FOR.items():
-        if strategy != arguments.strategy and (idle := [name for name in names if name in changes]):
-            flag = f"--{idle[0].replace('_', '-')}"
-            raise ArgumentError(
-                f"{flag}: is looked at by --strategy {strategy} only; leave it out or choose that"
-            )
-    config = recipe(arguments.iterations, rescale=not arguments.no_rescale, **changes)
-    if config.strategy == "mcmc" and config.max_gaussians is None:
-        raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
-    settings = DataSettings(
-        resolution=arguments.resolution,
-        test_every=arguments.test_every,
-        background=None if config.random_background else config.background,
-        image_memory=arguments.image_memory,
-    )
-    return RunOptions(
-        data=arguments.data,
-        out=arguments.out,
-        config=config,
-        data_settings=settings,
-        points=arguments.points,
-        backend=resolve_backend(arguments.backend),
-        eval_every=arguments.eval_every,
-        save_every=arguments.save_every,
-        time_limit=arguments.time_limit,
-        resume=arguments.resume,
-    )
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -237,10 +51,17 @@ def run(arguments: argparse.Namespace) -> None:
     live = _live(arguments)
     for path in arguments.export:
         check_target("--export", path)
+    chosen = _planned(arguments, console, say)
     with interruptible() as interrupted, ExitStack() as closing:
-        capture = CaptureRun(options_from(arguments), say)
+        capture = CaptureRun(chosen.options, say)
         if capture.finished:
             return
+        callbacks: list[Callback] = []
+        ends = interrupted
+        if arguments.time_limit is not None:
+            pace = Pace(capture, arguments.time_limit, extend=chosen.by_time, say=say)
+            callbacks.append(pace)
+            ends = functools.partial(_either, interrupted, pace.over)
         view = None
         if live is not None:
             host, port = arguments.view_host or live.LOOPBACK, arguments.view_port
@@ -250,7 +71,7 @@ def run(arguments: argparse.Namespace) -> None:
             if warning := exposure(host, "sees the training and can pause it"):
                 say(warning)
         with _bar(console, "{task.fields[state]}") as bar:
-            _train(capture, bar, interrupted, [] if view is None else [view.show])
+            _train(capture, bar, interrupted, ends, callbacks if view is None else [*callbacks, view.show])
         if interrupted():
             raise KeyboardInterrupt(
                 f"interrupted after {capture.trainer.iteration} iterations;"
@@ -279,6 +100,36 @@ def run(arguments: argparse.Namespace) -> None:
         if view is not None and view.watched:
             say("the live view stays until its last browser is closed, or Ctrl-C")
             view.stay()
+
+
+def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None]) -> RunOptions:
+    """Find the poses of plain photos or a video first; the capture is kept in the run's folder."""
+    if not needs_poses(options.data):
+        return options
+    found = options.folder.path / "capture"
+    say(f"{options.data}: comes without poses; finding them first, into {found}")
+    with stage_bars(console) as progress:
+        try:
+            reconstruct(SfmOptions(options.data, found), say, progress)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                "interrupted while finding poses; the same command goes on behind the last finished stage"
+            ) from None
+    return replace(options, data=found)
+
+
+def _planned(arguments: argparse.Namespace, console: Console, say: Callable[[str], None]) -> Plan:
+    """Find poses where there are none, and choose what the limits leave open."""
+    options = _with_poses(options_from(arguments), console, say)
+    limits, given = limits_from(arguments), given_from(arguments)
+    chosen = plan(options, limits, given, rescale=not arguments.no_rescale)
+    for sentence in chosen.sentences:
+        say(sentence)
+    return chosen
+
+
+def _either(first: Callable[[], bool], second: Callable[[], bool]) -> bool:
+    return first() or second()
 
 
 def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None]) -> None:
@@ -312,7 +163,11 @@ def _live(arguments: argparse.Namespace) -> ModuleType | None:
 
 
 def _train(
-    capture: CaptureRun, bar: Progress, interrupted: Callable[[], bool], callbacks: Sequence[Callback]
+    capture: CaptureRun,
+    bar: Progress,
+    interrupted: Callable[[], bool],
+    ends: Callable[[], bool],
+    callbacks: Sequence[Callback],
 ) -> None:
     iterations = capture.options.config.iterations
     photos = bar.add_task("photos", total=None, state="")
@@ -321,11 +176,12 @@ def _train(
     def show(trainer: Trainer, event: Event) -> None:
         if not isinstance(event, StepEvent):
             return
+        iterations = trainer.config.iterations  # a limit of time may have made them more
         if event.iteration % PSNR_EVERY == 0 or trainer.iteration == iterations:
             speed = bar.tasks[-1].speed or 0.0
             state = f"loss {event.loss:.3f}  PSNR {_psnr(trainer):.1f}  {event.num_gaussians} Gaussians"
             bar.update(task, state=f"{state}  {speed:.0f} it/s")
-        bar.update(task, completed=trainer.iteration)
+        bar.update(task, completed=trainer.iteration, total=iterations)
         if bar.disable and trainer.iteration % max(iterations // LINES, 1) == 0:
             figures = f"loss {event.loss:.4f}, PSNR {_psnr(trainer):.2f} dB, {event.num_gaussians} Gaussians"
             bar.console.print(f"iteration {trainer.iteration}/{iterations}: {figures}", soft_wrap=True)
@@ -338,7 +194,7 @@ def _train(
     trainer = capture.start(loaded, [show, *callbacks])
     bar.remove_task(photos)
     bar.reset(task, total=iterations, completed=trainer.iteration, visible=True)
-    capture.train(interrupted)
+    capture.train(ends)
 
 
 def _psnr(trainer: Trainer) -> float:

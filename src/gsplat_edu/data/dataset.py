@@ -152,7 +152,7 @@ def load_dataset(
         DatasetError: nothing of that kind is there, or it cannot be used; names the file and what to do.
     """
     path = Path(path)
-    capture = _read(path)
+    capture = read_capture(path)
     notes = list(capture.notes)
     frames = sorted(capture.frames, key=lambda frame: frame.name)
     frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
@@ -198,8 +198,12 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     return EXTENT_MARGIN * spread if spread > 1e-9 * max(1.0, float(np.abs(eyes).max())) else 1.0
 
 
-def _read(path: Path) -> Capture:
-    """Find out what a path holds, and read it."""
+def read_capture(path: Path) -> Capture:
+    """Find out which layout a path holds, and read it: poses and names, no photo.
+
+    Raises:
+        DatasetError: it holds no capture, or a damaged one.
+    """
     if path.suffix.lower() == ".json" and is_file(path):
         return read_blender(path.parent) if path.name == TRAIN_FILE else read_transforms(path)
     if not is_folder(path):
@@ -218,8 +222,8 @@ def _read(path: Path) -> Capture:
     folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]
     if any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in entries(folder)):
         raise DatasetError(
-            f"{path}: holds photos but no camera poses; find them with structure from motion, such as "
-            f"`colmap automatic_reconstructor` (looked for {looked})"
+            f"{path}: holds photos but no camera poses; find them with "
+            f"`gsplat-edu sfm {path} OUT` (looked for {looked})"
         )
     raise DatasetError(f"{path}: is no capture; looked for {looked}")
 

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.camera import Camera, scaled_intrinsics
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
-from gsplat_edu.data.dataset import _read as read_capture
+from gsplat_edu.data.dataset import read_capture
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.doctor.geometry import Geometry

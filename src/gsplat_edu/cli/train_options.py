@@ -1,0 +1,221 @@
+"""The options of `gsplat-edu train`, and the run they describe."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
+from gsplat_edu.data.dataset import DataSettings
+from gsplat_edu.doctor.plan import PLANNED, Limits
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.runs.training import RunOptions
+from gsplat_edu.train.config import ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
+
+NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background")
+"""Fields of the recipe that have their options spelled out below; the others are made from `TrainConfig`."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.add_argument(
+        "data",
+        type=Path,
+        metavar="DATA",
+        help="a capture: COLMAP, transforms.json or Blender; or photos or a video, whose poses are found first",
+    )
+    parser.add_argument("--out", type=Path, metavar="RUN", required=True, help="folder of the run")
+    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint in RUN")
+    _add_budget(parser.add_argument_group("budget"))
+    _add_view(parser.add_argument_group("live view"))
+    _add_data(parser.add_argument_group("photos"))
+    group = parser.add_argument_group("recipe, see docs/RECIPE.md; defaults are those of 30,000 iterations")
+    behind = group.add_mutually_exclusive_group()
+    behind.add_argument(
+        "--white-background", action="store_true", help="white behind everything (default: black)"
+    )
+    behind.add_argument(
+        "--background", type=float, nargs=3, metavar=("R", "G", "B"), help="another colour, 0 to 1"
+    )
+    group.add_argument(
+        "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
+    )
+    meanings = _meanings()
+    for field in fields(TrainConfig):
+        if field.name not in NAMED:
+            _add_field(group, field.name, field.default, meanings[field.name])
+
+
+def _add_budget(group: argparse._ArgumentGroup) -> None:
+    def number(flag: str, text: str, default: int | None = None) -> None:
+        group.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
+
+    number("--iterations", f"steps of training (default: {RECIPE_ITERATIONS}, or what --time-limit allows)")
+    group.add_argument(
+        "--no-rescale",
+        action="store_true",
+        help="keep the schedule of 30,000 iterations whatever --iterations is",
+    )
+    names = ", ".join(STRATEGIES)
+    group.add_argument("--strategy", metavar="NAME", default="adc", help=f"one of {names} (default: adc)")
+    number("--max-gaussians", "cap on the number of Gaussians (default: none; mcmc needs one)")
+    number("--seed", "seed of all that is drawn at random (default: 0)", 0)
+    for flag, what, every in (
+        ("--eval-every", "judgements by the test views", RunOptions.eval_every),
+        ("--save-every", "checkpoints", RunOptions.save_every),
+    ):
+        number(flag, f"iterations between {what}, 0 for none (default: {every})", every)
+    group.add_argument(
+        "--time-limit",
+        type=seconds_text,
+        metavar="TIME",
+        help="end after, for example, 90s, 20m or 2h: without --iterations, as many are chosen as fit",
+    )
+    group.add_argument(
+        "--max-memory",
+        type=bytes_text,
+        metavar="SIZE",
+        help="keep the process below, for example, 4GiB: photos' size, those kept and the cap of Gaussians are chosen",
+    )
+    group.add_argument(
+        "--export",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="write the scene in other formats too, as `gsplat-edu convert --verify` does: scene.spz scene.html ...",
+    )
+    add_backend(group)
+
+
+def _add_view(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--view",
+        action="store_true",
+        help="show the training in the browser while it runs, with pause and single step; it takes at most a fifth of"
+        " the time and changes no bit. Afterwards the scene is shown until the last browser is closed, or Ctrl-C",
+    )
+    group.add_argument(
+        "--view-host", metavar="ADDRESS", help="where to listen (default: 127.0.0.1, for this computer only)"
+    )
+    group.add_argument(
+        "--view-port",
+        type=whole_number_text,
+        metavar="N",
+        help="port, 0 for any that is free (default: 8080)",
+    )
+
+
+def _add_data(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--resolution",
+        type=float,
+        metavar="R",
+        help="below 32: divide sizes by it; from 32 on: longest side in px (default: as they are)",
+    )
+    group.add_argument(
+        "--test-every",
+        type=whole_number_text,
+        metavar="N",
+        help="every n-th view by name is for testing, 0 for none (default: the capture's own split, or 8)",
+    )
+    group.add_argument(
+        "--image-memory",
+        type=bytes_text,
+        metavar="SIZE",
+        help="decoded photos kept in memory, for example 500MB; others are read again (default: 4GiB)",
+    )
+    group.add_argument(
+        "--points", type=Path, metavar="X.ply", help="start from these points, not the capture's"
+    )
+
+
+def _meanings() -> dict[str, str]:
+    """Return what the docstring of `TrainConfig` says of each field."""
+    text = (inspect.getdoc(TrainConfig) or "").partition("Args:")[2].partition("Raises:")[0]
+    entries = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
+    found = {name: " ".join(words.split()).replace("%", "%%") for name, words in entries}
+    return {field.name: found.get(field.name, "") for field in fields(TrainConfig)}
+
+
+def _add_field(group: argparse._ArgumentGroup, name: str, default: object, meaning: str) -> None:
+    flag, text = f"--{name.replace('_', '-')}", f"{meaning} (default: {default})"
+    if isinstance(default, bool):
+        group.add_argument(flag, action="store_true", default=None, help=text)
+    elif isinstance(default, str):
+        group.add_argument(flag, metavar="NAME", help=text)
+    elif isinstance(default, int):
+        group.add_argument(flag, type=whole_number_text, metavar="N", help=text)
+    else:
+        kind = _number_or_none if name == "jacobian_limit" else _number
+        group.add_argument(flag, type=kind, metavar="X", help=text)
+
+
+def _number_or_none(text: str) -> float | str:
+    return text if text == "none" else _number(text)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def options_from(arguments: argparse.Namespace) -> RunOptions:
+    """Turn what `add_arguments` parsed into the options of a run.
+
+    Raises:
+        ArgumentError: an option is out of range.
+        BackendUnavailableError: the backend does not run here.
+    """
+    changes: dict[str, Any] = {}
+    for field in fields(TrainConfig):
+        given = getattr(arguments, field.name, None)
+        if given is not None and field.name not in ("iterations", "background"):
+            changes[field.name] = None if field.name == "jacobian_limit" and given == "none" else given
+    if arguments.white_background or arguments.background:
+        changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
+    for strategy, names in ONLY_FOR.items():
+        if strategy != arguments.strategy and (idle := [name for name in names if name in changes]):
+            flag = f"--{idle[0].replace('_', '-')}"
+            raise ArgumentError(
+                f"{flag}: is looked at by --strategy {strategy} only; leave it out or choose that"
+            )
+    iterations = RECIPE_ITERATIONS if arguments.iterations is None else arguments.iterations
+    config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
+    if config.strategy == "mcmc" and config.max_gaussians is None:
+        raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
+    settings = DataSettings(
+        resolution=arguments.resolution,
+        test_every=arguments.test_every,
+        background=None if config.random_background else config.background,
+        image_memory=DataSettings.image_memory if arguments.image_memory is None else arguments.image_memory,
+    )
+    return RunOptions(
+        data=arguments.data,
+        out=arguments.out,
+        config=config,
+        data_settings=settings,
+        points=arguments.points,
+        backend=resolve_backend(arguments.backend),
+        eval_every=arguments.eval_every,
+        save_every=arguments.save_every,
+        time_limit=arguments.time_limit,
+        resume=arguments.resume,
+    )
+
+
+def limits_from(arguments: argparse.Namespace) -> Limits:
+    """Return what the run may take."""
+    return Limits(arguments.max_memory, arguments.time_limit)
+
+
+def given_from(arguments: argparse.Namespace) -> list[str]:
+    """Return the names of those settings a plan may choose that the user gave."""
+    return [name for name in PLANNED if getattr(arguments, name) is not None]
