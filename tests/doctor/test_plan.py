@@ -259,40 +259,56 @@ class Clock:
         return self.before + 10.0 * self.iteration
 
 
-def paced(run, limit, clock, said=None, **settings):
-    said = [] if said is None else said
-    pace = Pace(run, limit, clock=clock, say=said.append, **settings)
-    return trained(run, [clock, pace], pace.over)
+def paced(run, limit, clock, **settings):
+    pace = Pace(run, limit, clock=clock, **settings)
+    return trained(run, [clock, pace], pace.over), pace.outcome
 
 
 def test_training_ends_in_time_to_judge(capture, tmp_path):
     """600 s less those before training and those to judge, which is the 2.5 s of the report and little more."""
     run = CaptureRun(options(capture, tmp_path / "run", 100))
-    folder = paced(run, 600.0, Clock(before=100.0))
+    folder, outcome = paced(run, 600.0, Clock(before=100.0))
     # the first iteration after which less than 10 s and the reserve are left; judging 16 tiny views is not 30 s
     assert 46 <= folder.read_metrics()["iterations"] <= 50
-    assert folder.read_config()["train"]["iterations"] == 100, "it can be resumed"
+    assert folder.read_config()["train"]["iterations"] == 100 and outcome is None, "it can be resumed"
 
 
 def test_time_that_is_left_is_used_and_the_numbers_give_the_same_bits(capture, tmp_path):
-    run, said = CaptureRun(options(capture, tmp_path / "run", max_gaussians=400)), list[str]()
-    folder = paced(run, 600.0, Clock(), said, extend=True)
+    run = CaptureRun(options(capture, tmp_path / "run", max_gaussians=400))
+    folder, outcome = paced(run, 600.0, Clock(), extend=True)
     total = folder.read_metrics()["iterations"]
     # 60 would fit without judging; what is left at the end is less than 2.5 % or less than one iteration is worth
     assert 50 <= total <= 59
     stored = folder.read_config()["train"]
     assert stored["iterations"] == total and stored["means_rate_iterations"] == 20, "milestones stay"
-    assert f"--iterations {total}" in said[-1]
-    words = said[-1].split("the same again: ")[1].split()
+    assert f"20 iterations were planned, {total} fitted" in outcome
+    words = outcome.split("the same again: ")[1].split()
     fixed = ["--save-every", "0", "--eval-every", "0"]
     assert main(["train", str(capture), "--out", str(tmp_path / "again"), *fixed, *words]) == 0
     scenes = [RunFolder(tmp_path / name).latest_scene()[0].read_bytes() for name in ("run", "again")]
     assert scenes[0] == scenes[1]
 
 
+class SlowingClock(Clock):
+    """Ten seconds for each of the first 25 iterations, 40 for every later one."""
+
+    def __call__(self, trainer=None, event=None):
+        return super().__call__(trainer, event) + 30.0 * max(self.iteration - 25, 0)
+
+
+def test_a_lengthened_run_that_is_cut_is_complete_all_the_same(capture, tmp_path):
+    """20 iterations are done at 200 s of 600; what then seems to fit does not, since the machine slows down."""
+    run = CaptureRun(options(capture, tmp_path / "run"))
+    folder, outcome = paced(run, 600.0, SlowingClock(), extend=True)
+    # 250 s for 25, and (600 - 250 - reserve) / 40 more, for a reserve of less than 40 s; the last may run over
+    assert folder.read_metrics()["iterations"] == folder.read_config()["train"]["iterations"] in (33, 34)
+    assert "20 iterations were planned" in outcome
+    assert CaptureRun(dataclasses.replace(run.options, resume=True)).finished
+
+
 def test_a_run_that_was_not_planned_is_not_lengthened(capture, tmp_path):
-    folder = paced(CaptureRun(options(capture, tmp_path / "run")), 600.0, Clock())
-    assert folder.read_metrics()["iterations"] == 20
+    folder, outcome = paced(CaptureRun(options(capture, tmp_path / "run")), 600.0, Clock())
+    assert outcome is None and folder.read_metrics()["iterations"] == 20
 
 
 def test_flags_name_milestones_that_iterations_do_not_give():

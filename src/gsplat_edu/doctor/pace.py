@@ -17,7 +17,8 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
 LOOKS = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Parts of the limit at which it is measured again what judging takes: a view is scored and thrown away."""
+"""Parts of the limit at which it is measured again what judging takes: a view is scored and thrown away. The slowest of
+the last three counts."""
 
 WINDOW = 200
 """Iterations over which the present speed is taken."""
@@ -61,10 +62,27 @@ class Pace:
         self._costs = deque[tuple[float, float]](maxlen=3)
         self._marks = deque[tuple[int, float]](maxlen=WINDOW)
         self._reserve = 0.0
+        self._planned: int | None = None
 
     def over(self) -> bool:
         """Say whether training has to end now."""
-        return self._clock() + self._reserve >= self._limit
+        late = self._clock() + self._reserve >= self._limit
+        if (
+            late and self._planned is not None
+        ):  # what was planned is done: the run is complete where it stands
+            self._settle(self._run.trainer.iteration)
+        return late
+
+    @property
+    def outcome(self) -> str | None:
+        """Say what became of the plan, once the run has ended; None where it was kept to the letter."""
+        if self._planned is None:
+            return None
+        options = self._run.options
+        return (
+            f"{self._planned} iterations were planned, {options.config.iterations} fitted; "
+            f"the same again: {flags(options)}"
+        )
 
     def __call__(self, trainer: Trainer, event: Event) -> None:
         """Take note of a step; measure where a look is due; lengthen the run where it ends early."""
@@ -83,7 +101,7 @@ class Pace:
         dataset, options = self._run.dataset, self._run.options
         view = (dataset.test or dataset.train)[0]
         self._costs.append(judging_seconds(trainer.gaussians, [view], options.config, options.backend))
-        score, picture = (sum(parts) / len(self._costs) for parts in zip(*self._costs, strict=True))
+        score, picture = (max(parts) for parts in zip(*self._costs, strict=True))
         count, degree = len(trainer.gaussians), options.config.sh_degree
         self._reserve = ending_seconds(self._facts, score, picture) + 2 * saving_seconds(count, degree)
 
@@ -95,11 +113,16 @@ class Pace:
         total = min(done + int(CAREFUL * left * (done - first) / (now - then)), RECIPE_ITERATIONS)
         if total <= done:
             return
-        trainer.config = dataclasses.replace(trainer.config, iterations=total)
+        self._planned = self._planned or done
+        self._settle(total)
+        self._say(f"iteration {done}: there is time for {total - done} more")
+
+    def _settle(self, iterations: int) -> None:
+        """Make the run one of so many iterations, here and in config.json; no milestone moves."""
         run = self._run
-        run.options = dataclasses.replace(run.options, config=trainer.config)
+        if run.options.config.iterations == iterations:
+            return
+        config = dataclasses.replace(run.options.config, iterations=iterations)
+        run.trainer.config, run.options = config, dataclasses.replace(run.options, config=config)
         stored = run.folder.read_config()
-        run.folder.write_config(stored | {"train": {**stored["train"], "iterations": total}})
-        self._say(
-            f"iteration {done}: there is time for {total - done} more; the same again: {flags(run.options)}"
-        )
+        run.folder.write_config(stored | {"train": {**stored["train"], "iterations": iterations}})

@@ -29,6 +29,9 @@ FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
 SMALLEST_SIDE = 64
 """px: no photo is made smaller than this."""
 
+START_PAIRS = 16
+"""Pairs of Gaussian and tile for each Gaussian of a start, before they are counted: more than most have."""
+
 LEAST_GAUSSIANS = 1_000
 
 DENSITY = 0.05
@@ -198,9 +201,10 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
         side = min(min(view.camera.W, view.camera.H) for view in (*files.train, *files.test))
         factors += tuple(factor for factor in FACTORS if factor > 1 and side / factor >= SMALLEST_SIDE)
     request = Request(options, limits, fixed, rescale, Facts.of(dataset, files), factors)
-    # How many tiles a start covers is not known yet: 16 for each of its Gaussians is more than most do.
     length = options.config.iterations
-    first = _within_memory(request, resident_bytes() + LATER, 16 * len(dataset.points), length, factors)
+    first = _within_memory(
+        request, resident_bytes() + LATER, START_PAIRS * len(dataset.points), length, factors
+    )
     reduced = dataclasses.replace(settings, resolution=_resolution(request, first.factor), image_memory=0)
     dataset = load_dataset(options.data, reduced, points=options.points)
     measured = probe(dataset, request.config(length, first.factor, first.cap), options.backend)

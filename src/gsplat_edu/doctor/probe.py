@@ -8,11 +8,11 @@ import dataclasses
 import functools
 import math
 import os
-import resource
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -44,8 +44,18 @@ PROBE_STEPS = 9
 PROBE_SECONDS = 1.5
 """A probe ends after this many steps, or after this long, but not before its third step; the first is not counted."""
 
+SMALL = 32
+"""px: views whose sides would be smaller than this are not halved for a trial."""
+
+SPREAD = 1.2
+"""Factor on the pairs of the views of a probe: another view may have more. In fox they are 11 % apart."""
+
 GROWN = (125_000, 250_000)
 """Gaussians that the probe grows the start to, at most: by several doublings, and by the first."""
+
+
+ASSUMED = 400 * 2**20
+"""Bytes of a process that has loaded torch, on systems that cannot be asked."""
 
 
 def process_age() -> float:
@@ -59,13 +69,17 @@ def process_age() -> float:
 
 
 def resident_bytes() -> int:
-    """Return the memory this process holds now; where the system does not tell, the most it has held."""
+    """Return the memory this process holds now; where the system does not tell, the most it has held, or a guess."""
     try:
         for line in Path("/proc/self/status").read_text("ascii", errors="replace").splitlines():
             if line.startswith("VmRSS:"):
                 return 1024 * int(line.split()[1])
     except OSError:
         pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return ASSUMED
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else 1024 * most
 
@@ -101,37 +115,45 @@ def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measur
         photo = view.read()
         reading.append(time.perf_counter() - began)
         photos.append(View(view.camera, photo.image, alpha=photo.alpha, mask=photo.mask, name=view.name))
-    cloud = dataset.points, dataset.colors
-    start = from_points(*cloud, config)
+    start = from_points(dataset.points, dataset.colors, config)
+    by_points = from_points(dataset.points, dataset.colors, dataclasses.replace(config, strategy="none"))
     pixels = sum(view.camera.W * view.camera.H for view in dataset.train) / len(dataset.train)
-    wanted = int(expected_counts(config, len(start), pixels)[-1])
-    grown = _grown(from_points(*cloud, dataclasses.replace(config, strategy="adc")), wanted)
+    grown = _grown(by_points, int(expected_counts(config, len(start), pixels)[-1]))
     if len(grown) == len(start) > 1:
         start = start.map(lambda tensor: tensor[::2])
-    trial = functools.partial(_trial, config=config, backend=backend)
-    extent = scene_extent([view.camera for view in dataset.train])
-    steps, pairs = trial(start, photos, extent)
-    more, _ = trial(grown, photos, extent)
-    here = float(np.mean([view.camera.W * view.camera.H for view in photos]))
-    table = [(len(start), here, _median(steps)), (len(grown), here, _median(more))]
+    trial = functools.partial(
+        _trial, extent=scene_extent([view.camera for view in dataset.train]), config=config, backend=backend
+    )
     small = [_halved(view) for view in photos]
-    if min(min(view.camera.W, view.camera.H) for view in small) >= 32:
-        fewer, _ = trial(start, small, extent)
-        table.append((len(start), float(np.mean([v.camera.W * v.camera.H for v in small])), _median(fewer)))
+    trials = [trial(start, photos), trial(grown, photos)]
+    if min(min(view.camera.W, view.camera.H) for view in small) >= SMALL:
+        trials.append(trial(start, small))
     score, picture = judging_seconds(grown, photos[:2], config, backend)
-    del start, grown, small, photos
+    # of all of the start, and more than the few views had that were looked at
+    pairs = math.ceil(SPREAD * trials[0].pairs * len(by_points) / len(start))
+    del start, by_points, grown, small, photos
     give_back()
     return Measurements(
         backend=backend,
-        speed=Speed.fitted(table),
+        speed=Speed.fitted([(t.gaussians, t.pixels, _median(t.seconds)) for t in trials]),
         read=_median(reading),
         score=score,
         picture=picture,
         pairs=pairs,
         resident=resident,
         settled=resident_bytes(),
-        noise=math.sqrt(max(steps) / min(steps)),
+        noise=math.sqrt(max(trials[0].seconds) / min(trials[0].seconds)),
     )
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A few steps: Gaussians, mean pixels of the views, most pairs of a view, seconds of each step but the first."""
+
+    gaussians: int
+    pixels: float
+    pairs: int
+    seconds: list[float]
 
 
 def _grown(start: Gaussians, wanted: int) -> Gaussians:
@@ -147,8 +169,7 @@ def _grown(start: Gaussians, wanted: int) -> Gaussians:
 
 def _trial(
     gaussians: Gaussians, views: Sequence[View], extent: float, config: TrainConfig, backend: str
-) -> tuple[list[float], int]:
-    """Take a few steps; return the seconds of each but the first, and the most pairs that a view had."""
+) -> _Trial:
     pairs, moments = [0], list[float]()
 
     def counting(gaussians: Gaussians, camera: Camera, *, settings: RenderSettings) -> RenderOutput:
@@ -175,7 +196,8 @@ def _trial(
     density = make_strategy(plain, extent, placed)
     trainer = Trainer(placed, views, plain, render=counting, extent=extent, density=density, callbacks=[note])
     trainer.run(_until(moments))
-    return np.diff(moments).tolist(), max(pairs)
+    pixels = float(np.mean([view.camera.W * view.camera.H for view in views]))
+    return _Trial(len(gaussians), pixels, max(pairs), np.diff(moments).tolist())
 
 
 def _until(moments: Sequence[float]) -> Callable[[], bool]:

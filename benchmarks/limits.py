@@ -1,0 +1,115 @@
+"""Do --max-memory and --time-limit hold, and how far off was the forecast?
+
+    python benchmarks/limits.py [CAPTURE] [--memory SIZE ...] [--time TIME ...] [--out FILE.json]
+
+Runs `gsplat-edu train CAPTURE` (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data) in a process of its own,
+once for each limit (default: 1GiB, 2GiB, 2m, 4m), and looks at it from outside: its peak RSS by wait4, its wall time,
+what it said it would take. Runs with a limit of memory get options that split every Gaussian as often as it goes, so
+that the cap which was chosen is reached and the memory used. Linux, where ru_maxrss is in KiB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
+
+FILLING = (
+    "--iterations 600 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20 --densify-stop 500"
+)
+FILLING += " --reset-every 0 --grad-threshold 2e-6 --eval-every 300 --save-every 200"
+"""Options that grow a scene to its cap in a few hundred iterations. What comes out is of no use otherwise."""
+
+UNITS = {"h": 3600.0, "min": 60.0, "s": 1.0}
+SIZES = {"MiB": 2.0**20, "GiB": 2.0**30}
+
+
+def train(capture: Path, limit: list[str]) -> dict[str, Any]:
+    """Train under one limit; return what was measured from outside and what was forecast."""
+    with tempfile.TemporaryDirectory() as scratch:
+        out = Path(scratch) / "run"
+        words = [sys.executable, "-c", COMMAND, "train", str(capture), "--out", str(out), *limit]
+        with (Path(scratch) / "said.txt").open("w+") as said:
+            # A child counts what its parent held when it was started; this process holds little.
+            actions = [(os.POSIX_SPAWN_DUP2, said.fileno(), descriptor) for descriptor in (1, 2)]
+            began = time.perf_counter()
+            child = os.posix_spawn(words[0], words, os.environ, file_actions=actions)
+            _, status, usage = os.wait4(child, 0)
+            seconds = time.perf_counter() - began
+            said.seek(0)
+            text = said.read()
+        code = os.waitstatus_to_exitcode(status)
+        if code:
+            raise SystemExit(f"limits.py: the training ended with {code}: {text.strip()[-500:]}")
+        metrics = json.loads((out / "metrics.json").read_text())
+        config = json.loads((out / "config.json").read_text())
+    return {
+        "limit": " ".join(limit[:2]),
+        "seconds": seconds,
+        "peak_rss": 1024 * usage.ru_maxrss,
+        "forecast": forecast(text),
+        "said": [line for line in text.splitlines() if "forecast" in line or "chosen" in line],
+        "iterations": [config["train"]["iterations"], metrics["iterations"]],
+        "max_gaussians": config["train"]["max_gaussians"],
+        "num_gaussians": metrics["num_gaussians"],
+        "resolution": config["data"]["resolution"],
+        "test_psnr": metrics["test"]["psnr"],
+        "ms": 1e3 * metrics["seconds"] / metrics["iterations"],
+    }
+
+
+def forecast(text: str) -> dict[str, float | None]:
+    """Read the forecast out of what the command printed: seconds, and bytes with all Gaussians that are allowed."""
+    duration = re.search(r"forecast: time: about ((?:\d+ (?:h|min|s) ?)+)", text)
+    sizes = re.findall(r"up to ([\d.e+]+) (MiB|GiB)", text)
+    seconds = None
+    if duration:
+        seconds = sum(float(n) * UNITS[unit] for n, unit in re.findall(r"(\d+) (h|min|s)", duration[1]))
+    return {"seconds": seconds, "peak_rss": float(sizes[-1][0]) * SIZES[sizes[-1][1]] if sizes else None}
+
+
+def line(found: dict[str, Any]) -> str:
+    """Write a run as a row."""
+    expected, gib = found["forecast"], 2.0**30
+    return (
+        f"{found['limit']:20} {found['seconds']:7.1f} s (forecast {expected['seconds'] or 0:.0f})  "
+        f"{found['peak_rss'] / gib:6.3f} GiB (forecast {(expected['peak_rss'] or 0) / gib:.3f})  "
+        f"{found['iterations'][1]} of {found['iterations'][0]} iterations at {found['ms']:.1f} ms, "
+        f"{found['num_gaussians']} Gaussians, cap {found['max_gaussians']}, resolution {found['resolution']}, "
+        f"test {found['test_psnr']:.2f} dB"
+    )
+
+
+def main() -> None:
+    """Train under every limit, print the rows, write the JSON."""
+    made = argparse.ArgumentParser(description="Limits of memory and time, from outside.")
+    data = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data"))
+    made.add_argument("capture", nargs="?", type=Path, default=data / "snowmiku97")
+    made.add_argument("--memory", nargs="*", default=["1GiB", "2GiB"], metavar="SIZE")
+    made.add_argument("--time", nargs="*", default=["2m", "4m"], metavar="TIME")
+    made.add_argument("--out", type=Path, help="JSON file to write")
+    arguments = made.parse_args()
+    if not arguments.capture.exists():
+        raise SystemExit(f"limits.py: {arguments.capture} is not there; name another capture")
+    limits = [["--max-memory", size, *FILLING.split()] for size in arguments.memory]
+    limits += [["--time-limit", duration] for duration in arguments.time]
+    rows = []
+    for limit in limits:
+        before = os.getloadavg()[0]
+        rows.append(train(arguments.capture, limit) | {"load": [before, os.getloadavg()[0]]})
+        print(line(rows[-1]) + f", load {rows[-1]['load'][0]:.1f} to {rows[-1]['load'][1]:.1f}", flush=True)
+    import hardware  # it imports torch, which the children would be charged for
+
+    hardware.report({"capture": arguments.capture.name, "runs": rows}, arguments.out)
+
+
+if __name__ == "__main__":
+    main()

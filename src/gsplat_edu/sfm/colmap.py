@@ -1,0 +1,126 @@
+"""COLMAP from the outside: jobs for `gsplat_edu.sfm.engine`, and what became of them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import queue
+import sqlite3
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.errors import ArgumentError, DatasetError
+
+POLL = 0.25
+"""Seconds between two looks at how far a job has come."""
+
+COUNTS = {
+    "features": "SELECT COUNT(*) FROM descriptors",
+    "matches": "SELECT COUNT(*) FROM two_view_geometries",
+}
+"""What tells how far the jobs are that say nothing themselves."""
+
+SEED = 0
+"""Seed of every random draw of COLMAP and of this package while poses are found."""
+
+
+def require_colmap() -> None:
+    """Check that pycolmap is installed, without loading it.
+
+    Raises:
+        ArgumentError: it is not; says how to install it.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise ArgumentError(
+            'sfm: needs pycolmap, which is not installed: pip install -c constraints.txt ".[sfm]"'
+        )
+
+
+def call(
+    job: str, log: Path, progress: Callable[[int], None] = lambda done: None, **arguments: object
+) -> dict[str, Any]:
+    """Let COLMAP do a job, in a process that ends with this call whatever happens.
+
+    Args:
+        job: One of `gsplat_edu.sfm.engine.JOBS`.
+        log: Where COLMAP's own words go, behind what stands there.
+        progress: Told how much is done, from the calling thread. What it raises ends the job.
+        arguments: Of the job.
+
+    Returns:
+        What the job returns.
+
+    Raises:
+        DatasetError: the job failed; names the log.
+    """
+    # -P: the files beside the program are no modules to be imported by their bare names
+    command = [sys.executable, "-P", str(Path(__file__).with_name("engine.py"))]
+    with log.open("ab") as words:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
+    answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    listener = threading.Thread(target=_listen, args=(process, answers), daemon=True)
+    count = COUNTS.get(job)
+    result: dict[str, Any] | None = None
+    try:
+        assert process.stdin is not None
+        with suppress(BrokenPipeError), process.stdin as stdin:  # broken: it failed at once
+            stdin.write(json.dumps({"job": job, **arguments}).encode())
+        listener.start()
+        while result is None:
+            try:
+                answer = answers.get(timeout=POLL)
+            except queue.Empty:
+                if count is not None:
+                    progress(_rows(Path(str(arguments["database"])), count))
+                continue
+            if "done" in answer:
+                progress(answer["done"])
+            elif "result" in answer:
+                result = answer["result"]
+            else:
+                break
+        code = process.wait()
+        if result is not None and count is not None:
+            progress(_rows(Path(str(arguments["database"])), count))
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        if listener.ident is not None:
+            listener.join()
+        if process.stdout is not None:
+            process.stdout.close()
+    if result is None:
+        how = f"was ended by signal {-code}" if code < 0 else f"failed with code {code}"
+        raise DatasetError(
+            f"COLMAP's {job} {how}: the last lines of {log} say why; give it less with --max-features or "
+            "--max-image-size, or start the command again"
+        )
+    return result
+
+
+def _listen(process: subprocess.Popen[bytes], answers: queue.SimpleQueue[dict[str, Any]]) -> None:
+    """Pass on what a process says, and say that it has ended."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        answers.put(json.loads(line))
+    answers.put({"ended": True})
+
+
+def _rows(database: Path, query: str) -> int:
+    """Count what a job has written; zero while there is nothing to read."""
+    try:
+        reader = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=1.0)
+    except sqlite3.Error:  # it is not there yet
+        return 0
+    try:
+        return int(reader.execute(query).fetchone()[0])
+    except sqlite3.Error:  # its tables are not there yet, or it is being written
+        return 0
+    finally:
+        reader.close()

@@ -1,0 +1,279 @@
+"""Which files are photos, what their EXIF says, and the working copies that features are found in."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import struct
+import warnings
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import ExifTags, Image
+
+from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS
+from gsplat_edu.data.images import AT_ONCE, decode
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.files import written_aside
+from gsplat_edu.views import Photo
+
+FORMATS = frozenset(("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "JPEG2000", "PPM"))
+"""Kinds of files that are photos, by Pillow's names; an animation or a drawing is none."""
+
+PASSED_OVER = frozenset(("masks", *PHOTO_FOLDERS[1:]))
+"""Folders beside photos whose images are no photos, or the same ones smaller."""
+
+PEEK = 65536
+"""Bytes at a file's beginning and at its end that tell it from others."""
+
+FULL_FRAME = math.hypot(36.0, 24.0)
+"""Diagonal of the film that equivalent focal lengths refer to, mm (CIPA DCG-001)."""
+
+TURNS = {3: 2, 6: 1, 8: 3}
+"""Quarter turns clockwise that bring a photo upright, by EXIF's orientation. The mirrored ones are no camera's."""
+
+COPY_QUALITY = 97
+"""JPEG quality of the working copies."""
+
+GRAY = (0.5, 0.5, 0.5)
+"""What is put behind transparent photos before features are looked for."""
+
+_UNREADABLE = (OSError, ValueError, SyntaxError, KeyError, TypeError, EOFError, struct.error)
+
+
+@dataclass(frozen=True)
+class PhotoFacts:
+    """A photo, without its pixels.
+
+    Args:
+        name: Its path below the source, with slashes.
+        copy: Name of its working copy.
+        W: Width as stored, px.
+        H: Height as stored, px.
+        turns: Quarter turns clockwise that bring it upright.
+        focal: Focal length by EXIF, px; None where it does not say.
+        camera: Equal for photos that one camera took with one lens and zoom.
+        place: Latitude and longitude in degrees and height in m by EXIF; None where it does not say.
+    """
+
+    name: str
+    copy: str
+    W: int
+    H: int
+    turns: int = 0
+    focal: float | None = None
+    camera: str = ""
+    place: tuple[float, float, float] | None = None
+
+    def copy_size(self, longest: int) -> tuple[int, int]:
+        """Return width and height of the working copy, px.
+
+        Args:
+            longest: Longest side of working copies, px.
+        """
+        factor = min(1.0, longest / max(self.W, self.H))
+        return max(1, round(factor * self.W)), max(1, round(factor * self.H))
+
+
+def photo_files(source: Path, besides: Path | None = None) -> list[Path]:
+    """List the photos in a folder and below, by what is in the files; hidden files and folders are passed over.
+
+    Args:
+        source: The folder.
+        besides: A folder that is passed over, resolved.
+
+    Returns:
+        Sorted by path. A file that is named like a photo is among them even if it is none.
+    """
+    found = []
+    for place, folders, files in os.walk(source):
+        here = Path(place)
+        folders[:] = [
+            name
+            for name in folders
+            if name[0] not in "._" and name not in PASSED_OVER and (here / name).resolve() != besides
+        ]
+        found += [here / name for name in files if name[0] != "." and _is_photo(here / name)]
+    return sorted(found)
+
+
+def fingerprint(files: Sequence[Path], source: Path) -> str:
+    """Return a digest of files: their names below the source, their sizes, and how they begin and end.
+
+    Raises:
+        DatasetError: a file cannot be read.
+    """
+    digest = hashlib.sha256()
+    for path in files:
+        try:
+            size = path.stat().st_size
+            with path.open("rb") as file:
+                ends = file.read(PEEK)
+                file.seek(max(0, size - PEEK))
+                ends += file.read(PEEK)
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+        name = path.relative_to(source).as_posix()
+        digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape") + ends)
+    return digest.hexdigest()
+
+
+def copy_photos(
+    files: Sequence[Path],
+    source: Path,
+    folder: Path,
+    longest: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[list[PhotoFacts], list[str]]:
+    """Write a working copy of every photo that can be decoded. Copies that are there already are kept.
+
+    Copies have names without spaces, which COLMAP's lists of pairs need, and are RGB in 8 bits: pycolmap reads fewer
+    kinds of files than Pillow.
+
+    Args:
+        files: The photos.
+        source: What their names are relative to.
+        folder: Where the copies go.
+        longest: Longest side of a copy, px; smaller photos keep their size.
+        progress: Told how many photos of how many are done, from the calling thread.
+
+    Returns:
+        facts: Of the photos that can be decoded, in the order of the files.
+        unreadable: Of the others: name and reason.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    facts, unreadable = list[PhotoFacts](), list[str]()
+    headers = list[tuple[Path, PhotoFacts]]()
+    for number, path in enumerate(files):
+        try:
+            headers.append((path, _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")))
+        except ValueError as error:
+            unreadable.append(f"{path.relative_to(source).as_posix()} ({error})")
+    largest = max((photo.W * photo.H for _, photo in headers), default=1)
+    pool = ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, AT_ONCE // largest)))
+    futures = [pool.submit(_copy, path, photo, folder, longest) for path, photo in headers]
+    try:
+        for done, ((_, photo), future) in enumerate(zip(headers, futures, strict=True), 1):
+            try:
+                future.result()
+                facts.append(photo)
+            except DatasetError as error:
+                reason = str(error).partition(": ")[2].partition("; ")[0]
+                unreadable.append(f"{photo.name}: {reason}")
+            progress(done, len(headers))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return facts, unreadable
+
+
+def _is_photo(path: Path) -> bool:
+    if path.suffix.lower() in (*PHOTO_ENDINGS, ".heif"):
+        return True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as file:
+                return file.format in FORMATS
+    except (*_UNREADABLE, Image.DecompressionBombError):
+        return False
+
+
+def _facts(path: Path, name: str, copy: str) -> PhotoFacts:
+    """Read a header.
+
+    Raises:
+        ValueError: the file is no photo; the message says why.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # of sizes and of odd EXIF, neither of which is the user's to mend
+            with Image.open(path) as file:
+                (W, H), exif = file.size, file.getexif()
+                kind = file.format
+                details = exif.get_ifd(ExifTags.IFD.Exif)
+                place = _place(exif.get_ifd(ExifTags.IFD.GPSInfo))
+    except _UNREADABLE as error:
+        if path.suffix.lower() in (".heic", ".heif"):
+            raise ValueError("HEIC is not decoded here: export it as JPEG") from None
+        reason = (
+            "no image that Pillow knows" if "cannot identify" in str(error) else str(error).split("\n")[0]
+        )
+        raise ValueError(reason) from None
+    except Image.DecompressionBombError:
+        raise ValueError("too large") from None
+    if kind not in FORMATS:
+        raise ValueError(f"{kind} is no kind of photo")
+    focal = _focal(details, W, H)
+    said = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)]
+    said += [details.get(tag) for tag in (ExifTags.Base.LensModel, ExifTags.Base.FocalLength)]
+    said += [details.get(ExifTags.Base.FocalLengthIn35mmFilm), details.get(ExifTags.Base.DigitalZoomRatio)]
+    camera = " ".join([f"{W}x{H}", *(str(value).strip("\0 ") for value in said if value is not None)])
+    turns = TURNS.get(exif.get(ExifTags.Base.Orientation, 1), 0)
+    return PhotoFacts(name, copy, W, H, turns, focal, camera, place)
+
+
+def _number(value: object) -> float:
+    """Turn what EXIF holds, perhaps 0/0, into a number; NaN where it is none."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return math.nan
+
+
+def _focal(details: dict[int, object], W: int, H: int) -> float | None:
+    """Work out the focal length in px: by the equivalent one, f / 43.27 mm = f_px / diagonal, or by the sensor's pitch.
+
+    A focal length outside 0.3 to 20 times the longer side is not believed.
+    """
+    equivalent = _number(details.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    focal = equivalent / FULL_FRAME * math.hypot(W, H)
+    if not focal > 0:  # NaN, too
+        unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(details.get(ExifTags.Base.FocalPlaneResolutionUnit, 2), 25.4)  # type: ignore[call-overload]
+        pitch = unit / _number(details.get(ExifTags.Base.FocalPlaneXResolution) or math.nan)  # mm
+        stored = _number(details.get(ExifTags.Base.ExifImageWidth))
+        shrunk = W / stored if stored > 0 else 1.0
+        focal = _number(details.get(ExifTags.Base.FocalLength)) / pitch * shrunk
+    return float(focal) if 0.3 * max(W, H) < focal < 20.0 * max(W, H) else None
+
+
+def _place(gps: dict[int, object]) -> tuple[float, float, float] | None:
+    """Read latitude, longitude and height."""
+    angles = []
+    for tag, side, negative in (
+        (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef, "S"),
+        (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef, "W"),
+    ):
+        parts = gps.get(tag)
+        if not isinstance(parts, tuple) or len(parts) != 3:
+            return None
+        degrees, minutes, seconds = (_number(part) for part in parts)
+        angle = degrees + minutes / 60.0 + seconds / 3600.0
+        angles.append(-angle if str(gps.get(side, "")).upper().startswith(negative) else angle)
+    height = _number(gps.get(ExifTags.GPS.GPSAltitude))
+    if not all(math.isfinite(angle) for angle in angles) or not any(angles):
+        return None
+    return angles[0], angles[1], height if math.isfinite(height) else 0.0
+
+
+def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int) -> None:
+    """Write the working copy, unless it is there.
+
+    Raises:
+        DatasetError: the photo cannot be decoded.
+    """
+    target = folder / photo.copy
+    if target.is_file():
+        return
+    image = np.asarray(Photo(*decode(path)).over(GRAY))
+    size = photo.copy_size(longest)
+    if image.shape[1::-1] != size:
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    with written_aside(target) as aside:
+        Image.fromarray(image).save(aside, format="JPEG", quality=COPY_QUALITY)

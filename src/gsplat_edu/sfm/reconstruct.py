@@ -1,0 +1,392 @@
+"""Photos or a video become a capture, stage by stage; an interrupted run goes on behind the last finished one."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.data.blender import TRAIN_FILE
+from gsplat_edu.data.capture import is_file, is_folder
+from gsplat_edu.data.colmap import find_model
+from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.files import check_folder, remove_leftovers
+from gsplat_edu.sfm import pairs
+from gsplat_edu.sfm.colmap import SEED, call, require_colmap
+from gsplat_edu.sfm.mapping import CAMERA_MODELS, MAPPERS, attempts, map_photos, no_overlap
+from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, photo_files
+from gsplat_edu.sfm.result import build_capture, publish
+from gsplat_edu.sfm.stages import Stages
+from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
+from gsplat_edu.validation import one_of, whole_number
+
+MATCHERS = ("auto", "exhaustive", "sequential", "nearest")
+
+EXHAUSTIVE = 150
+"""Photos up to which every pair is matched: 11,175 pairs, ten minutes on two cores."""
+
+OVERLAP = {"video": 10, "photos": 4}
+"""Photos that follow one another are matched with so many that follow; photos are mostly taken in a row, too."""
+
+ALIKE = {"video": 5, "photos": 25}
+"""Each photo is matched with so many that look alike: in a video, those that close a loop."""
+
+CLOSE_BY = 15
+"""Each photo whose EXIF says where it was taken is matched with so many that were taken close by."""
+
+INLIERS = 15
+"""Matches of one geometry from which two photos hang together: COLMAP's own bound."""
+
+NAMED = 12
+"""Photos that a sentence names; more are counted."""
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """One structure from motion.
+
+    Args:
+        source: A folder of photos, or a video.
+        out: Folder of the capture. The work is kept in its folder sfm/.
+        frames: How many frames of a video are taken, at most.
+        matcher: "exhaustive": every pair. "sequential": each photo with those that follow. "nearest": those, the ones
+            that look alike, and the ones taken close by. "auto": exhaustive up to 150 photos, else nearest; for
+            videos nearest.
+        mapper: "incremental", "global", or "auto": the former, and the other one where it does not do.
+        camera_model: COLMAP's name of the lens model; "auto": OPENCV, or SIMPLE_RADIAL where photos are few.
+        max_features: Most SIFT features of a photo.
+        max_image_size: Longest side at which features are found, px. The capture has the photos at full size.
+        threads: Threads of COLMAP; 0 for all.
+
+    Raises:
+        ArgumentError: a value is out of range.
+    """
+
+    source: Path
+    out: Path
+    frames: int = 150
+    matcher: str = "auto"
+    mapper: str = "auto"
+    camera_model: str = "auto"
+    max_features: int = 8192
+    max_image_size: int = 1600
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        whole_number("frames", self.frames, 3)
+        one_of("matcher", self.matcher, MATCHERS)
+        one_of("mapper", self.mapper, MAPPERS)
+        one_of("camera_model", self.camera_model, CAMERA_MODELS)
+        whole_number("max_features", self.max_features, 100)
+        whole_number("max_image_size", self.max_image_size, 64)
+        whole_number("threads", self.threads, 0)
+
+
+Say = Callable[[str], None]
+Progress = Callable[[str, int, int], None]
+"""Told which stage, how much of it is done, and of how much."""
+
+
+def needs_poses(path: str | Path) -> bool:
+    """Say whether a path is a video, or a folder of photos without poses in any layout that is read.
+
+    Args:
+        path: What the user named.
+    """
+    path = Path(path)
+    if is_file(path):
+        return is_video(path)
+    return is_folder(path) and not _is_capture(path) and bool(photo_files(path))
+
+
+def reconstruct(
+    options: SfmOptions,
+    say: Say = lambda sentence: None,
+    progress: Progress = lambda stage, done, total: None,
+) -> Path:
+    """Find poses for photos, and write a capture in COLMAP's layout: undistorted photos and a model of pinholes.
+
+    Features, matches and the order of all random draws are the same in every run. The mappers add up in an order that
+    depends on their threads: poses agree between runs to far below a pixel, not to the bit; with one thread they do.
+
+    Args:
+        options: What is asked for.
+        say: Told, in sentences, what the user wants to know.
+        progress: Told how far a stage has come. What it raises ends the run, which then can be taken up again.
+
+    Returns:
+        The capture's folder, `options.out`.
+
+    Raises:
+        ArgumentError: pycolmap is not installed, or the folder of the result cannot be used.
+        DatasetError: there are no photos, or they show too little in common.
+        OSError: a file cannot be written.
+    """
+    require_colmap()
+    files = _check(options)
+    return _Run(options, say, progress).run(files)
+
+
+class _Run:
+    """The stages of one run, each with what its outcome depends on."""
+
+    def __init__(self, options: SfmOptions, say: Say, progress: Progress) -> None:
+        self.options, self._say, self._progress = options, say, progress
+        self.folder = options.out / "sfm"
+        self.folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(self.folder)
+        self.stages = Stages(self.folder / "stages.json", say)
+        self.video = is_video(options.source)
+        self.threads = options.threads or -1
+
+    def run(self, files: list[Path]) -> Path:
+        """Go through the stages."""
+        options, source = self.options, self.options.source
+        if self.video:
+            wanted = {"video": fingerprint([source], source.parent), "frames": options.frames}
+            self._stage("frames", wanted, self._take_frames, [self.folder / "frames"])
+            source = self.folder / "frames"
+            files = photo_files(source)
+        self.source = source
+        wanted = {"photos": fingerprint(files, source), "max_image_size": options.max_image_size}
+        copies = self.folder / "photos"
+        facts = self._stage("photos", wanted, lambda: self._copy(files), [copies])
+        self.photos = [PhotoFacts(**photo | {"place": _tuple(photo["place"])}) for photo in facts["photos"]]
+        self.groups = _groups(self.photos, options.max_image_size)
+        database = [self.folder / f"database.db{ending}" for ending in ("", "-wal", "-shm")]
+        wanted = {"max_features": options.max_features, "pycolmap": version("pycolmap")}
+        self._stage("features", wanted, self._features, database)
+        facts = self._stage("matches", {"matcher": options.matcher}, self._match, [])
+        wanted = {"mapper": options.mapper, "camera_model": options.camera_model}
+        connected = facts["connected"]
+        self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
+        if not (options.out / "sparse" / "0").is_dir():
+            self.stages.forget("capture")
+        self._stage("capture", {}, self._finish, [])
+        return options.out
+
+    def _stage(
+        self, name: str, wanted: dict[str, Any], work: Callable[[], dict[str, Any]], rubbish: Sequence[Path]
+    ) -> dict[str, Any]:
+        """Do a stage, unless it is done.
+
+        Args:
+            name: The stage.
+            wanted: What its outcome depends on.
+            work: Does it, and returns what it found out; "summary" is for the user.
+            rubbish: What is removed before it begins anew.
+        """
+        facts = self.stages.finished(name, wanted)
+        if facts is not None:
+            self._say(f"{name}: {facts['summary']} (done before)")
+            return facts
+        if not self.stages.begun(name, wanted):
+            for path in rubbish:
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        began = time.perf_counter()
+        facts = work()
+        seconds = time.perf_counter() - began
+        self.stages.end(name, facts | {"seconds": round(seconds, 2)})
+        self._say(f"{name}: {facts['summary']} ({seconds:.1f} s)")
+        return facts
+
+    def _take_frames(self) -> dict[str, Any]:
+        source, folder = self.options.source, self.folder / "frames"
+        shutil.rmtree(folder, ignore_errors=True)
+        chosen = choose_frames(source, self.options.frames, self._progress)
+        written = write_frames(source, chosen, folder, self._progress)
+        if len(written) < 3:
+            raise DatasetError(
+                f"{source}: the camera moves too little ({len(written)} frames differ from the one before); walk "
+                "around the subject while filming"
+            )
+        same = (
+            f", {len(chosen) - len(written)} that show the same left out"
+            if len(written) < len(chosen)
+            else ""
+        )
+        return {"summary": f"{len(written)} of {source.name}{same}"}
+
+    def _copy(self, files: Sequence[Path]) -> dict[str, Any]:
+        longest = self.options.max_image_size
+        photos, unreadable = copy_photos(
+            files,
+            self.source,
+            self.folder / "photos",
+            longest,
+            lambda *count: self._progress("photos", *count),
+        )
+        if unreadable:
+            self._say(f"left out, cannot be decoded: {_listed(unreadable)}")
+        if len(photos) < 2:
+            raise DatasetError(_too_few(self.source, len(photos), unreadable))
+        lenses = len({photo.camera for photo in photos})
+        known = sum(photo.focal is not None for photo in photos)
+        kinds = "one camera" if lenses == 1 else f"{lenses} kinds of camera or zoom"
+        summary = f"{len(photos)} by {kinds}; {known} say their focal length"
+        return {"summary": summary, "photos": [asdict(photo) for photo in photos], "unreadable": unreadable}
+
+    def _features(self) -> dict[str, Any]:
+        total = len(self.photos)
+        found = self._call(
+            "features",
+            lambda done: self._progress("features", min(done, total), total),
+            photos=str(self.folder / "photos"),
+            groups=self.groups,
+            max_features=self.options.max_features,
+        )["features"]
+        names = [photo.name for photo in self.photos if not found.get(photo.copy)]
+        if names:
+            self._say(f"without features, blank or out of focus: {_listed(names)}")
+        return {"summary": f"{sum(found.values()):,} in {total - len(names)} photos"}
+
+    def _match(self) -> dict[str, Any]:
+        count = len(self.photos)
+        kind = self.options.matcher
+        if kind == "auto":
+            kind = "exhaustive" if count <= EXHAUSTIVE and not self.video else "nearest"
+        chosen = self._pairs(kind, 1)
+        verified = self._match_pairs(chosen)
+        part = pairs.largest_part(count, verified)
+        if len(part) < count and self.options.matcher == "auto" and kind == "nearest":
+            # What follows and looks alike was not enough: look farther.
+            chosen |= pairs.all_pairs(count) if count <= EXHAUSTIVE else self._pairs(kind, 3)
+            verified = self._match_pairs(chosen)
+            part = pairs.largest_part(count, verified)
+        if not verified:
+            raise DatasetError(no_overlap(f"{self.options.source}: of {len(chosen):,} pairs, none match"))
+        summary = f"{len(verified):,} of {len(chosen):,} pairs match"
+        if len(part) < count:
+            summary += f"; {len(part)} of {count} photos hang together"
+        return {"summary": summary, "connected": len(part)}
+
+    def _pairs(self, kind: str, farther: int) -> set[pairs.Pair]:
+        count, origin = len(self.photos), "video" if self.video else "photos"
+        if kind == "exhaustive":
+            return pairs.all_pairs(count)
+        overlap = OVERLAP["video"] if kind == "sequential" else OVERLAP[origin]
+        chosen = pairs.sequential_pairs(count, overlap)
+        if kind == "sequential":
+            return chosen
+        looks = pairs.looks(self.folder / "database.db", [photo.copy for photo in self.photos], SEED)
+        chosen |= pairs.nearest_pairs(looks, farther * ALIKE[origin], overlap + 1)
+        places = [photo.place for photo in self.photos if photo.place is not None]
+        if len(places) == count:
+            chosen |= pairs.nearest_pairs(pairs.on_the_ground(places), farther * CLOSE_BY)
+        return chosen
+
+    def _match_pairs(self, chosen: set[pairs.Pair]) -> list[pairs.Pair]:
+        """Match pairs, those that are not matched yet, and return those of all that hang together."""
+        names = [photo.copy for photo in self.photos]
+        listed = self.folder / "pairs.txt"
+        listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in sorted(chosen)), encoding="utf-8")
+        verified = self._call(
+            "matches",
+            lambda done: self._progress("matches", min(done, len(chosen)), len(chosen)),
+            pairs=str(listed),
+        )["verified"]
+        number = {name: i for i, name in enumerate(names)}
+        return [(number[a], number[b]) for a, b, count in verified if count >= INLIERS]
+
+    def _map(self, connected: int) -> dict[str, Any]:
+        options, total = self.options, len(self.photos)
+        ways = attempts(options.mapper, options.camera_model, total, len(self.groups), self.video)
+        model = map_photos(self.folder, ways, total, connected, self.threads, self._say, self._progress)
+        return model | {"summary": f"{len(model['names'])} of {total} photos have a pose ({model['way']})"}
+
+    def _finish(self) -> dict[str, Any]:
+        facts = build_capture(self.model, self.photos, self.source, self.folder, self._progress)
+        publish(self.folder, self.options.out)
+        if facts["left_out"]:
+            self._say(f"left out, no pose was found: {_listed(facts['left_out'])}")
+        figures = f"{facts['points']:,} points, mean reprojection error {facts['error']:.2f} px"
+        return facts | {"summary": f"{len(self.model['names'])} photos undistorted, {figures}"}
+
+    def _call(self, job: str, progress: Callable[[int], None], **arguments: object) -> dict[str, Any]:
+        database = str(self.folder / "database.db")
+        return call(
+            job,
+            self.folder / "log.txt",
+            progress,
+            database=database,
+            threads=self.threads,
+            seed=SEED,
+            **arguments,
+        )
+
+
+def _check(options: SfmOptions) -> list[Path]:
+    """Find out before any work whether there is something to do it with, and somewhere to put it.
+
+    Returns:
+        The photos; none where the source is a video.
+    """
+    source, out = options.source, options.out
+    check_folder("OUT", out)
+    here, there = source.resolve(), out.resolve()
+    if here == there or here.is_relative_to(there / "images"):
+        raise ArgumentError(f"OUT: {out} is where the photos themselves are; name another folder")
+    if not (out / "sfm" / "stages.json").is_file() and (_is_capture(out) or (out / "images").exists()):
+        raise ArgumentError(f"OUT: {out} holds photos or poses already; name another folder")
+    if is_file(source):
+        if not is_video(source):
+            kind = "one photo" if photo_files(source.parent).count(source) else "neither a folder nor a video"
+            raise DatasetError(f"{source}: is {kind}; name a folder of photos, or a video")
+        return []
+    if not is_folder(source):
+        raise DatasetError(f"{source}: is not there; name a folder of photos, or a video")
+    files = photo_files(source, there)
+    if len(files) < 2:
+        raise DatasetError(_too_few(source, len(files), []))
+    return files
+
+
+def _too_few(source: Path, count: int, unreadable: Sequence[str]) -> str:
+    """Say why there is nothing to do."""
+    if count == 1:
+        return f"{source}: holds one photo; poses need several, from different places"
+    if unreadable:
+        return f"{source}: holds no photo that can be decoded: {_listed(unreadable)}; export them as JPEG"
+    video = next((path.name for path in sorted(source.iterdir()) if is_video(path)), None)
+    advice = (
+        f"it holds a video, name that: {source / video}" if video else "name a folder of photos, or a video"
+    )
+    return f"{source}: holds no photo; {advice}"
+
+
+def _is_capture(path: Path) -> bool:
+    """Say whether a folder has poses in a layout that is read."""
+    return (
+        any(is_file(path / name) for name in (TRAIN_FILE, "transforms.json")) or find_model(path) is not None
+    )
+
+
+def _groups(photos: Sequence[PhotoFacts], longest: int) -> list[dict[str, Any]]:
+    """Put photos of one camera together, with the focal length that EXIF gives at the size of the working copies."""
+    groups: dict[str, dict[str, Any]] = {}
+    for photo in photos:
+        if photo.camera not in groups:
+            width, height = photo.copy_size(longest)
+            focal = None if photo.focal is None else photo.focal * width / photo.W
+            groups[photo.camera] = {
+                "names": [],
+                "focal": focal,
+                "width": width,
+                "height": height,
+            }
+        groups[photo.camera]["names"].append(photo.copy)
+    return list(groups.values())
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _tuple(value: list[float] | None) -> tuple[float, ...] | None:
+    return None if value is None else tuple(value)

@@ -1,0 +1,207 @@
+"""From a model of the working copies to a capture: undistorted photos, upright, and a model that goes with them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.colmap import read_cameras, read_images, read_points
+from gsplat_edu.data.images import AT_ONCE, PhotoFile, develop
+from gsplat_edu.data.lens import Lens, straightened
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.gaussian_math import quat_to_R
+from gsplat_edu.sfm.align import upright
+from gsplat_edu.sfm.colmap import call
+from gsplat_edu.sfm.photos import PhotoFacts
+
+QUALITY = 95
+"""JPEG quality of undistorted photos."""
+
+JPEGS = (".jpg", ".jpeg")
+"""Endings of photos that were compressed with losses before; the others are written as PNG."""
+
+PARTS = ("images", "masks", "sparse")
+"""What a capture consists of. The model comes last: it says that the capture is there."""
+
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""What a quarter turn clockwise of the image does to camera coordinates: right becomes down."""
+
+
+@dataclass(frozen=True, eq=False)
+class Undistorted:
+    """A photo of the capture.
+
+    Args:
+        photo: What it was.
+        name: Its name in images/.
+        lens: The lens that took it, at the size of the file.
+        pinhole: The camera of the undistorted, upright photo; no pose matters.
+    """
+
+    photo: PhotoFacts
+    name: str
+    lens: Lens
+    pinhole: Lens
+
+    def entry(self) -> dict[str, Any]:
+        """Return what `gsplat_edu.sfm.engine.finish` wants to know."""
+        p = self.pinhole  # formats put the first pixel's centre at (0.5, 0.5)
+        sizes = {"name": self.name, "W": p.W, "H": p.H, "turns": self.photo.turns}
+        return sizes | {"fx": p.fx, "fy": p.fy, "cx": p.cx + 0.5, "cy": p.cy + 0.5}
+
+
+def build_capture(
+    model: Mapping[str, Any],
+    photos: Sequence[PhotoFacts],
+    source: Path,
+    folder: Path,
+    progress: Callable[[str, int, int], None],
+) -> dict[str, Any]:
+    """Write images/, masks/ where a photo needs one, and sparse/0 into folder/result.
+
+    Args:
+        model: As `gsplat_edu.sfm.mapping.map_photos` returns it.
+        photos: All of them.
+        source: Where they are.
+        folder: Work folder; result/ in it is made anew.
+        progress: Told how many photos are undistorted.
+
+    Returns:
+        "points", "error" in px of the undistorted photos, and "left_out", the names of photos without a pose.
+
+    Raises:
+        DatasetError: a photo cannot be decoded any more, or COLMAP failed.
+    """
+    result = folder / "result"
+    shutil.rmtree(result, ignore_errors=True)
+    found, placed = folder / model["folder"], set(model["names"])
+    chosen = [photo for photo in photos if photo.copy in placed]
+    poses = {pose.name: pose for pose in read_images(found / "images.bin")}
+    lenses = read_cameras(found / "cameras.bin")
+    entries, cameras = list[Undistorted](), list[Camera]()
+    for photo, name in zip(chosen, output_names(chosen), strict=True):
+        pose = poses[photo.copy]
+        lens = lenses[pose.camera].resized(photo.W, photo.H)
+        pinhole = turned(straightened(lens), photo.turns)
+        entries.append(Undistorted(photo, name, lens, pinhole))
+        R = quat_to_R(pose.quat)
+        cameras.append(_camera(pinhole, np.linalg.matrix_power(QUARTER, photo.turns) @ R, -R.T @ pose.shift))
+    cloud = read_points(found)
+    if cloud is None:
+        raise DatasetError(f"{found}: holds no points; the photos show too little in common")
+    _write_photos(entries, source, result, progress)
+    move = upright(cameras, cloud.points)
+    facts = call(
+        "finish",
+        folder / "log.txt",
+        model=str(found),
+        out=str(result / "sparse" / "0"),
+        rotation=move.R.tolist(),
+        move=move.t.tolist(),
+        scale=move.s,
+        photos={entry.photo.copy: entry.entry() for entry in entries},
+    )
+    return facts | {"left_out": [photo.name for photo in photos if photo.copy not in placed]}
+
+
+def publish(folder: Path, out: Path) -> None:
+    """Put what `build_capture` wrote where the user wants it; what an earlier run put there goes.
+
+    Args:
+        folder: Work folder.
+        out: The capture.
+    """
+    old = folder / "old"
+    shutil.rmtree(old, ignore_errors=True)
+    old.mkdir()
+    for part in reversed(PARTS):
+        if (out / part).exists():
+            (out / part).replace(old / part)
+    for part in PARTS:
+        if (folder / "result" / part).exists():
+            (folder / "result" / part).replace(out / part)
+    shutil.rmtree(old, ignore_errors=True)
+    shutil.rmtree(folder / "result", ignore_errors=True)
+
+
+def turned(lens: Lens, turns: int) -> Lens:
+    """Return the pinhole of a photo that was turned clockwise: (u, v) becomes (H - 1 - v, u).
+
+    Args:
+        lens: A lens that does not distort.
+        turns: Quarter turns.
+    """
+    for _ in range(turns % 4):
+        lens = Lens(lens.H, lens.W, lens.fy, lens.fx, lens.H - 1 - lens.cy, lens.cx)
+    return lens
+
+
+def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
+    """Name the undistorted photos as the photos are named, each differently, and as the files they are.
+
+    Args:
+        photos: The photos.
+
+    Returns:
+        Paths below images/: JPEGs keep their names, others end in .png. What COLMAP's files cannot hold becomes "_".
+    """
+    names, taken = list[str](), set[str]()
+    for photo in photos:
+        clean = re.sub("[\\\\\x00-\x1f\ud800-\udfff]", "_", photo.name)
+        path = PurePosixPath(clean)
+        base, ending = path.with_suffix(""), path.suffix if path.suffix.lower() in JPEGS else ".png"
+        name, number = f"{base}{ending}", 2
+        while name.lower() in taken:  # file systems that know no case
+            name, number = f"{base}_{number}{ending}", number + 1
+        taken.add(name.lower())
+        names.append(name)
+    return names
+
+
+def _camera(pinhole: Lens, R: np.ndarray, eye: np.ndarray) -> Camera:
+    p = pinhole
+    return Camera(R, eye, p.fx, p.fy, p.cx, p.cy, p.H, p.W)
+
+
+def _write_photos(
+    entries: Sequence[Undistorted], source: Path, result: Path, progress: Callable[[str, int, int], None]
+) -> None:
+    """Undistort and turn photos, several at a time."""
+    largest = max(entry.lens.W * entry.lens.H for entry in entries)
+    pool = ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, AT_ONCE // largest)))
+    futures = [pool.submit(_write_photo, entry, source, result) for entry in entries]
+    try:
+        for done, future in enumerate(futures, 1):
+            future.result()
+            progress("undistorting", done, len(entries))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
+    lens = entry.lens
+    photo = develop(PhotoFile(source / entry.photo.name, None, lens, lens.W, lens.H, None))
+    pixels = np.asarray(photo.image)
+    if photo.alpha is not None:
+        pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)
+    target = result / "images" / entry.name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    jpeg = target.suffix.lower() in JPEGS and pixels.shape[2] == 3
+    options: dict[str, Any] = {"quality": QUALITY, "subsampling": 0} if jpeg else {"compress_level": 3}
+    upright_pixels = np.ascontiguousarray(np.rot90(pixels, -entry.photo.turns))
+    Image.fromarray(upright_pixels).save(target, format="JPEG" if jpeg else "PNG", **options)
+    if photo.mask is not None:
+        mask = result / "masks" / f"{entry.name}.png"
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        counts = np.where(np.rot90(photo.mask, -entry.photo.turns), 255, 0).astype(np.uint8)
+        Image.fromarray(counts).save(mask)

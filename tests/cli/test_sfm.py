@@ -1,0 +1,186 @@
+"""`gsplat-edu sfm`: what it says, and that bad input costs one line."""
+
+import importlib.util
+import io
+import signal
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from gsplat_edu.cli.main import build_parser, main
+from gsplat_edu.cli.sfm import options_from, stage_bars
+from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.sfm.reconstruct import SfmOptions
+from sfm.textured_box import camera_at, orbit, photograph
+
+
+@pytest.fixture
+def colmap():
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("pycolmap is not installed")
+
+
+def save(folder, cameras):
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, camera in enumerate(cameras):
+        Image.fromarray(photograph(camera)).save(folder / f"{i}.jpg")
+
+
+def test_options(tmp_path):
+    def options(*words):
+        return options_from(build_parser(["sfm"]).parse_args(["sfm", "photos", "out", *words]))
+
+    words = "--frames 40 --matcher nearest --mapper global --camera-model OPENCV_FISHEYE --max-features 5000"
+    words += " --max-image-size 2000 --threads 3"
+    chosen = options(*words.split())
+    source, out = chosen.source, chosen.out
+    assert options() == SfmOptions(source, out)
+    assert chosen == SfmOptions(source, out, 40, "nearest", "global", "OPENCV_FISHEYE", 5000, 2000, 3)
+
+
+@pytest.mark.usefixtures("colmap")
+def test_photos_become_a_capture(tmp_path, capsys):
+    save(tmp_path / "photos", orbit(6, turn=1.8))
+    assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "6 of 6 photos have a pose" in said and "mean reprojection error 0." in said
+    assert f"gsplat-edu train {tmp_path / 'out'}" in said.replace("\n", "")
+    assert len(load_dataset(tmp_path / "out").train) == 5
+
+
+def _noise(folder):
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(4):
+        Image.fromarray(rng.integers(0, 255, (120, 160, 3)).astype(np.uint8)).save(folder / f"{i}.png")
+
+
+def _blank(folder):
+    folder.mkdir()
+    for i in range(3):
+        Image.new("RGB", (160, 120), (200, 200, 200)).save(folder / f"{i}.png")
+
+
+def _texts(folder):
+    folder.mkdir()
+    for i in range(3):
+        (folder / f"{i}.txt").write_text("hello")
+
+
+def _video_inside(folder):
+    folder.mkdir()
+    (folder / "walk.mp4").write_bytes(b"")
+
+
+def _unreadable(folder):
+    folder.mkdir()
+    for i in range(3):
+        (folder / f"{i}.jpg").write_bytes(b"not a photo")
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda folder: None, "photos: is not there; name a folder of photos, or a video"),
+        (lambda folder: folder.mkdir(), "photos: holds no photo; name a folder of photos, or a video"),
+        (_texts, "photos: holds no photo; name a folder"),
+        (_video_inside, "photos: holds no photo; it holds a video, name that: "),
+        (lambda folder: save(folder, orbit(1)), "photos: holds one photo; poses need several"),
+        (_unreadable, "holds no photo that can be decoded: 0.jpg (no image that Pillow knows), 1.jpg"),
+        (_noise, "of 6 pairs, none match: the photos show too little in common; walk around the subject"),
+        (_blank, "the photos show too little in common"),
+        (lambda folder: folder.write_text("hello"), "photos: is neither a folder nor a video"),
+    ],
+)
+@pytest.mark.usefixtures("colmap", "as_shipped")
+def test_what_gives_no_poses_is_one_line(tmp_path, capsys, make, says):
+    make(tmp_path / "photos")
+    assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1 and said.startswith("gsplat-edu sfm: ")
+    assert not (tmp_path / "out" / "sparse").exists()
+
+
+@pytest.mark.usefixtures("colmap", "as_shipped")
+def test_an_empty_video_is_one_line(tmp_path, capsys):
+    (tmp_path / "walk.mp4").write_bytes(b"")
+    assert main(["sfm", str(tmp_path / "walk.mp4"), str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "walk.mp4: is no video that OpenCV can decode" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("out", "says"),
+    [
+        ("photos", "is where the photos themselves are"),
+        (".", "is where the photos themselves are"),
+        ("posed", "holds photos or poses already"),
+        ("photos/0.jpg", "0.jpg is a file; name a folder"),
+    ],
+)
+@pytest.mark.usefixtures("colmap", "as_shipped")
+def test_the_users_photos_are_not_written_over(tmp_path, capsys, out, says):
+    source = tmp_path / ("images" if out == "." else "photos")
+    save(source, orbit(3))
+    (tmp_path / "posed" / "images").mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["sfm", str(source), str(tmp_path / out)]) == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--frames", "2"], "frames"),
+        (["--frames", "many"], "--frames"),
+        (["--matcher", "best"], "matcher"),
+        (["--mapper", "glomap"], "mapper"),
+        (["--camera-model", "FOV"], "camera_model"),
+        (["--max-features", "0"], "max_features"),
+        (["--max-image-size", "8"], "max_image_size"),
+        (["--threads", "-1"], "threads"),
+    ],
+)
+@pytest.mark.usefixtures("as_shipped")
+def test_options_out_of_range_cost_one_line(tmp_path, capsys, words, named):
+    try:
+        code = main(["sfm", str(tmp_path), str(tmp_path / "out"), *words])
+    except SystemExit as stop:  # what argparse refuses
+        code = stop.code
+    said = capsys.readouterr().err
+    assert code == 2 and named in said and said.count("\n") == 1
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_without_pycolmap_one_line_says_how_to_install_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["sfm", str(tmp_path), str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert 'pip install -c constraints.txt ".[sfm]"' in said and said.count("\n") == 1
+
+
+@pytest.mark.usefixtures("colmap")
+def test_ctrl_c_says_that_it_goes_on(tmp_path, capsys, monkeypatch):
+    save(tmp_path / "photos", [camera_at(0.2 * i) for i in range(4)])
+
+    def press(*arguments):
+        signal.raise_signal(signal.SIGTERM)  # what a batch system sends
+
+    monkeypatch.setattr("gsplat_edu.sfm.reconstruct.copy_photos", press)
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 130
+    assert "the same command goes on behind the last finished stage" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_bars_show_a_stage_after_the_other():
+    drawn = io.StringIO()
+    with stage_bars(Console(file=drawn, force_terminal=True, width=100)) as progress:
+        for stage, total in (("features", 3), ("matches", 7)):
+            for done in range(total + 1):
+                progress(stage, done, total)
+    assert "features" in drawn.getvalue() and "7/7" in drawn.getvalue()

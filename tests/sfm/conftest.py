@@ -1,0 +1,48 @@
+"""What the tests of structure from motion share: photos of a box, and the capture that becomes of them."""
+
+import importlib.util
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from sfm.textured_box import orbit, photograph
+
+
+@pytest.fixture(scope="session")
+def colmap():
+    """Skip where pycolmap is not installed. It is not imported here: its libraries do not get along with Pillow's."""
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("pycolmap is not installed")
+
+
+@pytest.fixture(scope="session")
+def phone(tmp_path_factory):
+    """14 photos as a phone writes them: the sensor's pixels, and how it was held in EXIF; half of them upright."""
+    folder = tmp_path_factory.mktemp("phone") / "photos"
+    truth = {}
+    landscape, portrait = orbit(14), orbit(14, size=(240, 320))
+    for i in range(14):
+        # a name with a space, in a folder, and an ending in capitals
+        name = f"walk {i % 3}/IMG_{i:02d}.{'JPG' if i % 5 else 'png'}"
+        truth[name] = portrait[i] if i % 2 else landscape[i]
+        pixels = photograph(truth[name])
+        exif = Image.Exif()
+        if i % 2:
+            pixels = np.ascontiguousarray(np.rot90(pixels))  # the sensor lies on its side
+            exif[0x0112] = 6  # to be turned clockwise
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(folder / name, quality=95, exif=exif)
+    return SimpleNamespace(folder=folder, truth=truth)
+
+
+@pytest.fixture(scope="session")
+def done(colmap, phone, tmp_path_factory):
+    """The capture of the phone's photos, and what was said and told on the way."""
+    out = tmp_path_factory.mktemp("done") / "capture"
+    said, told = [], []
+    options = SfmOptions(phone.folder, out)
+    assert reconstruct(options, said.append, lambda *progress: told.append(progress)) == out
+    return SimpleNamespace(out=out, said=said, told=told, options=options, truth=phone.truth)

@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.lens import Lens
+from gsplat_edu.sfm.mapping import MANY_PHOTOS, Attempt, attempts
+from gsplat_edu.sfm.photos import PhotoFacts
+from gsplat_edu.sfm.result import QUARTER, output_names, turned
+
+
+def test_another_mapper_a_simpler_lens_and_a_camera_per_photo_are_tried_in_turn():
+    assert attempts("auto", "auto", 50, 1, one_lens=False) == [
+        Attempt("incremental", "OPENCV"),
+        Attempt("global", "OPENCV"),
+        Attempt("incremental", "SIMPLE_RADIAL", loose=True),
+        Attempt("incremental", "SIMPLE_RADIAL", per_photo=True, loose=True),
+    ]
+
+
+def test_frames_of_a_video_are_of_one_camera():
+    assert not any(way.per_photo for way in attempts("auto", "auto", 50, 1, one_lens=True))
+
+
+def test_few_photos_of_a_camera_fix_a_simple_lens_only():
+    assert attempts("auto", "auto", 9, 1, one_lens=True)[0].model == "SIMPLE_RADIAL"
+    assert attempts("auto", "auto", 25, 3, one_lens=True)[0].model == "SIMPLE_RADIAL"
+    assert attempts("auto", "auto", 10, 1, one_lens=True)[0].model == "OPENCV"
+
+
+def test_what_the_user_asks_for_stays():
+    ways = attempts("global", "OPENCV_FISHEYE", 50, 1, one_lens=False)
+    assert {(way.mapper, way.model) for way in ways} == {("global", "OPENCV_FISHEYE")}
+
+
+def test_many_photos_are_mapped_globally_first():
+    assert attempts("auto", "auto", MANY_PHOTOS + 1, 1, one_lens=True)[0].mapper == "global"
+    assert attempts("auto", "auto", MANY_PHOTOS, 1, one_lens=True)[0].mapper == "incremental"
+
+
+def test_a_way_says_what_it_is():
+    assert str(Attempt("global", "OPENCV")) == "global mapper, OPENCV"
+    last = attempts("auto", "auto", 50, 1, one_lens=False)[-1]
+    assert str(last) == "incremental mapper, SIMPLE_RADIAL, a camera per photo, lower thresholds"
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_a_turned_photo_has_a_turned_camera(turns):
+    """What a pixel shows, it shows after the photo is turned, at the place that it has then."""
+    lens = Lens(40, 30, 50.0, 55.0, 18.0, 16.5)
+    point = np.array([0.11, -0.07, 0.9])
+    u, v, _ = Camera(np.eye(3), np.zeros(3), 50.0, 55.0, 18.0, 16.5, 30, 40).project(point)
+    after = turned(lens, turns)
+    R = np.linalg.matrix_power(QUARTER, turns)
+    camera = Camera(R, np.zeros(3), after.fx, after.fy, after.cx, after.cy, after.H, after.W)
+    photo = np.zeros((30, 40))
+    rows, columns = np.mgrid[:30, :40]
+    photo = np.rot90(np.hypot(columns - u, rows - v), -turns)  # smallest where the point is
+    found = camera.project(camera.world_to_cam(point))
+    expected = np.unravel_index(photo.argmin(), photo.shape)
+    assert photo.shape == (after.H, after.W)
+    assert np.hypot(found[0] - expected[1], found[1] - expected[0]) <= 2**-0.5
+
+
+def test_names_keep_folders_and_say_what_the_files_are():
+    names = [
+        "a/IMG 1.JPG",
+        "a/b.webp",
+        "a/b.tif",
+        "b.png",
+        "B.tiff",
+        "new\nline.jpg",
+        "no_ending",
+        "x\\y.jpeg",
+    ]
+    photos = [PhotoFacts(name, "", 1, 1) for name in names]
+    assert output_names(photos) == [
+        "a/IMG 1.JPG",
+        "a/b.png",
+        "a/b_2.png",
+        "b.png",
+        "B_2.png",
+        "new_line.jpg",
+        "no_ending.png",
+        "x_y.jpeg",
+    ]

@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.sfm.photos import copy_photos, fingerprint, photo_files
+
+PIXELS = np.random.default_rng(0).integers(0, 255, (30, 40, 3)).astype(np.uint8)
+
+
+def photo(path, exif=None, pixels=PIXELS, **options):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, **({} if exif is None else {"exif": exif}), **options)
+    return path
+
+
+def facts(tmp_path, exif, **options):
+    path = photo(tmp_path / "photos" / "a.jpg", exif, **options)
+    (found,), unreadable = copy_photos([path], path.parent, tmp_path / "copies", 1600)
+    assert not unreadable
+    return found
+
+
+def test_photos_are_known_by_what_is_in_them(tmp_path):
+    wanted = [
+        photo(tmp_path / "IMG_1.JPG", format="JPEG"),
+        photo(tmp_path / "day 2" / "no_ending", format="PNG"),
+        photo(tmp_path / "day 2" / "b.webp"),
+        photo(tmp_path / "images" / "c.tif"),
+        photo(tmp_path / "named.png", format="JPEG"),
+    ]
+    (tmp_path / "torn.jpeg").write_bytes(b"")
+    wanted.append(tmp_path / "torn.jpeg")  # it is to be named later
+    photo(tmp_path / "masks" / "IMG_1.png")
+    photo(tmp_path / "images_4" / "c.png")
+    photo(tmp_path / ".hidden" / "d.png")
+    photo(tmp_path / "__MACOSX" / "e.png")
+    photo(tmp_path / "._IMG_1.JPG", format="JPEG")
+    photo(tmp_path / "out" / "images" / "f.png")
+    photo(tmp_path / "drawing.gif")
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "walk.mp4").write_bytes(b"\0" * 100)
+    assert photo_files(tmp_path, (tmp_path / "out").resolve()) == sorted(wanted)
+
+
+def test_copies_are_rgb_and_small_and_have_plain_names(tmp_path):
+    source = tmp_path / "photos"
+    files = [
+        photo(source / "ä b.png", pixels=np.dstack([PIXELS, np.zeros((30, 40), np.uint8)])),
+        photo(source / "gray16.png", pixels=(PIXELS[..., 0].astype(np.uint16) * 257)),
+        photo(source / "photo.webp", lossless=True),
+    ]
+    told = []
+    found, unreadable = copy_photos(files, source, tmp_path / "copies", 20, lambda *count: told.append(count))
+    assert unreadable == [] and told == [(1, 3), (2, 3), (3, 3)]
+    assert [f.name for f in found] == ["ä b.png", "gray16.png", "photo.webp"]
+    assert [f.copy for f in found] == ["000000.jpg", "000001.jpg", "000002.jpg"]
+    for fact in found:
+        with Image.open(tmp_path / "copies" / fact.copy) as copy:
+            assert (copy.format, copy.mode, copy.size) == ("JPEG", "RGB", (20, 15)) and fact.copy_size(
+                20
+            ) == (20, 15)
+            assert (fact.W, fact.H) == (40, 30)
+    with Image.open(tmp_path / "copies" / "000000.jpg") as copy:
+        assert abs(np.asarray(copy).astype(int) - 128).max() <= 2, "gray behind what is transparent"
+
+
+def test_copies_that_are_there_are_kept(tmp_path):
+    files = [photo(tmp_path / "photos" / name) for name in ("a.png", "b.png")]
+    copy_photos(files, tmp_path / "photos", tmp_path / "copies", 40)
+    kept = tmp_path / "copies" / "000001.jpg"
+    (tmp_path / "copies" / "000000.jpg").unlink()
+    before = kept.stat().st_mtime_ns
+    copy_photos(files, tmp_path / "photos", tmp_path / "copies", 40)
+    assert kept.stat().st_mtime_ns == before and (tmp_path / "copies" / "000000.jpg").is_file()
+
+
+def test_what_cannot_be_decoded_is_named_with_its_reason(tmp_path):
+    source = tmp_path / "photos"
+    good = photo(source / "good.png")
+    torn = photo(source / "torn.png", pixels=np.tile(PIXELS, (20, 20, 1)))
+    torn.write_bytes(torn.read_bytes()[:2000])
+    for name in ("empty.jpg", "phone.HEIC"):
+        (source / name).write_bytes(b"")
+    files = [source / "empty.jpg", good, source / "phone.HEIC", torn]
+    found, unreadable = copy_photos(files, source, tmp_path / "copies", 1600)
+    assert [(f.name, f.copy) for f in found] == [("good.png", "000001.jpg")]
+    assert unreadable[:2] == [
+        "empty.jpg (no image that Pillow knows)",
+        "phone.HEIC (HEIC is not decoded here: export it as JPEG)",
+    ]
+    assert unreadable[2].startswith("torn.png") and len(unreadable) == 3
+    assert all("\n" not in reason for reason in unreadable)
+
+
+def test_the_focal_length_is_that_of_exif(tmp_path):
+    exif = Image.Exif()
+    assert facts(tmp_path, exif).focal is None
+    details = exif.get_ifd(0x8769)
+    details[0xA405] = 26  # as on 36 x 24 mm film, whose diagonal is 43.27 mm
+    np.testing.assert_allclose(facts(tmp_path, exif).focal, 26 / 43.2666 * 50, rtol=1e-4)
+
+    details[0xA405] = 0  # not known; 5 mm, and 40 px over 8 mm: five to a millimetre
+    details[0x920A], details[0xA20E], details[0xA210] = 5.0, 50.0, 3
+    np.testing.assert_allclose(facts(tmp_path, exif).focal, 25.0, rtol=1e-4)
+    details[0xA002] = 80  # the photo was made half as large since
+    np.testing.assert_allclose(facts(tmp_path, exif).focal, 12.5, rtol=1e-4)
+
+    details[0x920A] = 500.0
+    assert facts(tmp_path, exif).focal is None, "more than twenty times the width is not believed"
+
+
+def test_photos_of_one_lens_and_zoom_share_a_camera(tmp_path):
+    cameras = []
+    for model, zoom, pixels in (
+        ("Phone", 26, PIXELS),
+        ("Phone", 26, PIXELS + 1),
+        ("Phone", 52, PIXELS),
+        ("Other", 26, PIXELS),
+        ("Phone", 26, PIXELS[:20]),
+    ):
+        exif = Image.Exif()
+        exif[0x0110] = model
+        exif.get_ifd(0x8769)[0xA405] = zoom
+        cameras.append(facts(tmp_path, exif, pixels=pixels).camera)
+        (tmp_path / "copies" / "000000.jpg").unlink()
+    assert cameras[0] == cameras[1] and len(set(cameras)) == 4
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 1), (8, 3), (2, 0), (99, 0)])
+def test_how_the_camera_was_held(tmp_path, orientation, turns):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    assert facts(tmp_path, exif).turns == turns
+
+
+def test_where_a_photo_was_taken(tmp_path):
+    exif = Image.Exif()
+    gps = exif.get_ifd(0x8825)
+    gps[1], gps[2], gps[3], gps[4], gps[6] = "S", (33.0, 51.0, 36.0), "E", (151.0, 12.0, 0.0), 25.0
+    np.testing.assert_allclose(facts(tmp_path, exif).place, (-33.86, 151.2, 25.0))
+    gps[2] = (0.0, 0.0, 0.0)
+    gps[4] = (0.0, 0.0, 0.0)
+    assert facts(tmp_path, exif).place is None, "nobody photographs there: the device did not know"
+
+
+def test_the_fingerprint_knows_names_sizes_and_contents(tmp_path):
+    a, b = photo(tmp_path / "a.png"), photo(tmp_path / "b.png")
+    first = fingerprint([a, b], tmp_path)
+    assert fingerprint([a, b], tmp_path) == first
+    assert fingerprint([a], tmp_path) != first
+    photo(b, pixels=PIXELS[::-1])
+    assert fingerprint([a, b], tmp_path) != first
+    photo(b)
+    assert fingerprint([a, b], tmp_path) == first, "when it was written does not matter"
+    b.rename(tmp_path / "c.png")
+    assert fingerprint([a, tmp_path / "c.png"], tmp_path) != first
+    with pytest.raises(DatasetError, match=r"b\.png: cannot be read"):
+        fingerprint([a, b], tmp_path)

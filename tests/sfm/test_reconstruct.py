@@ -1,0 +1,225 @@
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import gsplat_edu.sfm.engine
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.sfm.colmap import call
+from gsplat_edu.sfm.reconstruct import SfmOptions, needs_poses, reconstruct
+from sfm.textured_box import TURNED, aligned_errors, cameras_of, check, orbit, photograph
+
+pytestmark = pytest.mark.usefixtures("colmap")
+
+STAGES = ("photos", "features", "matches", "mapping", "capture")
+
+
+def test_every_photo_gets_its_pose(done):
+    found = cameras_of(done.out)
+    assert set(found) == set(done.truth)
+    R = check(found, done.truth)
+    for name, camera in found.items():
+        assert (camera.W, camera.H) == (done.truth[name].W, done.truth[name].H), "upright, and of full size"
+        assert abs(camera.fx / 352 - 1) < 0.03
+
+    # up is up: the truth's, whose cameras are level
+    assert np.degrees(np.arccos(R[1, 1])) < TURNED
+    eyes = np.stack([camera.eye for camera in found.values()])
+    first = found[min(found)]
+    assert abs(np.median(np.linalg.norm(eyes, axis=1)) - 5) < 1e-6, "zero is what the cameras look at, 5 away"
+    assert abs(first.R[2, 0]) < 1e-6 and first.R[2, 2] > 0, "the first photo looks along +z"
+
+
+def test_photos_are_upright_and_undistorted(done):
+    for view in load_dataset(done.out, DataSettings(test_every=0)).train:
+        taken = photograph(done.truth[view.name]).astype(float)
+        written = view.read().image.astype(float)
+        assert written.shape == taken.shape
+        # The lens that was found bends the photo by less than two pixels: apart from that it is the one taken.
+        inner = (slice(20, -20), slice(20, -20))
+        small = [image[inner][::8, ::8].mean(axis=2).ravel() for image in (taken, written)]
+        assert np.corrcoef(*small)[0, 1] > 0.5, view.name
+
+
+def test_points_lie_on_the_box_and_the_floor(done):
+    dataset = load_dataset(done.out, DataSettings(test_every=0))
+    found = {view.name: view.camera for view in dataset.train}
+    names = sorted(found)
+    a, b = (np.stack([cameras[name].eye for name in names]) for cameras in (found, done.truth))
+    _, _, R = aligned_errors(found, done.truth)
+    s = np.linalg.norm(b - b.mean(axis=0)) / np.linalg.norm(a - a.mean(axis=0))
+    points = s * (dataset.points - a.mean(axis=0)) @ R.T + b.mean(axis=0)
+    floor = np.abs(points[:, 1])
+    beyond = np.abs(points - [0.0, -0.5, 0.0]) - [0.7, 0.5, 0.5]
+    box = np.abs(beyond.max(axis=1))
+    # Two pixels at a distance of 4, along a ray that meets the floor at half a right angle or less.
+    assert np.mean(np.minimum(floor, box) < 4 * 2 * 4 / 352) > 0.9
+    assert len(points) > 300
+    assert dataset.colors.std() > 0.05, "points have the photos' colours"
+
+
+def test_stages_are_told_with_real_counts(done):
+    stages = list(dict.fromkeys(stage for stage, _, _ in done.told))
+    assert stages == ["photos", "features", "matches", "mapping", "undistorting"]
+    last = {stage: (count, total) for stage, count, total in done.told}
+    pairs = 14 * 13 // 2
+    assert last == {stage: (pairs, pairs) if stage == "matches" else (14, 14) for stage in stages}
+    assert [sentence.split(":")[0] for sentence in done.said] == list(STAGES)
+    assert "14 by one camera" in done.said[0], "held upright or not, the sensor is the same"
+    assert "14 of 14 photos have a pose (incremental mapper, OPENCV)" in done.said[3]
+    assert "COLMAP" not in done.said[0] and (done.out / "sfm" / "log.txt").stat().st_size > 1000
+
+
+def test_only_the_capture_and_the_work_are_left(done):
+    assert sorted(path.name for path in done.out.iterdir()) == ["images", "sfm", "sparse"]
+    assert {"result", "old"} & {path.name for path in (done.out / "sfm").iterdir()} == set()
+
+
+def test_a_finished_run_does_nothing(done):
+    before = {path: path.stat().st_mtime_ns for path in done.out.rglob("*.bin")}
+    said = []
+    reconstruct(done.options, said.append)
+    assert all(sentence.endswith("(done before)") for sentence in said) and len(said) == len(STAGES)
+    assert {path: path.stat().st_mtime_ns for path in done.out.rglob("*.bin")} == before
+
+
+class StoppedError(Exception):
+    pass
+
+
+def test_an_interrupted_run_goes_on(done, phone, tmp_path):
+    options = SfmOptions(phone.folder, tmp_path / "capture")
+    for finished, stage in enumerate(("photos", "features", "matches", "mapping", "undistorting")):
+        said = []
+
+        def stop(now, count, total, stage=stage):
+            if now == stage and count > 0:
+                raise StoppedError
+
+        with pytest.raises(StoppedError):
+            reconstruct(options, said.append, stop)
+        assert [sentence.split(":")[0] for sentence in said] == list(STAGES[:finished])
+        again = [sentence.endswith("(done before)") for sentence in said]
+        assert again == [True] * (finished - 1) + [False] * (finished > 0), stage
+        assert not (options.out / "sparse").exists(), "there is no capture before it is complete"
+    said = []
+    reconstruct(options, said.append)
+    assert [sentence.endswith("(done before)") for sentence in said] == [True] * 4 + [False]
+
+    whole, parts = cameras_of(done.out), cameras_of(options.out)
+    for name in whole:  # the mapper's threads round differently: by less than a hundredth of a pixel
+        np.testing.assert_allclose(parts[name].R, whole[name].R, atol=0.01 / 352)
+        np.testing.assert_allclose(parts[name].eye, whole[name].eye, atol=0.01 * 5 / 352)
+
+    # Other options begin again from the stage that they concern, and the old result goes when the new one is there.
+    said = []
+    reconstruct(replace(options, camera_model="SIMPLE_RADIAL"), said.append)
+    assert said[3] == "mapping: camera_model differ from those before; again from here"
+    assert [sentence.endswith("(done before)") for sentence in said] == [True] * 3 + [False] * 3
+    assert set(cameras_of(options.out)) == set(whole)
+
+
+def test_the_global_mapper_and_the_chosen_pairs_do_as_well(done, tmp_path):
+    """The nearest by looks and by sequence instead of all pairs; the work of the other run is taken over."""
+    out = tmp_path / "capture"
+    options = replace(done.options, out=out, matcher="nearest", mapper="global")
+    said = []
+    reconstruct(options, said.append)
+    check(cameras_of(out), done.truth)
+    assert "global mapper" in said[3]
+
+
+def test_what_cannot_be_used_is_named_and_left_out(phone, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i, camera in enumerate(orbit(8, turn=2.5)):
+        Image.fromarray(photograph(camera)).save(folder / f"good_{i}.jpg", quality=95)
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    Image.fromarray(noise).save(folder / "noise.png")
+    (folder / "broken.jpg").write_bytes((folder / "good_0.jpg").read_bytes()[:3000])
+    (folder / "notes.txt").write_text("not a photo")
+    (folder / "masks").mkdir()
+    Image.fromarray(noise).save(folder / "masks" / "good_0.png")
+    said = []
+    reconstruct(SfmOptions(folder, tmp_path / "out", max_image_size=300), said.append)
+    found = cameras_of(tmp_path / "out")
+    assert sorted(found) == [f"good_{i}.jpg" for i in range(8)]
+    assert all((camera.W, camera.H) == (320, 240) for camera in found.values())
+    words = "\n".join(said)
+    assert "left out, cannot be decoded: broken.jpg" in words
+    assert "left out, no pose was found: noise.png" in words
+    assert "8 of 9 photos" in words and "SIMPLE_RADIAL" in words, "few photos fix a simple lens only"
+
+
+def test_a_photo_in_a_wrong_place_is_placed_again(done, tmp_path):
+    """A pose that contradicts the photo's matches, as an early guess of the focal length may leave behind."""
+    stages = json.loads((done.out / "sfm" / "stages.json").read_text())["stages"]
+    models = done.out / "sfm" / "models" / "1"
+    chosen = done.out / "sfm" / stages["mapping"]["facts"]["folder"]
+    script = f"""
+import sys
+from pathlib import Path
+
+sys.path.insert(0, {str(Path(gsplat_edu.sfm.engine.__file__).parent)!r})
+import engine
+import pycolmap
+
+database, photos = {str(models / "database.db")!r}, {str(done.out / "sfm" / "photos")!r}
+model = pycolmap.Reconstruction({str(chosen)!r})
+image = model.image(5)
+truth = image.projection_center()
+print(engine._contradictory(model, database))
+moved = pycolmap.Rigid3d(pycolmap.Rotation3d([0.1, 0.0, 0.0]), [1.0, 0.0, 0.0])
+model.frame(image.frame_id).set_cam_from_world(image.camera_id, moved * image.cam_from_world())
+print(engine._contradictory(model, database))
+mended = engine._mended(model, database, photos, Path({str(tmp_path)!r}), engine._Options(False, -1, 0))
+print(engine._contradictory(mended, database))
+print(mended.num_reg_images(), abs(mended.image(5).projection_center() - truth).max())
+"""
+    ran = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    before, broken, after, last = ran.stdout.splitlines()
+    assert (before, broken, after) == ("[]", "[5]", "[]")
+    count, off = last.split()
+    assert count == "14" and float(off) < 0.2, "a fifth of what it was moved by"
+
+
+def test_a_job_that_fails_names_its_log(tmp_path):
+    with pytest.raises(
+        DatasetError, match=r"failed with code 1: the last lines of .*log\.txt say why"
+    ) as failure:
+        call(
+            "finish",
+            tmp_path / "log.txt",
+            model=str(tmp_path),
+            out="",
+            rotation=[],
+            move=[],
+            scale=1,
+            photos={},
+        )
+    assert "\n" not in str(failure.value)
+    assert "Traceback" in (tmp_path / "log.txt").read_text()
+
+
+def test_a_damaged_list_of_stages_is_one_line(done, tmp_path):
+    (tmp_path / "sfm").mkdir()
+    (tmp_path / "sfm" / "stages.json").write_text(json.dumps({"stages": {"photos": 3}}))
+    with pytest.raises(DatasetError, match="is damaged; remove .*sfm"):
+        reconstruct(replace(done.options, out=tmp_path))
+
+
+def test_who_needs_poses(done, phone, tmp_path):
+    assert needs_poses(phone.folder)
+    assert not needs_poses(done.out)
+    assert needs_poses("walk.MP4") is False, "it is not there"
+    (tmp_path / "walk.MP4").write_bytes(b"")
+    assert needs_poses(tmp_path / "walk.MP4")
+    assert not needs_poses(tmp_path), "a folder without photos"
+    assert not needs_poses(tmp_path / "gone")
