@@ -1,7 +1,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +9,12 @@ import pytest
 from PIL import Image
 
 import gsplat_edu.sfm.engine
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.colmap import read_cameras
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.colmap import call
+from gsplat_edu.sfm.mapping import attempts
 from gsplat_edu.sfm.reconstruct import SfmOptions, needs_poses, reconstruct
 from sfm.textured_box import TURNED, aligned_errors, cameras_of, check, orbit, photograph
 
@@ -223,3 +226,50 @@ def test_who_needs_poses(done, phone, tmp_path):
     assert needs_poses(tmp_path / "walk.MP4")
     assert not needs_poses(tmp_path), "a folder without photos"
     assert not needs_poses(tmp_path / "gone")
+
+
+def test_two_cameras_with_their_focal_lengths_in_exif(tmp_path):
+    """One of them zooms twice as far; sizes differ too."""
+    folder, truth = tmp_path / "photos", {}
+    folder.mkdir()
+    for i, near in enumerate(orbit(12, turn=3.5)):
+        camera = near
+        if i % 2:
+            camera = Camera(near.R, near.eye, 600.0, 600.0, 199.5, 149.5, 300, 400)
+        name = f"{'zoom' if i % 2 else 'wide'}_{i:02d}.jpg"
+        exif = Image.Exif()
+        exif[0x0110] = "Phone"
+        # the diagonal of the film is 43.27 mm, those of the photos 400 and 500 px; EXIF has whole numbers
+        exif.get_ifd(0x8769)[0xA405] = round(43.27 * camera.fx / np.hypot(camera.W, camera.H))
+        truth[name] = camera
+        Image.fromarray(photograph(camera)).save(folder / name, quality=95, exif=exif)
+    said = []
+    reconstruct(SfmOptions(folder, tmp_path / "out"), said.append)
+    assert "12 by 2 kinds of camera or zoom; 12 say their focal length" in said[0]
+    found = cameras_of(tmp_path / "out")
+    assert set(found) == set(truth)
+    check(found, truth)
+    for name, camera in found.items():
+        assert abs(camera.fx / truth[name].fx - 1) < 0.03
+        assert (camera.W, camera.H) == (truth[name].W, truth[name].H)
+
+
+def test_a_camera_per_photo_and_lower_thresholds(done, tmp_path):
+    """The last way that is tried."""
+    way = attempts("auto", "auto", 14, 1, one_lens=False)[-1]
+    work, told = done.out / "sfm", []
+    models = call(
+        "mapping",
+        tmp_path / "log.txt",
+        told.append,
+        database=str(work / "database.db"),
+        photos=str(work / "photos"),
+        out=str(tmp_path),
+        attempt=asdict(way),
+        threads=1,
+        seed=0,
+    )["models"]
+    best = max(models, key=lambda model: len(model["names"]))
+    assert len(best["names"]) >= 12 and max(told) >= 12
+    lenses = read_cameras(tmp_path / best["folder"] / "cameras.bin")
+    assert len({lens.fx for lens in lenses.values()}) >= 12

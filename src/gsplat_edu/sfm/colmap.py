@@ -66,8 +66,8 @@ def call(
     listener = threading.Thread(target=_listen, args=(process, answers), daemon=True)
     count = COUNTS.get(job)
     result: dict[str, Any] | None = None
+    assert process.stdin is not None and process.stdout is not None
     try:
-        assert process.stdin is not None
         with suppress(BrokenPipeError), process.stdin as stdin:  # broken: it failed at once
             stdin.write(json.dumps({"job": job, **arguments}).encode())
         listener.start()
@@ -93,8 +93,7 @@ def call(
             process.wait()
         if listener.ident is not None:
             listener.join()
-        if process.stdout is not None:
-            process.stdout.close()
+        process.stdout.close()
     if result is None:
         how = f"was ended by signal {-code}" if code < 0 else f"failed with code {code}"
         raise DatasetError(

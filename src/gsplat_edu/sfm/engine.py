@@ -211,11 +211,7 @@ def finish(
         key = (new["W"], new["H"], new["fx"], new["fy"], new["cx"], new["cy"])
         if key not in cameras:
             cameras[key] = len(cameras) + 1
-            after.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    model="PINHOLE", width=key[0], height=key[1], params=list(key[2:]), camera_id=cameras[key]
-                )
-            )
+            after.add_camera_with_trivial_rig(_pinhole(key, cameras[key]))
         turn = np.linalg.matrix_power(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), new["turns"] % 4)
         seen = [p for p in old.points2D if p.has_point3D()]
         where = before.camera(old.camera_id).cam_from_img(np.array([p.xy for p in seen]).reshape(-1, 2))
@@ -234,6 +230,11 @@ def finish(
     Path(out).mkdir(parents=True, exist_ok=True)
     after.write_binary(out)
     return {"points": after.num_points3D(), "error": float(after.compute_mean_reprojection_error())}
+
+
+def _pinhole(key: tuple[float, ...], number: int) -> pycolmap.Camera:
+    W, H, *intrinsics = key
+    return pycolmap.Camera(model="PINHOLE", width=W, height=H, params=intrinsics, camera_id=number)
 
 
 class _Options(NamedTuple):
