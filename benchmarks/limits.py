@@ -23,9 +23,9 @@ from typing import Any
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
 FILLING = (
-    "--iterations 600 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20 --densify-stop 500"
+    "--iterations 300 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20 --densify-stop 250"
 )
-FILLING += " --reset-every 0 --grad-threshold 2e-6 --eval-every 300 --save-every 200"
+FILLING += " --reset-every 0 --grad-threshold 2e-6 --eval-every 200 --save-every 100"
 """Options that grow a scene to its cap in a few hundred iterations. What comes out is of no use otherwise."""
 
 UNITS = {"h": 3600.0, "min": 60.0, "s": 1.0}

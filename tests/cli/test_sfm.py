@@ -92,6 +92,10 @@ def _unreadable(folder):
         (_noise, "of 6 pairs, none match: the photos show too little in common; walk around the subject"),
         (_blank, "the photos show too little in common"),
         (lambda folder: folder.write_text("hello"), "photos: is neither a folder nor a video"),
+        (
+            lambda file: Image.fromarray(photograph(camera_at(0.0))).save(file, format="PNG"),
+            "photos: is one photo; name a folder",
+        ),
     ],
 )
 @pytest.mark.usefixtures("colmap", "as_shipped")

@@ -25,7 +25,7 @@ COUNTS = {
 }
 """What tells how far the jobs are that say nothing themselves."""
 
-SEED = 0
+COLMAP_SEED = 0
 """Seed of every random draw of COLMAP and of this package while poses are found."""
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from gsplat_edu.data.colmap import read_cameras, read_images
 from gsplat_edu.data.lens import straightened
 from gsplat_edu.errors import DatasetError
-from gsplat_edu.sfm.colmap import SEED, call
+from gsplat_edu.sfm.colmap import COLMAP_SEED, call
 
 MAPPERS = ("auto", "incremental", "global")
 
@@ -128,7 +128,7 @@ def map_photos(
             out=str(out),
             attempt=asdict(way),
             threads=threads,
-            seed=SEED,
+            seed=COLMAP_SEED,
         )["models"]
         usable = [_usable(out, model) for model in found]
         largest: dict[str, Any] = max(

@@ -98,8 +98,21 @@ def photo_files(source: Path, besides: Path | None = None) -> list[Path]:
             for name in folders
             if name[0] not in "._" and name not in PASSED_OVER and (here / name).resolve() != besides
         ]
-        found += [here / name for name in files if name[0] != "." and _is_photo(here / name)]
+        found += [here / name for name in files if name[0] != "." and is_photo(here / name)]
     return sorted(found)
+
+
+def is_photo(path: Path) -> bool:
+    """Say whether a file is named like a photo, or is one."""
+    if path.suffix.lower() in (*PHOTO_ENDINGS, ".heif"):
+        return True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as file:
+                return file.format in FORMATS
+    except (*_UNREADABLE, Image.DecompressionBombError):
+        return False
 
 
 def fingerprint(files: Sequence[Path], source: Path) -> str:
@@ -169,18 +182,6 @@ def copy_photos(
     finally:
         pool.shutdown(cancel_futures=True)
     return facts, unreadable
-
-
-def _is_photo(path: Path) -> bool:
-    if path.suffix.lower() in (*PHOTO_ENDINGS, ".heif"):
-        return True
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path) as file:
-                return file.format in FORMATS
-    except (*_UNREADABLE, Image.DecompressionBombError):
-        return False
 
 
 def _facts(path: Path, name: str, copy: str) -> PhotoFacts:

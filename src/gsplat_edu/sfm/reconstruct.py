@@ -16,9 +16,9 @@ from gsplat_edu.data.colmap import find_model
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.sfm import pairs
-from gsplat_edu.sfm.colmap import SEED, call, require_colmap
+from gsplat_edu.sfm.colmap import COLMAP_SEED, call, require_colmap
 from gsplat_edu.sfm.mapping import CAMERA_MODELS, MAPPERS, attempts, map_photos, no_overlap
-from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, photo_files
+from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, is_photo, photo_files
 from gsplat_edu.sfm.result import build_capture, publish
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
@@ -273,7 +273,7 @@ class _Run:
         chosen = pairs.sequential_pairs(count, overlap)
         if kind == "sequential":
             return chosen
-        looks = pairs.looks(self.folder / "database.db", [photo.copy for photo in self.photos], SEED)
+        looks = pairs.looks(self.folder / "database.db", [photo.copy for photo in self.photos], COLMAP_SEED)
         chosen |= pairs.nearest_pairs(looks, farther * ALIKE[origin], overlap + 1)
         places = [photo.place for photo in self.photos if photo.place is not None]
         if len(places) == count:
@@ -315,7 +315,7 @@ class _Run:
             progress,
             database=database,
             threads=self.threads,
-            seed=SEED,
+            seed=COLMAP_SEED,
             **arguments,
         )
 
@@ -335,7 +335,7 @@ def _check(options: SfmOptions) -> list[Path]:
         raise ArgumentError(f"OUT: {out} holds photos or poses already; name another folder")
     if is_file(source):
         if not is_video(source):
-            kind = "one photo" if photo_files(source.parent).count(source) else "neither a folder nor a video"
+            kind = "one photo" if is_photo(source) else "neither a folder nor a video"
             raise DatasetError(f"{source}: is {kind}; name a folder of photos, or a video")
         return []
     if not is_folder(source):
