@@ -67,9 +67,8 @@ class Pace:
     def over(self) -> bool:
         """Say whether training has to end now."""
         late = self._clock() + self._reserve >= self._limit
-        if (
-            late and self._planned is not None
-        ):  # what was planned is done: the run is complete where it stands
+        if late and self._planned is not None:
+            # What was planned is done: the run is complete where it stands.
             self._settle(self._run.trainer.iteration)
         return late
 
