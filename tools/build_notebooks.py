@@ -3,8 +3,8 @@
     python tools/build_notebooks.py                      every chapter, on the full budget
     python tools/build_notebooks.py 09 --out DIR         those whose names start so, into another folder
 
-GSPLAT_EDU_BUDGET=reduced in the environment trains for less. A cell that raises stops the build with exit
-code 1, and the notebook that stood there stays.
+GSPLAT_EDU_BUDGET=reduced in the environment trains for less. A cell that raises, or a figure without titles and labels
+(tools/chapter_figures.py), stops the build with exit code 1, and the notebook that stood there stays.
 """
 
 from __future__ import annotations
@@ -21,6 +21,10 @@ from nbclient.exceptions import CellExecutionError
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ROOT / "notebooks" / "source"
+TOOLS = str(ROOT / "tools")
+STRICT_FIGURES = f"import sys; sys.path.append({TOOLS!r}); import chapter_figures; chapter_figures.install()"
+"""What the kernel executes before the first cell."""
+
 CELL_TIMEOUT = 3600  # seconds; the full training of chapter 09 takes minutes on two cores
 
 
@@ -42,7 +46,10 @@ def build(source: Path, out: Path) -> None:
         notebook,
         timeout=CELL_TIMEOUT,
         record_timing=False,
-        extra_arguments=["--IPKernelApp.log_level=40"],  # errors; it warns of its own local port otherwise
+        extra_arguments=[
+            "--IPKernelApp.log_level=40",  # errors; it warns of its own local port otherwise
+            f"--IPKernelApp.exec_lines={STRICT_FIGURES}",
+        ],
         resources={"metadata": {"path": str(ROOT)}},
     ).execute()
     out.mkdir(parents=True, exist_ok=True)

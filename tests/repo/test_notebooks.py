@@ -1,16 +1,23 @@
 """The chapters: nothing the package has is defined again, and what ships was executed from its source."""
 
 import ast
+import importlib.util
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import jupytext
+import matplotlib.pyplot as plt
 import nbformat
+import numpy as np
 import pytest
+from nbclient.exceptions import CellExecutionError
 
 ROOT = Path(__file__).parents[2]
+LONGEST = 400  # lines of a chapter's source
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 SOURCES = sorted((ROOT / "notebooks" / "source").glob("*.py"))
 CHAPTERS = pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
 
@@ -76,11 +83,176 @@ def test_a_redefinition_would_be_found(text):
     assert redefinitions(text)
 
 
+def violations(text: str) -> list[str]:
+    """Say what a chapter's source lacks, or has and should not."""
+    nodes = list(ast.walk(ast.parse(text)))
+    names = [node.attr for node in nodes if isinstance(node, ast.Attribute)]
+    made = sum(name in ("subplots", "figure", "subplot_mosaic") for name in names)
+    found = {
+        "it asserts nothing": not any(isinstance(node, ast.Assert) for node in nodes),
+        f"it is longer than {LONGEST} lines": text.count("\n") > LONGEST,
+        "it has no figure": not made,
+        "a figure is not shown by plt.show()": names.count("show") < made,
+        "it swallows errors": any(isinstance(node, ast.Try) for node in nodes)
+        or any(
+            isinstance(node, ast.Name | ast.Attribute) and "suppress" in ast.unparse(node) for node in nodes
+        ),
+        "it silences warnings": "simplefilter" in names or "filterwarnings" in names,
+        "it does not end by naming the next failure": "\n# ## The next failure\n" not in text,
+        "it links no module": "](../src/gsplat_edu/" not in text,
+    }
+    return [what for what, holds in found.items() if holds]
+
+
+GOOD = """# %% [markdown]
+# [a module](../src/gsplat_edu/camera.py)
+# %%
+import matplotlib.pyplot as plt
+fig, ax = plt.subplots()
+plt.show()
+assert 1 + 1 == 2
+# %% [markdown]
+# ## The next failure
+"""
+
+
 @CHAPTERS
-def test_chapters_assert_and_stay_short(source):
-    tree = ast.parse(source.read_text())
-    assert any(isinstance(node, ast.Assert) for node in ast.walk(tree))
-    assert source.read_text().count("\n") <= 400
+def test_chapters_keep_the_rules(source):
+    assert violations(source.read_text()) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ("assert 1 + 1 == 2", "1 + 1", "it asserts nothing"),
+        ("# %%\n", "# %%\n" + "#\n" * LONGEST, f"it is longer than {LONGEST} lines"),
+        ("plt.show()", "", "a figure is not shown by plt.show()"),
+        ("assert", "try:\n    pass\nexcept ValueError:\n    pass\nassert", "it swallows errors"),
+        ("assert", "with contextlib.suppress(OSError):\n    pass\nassert", "it swallows errors"),
+        ("assert", "warnings.simplefilter('ignore')\nassert", "it silences warnings"),
+        ("# ## The next failure", "# ## Summary", "it does not end by naming the next failure"),
+        ("../src/gsplat_edu/camera.py", "https://example.org", "it links no module"),
+    ],
+)
+def test_a_chapter_that_breaks_a_rule_is_rejected(old, new, what):
+    assert violations(GOOD) == []
+    assert violations(GOOD.replace(old, new, 1)) == [what]
+
+
+def tool(name):
+    """Import a script of tools/."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def figure(**settings):
+    """Draw a line with a title and labels, or with those that are given."""
+    made, axes = plt.subplots()
+    axes.plot([0, 1])
+    axes.set(**({"title": "a line", "xlabel": "x, px", "ylabel": "y, px"} | settings))
+    return made
+
+
+@pytest.fixture
+def faults():
+    yield tool("chapter_figures").faults
+    plt.close("all")
+
+
+@pytest.mark.parametrize("lacking", ["title", "xlabel", "ylabel"])
+def test_a_figure_without_title_or_labels_is_rejected(faults, lacking):
+    assert faults(figure()) == []
+    assert len(faults(figure(**{lacking: ""}))) == 1
+
+
+def test_images_need_titles_colour_bars_labels_and_inner_axes_nothing(faults):
+    assert faults(figure(xlabel="", ylabel="", xticks=[], yticks=[])) == []
+    made, axes = plt.subplots(1, 2, sharey=True)
+    for ax in axes:
+        ax.plot([0, 1])
+        ax.set(title="one of two", xlabel="x")
+    axes[0].set_ylabel("y")
+    assert faults(made) == []
+    bar = made.colorbar(axes[0].imshow(np.eye(2)), ax=axes[0])
+    assert len(faults(made)) == 1
+    bar.set_label("transmittance")
+    assert faults(made) == []
+    assert faults(plt.figure()) == ["the figure has no axes"]
+
+
+@pytest.mark.slow
+def test_a_chapter_whose_figure_lacks_labels_is_not_built(tmp_path):
+    source = tmp_path / "00_bad.py"
+    header = (ROOT / "notebooks" / "source" / "09_train_in_3d.py").read_text().split("# %%")[0]
+    source.write_text(header + GOOD)
+    with pytest.raises(CellExecutionError, match="no title"):
+        tool("build_notebooks").build(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@CHAPTERS
+def test_links_of_chapters_lead_somewhere_and_modules_link_back(source):
+    prose = "\n".join(c.source for c in jupytext.read(source).cells if c.cell_type == "markdown")
+    for link in LINK.findall(prose):
+        if link.startswith("https://"):
+            continue
+        target = (ROOT / "notebooks" / link.partition("#")[0]).resolve()
+        assert target.is_file(), f"{source.name}: {link} leads nowhere"
+        if target.is_relative_to(ROOT / "src"):
+            documented = ast.get_docstring(ast.parse(target.read_text())) or ""
+            said = re.search(r"^Chapters?: (.*)$", documented, flags=re.MULTILINE)
+            assert said and source.stem in said[1].rstrip(".").split(", "), (
+                f"{link} does not name {source.stem}"
+            )
+
+
+def test_chapters_that_modules_name_link_them():
+    for module in sorted((ROOT / "src" / "gsplat_edu").rglob("*.py")):
+        documented = ast.get_docstring(ast.parse(module.read_text())) or ""
+        for named in re.findall(r"^Chapters?: (.*)$", documented, flags=re.MULTILINE):
+            for chapter in named.rstrip(".").split(", "):
+                text = (ROOT / "notebooks" / "source" / f"{chapter}.py").read_text()
+                assert f"(../{module.relative_to(ROOT)})" in text, f"{chapter} does not link {module}"
+
+
+def prose_numbers(markdown: str) -> set[str]:
+    """Find numbers in prose that a reader would want to see measured: those with a point, a % or three digits."""
+    for apart in (
+        r"\$\$.*?\$\$",
+        r"\$.*?\$",
+        r"`[^`]*`",
+        r"\]\([^)]*\)",
+        r"^#+ .*$",
+        r"\bet al\. \d{4}|\b(19|20)\d\d\b",
+    ):
+        markdown = re.sub(apart, " ", markdown, flags=re.DOTALL | re.MULTILINE)
+    found = re.findall(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?:e-?\d+)?(?: ?%)?(?!\w)", markdown)
+    return {n.rstrip(",") for n in found if "." in n or "%" in n or sum(c.isdigit() for c in n) > 2}
+
+
+@CHAPTERS
+def test_numbers_in_the_prose_are_printed_on_the_page(source):
+    shipped = nbformat.read(ROOT / "notebooks" / f"{source.stem}.ipynb", as_version=4)
+    page = "".join(
+        cell.source + "".join(str(output.get("text", "")) for output in cell.outputs)
+        for cell in shipped.cells
+        if cell.cell_type == "code"
+    )
+    page = page.replace(",", "").replace("_", "")
+    equations = "".join(re.findall(r"\$.*?\$", "".join(c.source for c in shipped.cells), flags=re.DOTALL))
+    for cell in shipped.cells:
+        if cell.cell_type == "markdown":
+            for number in prose_numbers(cell.source):
+                bare = number.replace(",", "").rstrip("% ")
+                assert re.search(rf"(?<![\d.]){re.escape(bare)}(?!\d)", page + equations), (
+                    f"{number} is not printed"
+                )
+
+
+def test_thirteen_chapters():
+    assert [path.stem[:2] for path in SOURCES] == [f"{n:02d}" for n in range(1, 14)]
 
 
 @CHAPTERS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import statistics
 import time
 from collections import deque
 from collections.abc import Callable
@@ -17,8 +18,8 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
 LOOKS = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Parts of the limit at which it is measured again what judging takes: a view is scored and thrown away. The slowest of
-the last three counts."""
+"""Parts of the limit at which it is measured again what judging takes: a view is scored and thrown away. The median of
+the last three counts, so that one moment in which another program was busy does not."""
 
 WINDOW = 200
 """Iterations over which the present speed is taken."""
@@ -100,12 +101,13 @@ class Pace:
         dataset, options = self._run.dataset, self._run.options
         view = (dataset.test or dataset.train)[0]
         self._costs.append(judging_seconds(trainer.gaussians, [view], options.config, options.backend))
-        score, picture = (max(parts) for parts in zip(*self._costs, strict=True))
+        score, picture = (statistics.median(parts) for parts in zip(*self._costs, strict=True))
         count, degree = len(trainer.gaussians), options.config.sh_degree
         self._reserve = ending_seconds(self._facts, score, picture) + 2 * saving_seconds(count, degree)
 
     def _lengthen(self, trainer: Trainer) -> None:
         (first, then), (done, now) = self._marks[0], self._marks[-1]
+        self._look(trainer)
         left = self._limit - self._reserve - self._clock()
         if done == first or left < LEFT_OVER * self._limit:
             return
