@@ -55,7 +55,7 @@ def _add_budget(group: argparse._ArgumentGroup) -> None:
     def number(flag: str, text: str, default: int | None = None) -> None:
         group.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
 
-    number("--iterations", f"steps of training (default: {RECIPE_ITERATIONS}, or as many as --time-limit allows)")
+    number("--iterations", f"steps of training (default: {RECIPE_ITERATIONS}, or what fits --time-limit)")
     group.add_argument(
         "--no-rescale",
         action="store_true",
