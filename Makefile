@@ -5,7 +5,7 @@ OUT ?= out/sphere.png
 DATA := $(or $(GSPLAT_EDU_DATA),../shared/data)
 export PYTHON
 
-.PHONY: help demo test check sanitize bench notebooks clean
+.PHONY: help demo test check sanitize bench notebooks site clean
 
 help:
 	@echo "make demo        train the sphere on the embedded scene; writes $(OUT), curves and scene"
@@ -14,6 +14,7 @@ help:
 	@echo "make sanitize    native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
 	@echo "make bench       measure; prints tables and writes out/bench/*.json"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
+	@echo "make site        chapters, documents and reference as pages, out/site/index.html"
 	@echo "make clean       remove .venv, out and caches"
 
 demo:
@@ -49,6 +50,7 @@ bench:
 	@$(BIN)/python benchmarks/raster.py --out out/bench/raster.json
 	@$(BIN)/python benchmarks/sphere.py --out out/bench/sphere.json
 	@$(BIN)/python benchmarks/dense.py --out out/bench/dense.json
+	@$(BIN)/python benchmarks/ladder --out out/bench/ladder.json
 	@if test -d "$(DATA)/snowmiku97"; then $(BIN)/python benchmarks/train_step.py --out out/bench/train_step.json; \
 	    else echo "benchmarks/train_step.py: no snowmiku97 in $(DATA), skipped; set GSPLAT_EDU_DATA"; fi
 
@@ -56,6 +58,11 @@ notebooks:
 	@tools/set_up.sh dev
 	@echo "== notebooks: executing notebooks/source"
 	@$(BIN)/python tools/build_notebooks.py
+
+site:
+	@tools/set_up.sh dev
+	@echo "== site: chapters, documents and reference"
+	@$(BIN)/python tools/build_site.py
 
 clean:
 	rm -rf .venv out build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,9 @@ if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: to
     spec.loader.exec_module(sys.modules["gsplat_edu._native"])
 
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
+
+# Whatever was started in the background of a shell ignores Ctrl-C, and so would every program that is tested.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples in every run: a failure seen once is seen again.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=200)

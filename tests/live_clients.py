@@ -18,7 +18,7 @@ from gsplat_edu.cli.train_options import options_from
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.viewer.live import LiveView
 
-PATIENCE = 60.0
+PATIENCE = 180.0
 """Seconds after which whatever is waited for counts as hanging."""
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)

@@ -12,8 +12,8 @@ from rich.console import Console
 from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.sfm import options_from, stage_bars
 from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.data.textured_box import box_camera, box_orbit, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions
-from sfm.textured_box import camera_at, orbit, photograph
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def colmap():
 def save(folder, cameras):
     folder.mkdir(parents=True, exist_ok=True)
     for i, camera in enumerate(cameras):
-        Image.fromarray(photograph(camera)).save(folder / f"{i}.jpg")
+        Image.fromarray(photograph_box(camera)).save(folder / f"{i}.jpg")
 
 
 def test_options(tmp_path):
@@ -42,7 +42,7 @@ def test_options(tmp_path):
 
 @pytest.mark.usefixtures("colmap")
 def test_photos_become_a_capture(tmp_path, capsys):
-    save(tmp_path / "photos", orbit(6, turn=1.8))
+    save(tmp_path / "photos", box_orbit(6, turn=1.8))
     assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert "6 of 6 photos have a pose" in said and "mean reprojection error 0." in said
@@ -87,13 +87,13 @@ def _unreadable(folder):
         (lambda folder: folder.mkdir(), "photos: holds no photo; name a folder of photos, or a video"),
         (_texts, "photos: holds no photo; name a folder"),
         (_video_inside, "photos: holds no photo; it holds a video, name that: "),
-        (lambda folder: save(folder, orbit(1)), "photos: holds one photo; poses need several"),
+        (lambda folder: save(folder, box_orbit(1)), "photos: holds one photo; poses need several"),
         (_unreadable, "holds no photo that can be decoded: 0.jpg (no image that Pillow knows), 1.jpg"),
         (_noise, "of 6 pairs, none match: the photos show too little in common; walk around the subject"),
         (_blank, "the photos show too little in common"),
         (lambda folder: folder.write_text("hello"), "photos: is neither a folder nor a video"),
         (
-            lambda file: Image.fromarray(photograph(camera_at(0.0))).save(file, format="PNG"),
+            lambda file: Image.fromarray(photograph_box(box_camera(0.0))).save(file, format="PNG"),
             "photos: is one photo; name a folder",
         ),
     ],
@@ -127,7 +127,7 @@ def test_an_empty_video_is_one_line(tmp_path, capsys):
 @pytest.mark.usefixtures("colmap", "as_shipped")
 def test_the_users_photos_are_not_written_over(tmp_path, capsys, out, says):
     source = tmp_path / ("images" if out == "." else "photos")
-    save(source, orbit(3))
+    save(source, box_orbit(3))
     (tmp_path / "posed" / "images").mkdir(parents=True)
     before = sorted(tmp_path.rglob("*"))
     assert main(["sfm", str(source), str(tmp_path / out)]) == 2
@@ -169,7 +169,7 @@ def test_without_pycolmap_one_line_says_how_to_install_it(tmp_path, capsys, monk
 
 @pytest.mark.usefixtures("colmap")
 def test_ctrl_c_says_that_it_goes_on(tmp_path, capsys, monkeypatch):
-    save(tmp_path / "photos", [camera_at(0.2 * i) for i in range(4)])
+    save(tmp_path / "photos", [box_camera(0.2 * i) for i in range(4)])
 
     def press(*arguments):
         signal.raise_signal(signal.SIGTERM)  # what a batch system sends

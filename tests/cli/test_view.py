@@ -28,7 +28,7 @@ from gsplat_edu.viewer import page
 from splats import splats_on
 
 COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
-PATIENCE = 60.0
+PATIENCE = 180.0
 ORIGIN = (512.0, -64.0, 8.0)
 ORANGE = (1.0, 0.5, 0.0)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
-from sfm.textured_box import orbit, photograph
 
 
 @pytest.fixture(scope="session")
@@ -23,12 +23,12 @@ def phone(tmp_path_factory):
     """14 photos as a phone writes them: the sensor's pixels, and how it was held in EXIF; half of them upright."""
     folder = tmp_path_factory.mktemp("phone") / "photos"
     truth = {}
-    landscape, portrait = orbit(14), orbit(14, size=(240, 320))
+    landscape, portrait = box_orbit(14), box_orbit(14, size=(240, 320))
     for i in range(14):
         # a name with a space, in a folder, and an ending in capitals
         name = f"walk {i % 3}/IMG_{i:02d}.{'JPG' if i % 5 else 'png'}"
         truth[name] = portrait[i] if i % 2 else landscape[i]
-        pixels = photograph(truth[name])
+        pixels = photograph_box(truth[name])
         exif = Image.Exif()
         if i % 2:
             pixels = np.ascontiguousarray(np.rot90(pixels))  # the sensor lies on its side

@@ -12,11 +12,12 @@ import gsplat_edu.sfm.engine
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.colmap import read_cameras
 from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.textured_box import align_cameras, box_orbit, photograph_box
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.mapping import attempts
 from gsplat_edu.sfm.reconstruct import SfmOptions, needs_poses, reconstruct
-from sfm.textured_box import TURNED, aligned_errors, cameras_of, check, orbit, photograph
+from sfm.textured_box import TURNED, cameras_of, check
 
 pytestmark = pytest.mark.usefixtures("colmap")
 
@@ -41,7 +42,7 @@ def test_every_photo_gets_its_pose(done):
 
 def test_photos_are_upright_and_undistorted(done):
     for view in load_dataset(done.out, DataSettings(test_every=0)).train:
-        taken = photograph(done.truth[view.name]).astype(float)
+        taken = photograph_box(done.truth[view.name]).astype(float)
         written = view.read().image.astype(float)
         assert written.shape == taken.shape
         # The lens that was found bends the photo by less than two pixels: apart from that it is the one taken.
@@ -55,7 +56,7 @@ def test_points_lie_on_the_box_and_the_floor(done):
     found = {view.name: view.camera for view in dataset.train}
     names = sorted(found)
     a, b = (np.stack([cameras[name].eye for name in names]) for cameras in (found, done.truth))
-    _, _, R = aligned_errors(found, done.truth)
+    R = align_cameras(found, done.truth).R
     s = np.linalg.norm(b - b.mean(axis=0)) / np.linalg.norm(a - a.mean(axis=0))
     points = s * (dataset.points - a.mean(axis=0)) @ R.T + b.mean(axis=0)
     floor = np.abs(points[:, 1])
@@ -141,8 +142,8 @@ def test_the_global_mapper_and_the_chosen_pairs_do_as_well(done, tmp_path):
 def test_what_cannot_be_used_is_named_and_left_out(phone, tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
-    for i, camera in enumerate(orbit(8, turn=2.5)):
-        Image.fromarray(photograph(camera)).save(folder / f"good_{i}.jpg", quality=95)
+    for i, camera in enumerate(box_orbit(8, turn=2.5)):
+        Image.fromarray(photograph_box(camera)).save(folder / f"good_{i}.jpg", quality=95)
     noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
     Image.fromarray(noise).save(folder / "noise.png")
     (folder / "broken.jpg").write_bytes((folder / "good_0.jpg").read_bytes()[:3000])
@@ -232,7 +233,7 @@ def test_two_cameras_with_their_focal_lengths_in_exif(tmp_path):
     """One of them zooms twice as far; sizes differ too."""
     folder, truth = tmp_path / "photos", {}
     folder.mkdir()
-    for i, near in enumerate(orbit(12, turn=3.5)):
+    for i, near in enumerate(box_orbit(12, turn=3.5)):
         camera = near
         if i % 2:
             camera = Camera(near.R, near.eye, 600.0, 600.0, 199.5, 149.5, 300, 400)
@@ -242,7 +243,7 @@ def test_two_cameras_with_their_focal_lengths_in_exif(tmp_path):
         # the diagonal of the film is 43.27 mm, those of the photos 400 and 500 px; EXIF has whole numbers
         exif.get_ifd(0x8769)[0xA405] = round(43.27 * camera.fx / np.hypot(camera.W, camera.H))
         truth[name] = camera
-        Image.fromarray(photograph(camera)).save(folder / name, quality=95, exif=exif)
+        Image.fromarray(photograph_box(camera)).save(folder / name, quality=95, exif=exif)
     said = []
     reconstruct(SfmOptions(folder, tmp_path / "out"), said.append)
     assert "12 by 2 kinds of camera or zoom; 12 say their focal length" in said[0]

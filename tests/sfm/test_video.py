@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import gsplat_edu
+from gsplat_edu.data.textured_box import box_camera, photograph_box
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
-from sfm.textured_box import camera_at, cameras_of, check, photograph
+from sfm.textured_box import cameras_of, check
 
 BLURRED = range(7, 90, 9)
 """Frames that are planted: as sharp as a shaken camera's."""
@@ -46,8 +47,8 @@ def walk(tmp_path_factory):
     """A walk around the box: 20 frames standing still, then 100 that move, slower in the second half."""
     path = tmp_path_factory.mktemp("walk") / "walk.mp4"
     angles = np.concatenate([np.zeros(20), np.linspace(0, 2.6, 50), np.linspace(2.6, 3.9, 50)])
-    cameras = [camera_at(angle, 0.45 + 0.15 * np.sin(3 * angle)) for angle in angles]
-    frames = [photograph(camera) for camera in cameras]
+    cameras = [box_camera(angle, 0.45 + 0.15 * np.sin(3 * angle)) for angle in angles]
+    frames = [photograph_box(camera) for camera in cameras]
     for i in BLURRED:
         frames[i] = cv2.blur(frames[i], (9, 1))
     write_video(path, frames)
@@ -87,7 +88,7 @@ def test_frames_become_a_capture(walk, colmap, tmp_path):
 def test_frames_that_show_the_same_are_left_out(tmp_path):
     """Noise moves, too: a camera on a table gives one photo, not one of each interval."""
     rng = np.random.default_rng(0)
-    still = photograph(camera_at(0.3)).astype(int)
+    still = photograph_box(box_camera(0.3)).astype(int)
     frames = [np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8) for _ in range(40)]
     write_video(tmp_path / "table.mp4", frames)
     chosen = choose_frames(tmp_path / "table.mp4", 10, silent)
@@ -98,7 +99,7 @@ def test_frames_that_show_the_same_are_left_out(tmp_path):
 
 
 def test_a_short_video_gives_what_it_has(tmp_path):
-    write_video(tmp_path / "short.mp4", [photograph(camera_at(0.2 * i)) for i in range(5)])
+    write_video(tmp_path / "short.mp4", [photograph_box(box_camera(0.2 * i)) for i in range(5)])
     assert choose_frames(tmp_path / "short.mp4", 150, silent) == [0, 1, 2, 3, 4]
 
 
@@ -131,7 +132,9 @@ def test_frames_are_upright(tmp_path, matrix, corner):
 
 def test_a_long_video_is_looked_at_in_steps(tmp_path, monkeypatch):
     monkeypatch.setattr("gsplat_edu.sfm.video.CANDIDATES", 2)
-    write_video(tmp_path / "long.mp4", [photograph(camera_at(0.03 * i, size=(96, 64))) for i in range(64)])
+    write_video(
+        tmp_path / "long.mp4", [photograph_box(box_camera(0.03 * i, size=(96, 64))) for i in range(64)]
+    )
     chosen = choose_frames(tmp_path / "long.mp4", 8, silent)
     assert {number % 4 for number in chosen} == {0}, "of 64 frames, 16 for 8 intervals"
 

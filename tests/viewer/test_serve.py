@@ -19,7 +19,7 @@ from gsplat_edu.viewer.serve import PageServer, exposure, free_port, is_loopback
 PAGE = b"<!doctype html><title>page</title>" + bytes(range(256)) * 8192  # two MB: more than one write
 NAMES = ("--host", "--port")
 ORANGE = (1.0, 0.5, 0.0)
-PATIENCE = 60.0
+PATIENCE = 180.0
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
-from scipy.cluster.vq import kmeans2
+from scipy.cluster import vq
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -108,7 +108,7 @@ def looks(database: Path, names: Sequence[str], seed: int) -> Float32[np.ndarray
     learnt = np.concatenate(sample)
     if len(learnt) < WORDS:
         return np.zeros((len(names), 1), np.float32)
-    words, _ = kmeans2(learnt, WORDS, iter=10, minit="points", rng=rng)
+    words, _ = vq.kmeans2(learnt, WORDS, iter=10, minit="points", rng=rng)
     words = np.ascontiguousarray(words, dtype=np.float32)
     rows = [_vlad(descriptors, words) for descriptors in _descriptors(database, names)]
     return np.stack(rows)

@@ -1,4 +1,7 @@
-"""Photos or a video become a capture, stage by stage; an interrupted run goes on behind the last finished one."""
+"""Photos or a video become a capture, stage by stage; an interrupted run goes on behind the last finished one.
+
+Chapter: 13_photos_to_scene.
+"""
 
 from __future__ import annotations
 

@@ -1,0 +1,84 @@
+"""The site: built without a warning, opened from disk, and every link on it leads somewhere."""
+
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+class Page(HTMLParser):
+    """What a page links, what it loads, and what can be linked on it."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.links, self.loaded, self.anchors, self.tags = [], [], set(), set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        self.tags.add(tag)
+        self.anchors |= {found[name] for name in ("id", "name") if found.get(name)}
+        self.links += [found["href"]] if tag == "a" and found.get("href") else []
+        self.loaded += [found["href"]] if tag == "link" and found.get("rel") == "stylesheet" else []
+        self.loaded += [found["src"]] if tag in ("img", "script") and found.get("src") else []
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    out = tmp_path_factory.mktemp("built") / "site"
+    command = [sys.executable, str(ROOT / "tools" / "build_site.py"), "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stdout + done.stderr
+    return {path: Page(path.read_text()) for path in sorted(out.rglob("*.html"))}, out
+
+
+def broken(pages, out):
+    """Find links within the site that lead nowhere, or to a place that the page does not have."""
+    found = []
+    for path, page in pages.items():
+        for link in [*page.links, *page.loaded]:
+            url = urlsplit(link)
+            if url.scheme or url.netloc:
+                continue
+            target = (path.parent / unquote(url.path)).resolve() if url.path else path
+            lost = url.fragment and target.suffix == ".html" and url.fragment not in pages[target].anchors
+            if not target.is_file() or not target.is_relative_to(out) or lost:
+                found.append(f"{path.relative_to(out)}: {link}")
+    return found
+
+
+@pytest.mark.slow
+def test_no_link_is_broken_and_nothing_is_loaded_from_elsewhere(site):
+    pages, out = site
+    assert broken(pages, out) == []
+    assert not [
+        link for page in pages.values() for link in page.loaded if "://" in link or link.startswith("//")
+    ]
+
+
+@pytest.mark.slow
+def test_every_chapter_document_and_module_has_a_page(site):
+    pages, out = site
+    names = {str(path.relative_to(out).with_suffix("")) for path in pages}
+    assert {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")} <= names
+    assert {"README", "ARCHITECTURE", "docs/DECISIONS", "reference/gsplat_edu.camera"} <= names
+    modules = list((ROOT / "src" / "gsplat_edu").rglob("*.py"))
+    assert len([name for name in names if name.startswith("reference/")]) == len(modules)
+    course = [page for path, page in pages.items() if path.parent.name == "notebooks"]
+    assert all("img" in page.tags for page in course), "figures"
+    assert sum("math" in page.tags for page in course) > 5, "equations"
+
+
+@pytest.mark.slow
+def test_broken_links_would_be_found(site, tmp_path):
+    texts = {"a": '<a href="b.html#here">', "b": '<p id="there"><img src="c.png">'}
+    for name, text in texts.items():
+        (tmp_path / f"{name}.html").write_text(text)
+    pages = {tmp_path / f"{name}.html": Page(text) for name, text in texts.items()}
+    assert broken(pages, tmp_path) == ["a.html: b.html#here", "b.html: c.png"]

@@ -1,0 +1,76 @@
+"""One command: photos or a video without poses become a scene that is as good as with the true poses."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu.cli.main import main
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.textured_box import align_cameras, box_camera, box_orbit, photograph_box
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.views import View
+from sfm.test_video import write_video
+from sfm.textured_box import cameras_of, check
+
+TRAINING = [
+    "--iterations",
+    "300",
+    "--no-rescale",
+    "--strategy",
+    "none",
+    "--eval-every",
+    "0",
+    "--save-every",
+    "0",
+]
+
+
+def trained(source, run):
+    """Train by the command line; return the mean PSNR of the test views and of the others."""
+    assert main(["train", str(source), "--out", str(run), *TRAINING]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    return metrics["test"]["psnr"], metrics["train"]["psnr"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("colmap")
+def test_a_dozen_photos_train_as_well_as_with_their_true_poses(tmp_path, capsys):
+    photos, truth = tmp_path / "photos", {f"{i:02d}.png": camera for i, camera in enumerate(box_orbit(14))}
+    photos.mkdir()
+    for name, camera in truth.items():
+        Image.fromarray(photograph_box(camera)).save(photos / name)
+    reached, fitted = trained(photos, tmp_path / "found")
+    assert "comes without poses; finding them first" in capsys.readouterr().out
+    dataset = load_dataset(tmp_path / "found" / "capture", DataSettings(test_every=0))
+    cameras = {view.name: view.camera for view in dataset.train}
+    assert cameras.keys() == truth.keys()
+    check(cameras, truth)
+
+    # The same points in the true world: only poses and lens differ between the two trainings.
+    move = align_cameras(cameras, truth)
+    points = move.s * dataset.points @ move.R.T + move.t
+    views = [View(camera, photograph_box(camera), name=name) for name, camera in truth.items()]
+    write_colmap(tmp_path / "given", views, points, dataset.colors)
+    given, _ = trained(tmp_path / "given", tmp_path / "true")
+    # Photos 26 degrees apart show each other's views badly, with any poses; what was trained on is shown well.
+    assert fitted > 20.0
+    assert reached > given - 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("colmap")
+def test_a_video_becomes_a_scene_in_one_command(tmp_path):
+    angles = np.linspace(0.0, 3.9, 40)
+    video, run = tmp_path / "orbit.mp4", tmp_path / "run"
+    path = [box_camera(angle, 0.45 + 0.15 * np.sin(3 * angle)) for angle in angles]
+    write_video(video, [photograph_box(camera) for camera in path])
+    reached, _ = trained(video, run)
+    assert reached > 20.0
+    found = cameras_of(run / "capture")
+    numbers = {name: int(re.fullmatch(r"frame_(\d{6})\.jpg", name)[1]) for name in found}
+    assert len(found) >= 35
+    check(found, {name: path[number] for name, number in numbers.items()})
+    assert list(run.glob("point_cloud/*/point_cloud.ply"))
