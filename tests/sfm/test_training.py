@@ -15,22 +15,12 @@ from gsplat_edu.views import View
 from sfm.test_video import write_video
 from sfm.textured_box import cameras_of, check
 
-TRAINING = [
-    "--iterations",
-    "300",
-    "--no-rescale",
-    "--strategy",
-    "none",
-    "--eval-every",
-    "0",
-    "--save-every",
-    "0",
-]
+TRAINING = ["--no-rescale", "--strategy", "none", "--eval-every", "0", "--save-every", "0"]
 
 
-def trained(source, run):
+def trained(source, run, iterations=300):
     """Train by the command line; return the mean PSNR of the test views and of the others."""
-    assert main(["train", str(source), "--out", str(run), *TRAINING]) == 0
+    assert main(["train", str(source), "--out", str(run), "--iterations", str(iterations), *TRAINING]) == 0
     metrics = json.loads((run / "metrics.json").read_text())
     return metrics["test"]["psnr"], metrics["train"]["psnr"]
 
@@ -55,9 +45,10 @@ def test_a_dozen_photos_train_as_well_as_with_their_true_poses(tmp_path, capsys)
     views = [View(camera, photograph_box(camera), name=name) for name, camera in truth.items()]
     write_colmap(tmp_path / "given", views, points, dataset.colors)
     given, _ = trained(tmp_path / "given", tmp_path / "true")
-    # Photos 26 degrees apart show each other's views badly, with any poses; what was trained on is shown well.
-    assert fitted > 20.0
     assert reached > given - 0.5
+    # Photos 26 degrees apart say little of one another, with any poses; what was trained on is learned.
+    _, untrained = trained(tmp_path / "given", tmp_path / "untrained", 1)
+    assert fitted > untrained + 4.0
 
 
 @pytest.mark.slow
