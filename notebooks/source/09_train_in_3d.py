@@ -74,7 +74,8 @@ plt.show()
 # %% [markdown]
 # ## The same forward pass, in torch
 #
-# `render_t` does what `render_gaussians` does, in the same order: project, dilate, invert, sort by depth,
+# `render_t` ([gsplat_edu.render.torch_reference](../src/gsplat_edu/render/torch_reference.py)) does what
+# `render_gaussians` does, in the same order: project, dilate, invert, sort by depth,
 # composite from near to far. It differs in two places, and both concern what is *not* computed.
 #
 # - The NumPy renderer gives every splat a box and looks at no pixel outside it. A batched operation
@@ -180,7 +181,7 @@ print(f"opacity {float(cloud.opacities[0]):.4f}, cap {config.max_gaussians}")
 # ones drawn from its own distribution take its place. A splat too faint to be seen goes. Those that stay
 # keep what Adam has learned about them; the new ones start without a past.
 #
-# The rule, as it runs below:
+# The rule, as it runs below ([gsplat_edu.train.density.adc](../src/gsplat_edu/train/density/adc.py)):
 
 # %%
 print(inspect.getsource(AdaptiveDensityControl._densify))
@@ -188,8 +189,9 @@ print(inspect.getsource(AdaptiveDensityControl._densify))
 # %% [markdown]
 # ## The loop
 #
-# One view, one render, one comparison, one step, and now and then a densification. The loop is given its
-# views and its renderer; it does not ask where either comes from.
+# One view, one render, one comparison, one step, and now and then a densification. The loop
+# ([gsplat_edu.train.trainer](../src/gsplat_edu/train/trainer.py)) is given its views and its renderer; it does not
+# ask where either comes from.
 
 # %%
 print(inspect.getsource(Trainer.run))

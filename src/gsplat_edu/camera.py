@@ -2,6 +2,8 @@
 
 Axes are OpenCV's, for the world and the camera alike: +x right, +y down, +z forward. The world's up is
 (0, -1, 0). Pixels are sampled at integer coordinates.
+
+Chapters: 01_points, 03_gaussians_in_3d.
 """
 
 from __future__ import annotations

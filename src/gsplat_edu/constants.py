@@ -2,6 +2,8 @@
 
 Kerbl et al. 2023 is "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (ACM TOG 42.4);
 "its code" is the rasteriser published with it.
+
+Chapter: 02_gaussians_in_2d.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 Quaternion to rotation, rotation and scales to covariance, covariance to screen space. The names ending in
 `_batch` do the same for N at once; the two are tested to agree.
+
+Chapters: 02_gaussians_in_2d, 03_gaussians_in_3d, 04_splatting.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The native module, or the reason why it is not there. Every call of a native kernel goes through here."""
+"""The native module, or the reason why it is not there. Every call of a native kernel goes through here.
+
+Chapter: 10_the_naive_kernel.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Procedural scenes: Gaussians from a formula, so that their truth is known exactly."""
+"""Procedural scenes: Gaussians from a formula, so that their truth is known exactly.
+
+Chapter: 05_sort_and_composite.
+"""
 
 from __future__ import annotations
 

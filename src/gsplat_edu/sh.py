@@ -2,6 +2,8 @@
 
 The order and signs of the 16 harmonics are those of Kerbl et al.'s code, which every scene file in the
 field follows: within a degree from m = -l to m = l, with the Condon-Shortley sign (-1)^m.
+
+Chapter: 06_spherical_harmonics.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The doctor before training: all checks of a capture, and what they say together."""
+"""The doctor before training: all checks of a capture, and what they say together.
+
+Chapter: 13_photos_to_scene.
+"""
 
 from __future__ import annotations
 

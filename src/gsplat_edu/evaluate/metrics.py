@@ -8,6 +8,8 @@ of threads. Renders are clamped to 0..1 first, as a screen would. Three names sa
     ssim        mean of SSIM over pixels and channels: Gaussian window of 11 taps, sigma 1.5, zero outside the image
 
 A mean over images is the mean of the images' values. PSNR of a mean error is another number; nothing here is that.
+
+Chapter: 13_photos_to_scene.
 """
 
 from __future__ import annotations

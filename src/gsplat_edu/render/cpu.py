@@ -5,6 +5,8 @@
 The kernels live in `native/`; this module owns the tensors, and hands over addresses of contiguous memory.
 Nothing of torch's stands between parameters and gradients, so the gradients are the same to the bit on any
 number of threads.
+
+Chapters: 11_tiles, 12_the_backward_pass.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """The renderer that is trusted: project, sort, composite, one splat at a time, in float64 NumPy.
 
 It is short enough to check by eye against the equations, and everything else is measured against it.
+
+Chapter: 05_sort_and_composite.
 """
 
 from __future__ import annotations

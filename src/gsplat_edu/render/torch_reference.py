@@ -2,6 +2,8 @@
 
 Every splat is evaluated at every pixel: no boxes and no early stop, which changes cost and not values. The
 names end in _t, as in the course, and take any float dtype.
+
+Chapter: 09_train_in_3d.
 """
 
 from __future__ import annotations

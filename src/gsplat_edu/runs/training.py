@@ -1,6 +1,8 @@
 """A capture becomes a scene, in a run folder that can be taken up again wherever it was left.
 
 The trainer knows neither files nor datasets; this module gives it both, and writes what comes out.
+
+Chapter: 13_photos_to_scene.
 """
 
 from __future__ import annotations

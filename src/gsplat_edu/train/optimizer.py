@@ -1,4 +1,7 @@
-"""Adam, one rate per parameter group, with moments that follow their Gaussians through density control."""
+"""Adam, one rate per parameter group, with moments that follow their Gaussians through density control.
+
+Chapter: 12_the_backward_pass.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The training loop."""
+"""The training loop.
+
+Chapter: 09_train_in_3d.
+"""
 
 from __future__ import annotations
 

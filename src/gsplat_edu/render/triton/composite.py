@@ -5,6 +5,8 @@
 A program takes one tile and goes through its pairs in batches, as a matrix of pixels by Gaussians: T before each comes
 from a running product along the batch, the colours are a matrix product. The sums of the way back are plain sums: as
 exact matrix products they would take more registers than there are.
+
+Chapter: 10_the_naive_kernel.
 """
 
 from __future__ import annotations

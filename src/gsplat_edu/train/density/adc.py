@@ -1,6 +1,8 @@
 """Adaptive density control: clone, split and prune by the gradient of the means in the image; reset opacities.
 
 `gsplat_edu.train.config` holds its numbers.
+
+Chapter: 09_train_in_3d.
 """
 
 from __future__ import annotations

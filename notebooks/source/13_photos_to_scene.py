@@ -1,0 +1,404 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # 13 - From photos to a scene
+#
+# Everything so far was trained on photos that a renderer took, from cameras that were written down before the first
+# photo existed. A phone writes a folder of photos. Where it was held it does not say, its focal length not reliably
+# either, and one photo in twenty is shaken. [Chapter 12](12_the_backward_pass.ipynb) made training fast, but fast
+# training on cameras that are wrong arrives early at nothing.
+#
+# The photos of this page are taken of a box with painted sides on a painted floor
+# ([gsplat_edu.data.textured_box](../src/gsplat_edu/data/textured_box.py)). OpenCV draws them, not a splat of ours,
+# and the places they were taken from are put away until there is something to compare with them.
+
+# %%
+import functools
+import itertools
+import json
+import os
+import shutil
+import sqlite3
+import sys
+import tempfile
+import time
+import timeit
+from pathlib import Path
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from matplotlib_inline.backend_inline import set_matplotlib_formats
+from PIL import Image
+
+from gsplat_edu import Z_NEAR, Camera, _native
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.textured_box import align_cameras, box_camera, photograph_box
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.doctor.before import examine
+from gsplat_edu.doctor.finding import advice_lines, diagnosis_lines
+from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.evaluate.metrics import psnr, summarize, to_bytes
+from gsplat_edu.gaussians import cov3d_t
+from gsplat_edu.render.numpy_reference import project
+from gsplat_edu.runs.training import CaptureRun, RunOptions
+from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from gsplat_edu.train.config import recipe
+from gsplat_edu.views import View
+
+ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())
+sys.path.append(str(ROOT / "benchmarks"))
+from ladder.forward import tight
+from ladder.splats import from_cov2d
+from train_step import measure
+
+JPEG = functools.partial(set_matplotlib_formats, "jpeg", pil_kwargs={"quality": 80})
+JPEG()  # photos of noise are large as PNG
+SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
+COUNT, WIDTH, ITERATIONS = (25, 320, 500) if SHORT else (41, 480, 3000)
+WORK = Path(tempfile.mkdtemp())
+print(f"budget: {COUNT} photos, {WIDTH} px, {ITERATIONS} iterations{' (reduced)' if SHORT else ''}")
+
+# %% [markdown]
+# ## Photos, and nothing else
+#
+# Somebody walks around the box once, in steps that are not even, and holds the phone now higher and now lower. One
+# photo is shaken.
+
+# %%
+rng = np.random.default_rng(13)
+walk = 2 * np.pi * (np.arange(COUNT) + rng.uniform(-0.3, 0.3, COUNT)) / COUNT
+heights = 0.45 + 0.15 * np.sin(3 * walk) + rng.uniform(-0.05, 0.05, COUNT)
+names = [f"IMG_{i:02d}.png" for i in range(COUNT)]
+size, shaken = (WIDTH, 3 * WIDTH // 4), names[5]
+truth = {n: box_camera(a, h, size) for n, a, h in zip(names, walk, heights, strict=True)}
+photos = {name: photograph_box(camera) for name, camera in truth.items()}
+streak = WIDTH // 64  # px that the hand moved while the shutter was open
+photos[shaken] = cv2.blur(photos[shaken], (streak, 1))
+(WORK / "photos").mkdir()
+for name, photo in photos.items():
+    Image.fromarray(photo).save(WORK / "photos" / name)
+
+
+def gallery(title, images, rows=1, height=2.8):
+    fig, axes = plt.subplots(rows, len(images) // rows, figsize=(13, height), layout="constrained")
+    for ax, (name, image) in zip(axes.flat, images.items(), strict=True):
+        ax.imshow(image, interpolation="nearest")
+        ax.set(title=name, xticks=[], yticks=[])
+    fig.suptitle(title)
+    plt.show()
+
+
+gallery("the first ten photos: no pose, no focal length", {n: photos[n] for n in names[:10]}, 2, 4.4)
+
+# %% [markdown]
+# The obvious thing is to guess. The walk was about a circle, the steps were about even, the phone was held about so
+# high, and the lens is known. The guess becomes a capture with random points where the box must be, and
+# [gsplat_edu.runs.training](../src/gsplat_edu/runs/training.py) trains on it: what `gsplat-edu train` calls.
+
+
+# %%
+def trained(data, out, iterations, **reading):
+    config, settings = recipe(iterations, max_gaussians=20_000), DataSettings(**reading)
+    options = RunOptions(WORK / data, WORK / out, config, settings, eval_every=0, save_every=0)
+    before = time.perf_counter()
+    run = CaptureRun(options)
+    run.start()
+    read = time.perf_counter() - before
+    run.train()
+    before = time.perf_counter()
+    scores = run.finish()
+    return run, {"reading": read, "training": run.seconds, "judging": time.perf_counter() - before}, scores
+
+
+def picture(run, camera):
+    with torch.no_grad():
+        return to_bytes(run.options.renderer(run.trainer.gaussians, camera).image)
+
+
+even = 2 * np.pi * np.arange(COUNT) / COUNT
+guess = {name: box_camera(a, 0.45, size) for name, a in zip(names, even, strict=True)}
+cloud = rng.uniform([-2, -1.5, -2], [2, 0, 2], (4000, 3))
+views = [View(guess[name], photos[name], name=name) for name in names]
+write_colmap(WORK / "guess", views, cloud, np.full(cloud.shape, 0.5))
+FEW, SMALL = 300, 160
+mush, _, scores = trained("guess", "mush", FEW, resolution=SMALL)
+mushy, seen = (summarize(part)["psnr"] for part in (scores.test, scores.train))
+print(
+    f"guessed poses, {FEW} iterations at {SMALL} px: {mushy:.2f} dB held out, {seen:.2f} dB on its own photos"
+)
+shown = {}
+for v in mush.dataset.test[:2]:
+    shown |= {f"render, {v.name}": picture(mush, v.camera), f"photo, {v.name}": v.image}
+gallery("trained on guessed poses: every photo contradicts the next", shown)
+
+# %% [markdown]
+# A few degrees around the box move its corners by many pixels, and each photo is off by another amount. What all of
+# them agree on is an average. The cameras have to be found, and the only thing to find them with is the photos.
+#
+# ## What two photos say about each other
+#
+# A point of the scene lies on a ray through each photo that shows it. Let $x_1 = ((u_1 - c_x)/f, (v_1 - c_y)/f, 1)$
+# be its direction in the first camera and $x_2$ that in the second, and let the second camera see the first one's
+# coordinates through $R$ and $t$: $z_2 x_2 = R\, z_1 x_1 + t$. Cross with $t$, then take the product with $x_2$. Both
+# $t$ and the left side fall out, and so do the unknown depths:
+#
+# $$ x_2^\top [t]_\times R\, x_1 = 0 . $$
+#
+# One equation per match, linear in the nine numbers of $E = [t]_\times R$, and true only for the right motion. The
+# length of $t$ is a common factor and cannot be known. So poses can be found from matches, and matches from what does
+# not change between photos: SIFT describes the surroundings of a corner by gradients, at the corner's own scale and
+# angle (Lowe 2004). Then the mapper (Schönberger and Frahm 2016) begins with two photos, triangulates points, adds
+# the photo that sees most of them, and after each lets least squares move all poses, points and the lens together.
+#
+# [gsplat_edu.sfm](../src/gsplat_edu/sfm/reconstruct.py) drives COLMAP through these stages. It is what `gsplat-edu
+# sfm` calls. One thread makes the result the same to the bit in every run.
+
+# %%
+reconstruct(SfmOptions(WORK / "photos", WORK / "capture", threads=1), print)
+found_set = load_dataset(WORK / "capture", DataSettings(test_every=0))
+found = {view.name: view.camera for view in found_set.train}
+one, two, focal = *names[:2], truth[names[0]].fx
+print(f"{len(found)} of {COUNT} posed; focal length {found[one].fx:.2f} px, in truth {focal:.2f} px")
+assert len(found) >= COUNT - 1
+
+# What the stages saw is kept in a database: the features of each photo, and the matches of two.
+reader = sqlite3.connect(f"{(WORK / 'capture/sfm/database.db').as_uri()}?mode=ro", uri=True)
+number = {name: i + 1 for i, name in enumerate(names)}
+
+
+def read_rows(dtype, table, key, value):
+    query = f"SELECT rows, cols, data FROM {table} WHERE {key} = ?"
+    rows, cols, data = reader.execute(query, (value,)).fetchone()
+    return np.frombuffer(data or b"", dtype).reshape(rows, cols)
+
+
+def matched(*pair):
+    """Return where two photos match, px; COLMAP has the first pixel's centre at (0.5, 0.5)."""
+    i, j = (number[name] for name in pair)
+    chosen = read_rows(np.uint32, "two_view_geometries", "pair_id", (2**31 - 1) * i + j).T
+    points = (read_rows(np.float32, "keypoints", "image_id", k) for k in (i, j))
+    return [xy[rows, :2] - 0.5 for xy, rows in zip(points, chosen, strict=True)]
+
+
+points, (a, b) = read_rows(np.float32, "keypoints", "image_id", number[one]), matched(one, two)
+fig, axes = plt.subplots(1, 2, figsize=(13, 3.4), layout="constrained", width_ratios=[1, 2])
+axes[0].imshow(photos[one])
+widths = np.hypot(points[::4, 2], points[::4, 4])
+axes[0].scatter(*points[::4, :2].T, s=20 * widths, facecolors="none", edgecolors="yellow")
+axes[0].set(title=f"{len(points)} features, every fourth drawn", xlim=(0, WIDTH), ylim=(size[1], 0))
+axes[1].imshow(np.concatenate([photos[one], photos[two]], axis=1))
+axes[1].plot([a[::25, 0], b[::25, 0] + WIDTH], [a[::25, 1], b[::25, 1]], color="cyan", linewidth=0.7)
+axes[1].set(title=f"{len(a)} matches that one geometry explains, one in 25 drawn")
+plt.setp(axes, xticks=[], yticks=[])
+plt.show()
+
+# %% [markdown]
+# The equation can be asked of any cameras: how far is a match from the line that the other photo gives it? Features
+# are placed to a fraction of a pixel, so for the right poses half of the matches have to be closer than one.
+
+
+# %%
+def line_distances(cameras):
+    distances = []
+    for pair in itertools.pairwise(sorted(found)):
+        c1, c2 = (cameras[name] for name in pair)
+        a, b = ((xy - [c.cx, c.cy]) / c.fx for xy, c in zip(matched(*pair), (c1, c2), strict=True))
+        x1, x2 = (np.column_stack([xy, np.ones(len(xy))]) for xy in (a, b))
+        lines = np.cross(c2.R @ (c1.eye - c2.eye), x1 @ (c2.R @ c1.R.T).T)  # E x1, row by row
+        off = np.abs((x2 * lines).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1)
+        distances.append(c2.fx * off)
+    return np.concatenate(distances)
+
+
+off = {what: line_distances(c) for what, c in (("guess", guess), ("found", found), ("truth", truth))}
+for what, distances in off.items():
+    print(f"{what}: half of {len(distances)} matches lie within {np.median(distances):.2f} px of their line")
+assert np.median(off["found"]) < 1 < np.median(off["guess"])
+
+# %% [markdown]
+# ## Found, up to a similarity
+#
+# Photos know no north and no metre. Turn, move and enlarge the whole world, cameras and all, and every photo stays as
+# it is. So poses are compared with the truth after the similarity $x' = s R x + t$ that brings the centres closest
+# (Umeyama 1991).
+#
+# What is left has a size that can be said beforehand. A lens of $f$ pixels sees a pixel as $1/f$ radians, and from
+# the distance $4$ a pixel is $4/f$ world units. Features are better than a pixel, but focal length and distortion are
+# found from the same few photos and take up some of the poses: two pixels' worth is allowed, of angle and of place.
+
+# %%
+fit = align_cameras(found, truth)
+eyes = np.stack([truth[name].eye for name in found])
+allowed = 2 * 4 / focal / np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max()
+print(f"largest turn {fit.turned.max():.3f} degrees, allowed {np.degrees(2 / focal):.3f}")
+print(f"largest shift {100 * fit.moved.max():.3f} % of the extent, allowed {100 * allowed:.3f} %")
+assert fit.turned.max() < np.degrees(2 / focal)
+assert fit.moved.max() < allowed
+
+fig, ax = plt.subplots(figsize=(6.4, 6), layout="constrained")
+cloud_found = fit.s * found_set.points @ fit.R.T + fit.t
+ax.scatter(cloud_found[:, 0], cloud_found[:, 2], c=found_set.colors, s=4)
+for what, cameras, style in (("truth", truth, "ko"), ("guess", guess, "rx"), ("found", found, "b.")):
+    eyes = np.stack([camera.eye for camera in cameras.values()])
+    eyes = fit.s * eyes @ fit.R.T + fit.t if what == "found" else eyes
+    ax.plot(eyes[:, 0], eyes[:, 2], style, fillstyle="none", markersize=9, label=what)
+ax.set(title=f"from above: cameras, and the {len(cloud_found)} points that were triangulated")
+ax.set(xlabel="x, world units of the truth", ylabel="z, world units of the truth", aspect="equal")
+ax.legend()
+plt.show()
+
+# %% [markdown]
+# Below the cameras the box can be made out in the points: they are where training will start.
+#
+# ## A second opinion
+#
+# Structure from motion places a shaken photo like any other, since a blurred corner is still at the place of the
+# corner. A scene that trains on it learns the blur. The doctor
+# ([gsplat_edu.doctor](../src/gsplat_edu/doctor/before.py)) looks for that before any training: it compares the fine
+# detail of each photo, along eight directions, with that of its neighbours, which see the same.
+
+# %%
+for expected in ((shaken,), None):
+    diagnosis = examine(prepare(WORK / "capture"))
+    for line in (*diagnosis_lines(diagnosis), *advice_lines(diagnosis)):
+        print(line.replace(f"{WORK}/", ""))
+    assert {finding.name: finding.images for finding in diagnosis.findings}.get("blurred") == expected
+    # It names the photo that was planted. Its advice is taken.
+    (WORK / "capture/images" / shaken).unlink(missing_ok=True)
+
+# %% [markdown]
+# ## The scene
+#
+# Now the recipe, from the points that were triangulated, every eighth photo held out: the loss is $0.8\,L_1 + 0.2\,(1
+# - \mathrm{SSIM})$, harmonics rise by degrees, splats are cloned and split. The mean over the held-out photos of the
+# peak signal-to-noise ratio ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)) is the number that
+# the field compares, $10 \log_{10}(1/\mathrm{MSE})$ in decibels: 3 dB are half the squared error.
+
+# %%
+posed = summarize(trained("capture", "small", FEW, resolution=SMALL)[2].test)["psnr"]
+print(f"{FEW} iterations at {SMALL} px: {posed:.2f} dB held out, on guessed poses {mushy:.2f} dB")
+assert posed > mushy + 1
+final, seconds, scores = trained("capture", "scene", ITERATIONS)
+test, train = summarize(scores.test), summarize(scores.train)
+print(
+    f"{ITERATIONS} iterations, {len(final.trainer.gaussians)} Gaussians, {len(scores.test)} photos held out"
+)
+print(f"held out: PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.3f}; seen: PSNR {train['psnr']:.2f} dB")
+assert test["psnr"] > (17 if SHORT else 22)
+
+view = final.dataset.test[len(final.dataset.test) // 2]
+image = picture(final, view.camera)
+error = np.minimum(3 * np.abs(image.astype(int) - view.image), 255)
+panels = {"render": image, "photo": view.image, "difference, times 3": error}
+gallery(f"{view.name}, which was held out", panels, height=3.6)
+
+# %% [markdown]
+# ## Where the time went
+#
+# Poses are paid for once, and matching grows with the square of the number of photos. Training is the stage that a
+# budget decides. `benchmarks/train_step.py` takes its iteration apart, here on the trained scene: medians over steps
+# at one photo.
+
+# %%
+stages = json.loads((WORK / "capture/sfm/stages.json").read_text())["stages"]
+table = {name: stages[name]["facts"]["seconds"] for name in ("features", "matches", "mapping", "capture")}
+table = {name.replace("capture", "undistortion"): value for name, value in table.items()} | seconds
+iteration = measure(final.trainer.gaussians, [view], 10 if SHORT else 40)
+pairs = round(iteration.pop("pairs"))
+for unit, parts, whole in (("s ", table, sum(table.values())), ("ms", iteration, iteration["iteration"])):
+    for name, value in parts.items():
+        print(f"{name:18} {value:8.3f} {unit} {100 * value / whole:5.1f} %")
+    print()
+
+fig, ax = plt.subplots(figsize=(8, 3), layout="constrained")
+ax.barh(list(table), list(table.values()), color=["tab:blue"] * 4 + ["tab:orange"] * 3)
+ax.invert_yaxis()
+ax.set(title="from a folder of photos to a judged scene", xlabel="time, s", ylabel="stage")
+set_matplotlib_formats("png")
+plt.show()
+
+# %% [markdown]
+# ## How far from the machine's limits
+#
+# A kernel that is bound by arithmetic is no faster than its operations over the machine's rate of them. At how many
+# pixels a splat is above the floor is counted by the rung `tight` of [chapter 11](11_tiles.ipynb). What one of them
+# costs is counted by hand: in `native/composite.cpp` 2 operations for the exponent, 10 for its power of two, 3 for
+# the colour and 4 around them, 19 in all; in `native/composite_backward.cpp` 35. They are vector instructions that
+# compute, each for as many pixels as a vector has lanes; loads and stores are left out. The rate is that of
+# independent fused multiply-adds, measured. Adam does little with many numbers, so beside it stands the rate at which
+# one thread goes through memory in a plain sum of two arrays.
+
+# %%
+g = final.trainer.gaussians
+arrays = [a.detach().double().numpy() for a in (g.means, cov3d_t(g.log_scales, g.quats), g.opacities)]
+order, means2d, cov2d = project(view.camera, *arrays[:2], Z_NEAR, final.options.config.jacobian_limit)
+drawn = from_cov2d(means2d, cov2d, np.zeros((len(order), 3)), arrays[2][order], view.image.shape[:2])
+counts = tight(drawn).counts
+print(f"{counts.pairs} pairs by the rung, {pairs} by the kernels; {counts.mattered} pixels above the floor")
+assert abs(counts.pairs / pairs - 1) < 0.05
+
+lanes = {"v4": 16, "v3": 8}.get(_native.isa(), 4)
+peak = torch.get_num_threads() * lanes * max(_native.fma_rate() for _ in range(9))
+print(f"peak: {peak / 1e9:.0f} thousand million operations a second, {lanes} lanes a vector")
+for name, each in (("composite", 19), ("composite_backward", 35)):
+    share = counts.mattered * each / (1e-3 * iteration[name]) / peak
+    print(f"{name:18} {1e6 * iteration[name] / pairs:6.1f} ns a pair, {100 * share:5.1f} % of the peak")
+
+numbers_each = sum(tensor.numel() for tensor in g.tensors().values()) // len(g)
+moved = 4 * 7 * numbers_each * len(g)  # bytes: four arrays are read, three written
+print(f"Adam moves {moved / 1e6:.1f} MB, {moved / iteration['Adam'] / 1e6:.1f} GB/s")
+for what, count in (("as many", moved // 12), ("30 million", 30_000_000)):
+    a, b, c = np.ones((3, count), np.float32)
+    rate = 12e-9 * count / min(timeit.repeat(lambda a=a, b=b, c=c: np.add(a, b, out=c), number=1, repeat=12))
+    print(f"a sum of two arrays of {what} numbers: {rate:.1f} GB/s")
+
+# %% [markdown]
+# Read this with care. The share counts what is useful. The kernels work on whole rows of 16 pixels, so lanes outside
+# the ellipse are lost, and what is done once per pair is not counted: finding its rows, fetching its record, adding
+# up over the lanes. And where arrays fit into the caches, the rate is theirs.
+#
+# ## The next failure
+#
+# There is no next chapter, and there are failures left. The first is in every scene: it is right where somebody
+# stood. Here is a look from higher up than any photo was taken, which the scene was never asked for.
+
+# %%
+JPEG()
+above = box_camera(0.4, 1.25, size)
+R, eye = above.R @ fit.R, (above.eye - fit.t) @ fit.R / fit.s
+shown = picture(final, Camera(R, eye, focal, focal, above.cx, above.cy, above.H, above.W))
+real = photograph_box(above)
+print(f"from above: {psnr(shown / 255, real):.2f} dB, held out along the walk: {test['psnr']:.2f} dB")
+assert psnr(shown / 255, real) < test["psnr"] - 1
+gallery("higher up than any photo", {"render": shown, "what is there": real}, 1, 4.8)
+
+held = 16 * numbers_each  # bytes: its numbers, their gradients and two moments
+print(f"{held} bytes a Gaussian while it trains: ten million take {held / 100:.1f} GB")
+shutil.rmtree(WORK)
+
+# %% [markdown]
+# The others are of one kind: what the model has no number for it explains with the numbers it has.
+#
+# - **What moves.** A scene has one state: people and leaves become fog.
+# - **Mirrors and glass.** A reflection is learned as a room behind the wall, which is right from where the photos
+#   were taken and nowhere else; structure from motion may place points in it.
+# - **Exposure and white balance.** Two photos that disagree about a wall are both believed: the colour that depends
+#   on the direction takes up the difference. The doctor names jumps; nothing here models them.
+# - **Scenes larger than memory.** All Gaussians are held at once, in the bytes printed above.
+#
+# With photos of your own: `gsplat-edu sfm PHOTOS CAPTURE` finds the poses, `gsplat-edu doctor CAPTURE` says what is
+# wrong with them and how long a training takes on your machine, `gsplat-edu train CAPTURE --out RUN` trains, and
+# `gsplat-edu view RUN` shows the scene in a browser. It began with [a point](01_points.ipynb).

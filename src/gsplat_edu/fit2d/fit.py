@@ -1,0 +1,171 @@
+"""The loop that fits 2D splats to a picture: render, compare, differentiate, step.
+
+Chapter: 08_fit_an_image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from gsplat_edu.errors import ShapeError
+from gsplat_edu.fit2d.adam import AdamSettings, AdamState, adam_step_2d
+from gsplat_edu.fit2d.gradients import backward_2d, squared_error
+from gsplat_edu.fit2d.splats import Render2D, Splats2D, check_same_size, render_2d
+from gsplat_edu.validation import ArrayLike, check_shape, float64_array, in_range, whole_number
+
+SQUARED_ERROR_FLOOR = 1e-10
+"""Smallest mean squared error: equal images have 100 dB, as in `gsplat_edu.evaluate.metrics`."""
+
+
+@dataclass(frozen=True)
+class Fit2DSettings:
+    """How a picture is fitted.
+
+    Args:
+        iterations: Steps to take.
+        background: (r, g, b) behind the splats.
+        adam: Rates, decays, floor.
+        final_factor: What the rates have fallen to, exponentially, at the last step; 1 leaves them as they are.
+
+    Raises:
+        ShapeError: the background has not three numbers.
+        ArgumentError: a number is out of range.
+    """
+
+    iterations: int = 400
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    adam: AdamSettings = field(default_factory=AdamSettings)
+    final_factor: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        whole_number("iterations", self.iterations, 1)
+        float64_array("background", self.background, (3,))
+        in_range("final_factor", self.final_factor, 0.0, 1.0, open_low=True)
+
+
+class Step2D(NamedTuple):
+    """What a fit reports: of a picture, how good it is; after the last step, the finished one.
+
+    Args:
+        iteration: Steps taken before this picture, 0 to `iterations`.
+        loss: Its mean squared error, not clipped.
+        psnr: Its PSNR, dB.
+        rendered: The picture and its splats.
+    """
+
+    iteration: int
+    loss: float
+    psnr: float
+    rendered: Render2D
+
+
+class Fit2D(NamedTuple):
+    """What a fit comes to.
+
+    Args:
+        splats: The fitted splats.
+        image: (H, W, 3) their picture, not clipped.
+        losses: Mean squared error before each step, and after the last one.
+        psnrs: PSNR at the same times, dB.
+    """
+
+    splats: Splats2D
+    image: Float64[np.ndarray, "H W 3"]
+    losses: list[float]
+    psnrs: list[float]
+
+
+def fit_2d(
+    target: ArrayLike,
+    splats: Splats2D,
+    settings: Fit2DSettings | None = None,
+    callbacks: Sequence[Callable[[Step2D], None]] = (),
+) -> Fit2D:
+    """Fit splats to a picture.
+
+    The same arguments give the same bits, on any number of threads: every sum is NumPy's own.
+
+    Args:
+        target: (H, W, 3) the picture, 0 to 1.
+        splats: Where to start; N and the order stay.
+        settings: Iterations, rates, background; the defaults where None.
+        callbacks: Told of the picture before every step and after the last.
+
+    Returns:
+        The fitted splats, their picture and the curves.
+
+    Raises:
+        ShapeError: the target is not (H, W, 3).
+        ArgumentError: it is NaN or infinite somewhere.
+    """
+    settings = settings or Fit2DSettings()
+    truth = float64_array("target", target, ("H", "W", 3))
+    if not truth.size:
+        raise ShapeError(f"target: has no pixels, its shape is {truth.shape}")
+    height, width = truth.shape[:2]
+    losses: list[float] = []
+    psnrs: list[float] = []
+
+    def look(iteration: int, splats: Splats2D) -> tuple[Render2D, Float64[np.ndarray, "H W 3"]]:
+        rendered = render_2d(splats, height, width, settings.background)
+        loss, grad_image = squared_error(rendered.image, truth)
+        losses.append(loss)
+        psnrs.append(psnr_2d(rendered.image, truth))
+        for callback in callbacks:
+            callback(Step2D(iteration, loss, psnrs[-1], rendered))
+        return rendered, grad_image
+
+    state = AdamState.fresh(splats)
+    for iteration in range(settings.iterations):
+        factor = settings.final_factor ** (iteration / max(1, settings.iterations - 1))
+        gradients = backward_2d(*look(iteration, splats))
+        splats, state = adam_step_2d(splats, gradients, state, settings.adam, factor)
+    rendered, _ = look(settings.iterations, splats)
+    return Fit2D(splats, rendered.image, losses, psnrs)
+
+
+def psnr_2d(image: ArrayLike, target: ArrayLike) -> float:
+    """Return the peak signal-to-noise ratio, the image clamped to 0..1: -10 log10(max(MSE, 1e-10)).
+
+    Args:
+        image: (H, W, 3) rendered.
+        target: (H, W, 3) what it should be, 0 to 1.
+
+    Returns:
+        dB; 100 for equal images. The number that `gsplat_edu.evaluate.metrics.psnr` gives, without torch.
+
+    Raises:
+        ShapeError: the sizes differ.
+    """
+    check_same_size(image, target)
+    error = float(np.square(np.clip(image, 0.0, 1.0) - np.asarray(target)).mean())
+    return float(-10.0 * np.log10(max(error, SQUARED_ERROR_FLOOR)))
+
+
+def shrunk_photo(pixels: UInt8[np.ndarray, "H W 3"], longest: int) -> Float64[np.ndarray, "h w 3"]:
+    """Bring a photo to a size that can be fitted, each new pixel the mean of the area it covers.
+
+    Args:
+        pixels: (H, W, 3) photo, uint8.
+        longest: Height or width to come to, whichever is larger, px; a smaller photo keeps its size.
+
+    Returns:
+        (h, w, 3) from 0 to 1.
+
+    Raises:
+        ShapeError: not (H, W, 3).
+        ArgumentError: `longest` is not a whole number of at least 1.
+    """
+    check_shape("pixels", pixels.shape, ("H", "W", 3), {})
+    factor = min(1.0, whole_number("longest", longest, 1) / max(pixels.shape[:2]))
+    height, width = (max(1, round(factor * side)) for side in pixels.shape[:2])
+    if factor < 1.0:
+        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(pixels, dtype=np.float64) / 255.0
