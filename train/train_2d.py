@@ -66,7 +66,7 @@ class Fit2DOptions:
     out: Path
 
     def __post_init__(self) -> None:
-        """Check the ranges, and that there is a place for the files."""
+        """Check the ranges and the files' names."""
         for flag, largest in LARGEST.items():
             whole_number(flag, getattr(self, flag[2:]), 0 if flag == "--seed" else 1, largest)
         if not self.image.is_file():
@@ -75,7 +75,6 @@ class Fit2DOptions:
         if self.out.suffix.lower() != ".png":
             raise ArgumentError(f"--out: {str(self.out)!r} has to end in .png; the curves are named after it")
         for path in (self.out, self.curves):
-            check_writable("--out", path)
             if path.resolve() == self.image.resolve():
                 raise ArgumentError(f"--out: {path} is the picture itself; choose another name")
 
@@ -122,6 +121,8 @@ def curves_figure_2d(fit: Fit2D) -> Figure:
 def train(options: Fit2DOptions) -> None:
     """Fit the picture and write the two files."""
     target = read_target(options)
+    for path in (options.out, options.curves):
+        check_writable("--out", path)
     height, width = target.shape[:2]
     print(f"{options.image.name}: {width}x{height} px, {options.splats} splats", flush=True)
     start = random_splats_2d(options.splats, height, width, np.random.default_rng(options.seed))

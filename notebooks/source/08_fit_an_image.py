@@ -58,7 +58,7 @@ def draw_images(axes, images):
         ax.set(xticks=[], yticks=[], title=title)
 
 
-fig, axes = plt.subplots(1, 3, figsize=(10, 4.2), layout="constrained")
+fig, axes = plt.subplots(1, 3, figsize=(8.5, 3.6), layout="constrained")
 draw_images(axes, {"the photo": photo, "the picture": wrong.image})
 draw_ellipses(axes[2], start, "the ellipses it is made of")
 plt.show()
@@ -351,7 +351,7 @@ quality = psnr_2d(fit.image, photo)
 print(f"PSNR {fit.psnrs[0]:.2f} dB -> {quality:.2f} dB; {9 * COUNT:,} numbers for {photo.size:,}")
 assert quality > fit.psnrs[0] + (10 if SHORT else 15)
 
-fig, axes = plt.subplots(1, 4, figsize=(13, 4.2), layout="constrained")
+fig, axes = plt.subplots(1, 4, figsize=(11.5, 3.6), layout="constrained")
 draw_images(axes, {"the photo": photo, "fitted": fit.image})
 draw_ellipses(axes[2], fit.splats, "its ellipses")
 errors = axes[3].imshow(np.abs(fit.image - photo).max(axis=2), vmin=0, cmap="magma", interpolation="nearest")
@@ -385,8 +385,8 @@ def seen_from(x):
 
 assert np.abs(seen_from(0.0) - fit.image).max() < 1e-10
 
-fig, axes = plt.subplots(1, 3, figsize=(10, 4.2), layout="constrained")
-draw_images(axes, {f"{x} to the right, splats 2 to 4 away": seen_from(x) for x in (0.0, 0.3, 1.2)})
+fig, axes = plt.subplots(1, 3, figsize=(8.5, 3.6), layout="constrained")
+draw_images(axes, {f"{x} to the right, 2 to 4 away": seen_from(x) for x in (0.0, 0.3, 1.2)})
 plt.show()
 
 # %% [markdown]

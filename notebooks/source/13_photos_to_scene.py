@@ -64,8 +64,8 @@ from ladder.forward import tight
 from ladder.splats import from_cov2d
 from train_step import measure
 
-JPEG = functools.partial(set_matplotlib_formats, "jpeg", pil_kwargs={"quality": 80})
-JPEG()  # photos of noise are large as PNG
+JPEG = functools.partial(set_matplotlib_formats, "jpeg", pil_kwargs={"quality": 80})  # for photos of noise
+JPEG()
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 COUNT, WIDTH, ITERATIONS = (25, 320, 500) if SHORT else (41, 480, 3000)
 WORK = Path(tempfile.mkdtemp())
@@ -145,8 +145,8 @@ for v in mush.dataset.test[:2]:
 gallery("trained on guessed poses: every photo contradicts the next", shown)
 
 # %% [markdown]
-# A few degrees around the box move its corners by many pixels, and each photo is off by another amount. What all of
-# them agree on is an average. The cameras have to be found, and the only thing to find them with is the photos.
+# A few degrees around the box move its corners by many pixels, and each photo is off by another amount. The cameras
+# have to be found, and the only thing to find them with is the photos.
 #
 # ## What two photos say about each other
 #
@@ -173,7 +173,6 @@ found = {view.name: view.camera for view in found_set.train}
 one, two, focal = *names[:2], truth[names[0]].fx
 print(f"{len(found)} of {COUNT} posed; focal length {found[one].fx:.2f} px, in truth {focal:.2f} px")
 assert len(found) >= COUNT - 1
-
 # What the stages saw is kept in a database: the features of each photo, and the matches of two.
 reader = sqlite3.connect(f"{(WORK / 'capture/sfm/database.db').as_uri()}?mode=ro", uri=True)
 number = {name: i + 1 for i, name in enumerate(names)}
@@ -393,10 +392,9 @@ shutil.rmtree(WORK)
 # The others are of one kind: what the model has no number for it explains with the numbers it has.
 #
 # - **What moves.** A scene has one state: people and leaves become fog.
-# - **Mirrors and glass.** A reflection is learned as a room behind the wall, which is right from where the photos
-#   were taken and nowhere else; structure from motion may place points in it.
-# - **Exposure and white balance.** Two photos that disagree about a wall are both believed: the colour that depends
-#   on the direction takes up the difference. The doctor names jumps; nothing here models them.
+# - **Mirrors.** A reflection is learned as a room behind the wall, right from where the photos were taken.
+# - **Exposure.** Two photos that disagree about a wall are both believed: the colour that depends on the direction
+#   takes up the difference. The doctor names jumps; nothing here models them.
 # - **Scenes larger than memory.** All Gaussians are held at once, in the bytes printed above.
 #
 # With photos of your own: `gsplat-edu sfm PHOTOS CAPTURE` finds the poses, `gsplat-edu doctor CAPTURE` says what is

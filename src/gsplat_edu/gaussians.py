@@ -1,4 +1,7 @@
-"""The Gaussians that are learned: raw parameters, and the activations that turn them into what is drawn."""
+"""The Gaussians that are learned: raw parameters, and the activations that turn them into what is drawn.
+
+Chapter: 07_a_trained_scene.
+"""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.fit2d.splats import PER_SPLAT, Splats2D
 from gsplat_edu.validation import in_range
 
@@ -93,6 +93,9 @@ def adam_step_2d(
     Raises:
         ShapeError: splats, gradients and state have different N.
     """
+    for name, other in (("gradients", gradients), ("state", state.first)):
+        if len(other) != len(splats):
+            raise ShapeError(f"{name}: are of {len(other)} splats, but there are {len(splats)}")
     b1, b2 = settings.betas
     steps = state.steps + 1
     at, slopes = splats.arrays(), gradients.arrays()

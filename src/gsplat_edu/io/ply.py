@@ -11,6 +11,8 @@ are packed as SuperSplat packs them is read too.
 What the format has no property for stands in comments: see `gsplat_edu.io.ply_comments`.
 
 Source: the point_cloud.ply of Kerbl et al. 2023's code; Turk 1994, "The PLY Polygon File Format".
+
+Chapter: 07_a_trained_scene.
 """
 
 from __future__ import annotations

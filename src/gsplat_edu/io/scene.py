@@ -1,4 +1,7 @@
-"""What a scene file holds: Gaussians, and the few facts about them that some formats carry along."""
+"""What a scene file holds: Gaussians, and the few facts about them that some formats carry along.
+
+Chapter: 07_a_trained_scene.
+"""
 
 from __future__ import annotations
 
