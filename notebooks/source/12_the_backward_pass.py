@@ -102,7 +102,6 @@ plt.show()
 
 # %%
 def walk_back(alpha, layers):
-    """Composite near to far as kernels do, then recover the first T by dividing, all in float32."""
     T, alpha = np.float32(1), np.float32(alpha)
     for _ in range(layers):
         T = T - T * alpha
@@ -111,14 +110,13 @@ def walk_back(alpha, layers):
     return float(T)
 
 
-layers = np.arange(1, 31)
-found = np.array([walk_back(0.99, n) for n in layers])
+found = np.array([walk_back(0.99, n) for n in range(1, 31)])
 opaque = 1 - np.logspace(-1, -6.5, 23)
 single = np.array([walk_back(alpha, 1) for alpha in opaque])
 print("recovered of 1:", ", ".join(f"{found[n - 1]:.4f} behind {n} layers" for n in (10, 20, 22, 24)))
 assert found[23] == 0 and abs(found[9] - 1) < 1e-4
 fig, (left, right) = plt.subplots(1, 2, figsize=(11, 3.2), layout="constrained")
-left.plot(layers, found, "o-")
+left.plot(range(1, 31), found, "o-")
 left.set(title="recovered by dividing, layers of 0.99", xlabel="layers", ylabel="the first T, should be 1")
 right.loglog(1 - opaque, np.maximum(np.abs(single - 1), 1e-9), "o", label="error after one layer")
 right.loglog(1 - opaque, 2.0**-24 / (1 - opaque), "k--", label="half an eps over 1 - alpha")
@@ -142,8 +140,7 @@ plt.show()
 # $$ R = g \cdot C \quad\text{at first, and at each splat}\quad R \leftarrow R - T_i \alpha_i \, (g \cdot c_i),
 # \qquad \frac{\partial L}{\partial \alpha_i} = T_i \, (g \cdot c_i) - \frac{R}{1 - \alpha_i} . $$
 #
-# $C$ contains the background, so $R$ does, to the end. A loss on the final transmittance itself adds $t T_\infty$ to
-# the first $R$, $t = \partial L / \partial T_\infty$.
+# $C$ contains the background, so $R$ does, to the end.
 
 
 # %%
@@ -169,7 +166,7 @@ steps = 1e-3 * np.eye(12)
 moved = [[g @ pixel(alphas + sign * n, colors, background) for n in steps] for sign in (1, -1)]
 error = np.abs(pixel_gradient(alphas, colors, background, g) - np.subtract(*moved) / 2e-3).max()
 print(f"against finite differences: {error:.1e}")
-assert error < 1e-11
+assert error < 1e-11  # linear in each alpha: only rounding is left, some eps over a step of 1e-3
 
 worst = 0
 for _ in range(500):
@@ -181,9 +178,6 @@ print(f"float32, 500 rays of 12 layers: worst error {worst:.3f} of what rounding
 assert worst < 1
 
 # %% [markdown]
-# The pixel is linear in each single alpha, so a central difference is exact but for rounding: eps over the step of a
-# thousandth is $2\cdot 10^{-13}$, a few times that is allowed.
-#
 # It is not free. $R$ begins with the whole pixel: each of the $n$ subtractions may lose half an eps of the largest
 # $|R|$, at most $\sum_k |g_k|$ for colours up to one, and dividing by $1 - \alpha$ makes it a hundred times that at
 # the clamp. Where the other walk works it is the more exact one. Near to far buys the same lists, the same stop, the
@@ -206,7 +200,6 @@ assert worst < 1
 
 # %%
 def dense_image(means2d, conics, colors, opacities, H, W):
-    """Composite splats that are on the screen already, on black: the reference of this page."""
     y, x = torch.meshgrid(torch.arange(H).double(), torch.arange(W).double(), indexing="ij")
     dx, dy = x - means2d[:, 0, None, None], y - means2d[:, 1, None, None]
     A, B, C = conics[..., None, None].unbind(1)
@@ -317,8 +310,7 @@ for key, theirs in grads["dense"].items():
     print(f"{key:16} kernels against autograd, float64: {error:.1e} of the largest")
     assert error < 1e-10
 
-# The step itself is one more pass. Written in torch, Adam goes through memory once for every operation; the
-# package's reads four arrays and writes three, once.
+# Written in torch, Adam goes through memory once for every operation; the package's once.
 start = random_ball(5000, torch.Generator().manual_seed(6)).trainable()
 before, slope = start.means.detach().numpy().astype(float), rng.normal(size=(5000, 3))
 start.means.grad = torch.tensor(slope, dtype=torch.float32)

@@ -64,11 +64,11 @@ from ladder.forward import tight
 from ladder.splats import from_cov2d
 from train_step import measure
 
-JPEG = functools.partial(set_matplotlib_formats, "jpeg", pil_kwargs={"quality": 80})  # for photos of noise
-JPEG()
+JPEG = functools.partial(set_matplotlib_formats, "jpeg", pil_kwargs={"quality": 80})
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 COUNT, WIDTH, ITERATIONS = (25, 320, 500) if SHORT else (41, 480, 3000)
 WORK = Path(tempfile.mkdtemp())
+JPEG()  # photos of noise are large as PNG
 print(f"budget: {COUNT} photos, {WIDTH} px, {ITERATIONS} iterations{' (reduced)' if SHORT else ''}")
 
 # %% [markdown]
@@ -312,15 +312,14 @@ gallery(f"{view.name}, which was held out", panels, height=3.6)
 # at one photo.
 
 # %%
-stages = json.loads((WORK / "capture/sfm/stages.json").read_text())["stages"]
-table = {name: stages[name]["facts"]["seconds"] for name in ("features", "matches", "mapping", "capture")}
-table = {name.replace("capture", "undistortion"): value for name, value in table.items()} | seconds
+done = json.loads((WORK / "capture/sfm/stages.json").read_text())["stages"]
+table = {name: done[name]["facts"]["seconds"] for name in ("features", "matches", "mapping")}
+table |= {"undistortion": done["capture"]["facts"]["seconds"]} | seconds
 iteration = measure(final.trainer.gaussians, [view], 10 if SHORT else 40)
 pairs = round(iteration.pop("pairs"))
 for unit, parts, whole in (("s ", table, sum(table.values())), ("ms", iteration, iteration["iteration"])):
     for name, value in parts.items():
         print(f"{name:18} {value:8.3f} {unit} {100 * value / whole:5.1f} %")
-    print()
 
 fig, ax = plt.subplots(figsize=(8, 3), layout="constrained")
 ax.barh(list(table), list(table.values()), color=["tab:blue"] * 4 + ["tab:orange"] * 3)
@@ -391,8 +390,7 @@ shutil.rmtree(WORK)
 # %% [markdown]
 # The others are of one kind: what the model has no number for it explains with the numbers it has.
 #
-# - **What moves.** A scene has one state: people and leaves become fog.
-# - **Mirrors.** A reflection is learned as a room behind the wall, right from where the photos were taken.
+# - **What moves, what mirrors.** A scene has one state: people become fog, a reflection a room behind the wall.
 # - **Exposure.** Two photos that disagree about a wall are both believed: the colour that depends on the direction
 #   takes up the difference. The doctor names jumps; nothing here models them.
 # - **Scenes larger than memory.** All Gaussians are held at once, in the bytes printed above.
