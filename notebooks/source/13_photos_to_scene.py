@@ -41,7 +41,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib_inline.backend_inline import set_matplotlib_formats
-from PIL import Image
 
 from gsplat_edu import Z_NEAR, Camera, _native
 from gsplat_edu.data.dataset import DataSettings, load_dataset
@@ -64,7 +63,7 @@ from ladder.forward import tight
 from ladder.splats import from_cov2d
 from train_step import measure
 
-JPEG = functools.partial(set_matplotlib_formats, "jpeg", pil_kwargs={"quality": 80})
+JPEG = functools.partial(set_matplotlib_formats, "jpeg", pil_kwargs={"quality": 75})
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 COUNT, WIDTH, ITERATIONS = (25, 320, 500) if SHORT else (41, 480, 3000)
 WORK = Path(tempfile.mkdtemp())
@@ -82,14 +81,14 @@ rng = np.random.default_rng(13)
 walk = 2 * np.pi * (np.arange(COUNT) + rng.uniform(-0.3, 0.3, COUNT)) / COUNT
 heights = 0.45 + 0.15 * np.sin(3 * walk) + rng.uniform(-0.05, 0.05, COUNT)
 names = [f"IMG_{i:02d}.png" for i in range(COUNT)]
-size, shaken = (WIDTH, 3 * WIDTH // 4), names[5]
-truth = {n: box_camera(a, h, size) for n, a, h in zip(names, walk, heights, strict=True)}
+frame_size, shaken = (WIDTH, 3 * WIDTH // 4), names[5]
+truth = {n: box_camera(a, h, frame_size) for n, a, h in zip(names, walk, heights, strict=True)}
 photos = {name: photograph_box(camera) for name, camera in truth.items()}
 streak = WIDTH // 64  # px that the hand moved while the shutter was open
 photos[shaken] = cv2.blur(photos[shaken], (streak, 1))
 (WORK / "photos").mkdir()
 for name, photo in photos.items():
-    Image.fromarray(photo).save(WORK / "photos" / name)
+    cv2.imwrite(str(WORK / "photos" / name), photo[..., ::-1])
 
 
 def gallery(title, images, rows=1, height=2.8):
@@ -114,31 +113,29 @@ def trained(data, out, iterations, **reading):
     config, settings = recipe(iterations, max_gaussians=20_000), DataSettings(**reading)
     options = RunOptions(WORK / data, WORK / out, config, settings, eval_every=0, save_every=0)
     before = time.perf_counter()
-    run = CaptureRun(options)
-    run.start()
-    read = time.perf_counter() - before
-    run.train()
+    job = CaptureRun(options)
+    job.start()
+    loaded = time.perf_counter() - before
+    job.train()
     before = time.perf_counter()
-    scores = run.finish()
-    return run, {"reading": read, "training": run.seconds, "judging": time.perf_counter() - before}, scores
+    scores = job.finish()
+    return job, {"reading": loaded, "training": job.seconds, "judging": time.perf_counter() - before}, scores
 
 
-def picture(run, camera):
+def picture(job, camera):
     with torch.no_grad():
-        return to_bytes(run.options.renderer(run.trainer.gaussians, camera).image)
+        return to_bytes(job.options.renderer(job.trainer.gaussians, camera).image)
 
 
 even = 2 * np.pi * np.arange(COUNT) / COUNT
-guess = {name: box_camera(a, 0.45, size) for name, a in zip(names, even, strict=True)}
+guess = {name: box_camera(a, 0.45, frame_size) for name, a in zip(names, even, strict=True)}
 cloud = rng.uniform([-2, -1.5, -2], [2, 0, 2], (4000, 3))
 views = [View(guess[name], photos[name], name=name) for name in names]
 write_colmap(WORK / "guess", views, cloud, np.full(cloud.shape, 0.5))
-FEW, SMALL = 300, 160
-mush, _, scores = trained("guess", "mush", FEW, resolution=SMALL)
+BRIEFLY, SIDE_PX = 300, 160
+mush, _, scores = trained("guess", "mush", BRIEFLY, resolution=SIDE_PX)
 mushy, seen = (summarize(part)["psnr"] for part in (scores.test, scores.train))
-print(
-    f"guessed poses, {FEW} iterations at {SMALL} px: {mushy:.2f} dB held out, {seen:.2f} dB on its own photos"
-)
+print(f"guessed poses, {BRIEFLY} iterations at {SIDE_PX} px: {mushy:.2f} dB held out, {seen:.2f} dB seen")
 shown = {}
 for v in mush.dataset.test[:2]:
     shown |= {f"render, {v.name}": picture(mush, v.camera), f"photo, {v.name}": v.image}
@@ -178,7 +175,7 @@ reader = sqlite3.connect(f"{(WORK / 'capture/sfm/database.db').as_uri()}?mode=ro
 number = {name: i + 1 for i, name in enumerate(names)}
 
 
-def read_rows(dtype, table, key, value):
+def matrix_from(dtype, table, key, value):
     query = f"SELECT rows, cols, data FROM {table} WHERE {key} = ?"
     rows, cols, data = reader.execute(query, (value,)).fetchone()
     return np.frombuffer(data or b"", dtype).reshape(rows, cols)
@@ -187,19 +184,19 @@ def read_rows(dtype, table, key, value):
 def matched(*pair):
     """Return where two photos match, px; COLMAP has the first pixel's centre at (0.5, 0.5)."""
     i, j = (number[name] for name in pair)
-    chosen = read_rows(np.uint32, "two_view_geometries", "pair_id", (2**31 - 1) * i + j).T
-    points = (read_rows(np.float32, "keypoints", "image_id", k) for k in (i, j))
+    chosen = matrix_from(np.uint32, "two_view_geometries", "pair_id", (2**31 - 1) * i + j).T
+    points = (matrix_from(np.float32, "keypoints", "image_id", k) for k in (i, j))
     return [xy[rows, :2] - 0.5 for xy, rows in zip(points, chosen, strict=True)]
 
 
-points, (a, b) = read_rows(np.float32, "keypoints", "image_id", number[one]), matched(one, two)
+points, (a, b) = matrix_from(np.float32, "keypoints", "image_id", number[one]), matched(one, two)
 fig, axes = plt.subplots(1, 2, figsize=(13, 3.4), layout="constrained", width_ratios=[1, 2])
 axes[0].imshow(photos[one])
 widths = np.hypot(points[::4, 2], points[::4, 4])
 axes[0].scatter(*points[::4, :2].T, s=20 * widths, facecolors="none", edgecolors="yellow")
-axes[0].set(title=f"{len(points)} features, every fourth drawn", xlim=(0, WIDTH), ylim=(size[1], 0))
+axes[0].set(title=f"{len(points)} features, every fourth drawn", xlim=(0, WIDTH), ylim=(frame_size[1], 0))
 axes[1].imshow(np.concatenate([photos[one], photos[two]], axis=1))
-axes[1].plot([a[::25, 0], b[::25, 0] + WIDTH], [a[::25, 1], b[::25, 1]], color="cyan", linewidth=0.7)
+axes[1].plot([a[::25, 0], b[::25, 0] + WIDTH], [a[::25, 1], b[::25, 1]], color="white", linewidth=0.9)
 axes[1].set(title=f"{len(a)} matches that one geometry explains, one in 25 drawn")
 plt.setp(axes, xticks=[], yticks=[])
 plt.show()
@@ -287,8 +284,8 @@ for expected in ((shaken,), None):
 # the field compares, $10 \log_{10}(1/\mathrm{MSE})$ in decibels: 3 dB are half the squared error.
 
 # %%
-posed = summarize(trained("capture", "small", FEW, resolution=SMALL)[2].test)["psnr"]
-print(f"{FEW} iterations at {SMALL} px: {posed:.2f} dB held out, on guessed poses {mushy:.2f} dB")
+posed = summarize(trained("capture", "small", BRIEFLY, resolution=SIDE_PX)[2].test)["psnr"]
+print(f"{BRIEFLY} iterations at {SIDE_PX} px: {posed:.2f} dB held out, on guessed poses {mushy:.2f} dB")
 assert posed > mushy + 1
 final, seconds, scores = trained("capture", "scene", ITERATIONS)
 test, train = summarize(scores.test), summarize(scores.train)
@@ -375,7 +372,7 @@ for what, count in (("as many", moved // 12), ("30 million", 30_000_000)):
 
 # %%
 JPEG()
-above = box_camera(0.4, 1.25, size)
+above = box_camera(0.4, 1.25, frame_size)
 R, eye = above.R @ fit.R, (above.eye - fit.t) @ fit.R / fit.s
 shown = picture(final, Camera(R, eye, focal, focal, above.cx, above.cy, above.H, above.W))
 real = photograph_box(above)
