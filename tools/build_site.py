@@ -97,7 +97,7 @@ def gather(stage: Path) -> None:
 def _reference(name: str) -> str:
     # The package's own names stand where they are defined; there they are linked.
     again = "   :no-index:\n" if "." not in name else ""
-    return f"# {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n   :show-inheritance:\n{again}```\n"
+    return f"# {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}```\n"
 
 
 def _index(documents: list[Path], chapters: list[Path], names: list[str]) -> str:

@@ -22,6 +22,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 
 default_role = "py:obj"
+highlight_language = "text"  # equations of docstrings; notebooks and documents say what theirs is
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
@@ -30,6 +31,7 @@ napoleon_numpy_docstring = False
 
 CODE = re.compile(r"`[^`]*`")
 SECTION = re.compile(r"\s*(Args|Attributes|Returns|Yields|Raises):")
+of_variables = {}
 CHAPTERS = re.compile(r"Chapters?: (.*)\.")
 
 
@@ -59,6 +61,13 @@ def docstrings(app, what, name, thing, options, lines):
         else:
             found += [*map(escaped, rows), ""]
     lines[:] = found
+    if what in ("data", "attribute"):
+        of_variables[name], lines[:] = found, []
+
+
+def variables(app, what, name, thing, options, lines):
+    """Put a variable's docstring back: napoleon would have taken what stands before a colon for its type."""
+    lines[:] = of_variables.pop(name, lines)
 
 
 def setup(app):
@@ -74,3 +83,4 @@ def setup(app):
 
     app.add_html_math_renderer("mathml", (inline, None), (display, None))
     app.connect("autodoc-process-docstring", docstrings, priority=100)
+    app.connect("autodoc-process-docstring", variables, priority=900)

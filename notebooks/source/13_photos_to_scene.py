@@ -281,7 +281,8 @@ for expected in ((shaken,), None):
 # Now the recipe, from the points that were triangulated, every eighth photo held out: the loss is $0.8\,L_1 + 0.2\,(1
 # - \mathrm{SSIM})$, harmonics rise by degrees, splats are cloned and split. The mean over the held-out photos of the
 # peak signal-to-noise ratio ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)) is the number that
-# the field compares, $10 \log_{10}(1/\mathrm{MSE})$ in decibels: 3 dB are half the squared error.
+# the field compares, $10 \log_{10}(1/\mathrm{MSE})$ in decibels: 3 dB are half the squared error. Held against the
+# guess, the first line below credits the poses with their points as well: the guess had to begin with random ones.
 
 # %%
 posed = summarize(trained("capture", "small", BRIEFLY, resolution=SIDE_PX)[2].test)["psnr"]
