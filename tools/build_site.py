@@ -91,7 +91,7 @@ def gather(stage: Path) -> None:
     for name in names:
         _write(stage / "reference" / f"{name}.md", _reference(name))
     _write(stage / "index.md", _index(documents, chapters, names))
-    shutil.copyfile(ROOT / "docs" / "site" / "conf.py", stage / "conf.py")
+    shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
 
 
 def _reference(name: str) -> str:

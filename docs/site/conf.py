@@ -8,13 +8,14 @@ from latex2mathml.converter import convert
 project = "gsplat_edu"
 copyright = "the authors of gsplat_edu"  # noqa: A001
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["docs/site"]
 
 html_theme = "furo"
 html_title = "gsplat_edu"
 html_copy_source = False
 html_show_sphinx = False
 html_math_renderer = "mathml"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 
 # What a notebook shows was made by tools/build_notebooks.py.
 nb_execution_mode = "off"
