@@ -85,6 +85,7 @@ def test_bad_input_is_one_line_and_2(doctor, capture, tmp_path):
         ([tmp_path / "empty"], "is no capture"),
         ([capture[0], "--resolution", "0.5"], "resolution"),
         ([capture[0], "--backend", "abacus"], "abacus"),
+        ([capture[0], "--backend", "torch"], "--no-forecast"),
     ):
         code, said = doctor(*words)
         assert code == 2 and said.count("\n") == 1 and text in said

@@ -71,6 +71,12 @@ def test_durations(text, seconds):
     assert seconds_text(text) == seconds
 
 
+@pytest.mark.parametrize("limit", [["--max-memory", "4GiB"], ["--time-limit", "20m"]])
+def test_the_cap_of_mcmc_is_left_to_the_plan_where_there_is_one(limit):
+    words = ["train", "capture", "--out", "run", "--strategy", "mcmc", *limit]
+    assert options_from(build_parser(["train"]).parse_args(words)).config.max_gaussians is None
+
+
 @pytest.mark.parametrize(
     ("text", "size"), [("4GiB", 4 * 2**30), ("500MB", 500e6), ("1e9", 1e9), ("0", 0), ("3k", 3000)]
 )
@@ -84,6 +90,7 @@ def test_sizes(text, size):
         (["--iterations", "0"], "iterations"),
         (["--strategy", "best"], "strategy"),
         (["--strategy", "mcmc"], "--max-gaussians"),
+        (["--strategy", "mcmc", "--time-limit", "9s", "--iterations", "9"], "--max-gaussians"),
         (["--time-limit", "soon"], "--time-limit"),
         (["--image-memory", "much"], "--image-memory"),
         (["--resolution", "-2"], "resolution"),

@@ -136,6 +136,15 @@ def test_a_photo_of_another_exposure(scene, stops, sign, is_named):
     assert found["exposure"].images[0].startswith(views[7].name) if is_named else "exposure" not in found
 
 
+def test_a_scene_that_is_too_dark_as_a_whole_is_no_jump_of_every_photo(scene):
+    gaussians, views = scene
+    for i in range(len(views)):
+        views = with_photo(views, i, lambda image: np.clip(image * 2.0 ** (0.9 / 2.2), 0.0, 1.0))
+    run = trained(gaussians, views)
+    assert np.median([view.stops for view in run.train]) > 0.4
+    assert len(warnings(run)["exposure"].images if "exposure" in warnings(run) else ()) < len(views) / 4
+
+
 def in_front(gaussians, camera, share):
     """Add a splat a twentieth of the way to the scene that covers about so much of a camera's picture."""
     z = 0.05 * 3.2

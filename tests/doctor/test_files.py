@@ -129,6 +129,18 @@ def test_a_photo_of_another_shape_than_its_camera_is_named(diagnosed, orbit):
     assert found.images == (views[5].name,) and "another aspect ratio" in found.sentence
 
 
+def test_one_reason_is_told_once(diagnosed, orbit):
+    views, points = orbit
+
+    def spoil(folder):
+        for view in views[3:9]:
+            path = str(folder / "images" / view.name)
+            cv2.imwrite(path, cv2.imread(path)[:40])
+
+    (found,) = [f for f in diagnosed(views, points, spoil).findings if f.name == "unusable"]
+    assert len(found.images) == 6 and found.sentence.count("another aspect ratio") == 1
+
+
 def test_the_advice_is_three_sentences_the_gravest_first(diagnosed, orbit):
     views, points = orbit
 

@@ -153,6 +153,16 @@ def test_the_most_gaussians_fit_and_one_more_does_not(limit, kept):
     assert footprint.peak(most, kept) <= limit * 2**20 < footprint.peak(most + 1, kept)
 
 
+@pytest.mark.parametrize("limit", [1_450, 2_000])
+def test_gaussians_have_the_room_that_reading_leaves(limit):
+    """Photos of 12 MP, eight decoded at once: the peak without a Gaussian is that of the reading."""
+    large = dataclasses.replace(FACTS, full=12e6, workers=8)
+    footprint = Footprint(large, 400 * 2**20, 4_000, sh_degree=3)
+    most = footprint.most_gaussians(limit * 2**20, 0)
+    assert footprint.peak(most, 0) <= limit * 2**20 < footprint.peak(most + 1, 0)
+    assert most > 100_000
+
+
 def test_where_nothing_fits_there_is_no_room_for_any():
     assert Footprint(FACTS, 400 * 2**20, 4_000, sh_degree=3).most_gaussians(100 * 2**20, 0) == -1
 

@@ -77,6 +77,17 @@ def test_exposure(named, stops, sign, is_named, with_points):
         assert measured == pytest.approx(sign * stops, rel=0.2 if stops < 1 else 0.4)
 
 
+@pytest.mark.parametrize(
+    "which", [range(3, 7), range(12), range(0, 24, 2)], ids=["four", "half", "every second"]
+)
+@pytest.mark.parametrize(("stops", "is_named"), [(0.1, False), (0.9, True), (1.5, True)])
+def test_photos_that_are_dark_in_a_row(named, which, stops, is_named):
+    """They agree with one another; that so many neighbours differ gives them away."""
+    views, points = room("orbit")
+    dark = {i: with_photo(views[i], views[i].image * 2.0 ** (-stops / 2.2)) for i in which}
+    assert ("exposure" in named(replaced(views, dark), points)) == is_named
+
+
 @pytest.mark.parametrize(("stops", "is_named"), [(0.1, False), (0.7, True), (1.4, True)])
 @pytest.mark.parametrize("channel", [0, 2])
 def test_white_balance(named, channel, stops, is_named):

@@ -182,6 +182,21 @@ def test_the_sentence_given_as_options_is_the_same_run():
     assert bytes_text(words[words.index("--image-memory") + 1]) >= found.image_memory
 
 
+def test_large_photos_leave_a_cap_that_is_worth_having_and_are_kept_where_that_is_cheaper():
+    """60 photos of 12 MP; made smaller, all of them take less than decoding one of them again."""
+    facts = dataclasses.replace(
+        FACTS, train=52, test=8, pixels=12e6, largest=12e6, full=12e6, photo_bytes=60 * 36_000_000
+    )
+    for memory in (800, 1_024, 1_500):
+        found = choose(dataclasses.replace(request(memory), facts=facts), MEASURED, SPENT)
+        smaller = facts.smaller(found.resolution)
+        footprint = Footprint(smaller, MEASURED.process, MEASURED.pairs, found.options.config.sh_degree)
+        assert footprint.peak(found.max_gaussians, found.image_memory) <= memory * MIB
+        every = footprint.most_gaussians(int(0.95 * memory * MIB), smaller.photo_bytes)
+        assert found.image_memory >= smaller.photo_bytes or every < found.max_gaussians
+        assert found.max_gaussians >= 1_000
+
+
 def test_nothing_is_planned_without_need(tmp_path):
     """The capture is not there, so looking at it would fail: it is not looked at."""
     options = dataclasses.replace(OPTIONS, data=tmp_path / "nothing", time_limit=3.0)
@@ -225,6 +240,8 @@ def test_a_resumed_run_takes_the_numbers_of_its_config(capture, tmp_path):
     again = plan(plain, Limits(2**30, 100.0))
     assert again.options.config == begun.config and again.resolution == 2 and not again.by_time
     assert CaptureRun(again.options).finished
+    assert len(again.sentences) == 1 and "memory is not planned again" in again.sentences[0]
+    assert plan(plain, Limits(seconds=100.0)).sentences == ()
     with pytest.raises(CheckpointError, match="iterations = 20, not 30000"):
         CaptureRun(taken_up(plain, ["iterations"]))
 

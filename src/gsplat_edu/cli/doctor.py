@@ -89,6 +89,10 @@ def run(arguments: argparse.Namespace) -> None:
 def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
     settings, config = DataSettings(resolution=arguments.resolution), recipe(arguments.iterations)
     backend = resolve_backend(arguments.backend)
+    if backend == "torch" and not arguments.no_forecast:
+        raise ArgumentError(
+            "--backend torch: is too slow to be forecast; take cpu or cuda, or add --no-forecast"
+        )
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
         survey = prepare(arguments.path, lambda done, total: bar.update(task, completed=done, total=total))

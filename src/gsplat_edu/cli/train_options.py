@@ -189,7 +189,10 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
             )
     iterations = RECIPE_ITERATIONS if arguments.iterations is None else arguments.iterations
     config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
-    if config.strategy == "mcmc" and config.max_gaussians is None:
+    planned = limits_from(arguments).memory is not None or (
+        arguments.time_limit is not None and arguments.iterations is None
+    )
+    if config.strategy == "mcmc" and config.max_gaussians is None and not planned:
         raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
     settings = DataSettings(
         resolution=arguments.resolution,

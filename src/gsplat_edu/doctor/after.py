@@ -17,7 +17,8 @@ POOR = 20.0
 mean. Three captures had 27 to 32 after 2,000 iterations."""
 
 UNEXPLAINED = 3.0
-"""Decibels below the median of its split from which a view may be one the scene cannot explain: twice the error."""
+"""Decibels below the median of its split from which a view may be one the scene cannot explain: twice the squared
+error."""
 
 UNEXPLAINED_SPREAD = 3.0
 """It has to be so many standard deviations below as well, by the median absolute deviation."""
@@ -173,12 +174,13 @@ def _gap(run: Trained) -> list[Finding]:
 
 
 def _exposure(run: Trained) -> list[Finding]:
-    off = sorted(
-        (v for v in (*run.train, *run.test) if abs(v.stops) > JUMP), key=lambda view: -abs(view.stops)
-    )
+    views = (*run.train, *run.test)
+    # A scene that is not finished is too dark for all of them.
+    usual = float(np.median([view.stops for view in views])) if views else 0.0
+    off = sorted((v for v in views if abs(v.stops - usual) > JUMP), key=lambda v: -abs(v.stops - usual))
     if not off:
         return []
-    names = tuple(f"{view.name} ({view.stops:+.1f})" for view in off)
+    names = tuple(f"{view.name} ({view.stops - usual:+.1f})" for view in off)
     what = f"{counted(len(off), 'photo')}, in stops against the scene"
     advice = "take out the photos whose exposure jumps, or make them even: the scene explains them with fog"
     return [Finding("exposure", Severity.WARNING, what, advice, names)]

@@ -251,9 +251,10 @@ class Footprint:
 
     def most_gaussians(self, limit: int, image_memory: int) -> int:
         """Return how many Gaussians a limit in bytes leaves room for; below zero where there is none for any."""
-        if (free := limit - self.peak(0, image_memory)) < 0:
+        if self.peak(0, image_memory) > limit:
             return -1
-        low, high = 0, free // self._per_gaussian + 1  # of which the first fits and the second does not
+        # Where reading sets the peak, Gaussians take the room that it leaves; no more fit than all of the limit holds.
+        low, high = 0, limit // self._per_gaussian + 1  # of which the first fits and the second does not
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if self.peak(middle, image_memory) <= limit else (low, middle)

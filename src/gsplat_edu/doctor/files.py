@@ -72,7 +72,7 @@ def check_readable(survey: Survey) -> list[Finding]:
             "unusable",
             Severity.WARNING,
             f"{len(names)} of {len(survey.shots) + len(names)} photos ({reasons})",
-            f"copy {listed(names)} again or take them out of the capture: training refuses it as it is",
+            f"copy {listed(names)} again, calibrate again or take them out: training refuses the capture as it is",
             tuple(names),
         )
     ]
@@ -81,7 +81,8 @@ def check_readable(survey: Survey) -> list[Finding]:
 def _reason(message: str) -> str:
     """Shorten an error's line to why: what stands in brackets, or before the first semicolon without the file."""
     inner = re.search(r"cannot be decoded \((.*)\);", message)
-    return inner[1] if inner else message.split("; ")[0].rpartition(": ")[2]
+    short = inner[1] if inner else message.split("; ")[0].rpartition(": ")[2]
+    return re.sub(r"^the photo of .* is (?=\d)", "the photo is ", short)
 
 
 def check_poses(survey: Survey) -> list[Finding]:

@@ -29,7 +29,7 @@ before it has been told to."""
 
 FINE, COARSE = 1.0, 4.0
 """Standard deviations at which gradients are taken, px of a photo of 1024. A step loses energy as 1 / sigma; a blur of
-b px takes sqrt((1 + b²) / (16 + b²)) of the ratio of the two, whatever the step's height."""
+b px leaves sqrt((16 + b²) / (1 + b²)) as the ratio of the two, 4 where there is none, whatever the step's height."""
 
 ANGLES = np.arange(8) * math.pi / 8
 """Directions along which gradients are taken, radians: shaking the camera blurs along one of them only."""

@@ -184,7 +184,8 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
         CheckpointError: the config.json of a run to resume is damaged.
     """
     if options.resume and options.folder.exists():
-        return Plan(taken_up(options, given))
+        said = f"{limits}: a resumed run keeps the numbers of its config.json; memory is not planned again"
+        return Plan(taken_up(options, given), sentences=(said,) if limits.memory is not None else ())
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
         return Plan(options)
     if options.backend == "torch":
@@ -291,7 +292,9 @@ def _photos_kept(footprint: Footprint, aim: int, enough: int, wanted: int) -> in
         return photos
     half, spare = (aim - footprint.peak(0, 0)) // 2, aim - footprint.peak(wanted, 0)
     room = aim - footprint.peak(enough, 0)
-    return max(min(photos, max(half, spare), room), 0) // 2**20 * 2**20
+    part = max(min(photos, max(half, spare), room), 0) // 2**20 * 2**20
+    # Photos that are read again are decoded at the size of their files, which may take more than keeping all of them.
+    return photos if footprint.most_gaussians(aim, photos) >= footprint.most_gaussians(aim, part) else part
 
 
 def _within_time(
