@@ -41,6 +41,7 @@ def build(source: Path, out: Path) -> None:
     notebook = jupytext.read(source)
     for number, cell in enumerate(notebook.cells):
         cell["id"] = f"cell-{number:02d}"  # drawn at random otherwise
+        cell["metadata"] = {}  # a tag could excuse a cell that raises
     notebook.metadata = {"kernelspec": notebook.metadata["kernelspec"], "language_info": {"name": "python"}}
     NotebookClient(
         notebook,

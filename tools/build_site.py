@@ -122,6 +122,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Build the site of chapters, documents and reference.")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "site", help="folder (default: out/site)")
     out = parser.parse_args().out.resolve()
+    if out.exists() and not (out / "objects.inv").is_file() and not (out.is_dir() and not any(out.iterdir())):
+        print(f"build_site.py: --out: {out} is there and is no site; choose another folder", file=sys.stderr)
+        return 2
     with tempfile.TemporaryDirectory() as scratch:
         stage, made = Path(scratch) / "source", Path(scratch) / "site"
         gather(stage)
@@ -141,7 +144,8 @@ def main() -> int:
         if done.returncode:
             print("build_site.py: the lines above say what is wrong; nothing was written", file=sys.stderr)
             return 1
-        shutil.rmtree(out, ignore_errors=True)
+        if out.exists():
+            shutil.rmtree(out)
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(made, out)
     print(f"site: {out / 'index.html'}")

@@ -36,19 +36,19 @@ def faults(figure: Figure) -> list[str]:
 
 
 def _faults_of(number: int, axes: Axes) -> list[str]:
-    titles = (axes.get_title(loc="left"), axes.get_title(loc="center"), axes.get_title(loc="right"))
+    # A twin has the title of the axes that it lies on; a colour bar needs none.
+    same = [other for other in axes.figure.axes if other.bbox.bounds == axes.bbox.bounds]
+    titles = [other.get_title(loc=place).strip() for other in same for place in ("left", "center", "right")]  # type: ignore[arg-type]
     title = next((text for text in titles if text), "")
-    # A colour bar belongs to the axes beside it, a twin to the one it lies on.
-    twin = any(other is not axes and other.bbox.bounds == axes.bbox.bounds for other in axes.figure.axes)
     found = []
-    if not (title or twin or axes.get_label() == "<colorbar>"):
+    if not (title or axes.get_label() == "<colorbar>"):
         found.append(f"axes {number} has no title")
     if axes.axison:
         present = [getattr(axes, name) for name in ("xaxis", "yaxis", "zaxis") if hasattr(axes, name)]
         found += [
             f"axes {number} {title!r}: its {axis.axis_name} axis has numbers and no label"
             for axis in present
-            if _numbered(axis) and not axis.get_label_text()
+            if _numbered(axis) and not axis.get_label_text().strip()
         ]
     return found
 

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsplat_edu.constants import TILE
 from ladder.build import library
 from ladder.splats import Splats
 
 FLOATS, INTS = ctypes.POINTER(ctypes.c_float), ctypes.POINTER(ctypes.c_int32)
-TILE_EDGE = 16
 
 
 class Gradients(NamedTuple):
@@ -56,7 +56,7 @@ class _Gradient(ctypes.Structure):
 
 def num_tiles(splats: Splats) -> int:
     """Return how many tiles the screen has."""
-    return -(-splats.H // TILE_EDGE) * -(-splats.W // TILE_EDGE)
+    return -(-splats.H // TILE) * -(-splats.W // TILE)
 
 
 def atomics(

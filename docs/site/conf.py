@@ -51,6 +51,10 @@ def docstrings(app, what, name, thing, options, lines):
     found, in_section = [], False
     for paragraph in "\n".join(lines).split("\n\n"):
         rows = paragraph.strip("\n").split("\n")
+        if rows[0].strip() in ("Returns:", "Yields:") and len(rows) > 1:
+            # napoleon would take what stands before a colon for a type, but not before one that stands first
+            indent = len(rows[1]) - len(rows[1].lstrip())
+            rows[1] = rows[1][:indent] + ": " + rows[1][indent:]
         in_section = in_section or SECTION.match(rows[0]) is not None
         equation = " = " in paragraph and not rows[-1].rstrip().endswith((".", ":"))
         drawing = all(row.startswith("    ") for row in rows)
@@ -62,7 +66,7 @@ def docstrings(app, what, name, thing, options, lines):
         else:
             found += [*map(escaped, rows), ""]
     lines[:] = found
-    if what in ("data", "attribute"):
+    if what in ("data", "attribute", "property"):
         of_variables[name], lines[:] = found, []
 
 

@@ -160,8 +160,8 @@ for ax, owner, title in zip(axes, (listed_order, nearest_first), titles, strict=
 plt.show()
 
 # %% [markdown]
-# The far ball is small now, and its pattern is whole. In the near one there are specks. They are the next
-# thing that goes wrong.
+# The near ball has its pattern now, with specks in it. They are the next thing that goes wrong. The far ball
+# is small, as it should be, but of its pattern only noise is left: that comes after.
 #
 # ## Too near: holes
 #
@@ -187,9 +187,9 @@ plt.show()
 # $$\left(1 - \frac{a}{A}\right)^n \approx e^{-\lambda}.$$
 #
 # The patch follows from the ray. A pixel's ray is $e + t\,d$ with $d$ scaled so that $t$ is the depth; at
-# depth $t$ the pixel is $t/f$ wide, and a surface with normal $n$ that it meets at a slant shows it
+# depth $t$ the pixel is $t/f$ wide, and a surface with normal $\nu$ that it meets at a slant shows it
 #
-# $$a = \frac{t^2}{f^2\,|n \cdot d|}.$$
+# $$a = \frac{t^2}{f^2\,|\nu \cdot d|}.$$
 #
 # A ray meets a ball twice: in front, and again behind. Holes in the front are not black. In
 # $e^{-\lambda_{front}}(1 - e^{-\lambda_{back}})$ of the cases they show the inside of the other side.

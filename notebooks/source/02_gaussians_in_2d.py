@@ -152,7 +152,7 @@ assert peaks[0] == 1.0 and peaks[2] > 1e3
 # %% [markdown]
 # In the middle the ellipse has all but become a line. One small push further an eigenvalue is negative: along that
 # axis the exponent grows, the contours are hyperbolas, and what should have been a blob is brightest at infinity.
-# Nothing in the three numbers says where that border is.
+# The border is where $\Sigma_{xy}^2 = \Sigma_{xx}\Sigma_{yy}$, and a step on the three numbers does not look.
 #
 # So do not store $\Sigma$. Store $A$, in whatever form, and multiply. For any direction $w$
 #
@@ -339,10 +339,11 @@ assert np.abs(means[MODES[2]] / means[MODES[2]][0] - 1).max() < ripple
 #
 # ## How far a splat reaches
 #
-# A Gaussian is nowhere zero. Without an end every splat would have to be evaluated at every pixel. An image has
-# steps of 1/255, and what changes a pixel by less than one step need not be drawn. With opacity $o$
+# A Gaussian is nowhere zero. Without an end every splat would have to be evaluated at every pixel. An image has steps
+# of 1/255, and what changes a pixel by less than one step need not be drawn. With opacity $o$ its *alpha* is $o\,g$,
+# and
 #
-# $$o\,e^{-m^2/2} \ge \frac{1}{255} \quad\Longleftrightarrow\quad m^2 = d^\top\Sigma^{-1}d \le 2\ln(255\,o),$$
+# $$\alpha = o\,e^{-m^2/2} \ge \frac{1}{255} \quad\Longleftrightarrow\quad m^2 = d^\top\Sigma^{-1}d \le 2\ln(255\,o),$$
 #
 # an ellipse that reaches $\sqrt{2\ln(255\,o)}$ standard deviations. Its bounding box has the half extents
 # $\sqrt{2\ln(255\,o)\,\Sigma_{xx}}$ and $\sqrt{2\ln(255\,o)\,\Sigma_{yy}}$, because $x = a^\top q$, with $a$
@@ -371,7 +372,7 @@ assert abs(share_lost - ALPHA_MIN / 0.8) < 8 * reach.max() * step * ALPHA_MIN / 
 # %% [markdown]
 # Opaque splats reach further than 3 standard deviations, and a box of that size cuts them above the floor; faint
 # ones end long before it. The share of light that the floor takes is $1/(255\,o)$ exactly. The NumPy renderer of
-# this course can do both, the kernels do the exact extent.
+# this course can do both, the fast renderers of later chapters do the exact extent.
 #
 # ## The next failure
 #

@@ -237,7 +237,8 @@ plt.show()
 # $$u = A\,(\mu + R S q) + b = (A\mu + b) + (A R S)\,q$$
 #
 # is a matrix times a round Gaussian again. The image is a Gaussian with covariance $A \Sigma A^\top$, exactly, at
-# any size and from anywhere. Each direction in it has skewness 0.
+# any size and from anywhere. Each direction in it has *skewness* 0, the mean of the offset's cube in standard
+# deviations.
 
 # %%
 
@@ -321,7 +322,8 @@ assert shifts[0] > 5 * shifts[-1] and skews[0] > 0.5
 #
 # In the image these planes are lines, the tangents of the outline. A line $n_1 u + n_2 v + n_3 = 0$ is tangent to
 # an ellipse with centre $c$ and shape $M$ if $(n_1 c_1 + n_2 c_2 + n_3)^2 = (n_1, n_2)\,M\,(n_1, n_2)^\top$, a
-# quadratic form as well. So the outline is an ellipse, and comparing the two, with $f = 1$,
+# quadratic form as well. So, as long as the whole shell is in front of the camera, $m_z > k\sqrt{\Sigma_{zz}}$, the
+# outline is an ellipse, and comparing the two, with $f = 1$,
 #
 # $$c_1 = \frac{D_{13}}{D_{33}} = \frac{m_x m_z - k^2\Sigma_{xz}}{m_z^2 - k^2\Sigma_{zz}}.$$
 #
@@ -385,9 +387,9 @@ found = np.array([(distance2 < k * k).mean() for k in (1, 2, 3)])
 assert np.abs((found - promised) / error).max() > 20
 
 # %% [markdown]
-# It is wrong near the camera, it took all those samples to find, and it would have to be found again for every
-# splat, every picture and every step of a training. No Gaussian is exactly right, so the one to draw is chosen for
-# other reasons: it has to follow from $\mu$, $\Sigma$ and the camera by a formula short enough for a kernel, have
-# a derivative, and be right where splats are small against their distance, as nearly all of them are. Affine
-# cameras are exact. [Chapter 04](04_splatting.ipynb) replaces the pinhole, for each splat, by the affine camera that
-# fits it best at the mean, and goes looking for where that breaks.
+# It is wrong near the camera, it took all those samples to find, and it would have to be found again for every splat,
+# every picture and every step of a training. No Gaussian is exactly right, so the one to draw is chosen for other
+# reasons: it has to follow from $\mu$, $\Sigma$ and the camera by a formula short enough for millions of splats, have
+# a derivative, and be right where splats are small against their distance, as nearly all of them are. Affine cameras
+# are exact. [Chapter 04](04_splatting.ipynb) replaces the pinhole, for each splat, by the affine camera that fits it
+# best at the mean, and goes looking for where that breaks.

@@ -99,7 +99,7 @@ plt.show()
 # $$\pi(m + h) = \pi(m) + J h + O(f\,|h|^2 / z^2).$$
 #
 # The tangent takes six derivatives. Moving sideways moves the image by focal length over depth; moving away pulls
-# the image towards the principal point, faster the further it is from there:
+# the image towards $(c_x, c_y)$, the *principal point*, faster the further it is from there:
 #
 # $$J = \begin{pmatrix} f_x / z & 0 & -f_x\, x / z^2 \\ 0 & f_y / z & -f_y\, y / z^2 \end{pmatrix}.$$
 
@@ -129,9 +129,11 @@ assert np.abs(J @ close_mean).max() < 1e-12
 #
 # $$\Sigma_{2d} = J\, W\, \Sigma\, W^\top J^\top,$$
 #
-# two by two, in square pixels, around the projected mean. Zwicker et al. (2001) call the result elliptical
-# weighted average splatting, EWA; the ellipse is the *splat*. Written out it is one line, and `project_cov3d` in
-# [gsplat_edu.gaussian_math](../src/gsplat_edu/gaussian_math.py) is that line for many Gaussians at once.
+# two by two, in square pixels, around the projected mean. The formula is that of Zwicker et al. (2001). They convolve
+# this ellipse with the pixel's low-pass filter, as chapter 02 does with its dilation, and call that EWA splatting,
+# after Heckbert's elliptical weighted average. The ellipse is the *splat*. Written out it is one line, and
+# `project_cov3d` in [gsplat_edu.gaussian_math](../src/gsplat_edu/gaussian_math.py) is that line for many Gaussians at
+# once.
 
 
 # %%
@@ -317,10 +319,11 @@ plt.show()
 # image, and lay a veil over all of it. The tangent is right at the mean; eleven focal lengths away from the middle of
 # the image, where the mean is, that says nothing about the image.
 #
-# Kerbl et al. (2023) found a bound rather than a better formula. The mean is projected as before. Inside $J$, and
-# only there, $x/z$ and $y/z$ are clamped to the viewing directions of the image, enlarged 1.3 times around its
-# middle. A mean inside that window keeps its Jacobian to the last bit. A mean outside gets the one of the window's
-# rim: wrong, but of bounded width, so that its splat stays near its mean, out of the picture, where it belongs.
+# The code of Kerbl et al. (2023) has a bound rather than a better formula. The mean is projected as before. Inside
+# $J$, and only there, $x/z$ and $y/z$ are clamped to the viewing directions of the image, enlarged 1.3 times around
+# its middle. A mean inside that window keeps its Jacobian to the last bit. A mean outside gets the one of the
+# window's rim: wrong, but of bounded width, so that its splat stays near its mean, out of the picture, where it
+# belongs.
 
 # %%
 (low, high), _ = CAMERA.jacobian_bounds(1.3)
@@ -362,9 +365,9 @@ assert np.isnan(CAMERA.project(-close_mean)[0])
 # %% [markdown]
 # ## The next failure
 #
-# Every Gaussian now has its ellipse, and each ellipse is right. Here are 2,500 of them, flat disks laid on a sphere.
-# The colour tells where a disk lies. They are painted as opaque ellipses in the order in which they are stored, and
-# then in the opposite order.
+# Every Gaussian now has its ellipse, and each is right to a percent. Here are 2,500 of them, flat disks laid on a
+# sphere. The colour tells where a disk lies. They are painted as opaque ellipses in the order in which they are
+# stored, and then in the opposite order.
 
 # %%
 means, cov3ds, colors, _ = sphere_shell(2500)

@@ -289,7 +289,7 @@ assert np.all(np.diff(errors, axis=1) < 0) and errors[:, 3].max() < 0.2 * errors
 #
 # The coefficients describe functions of a direction in the world. Turn the scene by $R$ and they have to turn as
 # well: the new function at $d$ is the old one at $R^\top d$. A rotated polynomial is a polynomial of the same degree,
-# so each degree keeps to itself. Degree 0 stays. Degree 1 is a linear function
+# so each degree keeps to itself. Degree 0 stays. Degree 1 is a linear function, $C_1$ its harmonics' constant,
 # $C_1\,(-c_1 y + c_2 z - c_3 x) = g \cdot d$, an arrow $g = C_1\,(-c_3, -c_1, c_2)$, and an arrow turns by $R$. The
 # higher ones need small matrices; `sh_rotation` makes them.
 

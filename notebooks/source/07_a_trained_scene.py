@@ -190,7 +190,7 @@ plt.show()
 # as large as the scene, and there is fog. Colours as stored lack a factor and an offset, and it is another sphere. The
 # other two are the kind that is passed on. Opacities as stored drop every splat below one half and make most others
 # solid; here the solid ones cover the rest, and it hardly shows. A quaternion that is not of length 1 is no rotation:
-# its matrix shears and shrinks, and the rim frays. Whoever sees that blames the training.
+# a short one turns too little and shrinks across its axis, and the rim frays. Whoever sees that blames the training.
 #
 # ## Why not store what is drawn
 #

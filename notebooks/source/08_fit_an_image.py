@@ -216,8 +216,8 @@ agrees("logit_opacities", (1 - tiny.opacities) * h.sum(axis=(1, 2)))
 # ## Where it is, and what shape it has
 #
 # The exponent is $-\frac{1}{2} d^T \Lambda d$ with $d = x - \mu$. Moving the mean moves $d$ the other way, and the two
-# signs cancel: the slope is $\Lambda d$. A splat is pulled towards pixels where more of it would help, the more the
-# further out they lie, and not at all by its own centre.
+# signs cancel: the slope is $\Lambda d$. A splat is pulled towards pixels where more of it would help, most by those
+# one standard deviation out, and not at all by its own centre.
 #
 # $$\frac{\partial L}{\partial \mu_i} = \Lambda_i \sum_{\text{pixels}} h\, d$$
 #

@@ -158,7 +158,7 @@ gallery("trained on guessed poses: every photo contradicts the next", shown)
 # length of $t$ is a common factor and cannot be known. So poses can be found from matches, and matches from what does
 # not change between photos: SIFT describes the surroundings of a corner by gradients, at the corner's own scale and
 # angle (Lowe 2004). Then the mapper (Schönberger and Frahm 2016) begins with two photos, triangulates points, adds
-# the photo that sees most of them, and after each lets least squares move all poses, points and the lens together.
+# the photo that sees most of them, and again and again lets least squares move poses, points and the lens together.
 #
 # [gsplat_edu.sfm](../src/gsplat_edu/sfm/reconstruct.py) drives COLMAP through these stages. It is what `gsplat-edu
 # sfm` calls. One thread makes the result the same to the bit in every run.
@@ -278,11 +278,12 @@ for expected in ((shaken,), None):
 # %% [markdown]
 # ## The scene
 #
-# Now the recipe, from the points that were triangulated, every eighth photo held out: the loss is $0.8\,L_1 + 0.2\,(1
-# - \mathrm{SSIM})$, harmonics rise by degrees, splats are cloned and split. The mean over the held-out photos of the
-# peak signal-to-noise ratio ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)) is the number that
-# the field compares, $10 \log_{10}(1/\mathrm{MSE})$ in decibels: 3 dB are half the squared error. Held against the
-# guess, the first line below credits the poses with their points as well: the guess had to begin with random ones.
+# Now the recipe, from the points that were triangulated, every eighth photo held out: the loss is
+# $0.8\,L_1 + 0.2\,(1 - \mathrm{SSIM})$, where SSIM (Wang et al. 2004) is 1 if two photos agree in mean, contrast and
+# pattern around every pixel: $L_1$ alone forgives blur. Harmonics rise by degrees, splats are cloned and split. The
+# field compares the mean peak signal-to-noise ratio of held-out photos, $10 \log_{10}(1/\mathrm{MSE})$ in decibels
+# ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)): 3 dB are half the squared error. Held against
+# the guess, the first line below credits the poses with their points as well: the guess had to begin with random ones.
 
 # %%
 posed = summarize(trained("capture", "small", BRIEFLY, resolution=SIDE_PX)[2].test)["psnr"]
@@ -307,7 +308,7 @@ gallery(f"{view.name}, which was held out", panels, height=3.6)
 #
 # Poses are paid for once, and matching grows with the square of the number of photos. Training is the stage that a
 # budget decides. `benchmarks/train_step.py` takes its iteration apart, here on the trained scene: medians over steps
-# at one photo.
+# at one photo, each row's own: on a machine that does other things they need not add up to the whole.
 
 # %%
 done = json.loads((WORK / "capture/sfm/stages.json").read_text())["stages"]
@@ -335,7 +336,7 @@ plt.show()
 # the colour and 4 around them, 19 in all; in `native/composite_backward.cpp` 35. They are vector instructions that
 # compute, each for as many pixels as a vector has lanes; loads and stores are left out. The rate is that of
 # independent fused multiply-adds, measured. Adam does little with many numbers, so beside it stands the rate at which
-# one thread goes through memory in a plain sum of two arrays.
+# one thread goes through memory in a plain sum of two arrays; Adam has all threads.
 
 # %%
 g = final.trainer.gaussians
@@ -369,7 +370,8 @@ for what, count in (("as many", moved // 12), ("30 million", 30_000_000)):
 # ## The next failure
 #
 # There is no next chapter, and there are failures left. The first is in every scene: it is right where somebody
-# stood. Here is a look from higher up than any photo was taken, which the scene was never asked for.
+# stood. Here is a look from higher up than any photo was taken, which the scene was never asked for. Part of what
+# it loses is only that no plain sky is in it, which is easy; the rest is in the picture, on top of the box.
 
 # %%
 JPEG()
@@ -378,7 +380,7 @@ R, eye = above.R @ fit.R, (above.eye - fit.t) @ fit.R / fit.s
 shown = picture(final, Camera(R, eye, focal, focal, above.cx, above.cy, above.H, above.W))
 real = photograph_box(above)
 print(f"from above: {psnr(shown / 255, real):.2f} dB, held out along the walk: {test['psnr']:.2f} dB")
-assert psnr(shown / 255, real) < test["psnr"] - 1
+assert psnr(shown / 255, real) < test["psnr"] - (1 if SHORT else 2)
 gallery("higher up than any photo", {"render": shown, "what is there": real}, 1, 4.8)
 
 held = 16 * numbers_each  # bytes: its numbers, their gradients and two moments

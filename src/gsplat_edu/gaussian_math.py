@@ -124,7 +124,7 @@ def project_cov3d(
         ShapeError: a shape differs.
         ArgumentError: a mean is not in front of the camera (z <= 0), or anything is NaN or infinite.
 
-    Source: Zwicker et al. 2001, "EWA Splatting", eq. 31; Kerbl et al. 2023, eq. 5.
+    Source: Zwicker et al. 2002, "EWA Splatting", eq. 31; Kerbl et al. 2023, eq. 5.
     """
     cov3d = float64_array("cov3d", cov3d, ("...", 3, 3))
     mean_cam = float64_array("mean_cam", mean_cam, ("...", 3))

@@ -48,9 +48,23 @@ def redefinitions(text: str) -> set[str]:
             bound.add(node.name)
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del):
             bound.add(node.id)
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
+            bound.add(node.attr)
+        elif isinstance(node, ast.arg):
+            bound.add(node.arg)
+        elif isinstance(node, ast.MatchAs | ast.MatchStar) and node.name:
+            bound.add(node.name)
         elif isinstance(node, ast.Import | ast.ImportFrom):
-            ours = isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gsplat_edu")
-            bound |= {a.asname or a.name for a in node.names if not (ours and a.asname in (None, a.name))}
+            ours = isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "gsplat_edu"
+            for alias in node.names:
+                renamed = alias.asname not in (None, alias.name)
+                bound |= (
+                    {alias.asname or alias.name, alias.name}
+                    if not ours
+                    else {alias.name}
+                    if renamed
+                    else set()
+                )
     return bound & public_names()
 
 
@@ -77,10 +91,24 @@ def test_no_chapter_redefines_a_public_name(source):
         "Z_NEAR += 1",
         "print(T_STOP := 1)",
         "from gsplat_edu import Camera as View",
+        "from gsplat_edu import render_gaussians as rg",
+        "from gsplat_edu2 import Camera",
+        "lambda Camera: 1",
+        "match 1:\n    case Camera: pass",
+        "gsplat_edu.camera.Camera = 1",
     ],
 )
 def test_a_redefinition_would_be_found(text):
     assert redefinitions(text)
+
+
+def draws_aside(node: ast.AST) -> bool:
+    """Say whether a figure could appear that plt.show() has not seen."""
+    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "plt":
+        return node.attr not in ("subplots", "subplot_mosaic", "figure", "show", "setp")
+    if isinstance(node, ast.Call):
+        return isinstance(node.func, ast.Name) and node.func.id == "display"
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Name)
 
 
 def violations(text: str) -> list[str]:
@@ -93,11 +121,13 @@ def violations(text: str) -> list[str]:
         f"it is longer than {LONGEST} lines": text.count("\n") > LONGEST,
         "it has no figure": not made,
         "a figure is not shown by plt.show()": names.count("show") < made,
-        "it swallows errors": any(isinstance(node, ast.Try) for node in nodes)
+        "a figure is drawn past plt.subplots()": any(map(draws_aside, nodes)),
+        "it hides output": "%%capture" in text,
+        "it swallows errors": any(isinstance(node, ast.Try | ast.TryStar) for node in nodes)
         or any(
             isinstance(node, ast.Name | ast.Attribute) and "suppress" in ast.unparse(node) for node in nodes
         ),
-        "it silences warnings": "simplefilter" in names or "filterwarnings" in names,
+        "it silences warnings": bool({"simplefilter", "filterwarnings", "catch_warnings"} & set(names)),
         "it does not end by naming the next failure": "\n# ## The next failure\n" not in text,
         "it links no module": "](../src/gsplat_edu/" not in text,
     }
@@ -126,7 +156,18 @@ def test_chapters_keep_the_rules(source):
     [
         ("assert 1 + 1 == 2", "1 + 1", "it asserts nothing"),
         ("# %%\n", "# %%\n" + "#\n" * LONGEST, f"it is longer than {LONGEST} lines"),
+        ("fig, ax = plt.subplots()\nplt.show()\n", "", "it has no figure"),
         ("plt.show()", "", "a figure is not shown by plt.show()"),
+        ("assert", "plt.plot([1, 2])\nassert", "a figure is drawn past plt.subplots()"),
+        ("assert", "fig\nassert", "a figure is drawn past plt.subplots()"),
+        ("assert", "display(fig)\nassert", "a figure is drawn past plt.subplots()"),
+        ("assert", "# %%capture\nassert", "it hides output"),
+        ("assert", "try:\n    pass\nexcept* ValueError:\n    pass\nassert", "it swallows errors"),
+        (
+            "assert",
+            "with warnings.catch_warnings(action='ignore'):\n    pass\nassert",
+            "it silences warnings",
+        ),
         ("assert", "try:\n    pass\nexcept ValueError:\n    pass\nassert", "it swallows errors"),
         ("assert", "with contextlib.suppress(OSError):\n    pass\nassert", "it swallows errors"),
         ("assert", "warnings.simplefilter('ignore')\nassert", "it silences warnings"),
@@ -180,6 +221,13 @@ def test_images_need_titles_colour_bars_labels_and_inner_axes_nothing(faults):
     bar.set_label("transmittance")
     assert faults(made) == []
     assert faults(plt.figure()) == ["the figure has no axes"]
+    made = figure(title=" ")
+    twin = made.axes[0].twinx()
+    twin.plot([1, 0])
+    twin.set(ylabel="the other, px")
+    assert len(faults(made)) == 2, "two axes without a title do not excuse each other"
+    twin.set_title("two lines")
+    assert faults(made) == []
 
 
 @pytest.mark.slow

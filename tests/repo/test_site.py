@@ -1,5 +1,6 @@
 """The site: built without a warning, opened from disk, and every link on it leads somewhere."""
 
+import re
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -9,6 +10,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 ROOT = Path(__file__).parents[2]
+APART = ("pre", "code", "math", "script", "style", "title")
 
 
 class Page(HTMLParser):
@@ -17,15 +19,24 @@ class Page(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.links, self.loaded, self.anchors, self.tags = [], [], set(), set()
+        self.prose, self.within = [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attributes):
         found = dict(attributes)
         self.tags.add(tag)
+        self.within += [tag] if tag in APART else []
         self.anchors |= {found[name] for name in ("id", "name") if found.get(name)}
         self.links += [found["href"]] if tag == "a" and found.get("href") else []
         self.loaded += [found["href"]] if tag == "link" and found.get("rel") == "stylesheet" else []
         self.loaded += [found["src"]] if tag in ("img", "script") and found.get("src") else []
+
+    def handle_endtag(self, tag):
+        if self.within and self.within[-1] == tag:
+            self.within.pop()
+
+    def handle_data(self, text):
+        self.prose += [] if self.within else [text]
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +58,7 @@ def broken(pages, out):
             if url.scheme or url.netloc:
                 continue
             target = (path.parent / unquote(url.path)).resolve() if url.path else path
-            lost = url.fragment and target.suffix == ".html" and url.fragment not in pages[target].anchors
+            lost = url.fragment and target in pages and url.fragment not in pages[target].anchors
             if not target.is_file() or not target.is_relative_to(out) or lost:
                 found.append(f"{path.relative_to(out)}: {link}")
     return found
@@ -77,8 +88,25 @@ def test_every_chapter_document_and_module_has_a_page(site):
 
 @pytest.mark.slow
 def test_broken_links_would_be_found(site, tmp_path):
-    texts = {"a": '<a href="b.html#here">', "b": '<p id="there"><img src="c.png">'}
+    texts = {"a": '<a href="b.html#here"><a href="gone.html#x">', "b": '<p id="there"><img src="c.png">'}
     for name, text in texts.items():
         (tmp_path / f"{name}.html").write_text(text)
     pages = {tmp_path / f"{name}.html": Page(text) for name, text in texts.items()}
-    assert broken(pages, tmp_path) == ["a.html: b.html#here", "b.html: c.png"]
+    assert broken(pages, tmp_path) == ["a.html: b.html#here", "a.html: gone.html#x", "b.html: c.png"]
+
+
+@pytest.mark.slow
+def test_no_equation_and_no_docstring_is_torn_apart(site):
+    pages, out = site
+    for path, page in pages.items():
+        prose = "".join(page.prose)
+        assert "$" not in prose and not re.search(r"\\[a-zA-Z]", prose), path
+        assert "Return type" not in prose, "signatures carry the types"
+
+
+def test_a_folder_that_is_no_site_is_not_written_over(tmp_path):
+    (tmp_path / "thesis.txt").write_text("years")
+    command = [sys.executable, str(ROOT / "tools" / "build_site.py"), "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert (tmp_path / "thesis.txt").read_text() == "years"

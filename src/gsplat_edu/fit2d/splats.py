@@ -101,7 +101,7 @@ def random_splats_2d(count: int, height: int, width: int, rng: np.random.Generat
     """Scatter faint round splats over an image: what a fit starts from. It knows nothing of the picture.
 
     Args:
-        count: N.
+        count: N, how many.
         height: Height of the image, px.
         width: Its width, px.
         rng: Draws means, then colours.
