@@ -11,6 +11,8 @@ from rich.console import Console
 
 from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.sfm import options_from, stage_bars
+from gsplat_edu.cli.train import _with_poses
+from gsplat_edu.cli.train_options import options_from as train_options_from
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.textured_box import box_camera, box_orbit, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions
@@ -43,11 +45,11 @@ def test_options(tmp_path):
 @pytest.mark.usefixtures("colmap")
 def test_photos_become_a_capture(tmp_path, capsys):
     save(tmp_path / "photos", box_orbit(6, turn=1.8))
-    assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
-    said = capsys.readouterr().out
+    assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "my out")]) == 0
+    said = capsys.readouterr().out.replace("\n", "")
     assert "6 of 6 photos have a pose" in said and "mean reprojection error 0." in said
-    assert f"gsplat-edu train {tmp_path / 'out'}" in said.replace("\n", "")
-    assert len(load_dataset(tmp_path / "out").train) == 5
+    assert f"next: gsplat-edu train '{tmp_path / 'my out'}' --out RUN" in said, "it can be pasted"
+    assert len(load_dataset(tmp_path / "my out").train) == 5
 
 
 def _noise(folder):
@@ -126,7 +128,38 @@ def test_an_empty_video_is_one_line(tmp_path, capsys):
 )
 @pytest.mark.usefixtures("colmap", "as_shipped")
 def test_the_users_photos_are_not_written_over(tmp_path, capsys, out, says):
-    source = tmp_path / ("images" if out == "." else "photos")
+    _refused(tmp_path, capsys, tmp_path / ("images" if out == "." else "photos"), out, says)
+
+
+@pytest.mark.parametrize("place", ["sfm/photos", "sfm/frames", "masks", "sparse/0", "images/day 1"])
+@pytest.mark.usefixtures("colmap", "as_shipped")
+def test_photos_where_a_run_puts_things_are_not_removed(tmp_path, capsys, place):
+    _refused(tmp_path, capsys, tmp_path / "out" / place, "out", "is where the photos themselves are")
+
+
+@pytest.mark.usefixtures("colmap", "as_shipped")
+def test_a_video_where_a_run_puts_things_is_not_removed(tmp_path, capsys):
+    (tmp_path / "out" / "sfm" / "frames").mkdir(parents=True)
+    video = tmp_path / "out" / "sfm" / "frames" / "walk.mp4"
+    video.write_bytes(b"")
+    assert main(["sfm", str(video), str(tmp_path / "out")]) == 2
+    assert "is where the photos themselves are" in capsys.readouterr().err
+    assert video.is_file()
+
+
+@pytest.mark.parametrize(
+    "mine", ["masks/mine.png", "sparse/mine.txt", "images/mine.txt", "sfm/models/mine.txt", "sfm/database.db"]
+)
+@pytest.mark.usefixtures("colmap", "as_shipped")
+def test_what_no_run_put_there_stays(tmp_path, capsys, mine):
+    (tmp_path / "out" / mine).parent.mkdir(parents=True)
+    (tmp_path / "out" / mine).write_text("mine")
+    _refused(
+        tmp_path, capsys, tmp_path / "photos", "out", "holds photos or poses already; name another folder"
+    )
+
+
+def _refused(tmp_path, capsys, source, out, says):
     save(source, box_orbit(3))
     (tmp_path / "posed" / "images").mkdir(parents=True)
     before = sorted(tmp_path.rglob("*"))
@@ -188,3 +221,47 @@ def test_bars_show_a_stage_after_the_other():
             for done in range(total + 1):
                 progress(stage, done, total)
     assert "features" in drawn.getvalue() and "7/7" in drawn.getvalue()
+
+
+@pytest.fixture
+def never(monkeypatch):
+    """Fail if poses are looked for."""
+
+    def fail(*arguments):
+        raise AssertionError("poses were looked for")
+
+    monkeypatch.setattr("gsplat_edu.cli.train.reconstruct", fail)
+
+
+@pytest.mark.usefixtures("as_shipped", "never")
+def test_a_finished_run_is_asked_for_before_its_capture_is_replaced(tmp_path, capsys):
+    save(tmp_path / "photos", box_orbit(3))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text("{}")
+    assert main(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run")]) != 0
+    said = capsys.readouterr().err
+    assert "holds a run already; add --resume" in said and said.count("\n") == 1
+
+
+@pytest.mark.usefixtures("never")
+def test_a_run_that_goes_on_keeps_its_poses(tmp_path):
+    save(tmp_path / "photos", box_orbit(3))
+    found = tmp_path / "run" / "capture"
+    (found / "sparse" / "0").mkdir(parents=True)
+    (found / "sparse" / "0" / "cameras.bin").write_bytes(b"")
+    (tmp_path / "run" / "config.json").write_text("{}")
+    words = ["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--resume"]
+    options = train_options_from(build_parser(["train"]).parse_args(words))
+    said = []
+    assert _with_poses(options, Console(file=io.StringIO()), said.append).data == found
+    assert len(said) == 1 and "holds the poses that this run began with" in said[0]
+
+
+@pytest.mark.usefixtures("as_shipped", "never")
+def test_points_that_are_not_there_are_named_before_poses_are_looked_for(tmp_path, capsys):
+    save(tmp_path / "photos", box_orbit(3))
+    words = ["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--points", "nowhere.ply"]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "nowhere.ply: cannot be read" in said and said.count("\n") == 1
+    assert not (tmp_path / "run").exists()

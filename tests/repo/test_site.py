@@ -10,7 +10,8 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 ROOT = Path(__file__).parents[2]
-APART = ("pre", "code", "math", "script", "style", "title")
+APART = ("pre", "code", "dt", "math", "script", "style", "title")
+"""Tags whose text is no prose: programs, signatures, equations."""
 
 
 class Page(HTMLParser):

@@ -3,6 +3,8 @@ import pytest
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.lens import Lens
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.sfm import mapping
 from gsplat_edu.sfm.mapping import MANY_PHOTOS, Attempt, attempts
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.result import QUARTER, output_names, turned
@@ -59,6 +61,68 @@ def test_a_turned_photo_has_a_turned_camera(turns):
     expected = np.unravel_index(photo.argmin(), photo.shape)
     assert photo.shape == (after.H, after.W)
     assert np.hypot(found[0] - expected[1], found[1] - expected[0]) <= 2**-0.5
+
+
+def test_a_file_is_not_named_like_a_folder():
+    photos = [PhotoFacts(name, "", 1, 1) for name in ("a.tif", "A.png/1.png", "b.tif", "c/b.png/1.jpg")]
+    assert output_names(photos) == ["a_2.png", "A.png/1.png", "b.png", "c/b.png/1.jpg"]
+
+
+WAYS = attempts("auto", "auto", 10, 1, one_lens=True)
+
+
+@pytest.fixture
+def mapped(monkeypatch, tmp_path):
+    """Map ten photos by ways of which each gives as many a pose as is told, or fails where None is."""
+
+    def run(*counts):
+        tried, said = [], []
+
+        def job(name, log, progress, **arguments):
+            count = counts[len(tried)]
+            tried.append(arguments["attempt"])
+            if count is None:
+                raise DatasetError(f"COLMAP's mapping failed, number {len(tried)}")
+            names = [f"{i}.jpg" for i in range(count)]
+            return {"models": [{"folder": "0", "names": names, "points": 9, "error": 0.5}]}
+
+        monkeypatch.setattr(mapping, "call", job)
+        monkeypatch.setattr(mapping, "_usable", lambda out, model: model)
+        ways = WAYS[: len(counts)]
+        try:
+            best = mapping.map_photos(tmp_path, ways, 10, 10, 1, said.append, lambda *progress: None)
+        except DatasetError as error:
+            best = error
+        return best, len(tried), said
+
+    assert len(WAYS) == 3
+    return run
+
+
+def test_the_first_way_that_places_most_photos_is_the_last(mapped):
+    best, tried, said = mapped(4, 9, 10)
+    assert tried == 2 and len(best["names"]) == 9
+    assert best["folder"] == "models/2/0" and best["way"] == str(WAYS[1])
+    assert said == [f"{WAYS[0]}: 4 of 10 photos have a pose"]
+    assert mapped(8, 9, 10)[1] == 1, "80 % are enough"
+
+
+def test_the_largest_model_is_kept_where_none_has_most_photos(mapped):
+    best, tried, said = mapped(4, 7, 5)
+    assert tried == 3 and len(best["names"]) == 7 and best["way"] == str(WAYS[1])
+    assert said == [
+        f"{way}: {count} of 10 photos have a pose" for way, count in zip(WAYS, (4, 7, 5), strict=True)
+    ]
+
+
+def test_a_way_that_fails_is_not_the_end(mapped):
+    best, tried, said = mapped(None, 9, 10)
+    assert tried == 2 and len(best["names"]) == 9
+    assert said == [f"{WAYS[0]}: COLMAP's mapping failed, number 1"]
+    best, tried, said = mapped(4, None, None)
+    assert tried == 3 and len(best["names"]) == 4 and len(said) == 3
+    best, tried, said = mapped(None, None, None)
+    assert tried == 3 and str(best) == "COLMAP's mapping failed, number 3" and len(said) == 2
 
 
 def test_names_keep_folders_and_say_what_the_files_are():

@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -157,3 +159,26 @@ def test_the_fingerprint_knows_names_sizes_and_contents(tmp_path):
     assert fingerprint([a, tmp_path / "c.png"], tmp_path) != first
     with pytest.raises(DatasetError, match=r"b\.png: cannot be read"):
         fingerprint([a, b], tmp_path)
+
+
+def test_captures_and_runs_that_were_made_here_are_no_photos(tmp_path):
+    wanted = photo(tmp_path / "a.png")
+    for made in ("capture/images/b.png", "run/test/c.png"):
+        photo(tmp_path / made)
+    for note in ("capture/sfm/stages.json", "run/config.json", "run/cameras.json"):
+        (tmp_path / note).parent.mkdir(exist_ok=True)
+        (tmp_path / note).write_text("{}")
+    other = photo(tmp_path / "day 2" / "d.png")
+    (tmp_path / "day 2" / "config.json").write_text("{}")  # some camera's
+    assert photo_files(tmp_path) == [wanted, other]
+    assert photo_files(tmp_path / "capture") == [tmp_path / "capture" / "images" / "b.png"], (
+        "what is named counts"
+    )
+
+
+def test_links_to_nowhere_and_pipes_are_no_photos(tmp_path, monkeypatch):
+    wanted, asked = photo(tmp_path / "a.png"), []
+    (tmp_path / "z.jpg").symlink_to(tmp_path / "gone.jpg")
+    os.mkfifo(tmp_path / "pipe")
+    monkeypatch.setattr("gsplat_edu.sfm.photos.is_photo", lambda path: asked.append(path) or True)
+    assert photo_files(tmp_path) == asked == [wanted], "who opens a pipe waits for ever"

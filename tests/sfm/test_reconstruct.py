@@ -1,6 +1,9 @@
 import json
+import shutil
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,10 +16,11 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.colmap import read_cameras
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.textured_box import align_cameras, box_orbit, photograph_box
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.mapping import attempts
 from gsplat_edu.sfm.reconstruct import SfmOptions, needs_poses, reconstruct
+from gsplat_edu.sfm.result import publish, published
 from sfm.textured_box import TURNED, cameras_of, check
 
 pytestmark = pytest.mark.usefixtures("colmap")
@@ -127,6 +131,84 @@ def test_an_interrupted_run_goes_on(done, phone, tmp_path):
     assert said[3] == "mapping: camera_model differ from those before; again from here"
     assert [sentence.endswith("(done before)") for sentence in said] == [True] * 3 + [False] * 3
     assert set(cameras_of(options.out)) == set(whole)
+
+
+@pytest.fixture
+def taken_up(done, tmp_path):
+    """A copy of the finished capture."""
+    shutil.copytree(done.out, tmp_path / "copy")
+    return replace(done.options, out=tmp_path / "copy")
+
+
+def test_photos_that_are_gone_are_undistorted_again(taken_up):
+    shutil.rmtree(taken_up.out / "images")
+    said = []
+    reconstruct(taken_up, said.append)
+    assert [sentence.endswith("(done before)") for sentence in said] == [True] * 4 + [False]
+    assert len(cameras_of(taken_up.out)) == 14
+
+
+def test_masks_that_no_run_put_there_stay(taken_up):
+    mask = taken_up.out / "masks" / "mine.png"
+    mask.parent.mkdir()
+    mask.write_text("mine")
+    (taken_up.out / "sfm" / "published.json").unlink()  # captures of earlier versions have none
+    reconstruct(replace(taken_up, camera_model="SIMPLE_RADIAL"))
+    assert mask.read_text() == "mine" and published(taken_up.out / "sfm") == ("images", "sparse")
+
+
+def test_a_part_in_the_way_is_refused_and_untouched(tmp_path):
+    work, out = tmp_path / "out" / "sfm", tmp_path / "out"
+    for part in ("images", "masks", "sparse"):
+        (work / "result" / part).mkdir(parents=True)
+    (out / "masks").mkdir()
+    (out / "masks" / "mine.png").write_text("mine")
+    with pytest.raises(ArgumentError, match="masks is in the way and not of this command; move it away"):
+        publish(work, out)
+    assert (out / "masks" / "mine.png").is_file() and not (out / "images").exists()
+    (out / "masks").rename(out / "kept")
+    publish(work, out)
+    assert published(work) == ("images", "masks", "sparse")
+    (work / "result" / "images").mkdir(parents=True)
+    publish(work, out)
+    assert sorted(path.name for path in out.iterdir()) == ["images", "kept", "sfm"], (
+        "what a run put there goes"
+    )
+
+
+def test_photos_put_there_before_a_run_was_finished_stay(phone, tmp_path):
+    options = SfmOptions(phone.folder, tmp_path / "out")
+
+    def stop(*progress):
+        raise StoppedError
+
+    with pytest.raises(StoppedError):
+        reconstruct(options, progress=stop)
+    with pytest.raises(StoppedError):
+        reconstruct(options, progress=stop)  # goes on: its own work is no reason not to
+    (options.out / "images").mkdir()
+    with pytest.raises(ArgumentError, match="holds photos or poses already"):
+        reconstruct(options)
+
+
+def test_matches_of_an_earlier_choice_are_forgotten(taken_up, monkeypatch):
+    def count(table):
+        with closing(sqlite3.connect(taken_up.out / "sfm" / "database.db")) as reader:
+            return reader.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+
+    features = count("descriptors")
+    chosen = {(0, 5), (5, 10)}  # IMG_00, IMG_01 and IMG_02, side by side
+    monkeypatch.setattr("gsplat_edu.sfm.pairs.sequential_pairs", lambda total, overlap: chosen)
+    assert count("matches") == 91
+    with pytest.raises(StoppedError):
+        reconstruct(replace(taken_up, matcher="sequential"), progress=_stop_at_mapping)
+    assert count("two_view_geometries") == count("matches") == 2
+    assert count("descriptors") == features
+
+
+def _stop_at_mapping(stage, count, total):
+    if stage == "mapping":
+        raise StoppedError
 
 
 def test_the_global_mapper_and_the_chosen_pairs_do_as_well(done, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -78,7 +79,7 @@ def run(arguments: argparse.Namespace) -> None:
             raise KeyboardInterrupt(
                 "interrupted; the same command goes on behind the last finished stage"
             ) from None
-    say(f"wrote {options.out}; next: gsplat-edu train {options.out} --out RUN")
+    say(f"wrote {options.out}; next: gsplat-edu train {shlex.quote(str(options.out))} --out RUN")
 
 
 @contextmanager

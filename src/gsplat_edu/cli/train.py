@@ -20,9 +20,11 @@ from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.train_options import add_arguments as add_arguments
 from gsplat_edu.cli.train_options import given_from, limits_from, options_from
+from gsplat_edu.data.colmap import find_model
+from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.doctor.pace import Pace
 from gsplat_edu.doctor.plan import Plan, plan
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.training import CaptureRun, RunOptions
@@ -106,7 +108,18 @@ def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None
     """Find the poses of plain photos or a video first; the capture is kept in the run's folder."""
     if not needs_poses(options.data):
         return options
+    if options.points is not None:
+        read_points_ply(options.points)  # what is wrong with them is said before the long work
     found = options.folder.path / "capture"
+    if options.folder.exists():
+        if not options.resume:
+            raise CheckpointError(
+                f"--out: {options.folder.path} holds a run already; add --resume to go on with it, "
+                "or name another folder"
+            )
+        if find_model(found) is not None:
+            say(f"{found}: holds the poses that this run began with; {options.data} is not looked at again")
+            return replace(options, data=found)
     say(f"{options.data}: comes without poses; finding them first, into {found}")
     with stage_bars(console) as progress:
         try:

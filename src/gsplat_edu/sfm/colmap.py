@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +101,28 @@ def call(
             "--max-image-size, or start the command again"
         )
     return result
+
+
+def forget_matches(database: Path) -> None:
+    """Remove all matches from the database; features stay.
+
+    Args:
+        database: COLMAP's. Nothing is done where it is not there.
+
+    Raises:
+        DatasetError: it cannot be changed.
+    """
+    if not database.is_file():
+        return
+    try:
+        with closing(sqlite3.connect(database)) as writer, writer:
+            for table in ("matches", "two_view_geometries"):
+                writer.execute(f"DELETE FROM {table}")
+    except sqlite3.Error as error:
+        raise DatasetError(
+            f"{database}: cannot be changed ({error}); remove {database.parent / 'stages.json'} and "
+            f"{database}, or name another folder"
+        ) from None
 
 
 def _listen(process: subprocess.Popen[bytes], answers: queue.SimpleQueue[dict[str, Any]]) -> None:

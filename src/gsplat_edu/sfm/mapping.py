@@ -36,7 +36,7 @@ MANY_PHOTOS = 400
 """Photos beyond which the global mapper comes first: the incremental one's time grows with their square."""
 
 FEWEST = 3
-"""Photos of a model that is worth having; two where there are only two."""
+"""Photos of a model that is worth having. Two photos alone get no pose: no mapper makes a model of so few here."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def map_photos(
         "way" that gave it.
 
     Raises:
-        DatasetError: no way gives enough photos a pose to be a model.
+        DatasetError: no way gives enough photos a pose to be a model, or the last one failed and none gave any.
     """
     models = folder / "models"
     shutil.rmtree(models, ignore_errors=True)
@@ -119,21 +119,15 @@ def map_photos(
     for number, way in enumerate(ways, 1):
         out = models / str(number)
         out.mkdir(parents=True)
-        found = call(
-            "mapping",
-            folder / "log.txt",
-            lambda done: progress("mapping", min(done, total), total),
-            database=str(folder / "database.db"),
-            photos=str(folder / "photos"),
-            out=str(out),
-            attempt=asdict(way),
-            threads=threads,
-            seed=COLMAP_SEED,
-        )["models"]
-        usable = [_usable(out, model) for model in found]
-        largest: dict[str, Any] = max(
-            usable, key=lambda model: (len(model["names"]), -model["error"]), default={"names": []}
-        )
+        try:
+            largest = _largest(
+                folder, out, way, threads, lambda done: progress("mapping", min(done, total), total)
+            )
+        except DatasetError as error:
+            if number == len(ways) and not best["names"]:
+                raise
+            say(f"{way}: {error}")
+            continue
         if len(largest["names"]) > len(best["names"]):
             best = largest | {"folder": f"models/{number}/{largest['folder']}", "way": str(way)}
         if len(best["names"]) >= ENOUGH * connected:
@@ -142,6 +136,25 @@ def map_photos(
     if len(best["names"]) < min(FEWEST, total):
         raise DatasetError(no_overlap(f"of {total} photos, {len(best['names'])} could be given a pose"))
     return best
+
+
+def _largest(
+    folder: Path, out: Path, way: Attempt, threads: int, progress: Callable[[int], None]
+) -> dict[str, Any]:
+    """Map in one way, and return the model with the most photos; without "names" where there is none."""
+    found = call(
+        "mapping",
+        folder / "log.txt",
+        progress,
+        database=str(folder / "database.db"),
+        photos=str(folder / "photos"),
+        out=str(out),
+        attempt=asdict(way),
+        threads=threads,
+        seed=COLMAP_SEED,
+    )["models"]
+    usable = [_usable(out, model) for model in found]
+    return max(usable, key=lambda model: (len(model["names"]), -model["error"]), default={"names": []})
 
 
 def no_overlap(what: str) -> str:

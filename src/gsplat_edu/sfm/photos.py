@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
-from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS
+from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, is_file
 from gsplat_edu.data.images import AT_ONCE, decode
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
@@ -81,7 +81,9 @@ class PhotoFacts:
 
 
 def photo_files(source: Path, besides: Path | None = None) -> list[Path]:
-    """List the photos in a folder and below, by what is in the files; hidden files and folders are passed over.
+    """List the photos in a folder and below, by what is in the files.
+
+    Hidden files and folders are passed over, and so are captures and runs that were made here.
 
     Args:
         source: The folder.
@@ -96,10 +98,18 @@ def photo_files(source: Path, besides: Path | None = None) -> list[Path]:
         folders[:] = [
             name
             for name in folders
-            if name[0] not in "._" and name not in PASSED_OVER and (here / name).resolve() != besides
+            if name[0] not in "._" and name not in PASSED_OVER
+            if (here / name).resolve() != besides and not _made_here(here / name)
         ]
-        found += [here / name for name in files if name[0] != "." and is_photo(here / name)]
+        visible = [here / name for name in files if name[0] != "."]
+        found += [path for path in visible if is_file(path) and is_photo(path)]  # no pipe, no link to nowhere
     return sorted(found)
+
+
+def _made_here(folder: Path) -> bool:
+    """Say whether a folder is a capture that structure from motion wrote, or a run."""
+    capture, run = (folder / "sfm" / "stages.json",), (folder / "config.json", folder / "cameras.json")
+    return all(map(is_file, capture)) or all(map(is_file, run))
 
 
 def is_photo(path: Path) -> bool:

@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.data.blender import TRAIN_FILE
-from gsplat_edu.data.capture import is_file, is_folder
+from gsplat_edu.data.capture import entries, is_file, is_folder
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.sfm import pairs
-from gsplat_edu.sfm.colmap import COLMAP_SEED, call, require_colmap
+from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, require_colmap
 from gsplat_edu.sfm.mapping import CAMERA_MODELS, MAPPERS, attempts, map_photos, no_overlap
 from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, is_photo, photo_files
-from gsplat_edu.sfm.result import build_capture, publish
+from gsplat_edu.sfm.result import PARTS, build_capture, note_published, publish, published
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
 from gsplat_edu.validation import one_of, whole_number
@@ -143,6 +143,8 @@ class _Run:
         self.folder = options.out / "sfm"
         self.folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.folder)
+        if parts := published(self.folder):
+            note_published(self.folder, parts)  # before a stage is forgotten that tells of it
         self.stages = Stages(self.folder / "stages.json", say)
         self.video = is_video(options.source)
         self.threads = options.threads or -1
@@ -164,17 +166,22 @@ class _Run:
         database = [self.folder / f"database.db{ending}" for ending in ("", "-wal", "-shm")]
         wanted = {"max_features": options.max_features, "pycolmap": version("pycolmap")}
         self._stage("features", wanted, self._features, database)
-        facts = self._stage("matches", {"matcher": options.matcher}, self._match, [])
+        facts = self._stage("matches", {"matcher": options.matcher}, self._match, [], self._forget_matches)
         wanted = {"mapper": options.mapper, "camera_model": options.camera_model}
         connected = facts["connected"]
         self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
-        if not (options.out / "sparse" / "0").is_dir():
+        if not all((options.out / part).is_dir() for part in ("images", "sparse/0")):
             self.stages.forget("capture")
         self._stage("capture", {}, self._finish, [])
         return options.out
 
     def _stage(
-        self, name: str, wanted: dict[str, Any], work: Callable[[], dict[str, Any]], rubbish: Sequence[Path]
+        self,
+        name: str,
+        wanted: dict[str, Any],
+        work: Callable[[], dict[str, Any]],
+        rubbish: Sequence[Path],
+        tidy: Callable[[], None] = lambda: None,
     ) -> dict[str, Any]:
         """Do a stage, unless it is done.
 
@@ -183,6 +190,7 @@ class _Run:
             wanted: What its outcome depends on.
             work: Does it, and returns what it found out; "summary" is for the user.
             rubbish: What is removed before it begins anew.
+            tidy: Done then, too.
         """
         facts = self.stages.finished(name, wanted)
         if facts is not None:
@@ -191,6 +199,7 @@ class _Run:
         if not self.stages.begun(name, wanted):
             for path in rubbish:
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+            tidy()
         began = time.perf_counter()
         facts = work()
         seconds = time.perf_counter() - began
@@ -268,6 +277,10 @@ class _Run:
             summary += f"; {len(part)} of {count} photos hang together"
         return {"summary": summary, "connected": len(part)}
 
+    def _forget_matches(self) -> None:
+        """Matches of pairs that were chosen in another way would stay, and be mapped."""
+        forget_matches(self.folder / "database.db")
+
     def _pairs(self, kind: str, farther: int) -> set[pairs.Pair]:
         count, origin = len(self.photos), "video" if self.video else "photos"
         if kind == "exhaustive":
@@ -332,9 +345,9 @@ def _check(options: SfmOptions) -> list[Path]:
     source, out = options.source, options.out
     check_folder("OUT", out)
     here, there = source.resolve(), out.resolve()
-    if here == there or here.is_relative_to(there / "images"):
+    if here == there or any(here.is_relative_to(there / part) for part in (*PARTS, "sfm")):
         raise ArgumentError(f"OUT: {out} is where the photos themselves are; name another folder")
-    if not (out / "sfm" / "stages.json").is_file() and (_is_capture(out) or (out / "images").exists()):
+    if _holds_others(out):
         raise ArgumentError(f"OUT: {out} holds photos or poses already; name another folder")
     if is_file(source):
         if not is_video(source):
@@ -347,6 +360,19 @@ def _check(options: SfmOptions) -> list[Path]:
     if len(files) < 2:
         raise DatasetError(_too_few(source, len(files), []))
     return files
+
+
+def _holds_others(out: Path) -> bool:
+    """Say whether the folder of the result holds what no run put there and a run would put away.
+
+    Masks beside a run's capture are no such thing: they stay.
+    """
+    work = out / "sfm"
+    if not (work / "stages.json").is_file():
+        begun = is_folder(work) and any(path.name[0] != "." for path in entries(work))
+        return begun or _is_capture(out) or any((out / part).exists() for part in PARTS)
+    others = {"images", "sparse"}.difference(published(work))
+    return any((out / part).exists() for part in others)
 
 
 def _too_few(source: Path, count: int, unreadable: Sequence[str]) -> str:

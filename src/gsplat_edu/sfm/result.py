@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -18,7 +19,8 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.colmap import read_cameras, read_images, read_points
 from gsplat_edu.data.images import AT_ONCE, PhotoFile, develop
 from gsplat_edu.data.lens import Lens, straightened
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.files import written_aside
 from gsplat_edu.gaussian_math import quat_to_R
 from gsplat_edu.sfm.align import upright
 from gsplat_edu.sfm.colmap import call
@@ -32,6 +34,9 @@ JPEGS = (".jpg", ".jpeg")
 
 PARTS = ("images", "masks", "sparse")
 """What a capture consists of. The model comes last: it says that the capture is there."""
+
+PUBLISHED = "published.json"
+"""File in the work folder that names the parts which runs put into the capture."""
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """What a quarter turn clockwise of the image does to camera coordinates: right becomes down."""
@@ -114,24 +119,74 @@ def build_capture(
     return facts | {"left_out": [photo.name for photo in photos if photo.copy not in placed]}
 
 
+def published(folder: Path) -> tuple[str, ...]:
+    """Return which parts of the capture earlier runs put there; the others are the user's.
+
+    Args:
+        folder: Work folder.
+
+    Raises:
+        DatasetError: the file that says so is damaged.
+    """
+    path = folder / PUBLISHED
+    if not path.is_file():
+        return _published_before(folder / "stages.json")
+    try:
+        named = json.loads(path.read_text(encoding="utf-8"))["parts"]
+        return tuple(part for part in PARTS if part in named)
+    except (ValueError, KeyError, TypeError):
+        raise DatasetError(f"{path}: is damaged; name another folder, or remove the capture") from None
+
+
+def _published_before(stages: Path) -> tuple[str, ...]:
+    """Return the parts of captures that were finished before there was a file that names them."""
+    try:
+        finished = json.loads(stages.read_text(encoding="utf-8"))["stages"]["capture"]["facts"] is not None
+    except (OSError, ValueError, KeyError, TypeError):
+        return ()
+    return ("images", "sparse") if finished else ()
+
+
 def publish(folder: Path, out: Path) -> None:
-    """Put what `build_capture` wrote where the user wants it; what an earlier run put there goes.
+    """Put what `build_capture` wrote where the user wants it; what an earlier run put there goes, nothing else.
 
     Args:
         folder: Work folder.
         out: The capture.
+
+    Raises:
+        ArgumentError: a part is in the way that no run put there.
     """
+    new = [part for part in PARTS if (folder / "result" / part).exists()]
+    ours = published(folder)
+    for part in new:
+        if part not in ours and (out / part).exists():
+            raise ArgumentError(
+                f"OUT: {out / part} is in the way and not of this command; move it away, and the same command goes on"
+            )
+    note_published(folder, {*ours, *new})
     old = folder / "old"
     shutil.rmtree(old, ignore_errors=True)
     old.mkdir()
-    for part in reversed(PARTS):
+    for part in reversed(ours):
         if (out / part).exists():
             (out / part).replace(old / part)
-    for part in PARTS:
-        if (folder / "result" / part).exists():
-            (folder / "result" / part).replace(out / part)
+    for part in new:
+        (folder / "result" / part).replace(out / part)
+    note_published(folder, set(new))
     shutil.rmtree(old, ignore_errors=True)
     shutil.rmtree(folder / "result", ignore_errors=True)
+
+
+def note_published(folder: Path, parts: Iterable[str]) -> None:
+    """Note which parts of the capture runs put there.
+
+    Args:
+        folder: Work folder.
+        parts: Some of `PARTS`.
+    """
+    with written_aside(folder / PUBLISHED) as aside:
+        aside.write_text(json.dumps({"parts": sorted(parts)}) + "\n", encoding="utf-8")
 
 
 def turned(lens: Lens, turns: int) -> Lens:
@@ -155,10 +210,12 @@ def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
     Returns:
         Paths below images/: JPEGs keep their names, others end in .png. What COLMAP's files cannot hold becomes "_".
     """
-    names, taken = list[str](), set[str]()
-    for photo in photos:
-        clean = re.sub("[\\\\\x00-\x1f\ud800-\udfff]", "_", photo.name)
-        path = PurePosixPath(clean)
+    paths = [PurePosixPath(re.sub("[\\\\\x00-\x1f\ud800-\udfff]", "_", photo.name)) for photo in photos]
+    names = list[str]()
+    taken = {
+        str(folder).lower() for path in paths for folder in path.parents
+    }  # no file is named like a folder
+    for path in paths:
         base, ending = path.with_suffix(""), path.suffix if path.suffix.lower() in JPEGS else ".png"
         name, number = f"{base}{ending}", 2
         while name.lower() in taken:  # file systems that know no case
