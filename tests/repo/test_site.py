@@ -98,7 +98,7 @@ def test_broken_links_would_be_found(site, tmp_path):
 
 @pytest.mark.slow
 def test_no_equation_and_no_docstring_is_torn_apart(site):
-    pages, out = site
+    pages, _ = site
     for path, page in pages.items():
         prose = "".join(page.prose)
         assert "$" not in prose and not re.search(r"\\[a-zA-Z]", prose), path
