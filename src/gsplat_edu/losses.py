@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsplat_edu.buffers import empty
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.kernels import REASON, SUFFIXES, kernel
 from gsplat_edu.render.backends import unavailable
@@ -44,7 +45,8 @@ def photo_loss(
         counts = torch.as_tensor(mask, device=image.device)[..., None]
         # Times 0 or 1: exact, on any number of threads.
         check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
-        image, target = image * counts, target * counts
+        image = _Masked.apply(image, counts)  # type: ignore[no-untyped-call]
+        target = torch.mul(target, counts, out=empty(target.shape, target))
     if image.device.type == "cuda" and image.dtype == torch.float32 and unavailable("cuda") is None:
         from gsplat_edu.render.triton.loss import l1_ssim_triton
 
@@ -119,13 +121,28 @@ def l1_ssim(
     return loss
 
 
+class _Masked(torch.autograd.Function):
+    """An image times a mask of 0 and 1, in buffers that are used again."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, counts: Tensor) -> Tensor:  # noqa: ANN401
+        ctx.save_for_backward(counts)
+        return torch.mul(image, counts, out=empty(image.shape, image))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
+        (counts,) = ctx.saved_tensors
+        return torch.mul(grad, counts, out=empty(grad.shape, grad)), None
+
+
 class _L1Ssim(torch.autograd.Function):
     """Loss and gradient in one pass; backward only scales."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:  # noqa: ANN401
         x, y = image.detach().contiguous(), target.detach().contiguous()
-        gradient = torch.empty_like(x)
+        gradient = empty(x.shape, x)
         photo = (0, y.data_ptr()) if y.dtype == torch.uint8 else (y.data_ptr(), 0)
         l1_mean, ssim_mean = kernel("loss_f", x.dtype)(
             (x.data_ptr(), *photo, gradient.data_ptr()), *x.shape[:2], ssim_weight, torch.get_num_threads()

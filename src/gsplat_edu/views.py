@@ -15,6 +15,10 @@ from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_a
 Pixels = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
 
 
+AT_ONCE = 8192
+"""Pixels that are put over a background at a time."""
+
+
 @dataclass(frozen=True, eq=False, init=False)
 class Photo:
     """The pixels of a view.
@@ -73,11 +77,15 @@ class Photo:
         """
         if self.alpha is None:
             return self.image
-        share = self.alpha[..., None].astype(np.float32) / 255.0
-        image = self.image.astype(np.float32) / (255.0 if self.image.dtype == np.uint8 else 1.0)
         behind = np.asarray(background, dtype=np.float32)
-        mixed = np.clip(image * share + behind * (1.0 - share), 0.0, 1.0)
-        flat: UInt8[np.ndarray, "H W 3"] = np.round(255.0 * mixed).astype(np.uint8)
+        flat: UInt8[np.ndarray, "H W 3"] = np.empty(self.image.shape, dtype=np.uint8)
+        rows = max(1, AT_ONCE // max(self.image.shape[1], 1))
+        for top in range(0, len(flat), rows):  # the floats of a few rows stay in the cache, and out of the heap
+            band = slice(top, top + rows)
+            share = self.alpha[band, :, None].astype(np.float32) / 255.0
+            image = self.image[band].astype(np.float32) / (255.0 if self.image.dtype == np.uint8 else 1.0)
+            mixed = np.clip(image * share + behind * (1.0 - share), 0.0, 1.0)
+            flat[band] = np.round(255.0 * mixed)
         return flat
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsplat_edu.buffers import empty
 from gsplat_edu.camera import Camera
 from gsplat_edu.constants import Z_NEAR
 from gsplat_edu.errors import ArgumentError
@@ -158,14 +159,14 @@ class _Rasterize(torch.autograd.Function):
             call.settings.antialiased,
             torch.get_num_threads(),
         )
-        image = means.new_empty(camera.H, camera.W, 3)
-        transmittance = means.new_empty(camera.H, camera.W)
-        depth = means.new_empty((camera.H, camera.W) if call.settings.depth else 0)
+        image = empty((camera.H, camera.W, 3), means)
+        transmittance = empty((camera.H, camera.W), means)
+        depth = empty((camera.H, camera.W) if call.settings.depth else (0,), means)
         frame.composite(
             image.data_ptr(), transmittance.data_ptr(), depth.data_ptr() if call.settings.depth else 0
         )
-        call.visible = torch.empty(frame.num_visible, dtype=torch.int64)
-        call.radii = means.new_empty(frame.num_visible, 2)
+        call.visible = empty((frame.num_visible,), means, torch.int64)
+        call.radii = empty((frame.num_visible, 2), means)
         frame.visible(call.visible.data_ptr(), call.radii.data_ptr())
         call.num_pairs = frame.num_pairs
         ctx.set_materialize_grads(False)
@@ -181,8 +182,8 @@ class _Rasterize(torch.autograd.Function):
         incoming = [None if g is None else g.contiguous() for g in grads]
         if incoming[0] is None:
             incoming[0] = torch.zeros_like(image)
-        outgoing = [torch.empty_like(p) for p in kept]
-        norms = kept[0].new_empty(len(kept[0]))
+        outgoing = [empty(p.shape, p) for p in kept]
+        norms = empty((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
         # Saved tensors may have been moved since the forward pass: the kernels are told where they are now.
         ctx.frame.backward(

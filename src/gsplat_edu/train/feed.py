@@ -1,43 +1,118 @@
-"""Which view comes next, and its photo, read ahead where it lies on disk."""
+"""Which view comes next, and what its render is compared with: read ahead, put over the background, kept on a GPU."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float32, UInt8
+from torch import Tensor
 
 from gsplat_edu.views import Photo, View
 
+DEVICE_SHARE = 0.25
+"""Of the memory that is free on a GPU when training begins: what photos may take. Gaussians take the rest."""
+
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What the render of a view is compared with, where the Gaussians are.
+
+    Args:
+        image: (H, W, 3) the photo, over the background.
+        mask: (H, W) true where a pixel counts; None where all do.
+    """
+
+    image: UInt8[Tensor, "H W 3"] | Float32[Tensor, "H W 3"]
+    mask: Bool[Tensor, "H W"] | None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes it takes."""
+        return sum(tensor.nbytes for tensor in (self.image, self.mask) if tensor is not None)
+
 
 class ViewFeed:
-    """An endless sequence of views, the same for the same seed.
+    """An endless sequence of views and targets, the same for the same seed.
+
+    A photo that lies on disk is read while the step before it is taken. Targets that do not change are made once and
+    kept: on a GPU as many as there is room for, and those views are not read again; elsewhere those of photos that are
+    in memory and not opaque.
 
     Args:
         views: What to draw from, at least one.
         order: "shuffled": each once before any comes again; "random": with replacement.
         seed: Seed of the order.
+        background: Behind photos that are not opaque; None: another colour with every draw.
+        device: Where the Gaussians are.
+        room: Bytes of targets to keep on a GPU; `DEVICE_SHARE` of what is free where None.
     """
 
-    def __init__(self, views: Sequence[View], order: str, seed: int) -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        order: str,
+        seed: int,
+        background: Color | None = (0.0, 0.0, 0.0),
+        device: torch.device = torch.device("cpu"),
+        room: int | None = None,
+    ) -> None:
         self.views, self._order = tuple(views), order
+        self._background, self._device = background, device
         self._generator = np.random.default_rng(seed)
         self._queue: list[int] = []
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="photo")
         self._ahead: tuple[int, Future[Photo]] | None = None
+        self._kept: dict[View, Target] = {}
+        self._room = _free_bytes(device) if room is None else room
 
-    def next(self) -> tuple[View, Photo]:
-        """Draw a view, and begin to read the photo of the one after it."""
+    def next(self, background: Color) -> tuple[View, Target]:
+        """Draw a view, and begin to read the photo of the one after it.
+
+        Args:
+            background: Behind this photo, where it is not opaque; the feed's own if it has one.
+        """
         index = self._following()
         self._queue.pop(0)
         ahead, self._ahead = self._ahead, None
         view = self.views[index]
-        photo = ahead[1].result() if ahead and ahead[0] == index else view.read()
+        target = self._kept.get(view)
+        if target is None:
+            photo = ahead[1].result() if ahead and ahead[0] == index else self._read(view)
+            target = self._target(view, photo, background)
         following = self._following()
-        if self.views[following].on_disk:
-            self._ahead = following, self._reader.submit(self.views[following].read)
-        return view, photo
+        after = self.views[following]
+        if after.on_disk and after not in self._kept:
+            self._ahead = following, self._reader.submit(self._read, after)
+        return view, target
+
+    def _read(self, view: View) -> Photo:
+        """Read a photo, in the thread that reads ahead too; put it over the background if that is known."""
+        photo = view.read()
+        if photo.alpha is None or self._background is None:
+            return photo
+        return Photo(photo.over(self._background), mask=photo.mask)
+
+    def _target(self, view: View, photo: Photo, background: Color) -> Target:
+        """Bring a photo to where the Gaussians are; keep it there if it stays as it is and there is room."""
+        mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(self._device)
+        target = Target(torch.from_numpy(photo.over(background)).to(self._device), mask)
+        if photo.alpha is not None:
+            return target
+        if self._device.type == "cpu":
+            # Kept by whoever made the view, unless it was made here from a photo with alpha.
+            if not view.on_disk and photo is not view.read():
+                self._kept[view] = target
+        elif target.nbytes <= self._room:
+            self._kept[view] = target
+            self._room -= target.nbytes
+        return target
 
     def _following(self) -> int:
         if not self._queue and self._order == "random":
@@ -56,3 +131,9 @@ class ViewFeed:
         if any(not 0 <= index < len(self.views) for index in self._queue):
             raise ValueError("it names a view that is not there")
         self._generator.bit_generator.state = state["generator"]
+
+
+def _free_bytes(device: torch.device) -> int:
+    if device.type != "cuda":
+        return 0
+    return int(DEVICE_SHARE * torch.cuda.mem_get_info(device)[0])

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsplat_edu.buffers import reused_buffers
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
@@ -27,7 +28,7 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.feed import ViewFeed
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import means_rate, sh_degree
-from gsplat_edu.views import Photo, View
+from gsplat_edu.views import View
 
 
 @runtime_checkable
@@ -59,6 +60,35 @@ class TrainResult:
     losses: list[float]
     counts: list[int]
     seconds: float
+
+
+class _Losses:
+    """Losses of a run as numbers. A GPU's are collected where they are, and read many at a time: reading waits."""
+
+    ROOM = 1024
+
+    def __init__(self) -> None:
+        self._read: list[float] = []
+        self._waiting: Tensor | None = None
+        self._count = 0
+
+    def add(self, loss: Tensor) -> None:
+        if loss.device.type == "cpu":
+            self._read.append(loss.item())
+            return
+        if self._waiting is None:
+            self._waiting = loss.new_empty(self.ROOM)
+        self._waiting[self._count] = loss
+        self._count += 1
+        if self._count == self.ROOM:
+            self.read()
+
+    def read(self) -> list[float]:
+        """Return all losses so far."""
+        if self._waiting is not None:
+            self._read += self._waiting[: self._count].tolist()
+            self._count = 0
+        return self._read
 
 
 class Trainer:
@@ -107,10 +137,10 @@ class Trainer:
         self.gaussians = gaussians.trainable()
         self.config, self.extent, self.density = config, extent, density
         self.iteration = 0
-        self.last: tuple[Tensor, Tensor, np.ndarray[Any, Any] | None] | None = None
+        self.last: tuple[Tensor, Tensor, Tensor | None] | None = None
         self._render, self._callbacks = render, tuple(callbacks)
-        self._photos: dict[View, tuple[Tensor, Tensor | None]] = {}
-        self._feed = ViewFeed(views, config.view_order, config.seed)
+        behind, device = None if config.random_background else config.background, gaussians.means.device
+        self._feed = ViewFeed(views, config.view_order, config.seed, behind, device)
         self._optimizer = Adam(self.gaussians, config.learning_rates, eps=config.adam_eps)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
@@ -120,30 +150,30 @@ class Trainer:
         Args:
             stop: Asked after every iteration; the run ends when it says so, and can be taken up again.
         """
-        losses, counts = [], []
+        losses, counts = _Losses(), []
         start = time.perf_counter()
-        while self.iteration < self.config.iterations:
-            step = self._step()
-            losses.append(step.loss_tensor)
-            counts.append(step.num_gaussians)
-            self._tell(step)
-            if self.density is not None:
-                with one_thread():
-                    changed = self.density.update(step.iteration, self.gaussians, self._optimizer)
-                self.gaussians, events = changed
-                for event in events:
-                    self._tell(event)
-            if stop():
-                break
-        read = torch.stack(losses).tolist() if losses else []
-        return TrainResult(read, counts, time.perf_counter() - start)
+        with reused_buffers():
+            while self.iteration < self.config.iterations:
+                step = self._step()
+                losses.add(step.loss_tensor)
+                counts.append(step.num_gaussians)
+                self._tell(step)
+                if self.density is not None:
+                    with one_thread():
+                        changed = self.density.update(step.iteration, self.gaussians, self._optimizer)
+                    self.gaussians, events = changed
+                    for event in events:
+                        self._tell(event)
+                if stop():
+                    break
+        return TrainResult(losses.read(), counts, time.perf_counter() - start)
 
     def _step(self) -> StepEvent:
         iteration, config = self.iteration, self.config
-        view, photo = self._feed.next()
         background = config.background
         if config.random_background:
             background = tuple(self._backgrounds.uniform(size=3).tolist())
+        view, target = self._feed.next(background)
         settings = RenderSettings(
             background=background,
             sh_degree=sh_degree(config, iteration),
@@ -152,33 +182,16 @@ class Trainer:
             depth=False,
         )
         output = self._render(self.gaussians, view.camera, settings=settings)
-        target, mask = self._on_device(view, photo, background)
-        loss = photo_loss(output.image, target, mask, config.ssim_weight)
+        loss = photo_loss(output.image, target.image, target.mask, config.ssim_weight)
         loss.backward()  # type: ignore[no-untyped-call]
         if self.density is not None:
             with one_thread():
                 self.density.observe(self.gaussians, output)
         self._optimizer.learning_rates["means"] = means_rate(config, self.extent, iteration)
         self._optimizer.step(self.gaussians)
-        self.last = output.image.detach(), target, photo.mask
+        self.last = output.image.detach(), target.image, target.mask
         self.iteration += 1
         return StepEvent(iteration, loss.detach(), len(self.gaussians))
-
-    def _on_device(
-        self, view: View, photo: Photo, background: Sequence[float]
-    ) -> tuple[Tensor, Tensor | None]:
-        """Return photo and mask where the Gaussians are; they stay there unless random backgrounds show through."""
-        device = self.gaussians.means.device
-
-        def sent() -> tuple[Tensor, Tensor | None]:
-            mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(device)
-            return torch.from_numpy(photo.over(background)).to(device), mask
-
-        if device.type == "cpu" or (photo.alpha is not None and self.config.random_background):
-            return sent()
-        if view not in self._photos:
-            self._photos[view] = sent()
-        return self._photos[view]
 
     def _tell(self, event: Event) -> None:
         for callback in self._callbacks:
