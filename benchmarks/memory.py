@@ -3,10 +3,10 @@
     python benchmarks/memory.py [--smoke] [--size PX] [--photos N] [--iterations N] [--keep FOLDER] [--out FILE.json]
                                 [-- options of gsplat-edu train]
 
-Makes a capture of its own in Blender's layout: a patterned ball with transparent surroundings, in RGBA photos. Runs
-`gsplat-edu train` on it in a process of its own, with few Gaussians so that images are what takes memory, and reads that
-process's resident set size (RSS) from outside while the log grows; the peak is what wait4 reports. Prints a table of
-iterations and RSS. The default is 5,000 iterations of 100 photos of 800 x 800 on white. Linux, which has /proc.
+Makes a capture in Blender's layout: RGBA photos of a patterned ball. Runs `gsplat-edu train` on it in a process of its
+own, with few Gaussians so that images are what takes memory, and reads the resident set size (RSS) of that process
+from outside while the log grows; the peak is what wait4 reports. Prints a table of iterations and RSS. The default is
+5,000 iterations of 100 photos of 800 x 800 on white. Linux, which has /proc.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import multiprocessing
 import os
 import sys
 import tempfile
@@ -56,7 +57,9 @@ def make_capture(folder: Path, size: int, count: int) -> None:
         height, turn = 1.6 * (i + 0.5) / total - 0.8, 2.4 * i  # the golden angle
         across = math.sqrt(1 - height * height)
         eye = 3.0 * np.array([across * math.sin(turn), height, across * math.cos(turn)])
-        camera = Camera(look_at(eye, np.zeros(3)), eye, focal, focal, (size - 1) / 2, (size - 1) / 2, size, size)
+        camera = Camera(
+            look_at(eye, np.zeros(3)), eye, focal, focal, (size - 1) / 2, (size - 1) / 2, size, size
+        )
         image, alpha = _photograph(camera)
         views.append(View(camera, image, alpha=alpha, name=f"photo_{i:03d}.png"))
     write_blender(folder, views[:count], views[count:])
@@ -139,11 +142,15 @@ def table(curve: list[list[int]]) -> list[list[int]]:
 def main() -> None:
     """Make the capture, train, print the table, write the JSON."""
     made = argparse.ArgumentParser(description="The memory of a training, iteration by iteration.")
-    made.add_argument("--smoke", action="store_true", help="a tiny capture and a few iterations: does it run at all?")
+    made.add_argument(
+        "--smoke", action="store_true", help="a tiny capture and a few iterations: does it run at all?"
+    )
     made.add_argument("--size", type=int, default=800, help="height and width of the photos, px")
     made.add_argument("--photos", type=int, default=100, help="photos to train on")
     made.add_argument("--iterations", type=int, default=5_000)
-    made.add_argument("--keep", type=Path, help="folder for capture and run (default: one that is thrown away)")
+    made.add_argument(
+        "--keep", type=Path, help="folder for capture and run (default: one that is thrown away)"
+    )
     made.add_argument("--out", type=Path, help="JSON file to write")
     made.add_argument("options", nargs="*", help=f"of gsplat-edu train, after -- (default: {OPTIONS})")
     given = made.parse_args()
@@ -153,20 +160,35 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = given.keep or Path(scratch)
         capture, run = folder / "capture", folder / "run"
-        if not capture.exists():
-            make_capture(capture, given.size, given.photos)
+        if (
+            not capture.exists()
+        ):  # elsewhere: a child is charged with what its parent held when it was started
+            maker = multiprocessing.get_context("spawn").Process(
+                target=make_capture, args=(capture, given.size, given.photos)
+            )
+            maker.start()
+            maker.join()
+            if maker.exitcode:
+                raise SystemExit(f"memory.py: the capture could not be made: exit code {maker.exitcode}")
         found = watch(capture, run, ["--iterations", str(given.iterations), *options])
-    if found["code"]:
-        raise SystemExit(f"memory.py: the training ended with {found['code']}: {found['said'].strip()[-500:]}")
     print("iteration  RSS MiB")
     for iteration, resident in table(found["curve"]):
         print(f"{iteration:9,}  {resident / MIB:7.1f}")
     print(f"peak {found['peak_rss'] / MIB:.1f} MiB, {found['seconds']:.1f} s")
-    import hardware  # it imports torch; the child would be charged for what this process holds when it starts it
+    if found["code"]:
+        raise SystemExit(
+            f"memory.py: the training ended with {found['code']}: {found['said'].strip()[-500:]}"
+        )
+    import hardware  # it imports torch, which the child would be charged with as well
 
     parts = ("curve", "peak_rss", "seconds")
     hardware.report(
-        {"size": given.size, "photos": given.photos, "options": options, **{name: found[name] for name in parts}},
+        {
+            "size": given.size,
+            "photos": given.photos,
+            "options": options,
+            **{name: found[name] for name in parts},
+        },
         given.out,
     )
 

@@ -5,15 +5,16 @@ between them small tensors that live longer. glibc (2.36) cuts a 64-byte aligned
 freed, the hole is too small for the next aligned request of the same size, unless its neighbour is free as well. One
 small tensor kept per step is enough, and the process grows by an image in every iteration.
 
-Inside `reused_buffers`, `empty` maps memory of its own instead and hands it out again once nothing refers to it: not the
-tensor, not a view of it, not what autograd saved. Nobody's tensor is ever written over. When the block ends, the system
-gets everything back that is not in use.
+Inside `reused_buffers`, `empty` maps memory of its own instead and hands it out again once nothing refers to it: not
+the tensor, not a view of it, not what autograd saved. Nobody's tensor is ever written over. When the block ends, the
+system gets everything back that is not in use.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import math
 import mmap
 import platform
@@ -111,10 +112,10 @@ _current = _Current()
 def reused_buffers() -> Iterator[None]:
     """Let `empty` use memory again inside the block, in this thread. Blocks inside one another share theirs.
 
-    From the first block on, glibc's heap keeps out of large requests for as long as the process runs: what is left
-    of them (photos that are read again, the work of density control) goes back to the system when it is freed. By
-    default glibc raises its limit for that to the size of whatever was freed, up to 32 MiB. Other C libraries are left as
-    they are: musl's limit is fixed, and macOS has an arena of its own for large requests.
+    From the first block on, glibc maps every other large request separately too, for as long as the process runs:
+    photos that are read again and the work of density control go back to the system when they are freed. By default
+    glibc raises its limit for that to the size of whatever was freed, up to 32 MiB. Other C libraries are left as
+    they are: musl's limit is fixed, and macOS keeps large requests out of its small regions.
     """
     _limit_heap()
     before = _current.pool
@@ -147,11 +148,7 @@ def _mapped(nbytes: int) -> mmap.mmap:
     return mmap.mmap(-1, nbytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
 
 
+@functools.cache
 def _limit_heap() -> None:
-    global _heap_is_limited
-    if not _heap_is_limited and platform.libc_ver()[0] == "glibc":
+    if platform.libc_ver()[0] == "glibc":
         ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, HEAP_LIMIT)
-    _heap_is_limited = True
-
-
-_heap_is_limited = False

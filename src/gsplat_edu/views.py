@@ -80,7 +80,9 @@ class Photo:
         behind = np.asarray(background, dtype=np.float32)
         flat: UInt8[np.ndarray, "H W 3"] = np.empty(self.image.shape, dtype=np.uint8)
         rows = max(1, AT_ONCE // max(self.image.shape[1], 1))
-        for top in range(0, len(flat), rows):  # the floats of a few rows stay in the cache, and out of the heap
+        for top in range(
+            0, len(flat), rows
+        ):  # the floats of a few rows stay in the cache, and out of the heap
             band = slice(top, top + rows)
             share = self.alpha[band, :, None].astype(np.float32) / 255.0
             image = self.image[band].astype(np.float32) / (255.0 if self.image.dtype == np.uint8 else 1.0)

@@ -17,6 +17,8 @@ from gsplat_edu.views import Photo, View
 DEVICE_SHARE = 0.25
 """Of the memory that is free on a GPU when training begins: what photos may take. Gaussians take the rest."""
 
+CPU = torch.device("cpu")
+
 Color = tuple[float, float, float]
 
 
@@ -41,9 +43,9 @@ class Target:
 class ViewFeed:
     """An endless sequence of views and targets, the same for the same seed.
 
-    A photo that lies on disk is read while the step before it is taken. Targets that do not change are made once and
-    kept: on a GPU as many as there is room for, and those views are not read again; elsewhere those of photos that are
-    in memory and not opaque.
+    A photo on disk is read while the step before it runs. A photo in memory that is not opaque is put over a fixed
+    background once. A GPU keeps as many targets as it has room for, and their photos are not read again; targets over
+    random backgrounds are made anew for every step.
 
     Args:
         views: What to draw from, at least one.
@@ -60,7 +62,7 @@ class ViewFeed:
         order: str,
         seed: int,
         background: Color | None = (0.0, 0.0, 0.0),
-        device: torch.device = torch.device("cpu"),
+        device: torch.device = CPU,
         room: int | None = None,
     ) -> None:
         self.views, self._order = tuple(views), order
@@ -69,6 +71,7 @@ class ViewFeed:
         self._queue: list[int] = []
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="photo")
         self._ahead: tuple[int, Future[Photo]] | None = None
+        self._flat: dict[View, Photo] = {}
         self._kept: dict[View, Target] = {}
         self._room = _free_bytes(device) if room is None else room
 
@@ -93,23 +96,20 @@ class ViewFeed:
         return view, target
 
     def _read(self, view: View) -> Photo:
-        """Read a photo, in the thread that reads ahead too; put it over the background if that is known."""
-        photo = view.read()
+        """Read a photo and put it over the background if that is known; a photo in memory only once."""
+        photo = self._flat.get(view) or view.read()
         if photo.alpha is None or self._background is None:
             return photo
-        return Photo(photo.over(self._background), mask=photo.mask)
+        flat = Photo(photo.over(self._background), mask=photo.mask)
+        if not view.on_disk:
+            self._flat[view] = flat
+        return flat
 
     def _target(self, view: View, photo: Photo, background: Color) -> Target:
         """Bring a photo to where the Gaussians are; keep it there if it stays as it is and there is room."""
         mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(self._device)
         target = Target(torch.from_numpy(photo.over(background)).to(self._device), mask)
-        if photo.alpha is not None:
-            return target
-        if self._device.type == "cpu":
-            # Kept by whoever made the view, unless it was made here from a photo with alpha.
-            if not view.on_disk and photo is not view.read():
-                self._kept[view] = target
-        elif target.nbytes <= self._room:
+        if self._device.type != "cpu" and photo.alpha is None and target.nbytes <= self._room:
             self._kept[view] = target
             self._room -= target.nbytes
         return target

@@ -1,0 +1,127 @@
+"""Buffers are used again when nothing refers to them any more, and not a moment before."""
+
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+
+from gsplat_edu import buffers
+from gsplat_edu.buffers import LARGE, empty, reused_buffers
+
+SHAPE = (LARGE // 4, 3)
+LIKE = torch.zeros(())
+
+
+def address():
+    """Take a buffer, let it go, and return where it was."""
+    return empty(SHAPE, LIKE).data_ptr()
+
+
+def test_a_buffer_that_nobody_holds_is_used_again():
+    with reused_buffers():
+        assert address() == address()
+
+
+@pytest.mark.parametrize(
+    "hold",
+    [
+        lambda tensor: tensor,
+        lambda tensor: tensor[5:6, 1],
+        lambda tensor: tensor.detach(),
+        lambda tensor: tensor.numpy(),
+        lambda tensor: (torch.ones_like(tensor, requires_grad=True) * tensor).sum(),  # saved by autograd
+    ],
+)
+def test_a_buffer_that_somebody_holds_stays_as_it_is(hold):
+    with reused_buffers():
+        first = empty(SHAPE, LIKE).fill_(7.0)
+        held, where = hold(first), first.data_ptr()
+        del first
+        others = [empty(SHAPE, LIKE).fill_(1.0) for _ in range(3)]
+        assert where not in [other.data_ptr() for other in others]
+    del others
+    with reused_buffers():
+        assert address() != where
+    if isinstance(held, torch.Tensor) and held.grad_fn is None:
+        assert bool((held == 7.0).all())
+    del held
+
+
+def test_a_tensor_outlives_the_block():
+    with reused_buffers():
+        image = empty(SHAPE, LIKE).fill_(3.0)
+    assert bool((image == 3.0).all())
+
+
+def test_small_ones_and_those_outside_the_block_are_torchs():
+    with reused_buffers():
+        assert empty((LARGE // 4 - 1,), LIKE).untyped_storage().resizable()
+        assert not empty((LARGE // 4,), LIKE).untyped_storage().resizable()
+    assert empty(SHAPE, LIKE).untyped_storage().resizable()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64, torch.uint8])
+def test_shape_and_dtype(dtype):
+    with reused_buffers():
+        made = empty((300, 1000, 3), LIKE, dtype)
+    assert made.shape == (300, 1000, 3) and made.dtype == dtype and made.is_contiguous()
+    assert made.data_ptr() % 64 == 0
+    assert empty((0, 3), LIKE).shape == (0, 3)
+
+
+def test_blocks_inside_one_another_share_and_threads_do_not():
+    with reused_buffers():
+        where = address()
+        with reused_buffers():
+            assert address() == where
+        assert address() == where
+        seen = []
+        thread = threading.Thread(
+            target=lambda: seen.append(empty(SHAPE, LIKE).untyped_storage().resizable())
+        )
+        thread.start()
+        thread.join()
+        assert seen == [True], "a thread that is not in a block takes its memory from torch"
+
+
+def test_no_more_is_held_than_was_once_in_use():
+    """Two at a time, of sizes that never come again: nothing fits, and what waits has to go."""
+    pool = buffers._Pool()
+    largest = 0
+    for i in range(300):
+        size = LARGE + 4096 * ((i * 7919) % 500)
+        pair = [pool.take(size), pool.take(2 * size)]
+        largest = max(largest, sum(-(-a.nbytes // 4096) * 4096 for a in pair))
+        del pair
+        # A buffer that is handed out again may be SLACK larger than the request.
+        assert pool.nbytes <= buffers.SLACK * largest
+
+
+def test_what_is_not_wanted_any_more_goes_back():
+    pool = buffers._Pool()
+    many = [pool.take(LARGE) for _ in range(50)]
+    del many
+    assert pool.nbytes == 50 * LARGE
+    for _ in range(2 * pool.SPAN):
+        pool.take(LARGE)
+    assert pool.nbytes <= 2 * LARGE
+
+
+@pytest.mark.own_process
+@pytest.mark.skipif(sys.platform == "win32", reason="no fork")
+def test_a_forked_child_has_a_copy():
+    code = """
+import os, torch
+from gsplat_edu.buffers import empty, reused_buffers
+with reused_buffers():
+    image = empty((1000, 1000), torch.zeros(())).fill_(1.0)
+    child = os.fork()
+    if child == 0:
+        image[:2] = 5.0
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert bool((image == 1.0).all())
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=120)

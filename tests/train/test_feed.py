@@ -1,0 +1,127 @@
+"""What a render is compared with: made once where it stays as it is, read again only where it has to be.
+
+The room on a GPU is a number of bytes, and torch's device "meta" takes a GPU's place: the code is the same.
+"""
+
+import collections
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.camera import orbit_camera
+from gsplat_edu.train.feed import ViewFeed
+from gsplat_edu.views import AT_ONCE, Photo, View
+
+SIZE = 16
+BYTES = 3 * SIZE * SIZE
+WHITE = (1.0, 1.0, 1.0)
+META = torch.device("meta")
+
+
+def photos(count, alpha=False, mask=False):
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        yield Photo(
+            rng.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8),
+            rng.integers(0, 256, (SIZE, SIZE), dtype=np.uint8) if alpha else None,
+            rng.random((SIZE, SIZE)) < 0.5 if mask else None,
+        )
+
+
+def stored(count, reads, **kinds):
+    """Make views whose photos are read from somewhere; `reads` counts how often."""
+    camera = orbit_camera(0.0, 0.0, SIZE, 20.0, 3.0)
+
+    def reading(i, photo):
+        def read():
+            reads[i] += 1
+            return photo
+
+        return read
+
+    return [View.stored(camera, reading(i, photo)) for i, photo in enumerate(photos(count, **kinds))]
+
+
+def in_memory(count, **kinds):
+    camera = orbit_camera(0.0, 0.0, SIZE, 20.0, 3.0)
+    return [View(camera, p.image, alpha=p.alpha, mask=p.mask) for p in photos(count, **kinds)]
+
+
+def drawn(feed, count, background=WHITE):
+    targets = [feed.next(background) for _ in range(count)]
+    feed._reader.shutdown()  # what is being read ahead is counted too
+    return targets
+
+
+@pytest.mark.parametrize(
+    ("room", "kept"), [(0, 0), (BYTES - 1, 0), (BYTES, 1), (5 * BYTES, 5), (99 * BYTES, 6)]
+)
+def test_a_gpu_keeps_what_there_is_room_for_and_the_rest_is_read_again(room, kept):
+    reads = collections.Counter()
+    feed = ViewFeed(stored(6, reads), "shuffled", 0, WHITE, META, room)
+    targets = drawn(feed, 60)
+    assert sum(len({id(t) for v, t in targets if v is view}) == 1 for view in feed.views) == kept
+    assert sum(t.nbytes for t in feed._kept.values()) <= room
+    assert sorted(reads.values())[:kept] == [1] * kept, "kept: read once, not once per step"
+    assert all(count >= 10 for count in sorted(reads.values())[kept:])
+
+
+def test_masks_count_in_the_room():
+    feed = ViewFeed(stored(4, collections.Counter(), mask=True), "shuffled", 0, WHITE, META, 2 * BYTES)
+    drawn(feed, 12)
+    assert len(feed._kept) == 1
+
+
+def test_targets_on_a_gpu_are_the_photos():
+    """The same code with room on the CPU's own device: bytes as they are in the photo."""
+    views = stored(3, collections.Counter(), mask=True)
+    for view, target in drawn(ViewFeed(views, "shuffled", 0, WHITE), 6):
+        assert np.array_equal(target.image.numpy(), view.read().image)
+        assert np.array_equal(target.mask.numpy(), view.read().mask)
+
+
+@pytest.mark.parametrize("device", [META, torch.device("cpu")])
+def test_photos_over_random_colours_are_not_kept(device):
+    reads = collections.Counter()
+    feed = ViewFeed(stored(2, reads, alpha=True), "shuffled", 0, None, device, 99 * BYTES)
+    drawn(feed, 8)
+    assert not feed._kept and sum(reads.values()) >= 8
+
+
+def test_photos_in_memory_are_put_over_the_background_once():
+    views = in_memory(3, alpha=True)
+    targets = drawn(ViewFeed(views, "shuffled", 0, WHITE), 12)
+    assert len({target.image.data_ptr() for _, target in targets}) == 3
+    for view, target in targets:
+        assert np.array_equal(target.image.numpy(), view.read().over(WHITE))
+
+
+def test_opaque_photos_in_memory_are_not_copied():
+    views = in_memory(3)
+    feed = ViewFeed(views, "shuffled", 0, WHITE)
+    for view, target in drawn(feed, 6):
+        assert target.image.data_ptr() == view.image.ctypes.data
+    assert not feed._kept
+
+
+def test_every_draw_has_its_own_background():
+    view = in_memory(1, alpha=True)[0]
+    feed = ViewFeed([view], "shuffled", 0, None)
+    for color in (WHITE, (0.0, 0.5, 1.0)):
+        assert np.array_equal(feed.next(color)[1].image.numpy(), view.read().over(color))
+
+
+@pytest.mark.parametrize(("H", "W"), [(1, 3), (37, 500), (5, AT_ONCE + 1), (0, 4)])
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_a_photo_over_a_background_is_the_formula_to_the_bit(H, W, kind):
+    """`Photo.over` works on a few rows at a time; what comes out is that of the whole image at once."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (H, W, 3), dtype=np.uint8)
+    if kind is np.float32:
+        image = (image / np.float32(255)).astype(np.float32)
+    alpha, color = rng.integers(0, 256, (H, W), dtype=np.uint8), (0.2, 0.7, 1.0)
+    share = alpha[..., None].astype(np.float32) / 255.0
+    values = image.astype(np.float32) / (255.0 if kind is np.uint8 else 1.0)
+    mixed = np.clip(values * share + np.asarray(color, np.float32) * (1.0 - share), 0.0, 1.0)
+    assert np.array_equal(Photo(image, alpha).over(color), np.round(255.0 * mixed).astype(np.uint8))
