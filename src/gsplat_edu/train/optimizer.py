@@ -16,6 +16,9 @@ from gsplat_edu import kernels
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 
+NUMBERS = ("rate", "beta1", "beta2", "eps", "correction1", "correction2")
+"""What a step takes besides tensors, in the order of the implementations' last argument."""
+
 
 class Adam:
     """Adam over the raw parameters of Gaussians.
@@ -73,10 +76,17 @@ class Adam:
             if parameter.grad is None:
                 continue
             numbers = (rate, b1, b2, self.eps, 1 - b1**self.steps, 1 - b2**self.steps)
-            if m.shape != parameter.shape:
-                raise ArgumentError(
-                    f"{name}: has shape {tuple(parameter.shape)}, its moments {tuple(m.shape)}; call follow"
-                )
+            for moment in (m, v):
+                if moment.shape != parameter.shape:
+                    raise ArgumentError(
+                        f"{name}: has shape {tuple(parameter.shape)}, its moments {tuple(moment.shape)};"
+                        " call follow"
+                    )
+                if (moment.dtype, moment.device) != (parameter.dtype, parameter.device):
+                    raise ArgumentError(
+                        f"{name}: is {parameter.dtype} on {parameter.device}, its moments are {moment.dtype} on"
+                        f" {moment.device}"
+                    )
             step = _step_on_gpu if _gpu_takes(parameter) else _step_in_torch
             (_step_natively if _native_takes(parameter) else step)(parameter, m, v, numbers)
         for parameter in tensors.values():
@@ -132,9 +142,14 @@ def _step_on_gpu(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, 
 def _step_natively(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:
     gradient = parameter.grad
     if gradient is not None:
-        arrays = (parameter, m, v, gradient.to(parameter.dtype).contiguous())
-        step = kernels.kernel("adam_f", parameter.dtype)
-        step([a.data_ptr() for a in arrays], parameter.numel(), numbers, torch.get_num_threads())
+        kernels.kernel("adam_f", parameter.dtype)(
+            parameter=kernels.array(parameter),
+            first=kernels.array(m),
+            second=kernels.array(v),
+            gradient=kernels.array(gradient.to(parameter.dtype).contiguous()),
+            **dict(zip(NUMBERS, numbers, strict=True)),
+            threads=torch.get_num_threads(),
+        )
         torch.autograd.graph.increment_version(parameter)  # so that autograd knows of the change
 
 
