@@ -61,7 +61,7 @@ def backward(**changes):
 
 def adam(**changes):
     fields = {name: torch.zeros(N, 3) for name in ("parameter", "first", "second", "gradient")}
-    fields |= {name: 0.5 for name in ("rate", "beta1", "beta2", "eps", "correction1", "correction2")}
+    fields |= dict.fromkeys(("rate", "beta1", "beta2", "eps", "correction1", "correction2"), 0.5)
     _native.adam_f32(**fields | {"threads": 2} | changes)
 
 
@@ -96,12 +96,12 @@ def test_the_arguments_of_these_tests_are_right(call):
 def test_a_missing_or_senseless_argument_is_named(call, name, monkeypatch):
     with pytest.raises((TypeError, ValueError), match=rf": {name}: "):
         call(**{name: "nonsense"})
-    monkeypatch.setitem(call.__globals__, "_native", _dropped(_native, name))
+    monkeypatch.setitem(call.__globals__, "_native", Dropping(_native, name))
     with pytest.raises(TypeError, match=rf": {name} is missing$"):
         call()
 
 
-class _dropped:
+class Dropping:
     """The native module, whose calls lose one of their arguments on the way."""
 
     def __init__(self, source, name):
@@ -113,7 +113,7 @@ class _dropped:
         def without(*arguments, **fields):
             fields.pop(self.name, None)
             result = called(*arguments, **fields)
-            return result if not attribute.startswith("Frame") else _dropped(result, self.name)
+            return result if not attribute.startswith("Frame") else Dropping(result, self.name)
 
         return without if callable(called) else called
 

@@ -15,9 +15,13 @@ from torch import Tensor
 from gsplat_edu import kernels
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.train.saved import check_entries, check_not_negative, check_tensor_kind
 
 NUMBERS = ("rate", "beta1", "beta2", "eps", "correction1", "correction2")
 """What a step takes besides tensors, in the order of the implementations' last argument."""
+
+MOMENTS = ("first", "second")
+"""What Adam keeps of each parameter, decaying means of its gradient and of that squared."""
 
 
 class Adam:
@@ -117,6 +121,29 @@ class Adam:
         for moments in (self.first, self.second):
             for name, old in moments.items():
                 moments[name] = torch.cat([old[survivors], old.new_zeros(num_new, *old.shape[1:])])
+
+    def state(self) -> tuple[dict[str, dict[str, Tensor]], int]:
+        """Return the moments, as "first" and "second", and the number of steps taken."""
+        return {name: getattr(self, name) for name in MOMENTS}, self.steps
+
+    def load_state(self, moments: dict[str, dict[str, Tensor]], steps: int, gaussians: Gaussians) -> None:
+        """Restore what `state` returned.
+
+        Raises:
+            ArgumentError: a moment is not of its parameter's dtype and shape, or not there; nothing has changed.
+        """
+        for part in MOMENTS:
+            given = check_entries(part, moments[part], tuple(self.learning_rates))
+            for name, moment in given.items():
+                parameter = getattr(gaussians, name)
+                check_tensor_kind(f"{part}.{name}", moment, parameter.dtype, parameter.shape)
+        for name, moment in moments["second"].items():
+            check_not_negative(f"second.{name}", moment)
+        self.first, self.second = (
+            {name: moment.to(gaussians.means.device) for name, moment in moments[part].items()}
+            for part in MOMENTS
+        )
+        self.steps = steps
 
 
 def _native_takes(parameter: Tensor) -> bool:
