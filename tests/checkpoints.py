@@ -56,7 +56,21 @@ def write(path: Path, tensors: dict[str, torch.Tensor], metadata: dict[str, str]
 DTYPES = (torch.float16, torch.bfloat16, torch.float64, torch.int32, torch.int64, torch.uint8, torch.bool)
 POISONS = (float("nan"), float("inf"), -float("inf"), -1.0, 0.0, 1e-42, 3e38, -3e38, 1e20)
 ODD = (None, True, False, -1, 0, 1, 63, 64, 65, 2**31, 2**63, 2**64, 2**128, 10**400, 0.5, 1e300, -0.0)
-ODD += (float("nan"), float("inf"), "", "text", "\ud800", "1", [], [0], [[]], {}, {"a": 1}, [0, 0], [0, 1, 2, 3])
+ODD += (
+    float("nan"),
+    float("inf"),
+    "",
+    "text",
+    "\ud800",
+    "1",
+    [],
+    [0],
+    [[]],
+    {},
+    {"a": 1},
+    [0, 0],
+    [0, 1, 2, 3],
+)
 
 
 def changed_tensor(tensor: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
@@ -143,7 +157,9 @@ def mutate(data: bytes, path: Path, rng: np.random.Generator) -> None:
             if rng.random() < 0.1:
                 del tensors[str(rng.choice(sorted(tensors)))]
             if rng.random() < 0.1:
-                tensors[str(rng.choice(["more", "second.more", "density.", "gaussians.means.x"]))] = torch.ones(2)
+                tensors[str(rng.choice(["more", "second.more", "density.", "gaussians.means.x"]))] = (
+                    torch.ones(2)
+                )
         else:
             entry = "seconds" if rng.random() < 0.1 else "state"
             metadata[entry] = spelled(changed_json(json.loads(metadata[entry]), rng), rng)
