@@ -13,8 +13,8 @@ from checkpoints import Maker, mutate, step
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.train.checkpoint import load_checkpoint, read_seconds, save_checkpoint
 
-MUTATIONS = int(os.environ.get("GSPLAT_EDU_FUZZ_CHECKPOINTS", "1000"))
-"""Damaged checkpoints per strategy."""
+MUTATIONS = int(os.environ.get("GSPLAT_EDU_FUZZ_CHECKPOINTS", "100"))
+"""Damaged checkpoints per strategy; tools/sanitize.sh has more of them."""
 
 FIRST = int(os.environ.get("GSPLAT_EDU_FUZZ_FIRST", "0"))
 """Seed of the first."""
