@@ -1,6 +1,6 @@
 """How many splats should the dense torch renderer evaluate at once?
 
-    python benchmarks/dense.py [--out FILE.json]
+    python benchmarks/dense.py [--smoke] [--out FILE.json]
 
 Renders and differentiates a cloud of the course's size (1,600 splats, 128 px, float32) with several chunks,
 in turn, and prints the median time of each and its ratio to the chapter's chunk of 512 within the same round.
@@ -9,15 +9,13 @@ The ratios are what to compare: machines drift, rounds do not.
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import time
-from pathlib import Path
 
 import hardware
 import torch
 
+from gsplat_edu import Camera
 from gsplat_edu.data.synthetic import sphere_cameras
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
@@ -27,22 +25,24 @@ from gsplat_edu.train.initialize import random_ball
 CHUNKS = (512, 128, 64, 32, 16, 8, 4)
 CHAPTER = 512
 NUM_GAUSSIANS, SIZE, ROUNDS = 1600, 128, 7
-CAMERA = sphere_cameras(SIZE)[8]
 
 
-def seconds(gaussians: Gaussians, chunk: int) -> tuple[float, float]:
+def seconds(gaussians: Gaussians, camera: Camera, chunk: int) -> tuple[float, float]:
     """Time one forward and one backward pass."""
     start = time.perf_counter()
-    output = render(gaussians, CAMERA, settings=RenderSettings(dense_chunk=chunk), backend="torch")
+    output = render(gaussians, camera, settings=RenderSettings(dense_chunk=chunk), backend="torch")
     middle = time.perf_counter()
     output.image.mean().backward()
     return middle - start, time.perf_counter() - middle
 
 
-def measure() -> list[dict[str, float]]:
+def measure(count: int, size: int, num_rounds: int) -> list[dict[str, float]]:
     """Time every chunk in every round; the first round warms up and is not counted."""
-    gaussians = random_ball(NUM_GAUSSIANS, torch.Generator().manual_seed(0)).trainable()
-    rounds = [{chunk: seconds(gaussians, chunk) for chunk in CHUNKS} for _ in range(ROUNDS + 1)][1:]
+    camera = sphere_cameras(size)[8]
+    gaussians = random_ball(count, torch.Generator().manual_seed(0)).trainable()
+    rounds = [{chunk: seconds(gaussians, camera, chunk) for chunk in CHUNKS} for _ in range(num_rounds + 1)][
+        1:
+    ]
     rows = []
     for chunk in CHUNKS:
         forward, backward = (statistics.median(r[chunk][i] for r in rounds) for i in (0, 1))
@@ -54,18 +54,14 @@ def measure() -> list[dict[str, float]]:
 
 def main() -> None:
     """Measure, print the table, write the JSON."""
-    parser = argparse.ArgumentParser(description="Dense torch renderer: time against chunk size.")
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    arguments = parser.parse_args()
-    result = {"hardware": hardware.describe(), "rows": measure()}
-    print(", ".join(f"{key}: {value}" for key, value in result["hardware"].items()))
-    print(f"{NUM_GAUSSIANS} splats, {SIZE} px, float32, median of {ROUNDS} rounds")
+    arguments = hardware.parser("Dense torch renderer: time against chunk size.").parse_args()
+    count, size, num_rounds = (20, 8, 1) if arguments.smoke else (NUM_GAUSSIANS, SIZE, ROUNDS)
+    rows = measure(count, size, num_rounds)
+    hardware.report({"rows": rows}, arguments.out)
+    print(f"{count} splats, {size} px, float32, median of {num_rounds} rounds")
     print(f"{'chunk':>6} {'forward ms':>11} {'backward ms':>12} {f'vs {CHAPTER}':>8}")
-    for row in result["rows"]:
+    for row in rows:
         print("{chunk:6d} {forward_ms:11.1f} {backward_ms:12.1f} {times_faster:7.2f}x".format(**row))
-    if arguments.out:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """How long does a scene take to write and to read in each format, how large is it, and does it show the same?
 
-    python benchmarks/formats.py [SCENE|RUN] [--count N] [--formats .ply .spz ...] [--out FILE.json]
+    python benchmarks/formats.py [SCENE|RUN] [--count N] [--formats .ply .spz ...] [--smoke]
+        [--out FILE.json]
 
 Without a scene, N random Gaussians of SH degree 3 (default: a million) are written and read, and nothing is rendered:
 random numbers compress as no scene does. Of a scene, PSNR is that of `gsplat-edu convert --verify`. Each time is the
@@ -86,6 +87,8 @@ def main() -> int:
         "--rounds", type=int, default=ROUNDS, help="times each is done (default: %(default)s)"
     )
     options = parser.parse_args()
+    if options.smoke:
+        options.count, options.rounds = min(options.count, 300), 1
 
     def run() -> None:
         source = open_source(options.scene) if options.scene else random_source(options.count)

@@ -1,20 +1,22 @@
 """What does a training iteration cost on a GPU, stage by stage, and how near is it to the machine's limits?
 
-    python benchmarks/gpu.py [--out FILE.json]
+    python benchmarks/gpu.py [--smoke] [--out FILE.json]
 
 Random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 - SSIM), backward,
 Adam. Milliseconds per stage are the kernels' own, from torch's profiler, over 20 iterations; how often the host waits
 is counted too. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. Then the
 gradients' error and the time with each precision of matrix products, against the native kernels in float64; and, where
-gsplat can be imported, the same scene through it: times, and the agreement of images and gradients. Needs a GPU.
+gsplat can be imported, the same scene through it: times, and the agreement of images and gradients. Needs a GPU;
+without one it says so and exits with 2.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import hardware
 import torch
@@ -27,9 +29,21 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.optimizer import Adam
 
-COUNTS = (100_000, 1_000_000, 3_000_000)
-SIZES = ((1297, 840), (1920, 1080))
-ROUNDS = 20
+
+class Scale(NamedTuple):
+    """How much is measured."""
+
+    counts: tuple[int, ...]  # Gaussians
+    sizes: tuple[tuple[int, int], ...]  # px
+    rounds: int
+    copied: int  # floats
+    product: int  # rows and columns of the matrices
+    few: int  # Gaussians whose gradients are compared with float64
+    many: int  # Gaussians that are timed by precision, and beside gsplat
+
+
+FULL = Scale((100_000, 1_000_000, 3_000_000), ((1297, 840), (1920, 1080)), 20, 2**28, 8192, 50_000, 1_000_000)
+SMOKE = Scale((500,), ((64, 48),), 2, 2**16, 64, 200, 500)
 FLOATS = 59
 """Numbers of one Gaussian of SH degree 3."""
 
@@ -76,7 +90,7 @@ def camera(width: int, height: int) -> Camera:
     return Camera.looking_at((0, 0, -3.0), (0, 0, 0), 0.9 * width, 0.9 * width, height, width)
 
 
-def milliseconds(work: Callable[[], object], rounds: int = ROUNDS) -> float:
+def milliseconds(work: Callable[[], object], rounds: int) -> float:
     """Time work on the GPU, after three rounds of warming up."""
     for _ in range(3):
         work()
@@ -95,17 +109,17 @@ def iteration(gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer:
     optimizer.step(gaussians)
 
 
-def stages(count: int, width: int, height: int) -> dict[str, float]:
+def stages(count: int, width: int, height: int, rounds: int) -> dict[str, float]:
     """Return milliseconds per iteration, in all and by stage, waits per iteration and the peak of memory."""
     gaussians, cam = scene(count, "cuda"), camera(width, height)
     photo = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, device="cuda")
     config = TrainConfig()
     optimizer = Adam(gaussians, config.learning_rates, eps=config.adam_eps)
     torch.cuda.reset_peak_memory_stats()
-    found = {"iteration": milliseconds(lambda: iteration(gaussians, cam, photo, optimizer))}
+    found = {"iteration": milliseconds(lambda: iteration(gaussians, cam, photo, optimizer), rounds)}
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
     with torch.profiler.profile(activities=activities) as profile:
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             iteration(gaussians, cam, photo, optimizer)
         torch.cuda.synchronize()
     for (
@@ -114,14 +128,14 @@ def stages(count: int, width: int, height: int) -> dict[str, float]:
         spent = event.self_device_time_total if event.device_type == torch.autograd.DeviceType.CUDA else 0.0
         if spent:
             stage = next((s for part, s in STAGES.items() if part in event.key), "torch around them")
-            found[stage] = found.get(stage, 0.0) + spent / 1e3 / ROUNDS
+            found[stage] = found.get(stage, 0.0) + spent / 1e3 / rounds
     torch.cuda.set_sync_debug_mode("warn")
     with warnings.catch_warnings(record=True) as waits:
         warnings.simplefilter("always")
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             iteration(gaussians, cam, photo, optimizer)
     torch.cuda.set_sync_debug_mode("default")
-    found["waits"] = len(waits) / ROUNDS
+    found["waits"] = len(waits) / rounds
     found["peak GiB"] = torch.cuda.max_memory_allocated() / 2**30
     with torch.no_grad():
         pairs = render(gaussians, cam, settings=SETTINGS, backend="cuda").num_pairs or 0
@@ -143,23 +157,24 @@ def achieved(found: dict[str, float], count: int, pairs: int) -> dict[str, float
     }
 
 
-def ceilings() -> dict[str, float]:
+def ceilings(scale: Scale) -> dict[str, float]:
     """Measure what the machine can do: copying, and float32 products."""
-    block = torch.empty(2**28, device="cuda")
-    square = torch.randn(8192, 8192, device="cuda")
+    block = torch.empty(scale.copied, device="cuda")
+    square = torch.randn(scale.product, scale.product, device="cuda")
     torch.backends.cuda.matmul.allow_tf32 = False
-    copy, product = milliseconds(block.clone), milliseconds(lambda: square @ square, 5)
-    return {"copy GB/s": 2 * block.nbytes / copy / 1e6, "float32 TFLOP/s": 2 * 8192**3 / product / 1e9}
+    copy, product = milliseconds(block.clone, scale.rounds), milliseconds(lambda: square @ square, 5)
+    operations = 2 * scale.product**3
+    return {"copy GB/s": 2 * block.nbytes / copy / 1e6, "float32 TFLOP/s": operations / product / 1e9}
 
 
-def precisions() -> dict[str, dict[str, float]]:
+def precisions(scale: Scale) -> dict[str, dict[str, float]]:
     """Return the largest gradient error relative to the largest gradient, and the time, by precision."""
     from gsplat_edu.render.triton import rasterize
 
     cam = camera(640, 420)
 
     def gradients(backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
-        gaussians = scene(50_000, "cuda" if backend == "cuda" else "cpu", dtype)
+        gaussians = scene(scale.few, "cuda" if backend == "cuda" else "cpu", dtype)
         render(gaussians, cam, settings=SETTINGS, backend=backend).image.square().sum().backward()
         return {name: tensor.grad.double().cpu() for name, tensor in gaussians.tensors().items()}
 
@@ -168,20 +183,20 @@ def precisions() -> dict[str, dict[str, float]]:
         rasterize.PRECISION = name
         ours = gradients("cuda", torch.float32)
         error = max(float((ours[key] - t).abs().max() / t.abs().max()) for key, t in truth.items())
-        large, wide = scene(1_000_000, "cuda"), camera(1297, 840)
+        large, wide = scene(scale.many, "cuda"), camera(*scale.sizes[0])
         work = lambda: render(large, wide, settings=SETTINGS, backend="cuda").image.sum().backward()  # noqa: E731, B023
-        found[name] = {"error": error, "ms": milliseconds(work)}
+        found[name] = {"error": error, "ms": milliseconds(work, scale.rounds)}
     rasterize.PRECISION = before
     return found
 
 
-def beside_gsplat() -> dict[str, float] | None:
+def beside_gsplat(scale: Scale) -> dict[str, float] | None:
     """Render a million Gaussians with gsplat and with us; None where it is not installed."""
     try:
         from gsplat import rasterization
     except ImportError:
         return None
-    gaussians, cam = scene(1_000_000, "cuda"), camera(1297, 840)
+    gaussians, cam = scene(scale.many, "cuda"), camera(*scale.sizes[0])
     view = torch.eye(4, device="cuda")
     view[:3, :3] = torch.tensor(cam.R)
     view[:3, 3] = torch.tensor(-cam.R @ cam.eye)
@@ -205,31 +220,38 @@ def beside_gsplat() -> dict[str, float] | None:
             tensor.grad = None
     with torch.no_grad():
         found = {"largest difference of the images": float((ours() - theirs()).abs().max())}
-        found |= {"ours, forward ms": milliseconds(ours), "gsplat, forward ms": milliseconds(theirs)}
+        found |= {
+            "ours, forward ms": milliseconds(ours, scale.rounds),
+            "gsplat, forward ms": milliseconds(theirs, scale.rounds),
+        }
     for name, gradient in gradients[0].items():
         error = (gradient - gradients[1][name]).abs().max() / gradient.abs().max()
         found[f"largest difference of the gradients, {name}"] = float(error)
-    found["ours, forward and backward ms"] = milliseconds(lambda: ours().sum().backward())
-    found["gsplat, forward and backward ms"] = milliseconds(lambda: theirs().sum().backward())
+    found["ours, forward and backward ms"] = milliseconds(lambda: ours().sum().backward(), scale.rounds)
+    found["gsplat, forward and backward ms"] = milliseconds(lambda: theirs().sum().backward(), scale.rounds)
     return found
 
 
-def main() -> None:
+def main() -> int:
     """Measure, print the tables, write the JSON."""
     arguments = hardware.parser("A training iteration on a GPU, stage by stage.").parse_args()
     if not torch.cuda.is_available():
-        raise SystemExit("gpu.py: torch sees no GPU; benchmarks/train_step.py measures the CPU")
-    result: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "ceilings": ceilings(), "stages": {}}
-    for count in COUNTS:
-        for width, height in SIZES:
-            result["stages"][f"{count} at {width}x{height}"] = stages(count, width, height)
-    result |= {"precisions": precisions(), "gsplat": beside_gsplat()}
+        print("gpu.py: torch sees no GPU; benchmarks/train_step.py measures the CPU", file=sys.stderr)
+        return 2
+    scale = SMOKE if arguments.smoke else FULL
+    result: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "ceilings": ceilings(scale), "stages": {}}
+    for count in scale.counts:
+        for width, height in scale.sizes:
+            found = stages(count, width, height, scale.rounds)
+            result["stages"][f"{count} at {width}x{height}"] = found
+    result |= {"precisions": precisions(scale), "gsplat": beside_gsplat(scale)}
     hardware.report(result, arguments.out)
     for name, table in result.items():
         print(f"{name}: {table}" if not isinstance(table, dict) else name)
         for key, value in table.items() if isinstance(table, dict) else ():
             print(f"  {key}: {value}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

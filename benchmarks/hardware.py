@@ -33,8 +33,18 @@ def describe() -> dict[str, str | int]:
 def parser(description: str) -> argparse.ArgumentParser:
     """Make a benchmark's command line."""
     made = argparse.ArgumentParser(description=description)
-    made.add_argument("--out", type=Path, help="JSON file to write")
+    add_options(made)
     return made
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add what every benchmark takes."""
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    parser.add_argument(
+        "--smoke",
+        action="store_true",
+        help="run everything once at a tiny size, to see that it runs; the figures mean nothing",
+    )
 
 
 def report(result: dict[str, Any], out: Path | None) -> None:

@@ -1,9 +1,9 @@
 """Do --max-memory and --time-limit hold, and how far off was the forecast?
 
-    python benchmarks/limits.py [CAPTURE] [--memory SIZE ...] [--time TIME ...] [--out FILE.json]
+    python benchmarks/limits.py [CAPTURE] [--memory SIZE ...] [--time TIME ...] [--smoke] [--out FILE.json]
 
-Runs `gsplat-edu train CAPTURE` (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data) in a process of its own,
-once for each limit (default: 1GiB, 2GiB, 2m, 4m), and looks at it from outside: its peak RSS by wait4, its wall time,
+Runs `gsplat-edu train CAPTURE` (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else a procedural capture) in a process
+of its own, once for each limit (default: 1GiB, 2GiB, 2m, 4m), and looks at it from outside: its peak RSS by wait4, its wall time,
 what it said it would take. Runs with a limit of memory get options that split every Gaussian as often as it goes, so
 that the cap which was chosen is reached and the memory used. Linux, where ru_maxrss is in KiB.
 """
@@ -20,6 +20,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from captures import capture
+
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
 FILLING = (
@@ -32,11 +34,11 @@ UNITS = {"h": 3600.0, "min": 60.0, "s": 1.0}
 SIZES = {"MiB": 2.0**20, "GiB": 2.0**30}
 
 
-def train(capture: Path, limit: list[str]) -> dict[str, Any]:
+def train(folder: Path, limit: list[str]) -> dict[str, Any]:
     """Train under one limit; return what was measured from outside and what was forecast."""
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
-        words = [sys.executable, "-c", COMMAND, "train", str(capture), "--out", str(out), *limit]
+        words = [sys.executable, "-c", COMMAND, "train", str(folder), "--out", str(out), *limit]
         with (Path(scratch) / "said.txt").open("w+") as said:
             # A child counts what its parent held when it was started; this process holds little.
             actions = [(os.POSIX_SPAWN_DUP2, said.fileno(), descriptor) for descriptor in (1, 2)]
@@ -91,24 +93,29 @@ def line(found: dict[str, Any]) -> str:
 def main() -> None:
     """Train under every limit, print the rows, write the JSON."""
     made = argparse.ArgumentParser(description="Limits of memory and time, from outside.")
-    data = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data"))
-    made.add_argument("capture", nargs="?", type=Path, default=data / "snowmiku97")
-    made.add_argument("--memory", nargs="*", default=["1GiB", "2GiB"], metavar="SIZE")
-    made.add_argument("--time", nargs="*", default=["2m", "4m"], metavar="TIME")
+    made.add_argument("capture", nargs="?", type=Path)
+    made.add_argument("--memory", nargs="*", metavar="SIZE", help="limits of memory (default: 1GiB 2GiB)")
+    made.add_argument("--time", nargs="*", metavar="TIME", help="limits of time (default: 2m 4m)")
     made.add_argument("--out", type=Path, help="JSON file to write")
+    made.add_argument("--smoke", action="store_true", help="one tiny training per kind of limit")
     arguments = made.parse_args()
-    if not arguments.capture.exists():
-        raise SystemExit(f"limits.py: {arguments.capture} is not there; name another capture")
-    limits = [["--max-memory", size, *FILLING.split()] for size in arguments.memory]
-    limits += [["--time-limit", duration] for duration in arguments.time]
+    default = (["1GiB"], ["5s"]) if arguments.smoke else (["1GiB", "2GiB"], ["2m", "4m"])
+    memory, times = (
+        usual if given is None else given
+        for given, usual in zip((arguments.memory, arguments.time), default, strict=True)
+    )
+    limits = [["--max-memory", size, *FILLING.split()] for size in memory]
+    limits += [["--time-limit", duration] for duration in times]
     rows = []
-    for limit in limits:
-        before = os.getloadavg()[0]
-        rows.append(train(arguments.capture, limit) | {"load": [before, os.getloadavg()[0]]})
-        print(line(rows[-1]) + f", load {rows[-1]['load'][0]:.1f} to {rows[-1]['load'][1]:.1f}", flush=True)
+    with capture(arguments.capture, arguments.smoke) as folder:
+        for limit in limits:
+            before = os.getloadavg()[0]
+            rows.append(train(folder, limit) | {"load": [before, os.getloadavg()[0]]})
+            load = rows[-1]["load"]
+            print(line(rows[-1]) + f", load {load[0]:.1f} to {load[1]:.1f}", flush=True)
     import hardware  # it imports torch, which the children would be charged for
 
-    hardware.report({"capture": arguments.capture.name, "runs": rows}, arguments.out)
+    hardware.report({"capture": folder.name, "runs": rows}, arguments.out)
 
 
 if __name__ == "__main__":

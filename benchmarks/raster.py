@@ -1,6 +1,6 @@
 """What does a pair of Gaussian and tile cost, forward and backward?
 
-    python benchmarks/raster.py [--out FILE.json]
+    python benchmarks/raster.py [--smoke] [--out FILE.json]
 
 200,000 and 500,000 round Gaussians of 2 px at 1024 x 1024, float32, every instruction set of the machine, one and
 two threads. Times are medians of 7 rounds. A pair is one Gaussian in one 16 x 16 tile that its ellipse alpha >=
@@ -10,6 +10,7 @@ thread: machines drift, and that drifts with them.
 
 from __future__ import annotations
 
+import math
 import statistics
 from typing import NamedTuple
 
@@ -17,62 +18,84 @@ import hardware
 import numpy as np
 import torch
 
-from gsplat_edu import Camera, _native
+from gsplat_edu import _native
+from gsplat_edu.constants import Z_NEAR
 
 SIZE, FOCAL, SIGMA, ROUNDS = 1024, 1000.0, 2.0, 7
 STAGES = ("project", "sort", "intersect", "composite", "composite_backward", "project_backward")
 
 
-def scene(count: int) -> list[torch.Tensor]:
-    """Scatter round Gaussians over the image at random depths: means, covariances, colours, opacities."""
+def round_gaussians(count: int, size: int) -> dict[str, torch.Tensor]:
+    """Scatter round Gaussians over the image at random depths."""
     rng = np.random.default_rng(0)
-    z, u, v = rng.uniform(2, 10, count), rng.uniform(0, SIZE, count), rng.uniform(0, SIZE, count)
-    means = np.stack([(u - SIZE / 2) / FOCAL * z, (v - SIZE / 2) / FOCAL * z, z], axis=1)
+    z, u, v = rng.uniform(2, 10, count), rng.uniform(0, size, count), rng.uniform(0, size, count)
+    means = np.stack([(u - size / 2) / FOCAL * z, (v - size / 2) / FOCAL * z, z], axis=1)
     covs = np.eye(3) * ((SIGMA * z / FOCAL) ** 2)[:, None, None]
-    arrays = means, covs, rng.uniform(0, 1, (count, 3)), rng.uniform(0.1, 0.99, count)
-    return [torch.tensor(array, dtype=torch.float32) for array in arrays]
+    arrays = {
+        "means": means,
+        "cov3ds": covs,
+        "colors": rng.uniform(0, 1, (count, 3)),
+        "opacities": rng.uniform(0.1, 0.99, count),
+    }
+    return {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
 
 
 class Room(NamedTuple):
     """Where results go, made once: the system's handing out of pages is not the raster's cost."""
 
-    image: torch.Tensor
-    transmittance: torch.Tensor
-    gradient: torch.Tensor
-    out: list[torch.Tensor]
-    norms: torch.Tensor
-    background: torch.Tensor
+    images: _native.Images
+    incoming: _native.Images
+    gradients: _native.Gradients
 
 
-def room(parameters: list[torch.Tensor]) -> Room:
+def room(parameters: dict[str, torch.Tensor], size: int) -> Room:
     """Make room for the results of a scene."""
-    gradient = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
-    norms, out = torch.zeros(len(parameters[0])), [torch.zeros_like(p) for p in parameters]
-    return Room(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE), gradient, out, norms, torch.zeros(3))
+    gradient = torch.randn(size, size, 3, generator=torch.Generator().manual_seed(0))
+    out = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
+    norms = torch.zeros(len(parameters["means"]))
+    image, transmittance = torch.zeros(size, size, 3), torch.zeros(size, size)
+    return Room(
+        _native.Images(image=image, transmittance=transmittance, depth=None),
+        _native.Images(image=gradient, transmittance=None, depth=None),
+        _native.Gradients(**out, means2d_norm=norms, background=torch.zeros(3)),
+    )
 
 
-def frame_seconds(parameters: list[torch.Tensor], to: Room, threads: int) -> tuple[tuple[float, ...], int]:
+def frame_seconds(
+    parameters: dict[str, torch.Tensor], to: Room, size: int, threads: int
+) -> tuple[tuple[float, ...], int]:
     """Render once and go back once; return the seconds of each stage and the number of pairs."""
-    camera = Camera(np.eye(3), (0, 0, 0), FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE)
-    means, covs, colors, opacities = (p.data_ptr() for p in parameters)
-    view = [*camera.R.ravel(), *camera.eye, camera.fx, camera.fy, camera.cx, camera.cy, 0.05, 0, 0, 0]
-    addresses = [means, 0, 0, 0, 0, 0, covs, colors, opacities]
-    frame = _native.FrameF32(len(parameters[0]), 0, addresses, view, SIZE, SIZE, 0, False, threads)
-    forward = [to.image.data_ptr(), to.transmittance.data_ptr(), 0]
-    frame.composite(*forward)
-    outgoing = [to.out[0].data_ptr(), 0, 0, 0, 0, 0, *(o.data_ptr() for o in to.out[1:]), to.norms.data_ptr()]
-    incoming = [to.gradient.data_ptr(), 0, 0]
-    frame.backward(len(to.norms), 0, addresses, forward, incoming, outgoing, to.background.data_ptr())
+    scene = _native.Scene(**parameters)
+    unlimited = (-math.inf, math.inf)
+    frame = _native.FrameF32(
+        scene=scene,
+        camera=_native.Camera(
+            R=np.eye(3),
+            eye=np.zeros(3),
+            fx=FOCAL,
+            fy=FOCAL,
+            cx=size / 2,
+            cy=size / 2,
+            x_bounds=unlimited,
+            y_bounds=unlimited,
+            H=size,
+            W=size,
+        ),
+        settings=_native.Settings(z_near=Z_NEAR, background=[0.0] * 3, sh_degree=0, antialiased=False),
+        threads=threads,
+    )
+    frame.composite(to.images)
+    frame.backward(scene=scene, images=to.images, incoming=to.incoming, gradients=to.gradients)
     return frame.seconds, frame.num_pairs
 
 
-def measure(count: int, isa: str, threads: int) -> dict[str, float | str]:
+def measure(count: int, isa: str, threads: int, size: int, num_rounds: int) -> dict[str, float | str]:
     """Measure one line of the table."""
     _native.choose_isa(isa)
-    parameters = scene(count)
-    to = room(parameters)
-    frame_seconds(parameters, to, threads)
-    rounds = [frame_seconds(parameters, to, threads) for _ in range(ROUNDS)]
+    parameters = round_gaussians(count, size)
+    to = room(parameters, size)
+    frame_seconds(parameters, to, size, threads)
+    rounds = [frame_seconds(parameters, to, size, threads) for _ in range(num_rounds)]
     rate = statistics.median(_native.fma_rate() for _ in range(3))
     pairs = rounds[0][1]
     row: dict[str, float | str] = {
@@ -94,8 +117,10 @@ def main() -> None:
     """Measure, print the table, write the JSON."""
     arguments = hardware.parser("Raster: cost of a pair, per instruction set.").parse_args()
     before = _native.isa()
-    lines = [(200_000, isa, t) for isa in _native.isas() for t in (1, 2)]
-    rows = [measure(*line) for line in [*lines, (500_000, before, 1), (500_000, before, 2)]]
+    size, num_rounds, few, many = (64, 1, 200, 500) if arguments.smoke else (SIZE, ROUNDS, 200_000, 500_000)
+    lines = [(few, isa, threads) for isa in _native.isas() for threads in (1, 2)]
+    lines += [(many, before, threads) for threads in (1, 2)]
+    rows = [measure(*line, size, num_rounds) for line in lines]
     _native.choose_isa(before)
     hardware.report({"rows": rows}, arguments.out)
     columns = (

@@ -1,6 +1,6 @@
 """How long does an iteration of the course's training take, on the kernels and on the dense renderer?
 
-    python benchmarks/sphere.py [--out FILE.json]
+    python benchmarks/sphere.py [--smoke] [--out FILE.json]
 
 The chapter's run ends at 1,600 Gaussians at 128 px. From there, the number of Gaussians fixed, both backends take
 turns: the dense renderer with the chapter's chunk of 512 splats and with the 16 it trains with, the kernels in
@@ -42,9 +42,9 @@ def dense(gaussians: Gaussians, camera: Camera, *, settings: RenderSettings, chu
 DENSE = {chunk: functools.partial(dense, chunk=chunk) for chunk in (512, 16)}
 
 
-def whole_run() -> tuple[Gaussians, float]:
-    """Train the chapter's 800 iterations; return the scene and the milliseconds per iteration."""
-    capture, config = sphere_capture(128), course_config()
+def whole_run(size: int, iterations: int) -> tuple[Gaussians, float]:
+    """Train as the chapter does; return the scene and the milliseconds per iteration."""
+    capture, config = sphere_capture_once(size), course_config(iterations)
     generator = torch.Generator().manual_seed(9)
     start = random_ball(400, generator)
     control = AdaptiveDensityControl(config, EXTENT, generator, start)
@@ -53,23 +53,23 @@ def whole_run() -> tuple[Gaussians, float]:
     return trainer.gaussians, 1e3 * result.seconds / len(result.losses)
 
 
-def iteration_ms(scene: Gaussians, renderer: object, iterations: int) -> float:
+def iteration_ms(scene: Gaussians, renderer: object, size: int, iterations: int) -> float:
     """Time iterations of a fixed number of Gaussians."""
-    capture = sphere_capture_once()
+    capture = sphere_capture_once(size)
     config = course_config(iterations=iterations)
     trainer = Trainer(scene, capture.train, config, render=renderer, extent=EXTENT)
     return 1e3 * trainer.run().seconds / iterations
 
 
 @functools.cache
-def sphere_capture_once() -> SphereCapture:
+def sphere_capture_once(size: int) -> SphereCapture:
     """Take the photos once."""
-    return sphere_capture(128)
+    return sphere_capture(size)
 
 
-def stages(scene: Gaussians, rounds: int = 200) -> dict[str, float]:
+def stages(scene: Gaussians, size: int, rounds: int) -> dict[str, float]:
     """Split an iteration of the kernels into its stages, in milliseconds."""
-    view = sphere_capture_once().train[0]
+    view = sphere_capture_once(size).train[0]
     target, leaves = torch.tensor(view.image), scene.trainable()
     names = ("project", "sort", "intersect", "composite", "composite_backward", "project_backward")
     found: dict[str, list[float]] = {name: [] for name in (*names, "render", "loss", "backward")}
@@ -93,15 +93,20 @@ def stages(scene: Gaussians, rounds: int = 200) -> dict[str, float]:
 def main() -> None:
     """Measure, print the table, write the JSON."""
     arguments = hardware.parser("The course's training: kernels against the dense renderer.").parse_args()
-    runs = [whole_run() for _ in range(3)]
+    size, iterations, few, rounds_of_stages, turns = (
+        (16, 5, 1, 2, 1) if arguments.smoke else (128, 800, 200, 200, 3)
+    )
+    runs = [whole_run(size, iterations) for _ in range(turns)]
     scene = runs[0][0]
     rounds = []
-    for _ in range(3):
-        rounds.append({"native": iteration_ms(scene, NATIVE, 200)})
-        rounds[-1] |= {f"dense {chunk}": iteration_ms(scene, DENSE[chunk], 3) for chunk in DENSE}
+    for _ in range(turns):
+        rounds.append({"native": iteration_ms(scene, NATIVE, size, few)})
+        rounds[-1] |= {
+            f"dense {chunk}": iteration_ms(scene, DENSE[chunk], size, min(few, 3)) for chunk in DENSE
+        }
     ratios = {name: statistics.median(r[name] / r["native"] for r in rounds) for name in rounds[0]}
     medians = {name: statistics.median(r[name] for r in rounds) for name in rounds[0]}
-    split = stages(scene)
+    split = stages(scene, size, rounds_of_stages)
     result = {
         "run_ms": [ms for _, ms in runs],
         "iteration_ms": medians,
@@ -109,7 +114,9 @@ def main() -> None:
         "stages_ms": split,
     }
     hardware.report(result, arguments.out)
-    print(f"800 iterations, three runs: {', '.join(f'{ms:.3f}' for _, ms in runs)} ms per iteration")
+    print(
+        f"{iterations} iterations, {turns} runs: {', '.join(f'{ms:.3f}' for _, ms in runs)} ms per iteration"
+    )
     print(f"one iteration at K = {len(scene)}:")
     for name in medians:
         print(f"  {name:10} {medians[name]:10.3f} ms   {ratios[name]:8.1f} x the kernels")

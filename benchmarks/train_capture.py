@@ -1,22 +1,22 @@
 """What does a whole training of a capture come to, and where does its time go as the scene grows?
 
-    python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--out FILE.json] [options of gsplat-edu train]
+    python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--smoke] [--out FILE.json] [options of gsplat-edu train]
 
 Trains as `gsplat-edu train CAPTURE --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or
-../shared/data), and takes an iteration apart at the start, after 1,000 and 3,000 iterations and at the end: medians
+../shared/data, or else a procedural capture), and takes an iteration apart at the start, after 1,000 and 3,000 iterations and at the end: medians
 over 20 views. The wall time is that of the training with its checkpoints and evaluations, without these measurements.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import resource
 import sys
 import tempfile
 from pathlib import Path
 
 import hardware
+from captures import capture
 from train_step import STAGES, measure
 
 from gsplat_edu.cli import train as command
@@ -62,18 +62,17 @@ def train(options: argparse.Namespace, out: Path | None) -> None:
 
 def main() -> int:
     """Read the command line and train."""
-    data = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data"))
     outer = argparse.ArgumentParser(add_help=False)
-    outer.add_argument("--out", type=Path, help="JSON file to write")
+    hardware.add_options(outer)
     outer.add_argument("--run", type=Path, help="folder of the run (default: one that is thrown away)")
     mine, theirs = outer.parse_known_args()
     parser = OneLineParser(prog="train_capture.py", description="A whole training of a capture, taken apart.")
     command.add_arguments(parser)
-    if not theirs or theirs[0].startswith("-"):
-        theirs = [str(data / "snowmiku97"), *theirs]
-    with tempfile.TemporaryDirectory() as scratch:
+    named = None if not theirs or theirs[0].startswith("-") else Path(theirs.pop(0))
+    iterations = "10" if mine.smoke else "7000"
+    with tempfile.TemporaryDirectory() as scratch, capture(named, mine.smoke) as data:
         folder = str(mine.run or Path(scratch) / "run")
-        options = parser.parse_args([theirs[0], "--iterations", "7000", *theirs[1:], "--out", folder])
+        options = parser.parse_args([str(data), "--iterations", iterations, *theirs, "--out", folder])
         return run_command("train_capture.py", lambda: train(options, mine.out), debug=False)
 
 

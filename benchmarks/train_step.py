@@ -1,15 +1,15 @@
 """What does a training iteration of a real capture cost, stage by stage?
 
-    python benchmarks/train_step.py [CAPTURE] [--out FILE.json]
+    python benchmarks/train_step.py [CAPTURE] [--smoke] [--out FILE.json]
 
-CAPTURE is anything that `gsplat-edu train` takes (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data).
+CAPTURE is anything that `gsplat-edu train` takes (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data,
+or else a procedural capture).
 Gaussians start at its points, as the recipe has them. One iteration: render at full size, 0.8 L1 + 0.2 (1 - SSIM)
 against the uint8 photo, backward, Adam. Medians over 20 views.
 """
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from pathlib import Path
 
 import hardware
 import torch
+from captures import capture
 
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.gaussians import Gaussians
@@ -74,16 +75,14 @@ def measure(scene: Gaussians, views: Sequence[View], rounds: int = 20) -> dict[s
 def main() -> None:
     """Measure, print the table, write the JSON."""
     made = hardware.parser("A training iteration of a capture, stage by stage.")
-    data = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data"))
-    made.add_argument("capture", nargs="?", type=Path, default=data / "snowmiku97")
+    made.add_argument("capture", nargs="?", type=Path)
     arguments = made.parse_args()
-    if not arguments.capture.exists():
-        raise SystemExit(f"train_step.py: {arguments.capture} is not there; name another capture")
-    dataset = load_dataset(arguments.capture)
-    dataset.preload()
+    with capture(arguments.capture, arguments.smoke) as folder:
+        dataset = load_dataset(folder)
+        dataset.preload()
     scene = from_points(dataset.points, dataset.colors, TrainConfig())
-    medians = measure(scene, (*dataset.train, *dataset.test))
-    hardware.report({"capture": arguments.capture.name, "medians": medians}, arguments.out)
+    medians = measure(scene, (*dataset.train, *dataset.test), 1 if arguments.smoke else 20)
+    hardware.report({"capture": folder.name, "medians": medians}, arguments.out)
     raster = medians["composite"] + medians["composite_backward"]
     for name, value in medians.items():
         print(

@@ -1,103 +1,262 @@
-// The module gsplat_edu._native: the only file here that knows Python. Arrays come as addresses; render/cpu.py owns
-// the tensors and has checked dtype, shape and layout.
-#include <nanobind/nanobind.h>
+// The module gsplat_edu._native. Only this file and arguments.h know Python.
+//
+// Every call takes its arguments by name, and arrays as arrays: dtype, shape, layout, alignment and device of each are
+// checked here, before a kernel sees its address. Kernels check nothing.
+#include "arguments.h"
+
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
-#include <algorithm>
 #include <array>
 #include <chrono>
 #include <cstdlib>
-#include <string>
-#include <vector>
+#include <limits>
+#include <utility>
 
 #include "frame.h"
 #include "threads.h"
 
-namespace nb = nanobind;
 using namespace gsplat;
 
 namespace {
 
-using Address = uintptr_t;
+constexpr int64_t MOST = std::numeric_limits<int32_t>::max();
+constexpr int64_t MOST_THREADS = 65536;
 
-template <class T>
-T *at(Address address) {
-    return reinterpret_cast<T *>(address);
-}
-
-// View: R (9), eye (3), fx, fy, cx, cy, z_near, background (3), bounds of x/z (2) and y/z (2) inside the Jacobian.
-using View = std::array<double, 24>;
-
-Camera camera_of(const View &v, int32_t H, int32_t W) {
+Camera camera_of(Arguments a) {
     Camera cam{};
-    for (int k = 0; k < 9; ++k) cam.R[k] = v[k];
-    for (int k = 0; k < 3; ++k) cam.eye[k] = v[9 + k];
-    cam.fx = v[12], cam.fy = v[13], cam.cx = v[14], cam.cy = v[15];
-    cam.x_low = v[20], cam.x_high = v[21], cam.y_low = v[22], cam.y_high = v[23], cam.H = H, cam.W = W;
+    const Array R = a.array("R", {Kind::F64}, {3, 3}), eye = a.array("eye", {Kind::F64}, {3});
+    std::copy_n(R.as<double>(), 9, cam.R);
+    std::copy_n(eye.as<double>(), 3, cam.eye);
+    cam.fx = a.number("fx"), cam.fy = a.number("fy"), cam.cx = a.number("cx"), cam.cy = a.number("cy");
+    std::array<double, 2> x, y;
+    a.numbers("x_bounds", x.data(), 2), a.numbers("y_bounds", y.data(), 2);
+    cam.x_low = x[0], cam.x_high = x[1], cam.y_low = y[0], cam.y_high = y[1];
+    cam.H = int32_t(a.whole("H", 1, MOST)), cam.W = int32_t(a.whole("W", 1, MOST));
+    const int64_t tiles = ((int64_t(cam.H) + TILE - 1) / TILE) * ((int64_t(cam.W) + TILE - 1) / TILE);
+    if (tiles > MOST) a.fail("H", "times W is more pixels than can be rendered");
+    a.finish();
     return cam;
 }
 
+Settings settings_of(Arguments a) {
+    Settings set{};
+    set.z_near = a.number("z_near");
+    a.numbers("background", set.background, 3);
+    set.sh_degree = int32_t(a.whole("sh_degree", 0, 3));
+    set.antialiased = a.flag("antialiased");
+    a.finish();
+    return set;
+}
+
+// Arrays with an entry per Gaussian: raw parameters, or covariances, colours and opacities.
+struct PerGaussian {
+    Array means, quats, log_scales, sh0, sh_rest, logit_opacities, cov3ds, colors, opacities;
+    bool direct = false;
+    int64_t n = 0, rest = 0;
+
+    PerGaussian(Arguments &a, bool written) : direct(a.has("cov3ds")) {
+        means = a.array("means", {Kind::F32, Kind::F64}, {ANY, 3}, written);
+        const Kind kind = means.is(Kind::F32) ? Kind::F32 : Kind::F64;
+        n = means.shape[0];
+        if (direct) {
+            cov3ds = a.array("cov3ds", {kind}, {n, 3, 3}, written);
+            colors = a.array("colors", {kind}, {n, 3}, written);
+            opacities = a.array("opacities", {kind}, {n}, written);
+            return;
+        }
+        quats = a.array("quats", {kind}, {n, 4}, written);
+        log_scales = a.array("log_scales", {kind}, {n, 3}, written);
+        sh0 = a.array("sh0", {kind}, {n, 1, 3}, written);
+        sh_rest = a.array("sh_rest", {kind}, {n, ANY, 3}, written);
+        logit_opacities = a.array("logit_opacities", {kind}, {n}, written);
+        rest = sh_rest.shape[1];
+        if (rest != 0 && rest != 3 && rest != 8 && rest != 15) a.fail("sh_rest", "has to hold 0, 3, 8 or 15 coefficients per channel");
+    }
+};
+
+struct SceneArrays : PerGaussian {
+    explicit SceneArrays(Arguments a) : PerGaussian(a, false) { a.finish(); }
+
+    template <class T>
+    Scene<T> as() const {
+        return {n, means.as<T>(), quats.as<T>(), log_scales.as<T>(), sh0.as<T>(), sh_rest.as<T>(), logit_opacities.as<T>(),
+                int32_t(rest), cov3ds.as<T>(), colors.as<T>(), opacities.as<T>()};
+    }
+};
+
+struct GradientArrays : PerGaussian {
+    Array means2d_norm, background;
+
+    explicit GradientArrays(Arguments a) : PerGaussian(a, true) {
+        const Kind kind = means.is(Kind::F32) ? Kind::F32 : Kind::F64;
+        means2d_norm = a.array("means2d_norm", {kind}, {n}, true);
+        background = a.array("background", {kind}, {3}, true);
+        a.finish();
+    }
+
+    template <class T>
+    SceneGrads<T> as() const {
+        return {means.as<T>(), quats.as<T>(), log_scales.as<T>(), sh0.as<T>(), sh_rest.as<T>(), logit_opacities.as<T>(),
+                cov3ds.as<T>(), colors.as<T>(), opacities.as<T>(), means2d_norm.as<T>()};
+    }
+};
+
+// What a frame draws, or the loss's gradients of it; what is None is not wanted, or zero.
+struct ImageArrays {
+    Array image, transmittance, depth;
+
+    explicit ImageArrays(Arguments a) {
+        image = a.array("image", {Kind::F32, Kind::F64}, {ANY, ANY, 3}, true);
+        const Kind kind = image.is(Kind::F32) ? Kind::F32 : Kind::F64;
+        const Shape size{image.shape[0], image.shape[1]};
+        transmittance = a.array_or_none("transmittance", kind, size, true);
+        depth = a.array_or_none("depth", kind, size, true);
+        a.finish();
+    }
+};
+
+// Which scene and images a frame was made of, so that those of its other calls can be compared with them.
 template <class T>
-Scene<T> scene_of(int64_t n, int32_t rest, const std::array<Address, 9> &p) {
-    return {n, at<T>(p[0]), at<T>(p[1]), at<T>(p[2]), at<T>(p[3]), at<T>(p[4]), at<T>(p[5]), rest, at<T>(p[6]), at<T>(p[7]), at<T>(p[8])};
+struct BoundFrame {
+    int64_t n, rest;
+    bool direct, composited = false, with_depth = false;
+    int32_t H, W;
+    Frame<T> frame;
+
+    BoundFrame(const SceneArrays &scene, const Camera &camera, const Settings &settings, int threads)
+        : n(scene.n), rest(scene.rest), direct(scene.direct), H(camera.H), W(camera.W),
+          frame(scene.as<T>(), camera, settings, threads) {}
+
+    void check(const Arguments &a, const char *name, const PerGaussian &given) const {
+        if (!given.means.is(KIND<T>)) a.fail(name, "is of another dtype than the frame");
+        if (given.n != n || given.rest != rest || given.direct != direct) a.fail(name, "differs in shape from the scene of the frame");
+    }
+
+    void check(const Arguments &a, const char *name, const ImageArrays &given, bool whole) const {
+        if (!given.image.is(KIND<T>)) a.fail(name, "is of another dtype than the frame");
+        if (given.image.shape[0] != H || given.image.shape[1] != W) a.fail(name, "has another size than the frame");
+        if (whole && !given.transmittance) a.fail(name, "needs transmittance");
+    }
+};
+
+template <class S>
+const S &struct_of(Arguments &a, const char *name) {
+    const S *found = nullptr;
+    if (!nb::try_cast(a.take(name), found, false) || !found) a.fail(name, "has to be the structure of that name");
+    return *found;
+}
+
+template <class T>
+void make_frame(BoundFrame<T> *self, nb::args positional, nb::kwargs given) {
+    Arguments a("Frame", positional, given);
+    const auto &scene = struct_of<SceneArrays>(a, "scene");
+    const auto &camera = struct_of<Camera>(a, "camera");
+    const auto &settings = struct_of<Settings>(a, "settings");
+    const int threads = int(a.whole("threads", 1, MOST_THREADS));
+    a.finish();
+    if (!scene.means.is(KIND<T>)) a.fail("scene", "is of another dtype than the frame");
+    if (!scene.direct && (settings.sh_degree + 1) * (settings.sh_degree + 1) - 1 > scene.rest)
+        a.fail("settings", "sh_degree is above the degree of the scene's sh_rest");
+    nb::gil_scoped_release release;
+    new (self) BoundFrame<T>(scene, camera, settings, threads);
+}
+
+template <class T>
+void composite(BoundFrame<T> &self, const ImageArrays &images) {
+    self.check(Arguments("Frame.composite", nb::args(), nb::kwargs()), "images", images, true);
+    nb::gil_scoped_release release;
+    self.frame.composite({images.image.as<T>(), images.transmittance.as<T>(), images.depth.as<T>()});
+    self.composited = true, self.with_depth = bool(images.depth);
+}
+
+template <class T>
+void backward(BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
+    Arguments a("Frame.backward", positional, given);
+    const auto &scene = struct_of<SceneArrays>(a, "scene");
+    const auto &images = struct_of<ImageArrays>(a, "images");
+    const auto &incoming = struct_of<ImageArrays>(a, "incoming");
+    const auto &gradients = struct_of<GradientArrays>(a, "gradients");
+    a.finish();
+    if (!self.composited) a.fail("images", "are not there yet; call composite first");
+    self.check(a, "scene", scene), self.check(a, "gradients", gradients);
+    self.check(a, "images", images, true), self.check(a, "incoming", incoming, false);
+    if (bool(images.depth) != self.with_depth) a.fail("images", "has to have a depth exactly where the composited ones had");
+    if (incoming.depth && !images.depth) a.fail("incoming", "has a gradient of the depth, which was not rendered");
+    nb::gil_scoped_release release;
+    self.frame.backward(scene.as<T>(), {images.image.as<T>(), images.transmittance.as<T>(), images.depth.as<T>()},
+                        {incoming.image.as<T>(), incoming.transmittance.as<T>(), incoming.depth.as<T>()}, gradients.as<T>(),
+                        gradients.background.as<T>());
+}
+
+template <class T>
+void visible(const BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
+    Arguments a("Frame.visible", positional, given);
+    const int64_t count = self.frame.num_visible();
+    const Array ids = a.array("ids", {Kind::I64}, {count}, true), radii = a.array("radii", {KIND<T>}, {count, 2}, true);
+    a.finish();
+    for (int64_t k = 0; k < count; ++k) {
+        const uint32_t id = self.frame.visible()[k];
+        ids.as<int64_t>()[k] = id;
+        for (int j = 0; j < 2; ++j) radii.as<T>()[2 * k + j] = self.frame.splats()[id].extent[j];
+    }
 }
 
 template <class T>
 void bind_frame(nb::module_ &m, const char *name) {
-    using F = Frame<T>;
+    using F = BoundFrame<T>;
     nb::class_<F>(m, name)
-        .def("__init__",
-             [](F *self, int64_t n, int32_t rest, const std::array<Address, 9> &scene, const View &view, int32_t H, int32_t W,
-                int32_t sh_degree, bool antialiased, int threads) {
-                 nb::gil_scoped_release release;
-                 Settings set{view[16], {view[17], view[18], view[19]}, sh_degree, antialiased};
-                 new (self) F(scene_of<T>(n, rest, scene), camera_of(view, H, W), set, threads);
-             })
-        .def("composite",
-             [](F &self, Address image, Address transmittance, Address depth) {
-                 nb::gil_scoped_release release;
-                 self.composite({at<T>(image), at<T>(transmittance), at<T>(depth)});
-             })
-        .def("backward",
-             [](F &self, int64_t n, int32_t rest, const std::array<Address, 9> &scene, const std::array<Address, 3> &forward,
-                const std::array<Address, 3> &in, const std::array<Address, 10> &out, Address background) {
-                 nb::gil_scoped_release release;
-                 SceneGrads<T> grads{at<T>(out[0]), at<T>(out[1]), at<T>(out[2]), at<T>(out[3]), at<T>(out[4]),
-                                     at<T>(out[5]), at<T>(out[6]), at<T>(out[7]), at<T>(out[8]), at<T>(out[9])};
-                 self.backward(scene_of<T>(n, rest, scene), {at<T>(forward[0]), at<T>(forward[1]), at<T>(forward[2])},
-                               {at<T>(in[0]), at<T>(in[1]), at<T>(in[2])}, grads, at<T>(background));
-             })
-        .def("visible",
-             [](const F &self, Address ids, Address radii) {
-                 for (int64_t k = 0; k < self.num_visible(); ++k) {
-                     const uint32_t id = self.visible()[k];
-                     at<int64_t>(ids)[k] = id;
-                     for (int j = 0; j < 2; ++j) at<T>(radii)[2 * k + j] = self.splats()[id].extent[j];
-                 }
-             })
-        .def_prop_ro("seconds", &F::seconds)
-        .def_prop_ro("num_visible", &F::num_visible)
-        .def_prop_ro("num_pairs", &F::num_pairs);
+        .def("__init__", &make_frame<T>)
+        .def("composite", &composite<T>)
+        .def("backward", &backward<T>)
+        .def("visible", &visible<T>)
+        .def_prop_ro("seconds", [](const F &self) { return self.frame.seconds(); })
+        .def_prop_ro("num_visible", [](const F &self) { return self.frame.num_visible(); })
+        .def_prop_ro("num_pairs", [](const F &self) { return self.frame.num_pairs(); });
+}
+
+template <class S>
+void bind_struct(nb::module_ &m, const char *name, S (*made)(Arguments)) {
+    nb::class_<S>(m, name).def("__init__", [name, made](S *self, nb::args positional, nb::kwargs given) {
+        new (self) S(made(Arguments(name, positional, given)));
+    });
 }
 
 template <class T>
-void adam(const std::array<Address, 4> &arrays, int64_t size, const std::array<double, 6> &number, int threads) {
+void adam(nb::args positional, nb::kwargs given) {
+    Arguments a("adam", positional, given);
+    const Array parameter = a.array_of_any_shape("parameter", KIND<T>, true);
+    const Array first = a.array("first", {KIND<T>}, parameter.shape, true), second = a.array("second", {KIND<T>}, parameter.shape, true);
+    const Array gradient = a.array("gradient", {KIND<T>}, parameter.shape);
+    AdamArgs<T> args{parameter.as<T>(), first.as<T>(), second.as<T>(), gradient.as<T>(),
+                     a.number("rate"), a.number("beta1"), a.number("beta2"), a.number("eps"),
+                     a.number("correction1"), a.number("correction2")};
+    const int threads = int(a.whole("threads", 1, MOST_THREADS));
+    a.finish();
+    const int64_t size = parameter.shape.size();
     nb::gil_scoped_release release;
-    AdamArgs<T> args{at<T>(arrays[0]), at<T>(arrays[1]), at<T>(arrays[2]), at<T>(arrays[3]),
-                     number[0], number[1], number[2], number[3], number[4], number[5]};
     constexpr int64_t GRAIN = 1 << 15;
     parallel(threads, (size + GRAIN - 1) / GRAIN, [&](int64_t task, int) {
         kernels<T>().adam(args, task * GRAIN, std::min(size, (task + 1) * GRAIN));
     });
 }
 
-// image, target, bytes, gradient -> (mean |x - y|, mean SSIM)
+// -> (mean |x - y|, mean SSIM); the gradient is written.
 template <class T>
-std::array<double, 2> loss_of(const std::array<Address, 4> &p, int32_t H, int32_t W, double ssim_weight, int threads) {
+std::array<double, 2> loss_of(nb::args positional, nb::kwargs given) {
+    Arguments a("loss", positional, given);
+    const Array image = a.array("image", {KIND<T>}, {ANY, ANY, 3});
+    const Array target = a.array("target", {KIND<T>, Kind::U8}, image.shape);
+    const Array gradient = a.array("gradient", {KIND<T>}, image.shape, true);
+    const double ssim_weight = a.number("ssim_weight");
+    const int threads = int(a.whole("threads", 1, MOST_THREADS));
+    a.finish();
+    if (image.shape[0] > MOST || image.shape[1] > MOST / 3) a.fail("image", "is too large");
+    const bool bytes = target.is(Kind::U8);
+    LossArgs<T> args{image.as<T>(), bytes ? nullptr : target.as<T>(), bytes ? target.as<uint8_t>() : nullptr,
+                     int32_t(image.shape[0]), int32_t(image.shape[1]), ssim_weight, gradient.as<T>(), nullptr};
     nb::gil_scoped_release release;
-    LossArgs<T> args{at<T>(p[0]), at<T>(p[1]), at<uint8_t>(p[2]), H, W, ssim_weight, at<T>(p[3]), nullptr};
     std::array<double, 2> means;
     loss<T>(args, &means[0], &means[1], threads);
     return means;
@@ -125,6 +284,11 @@ std::vector<std::string> isas() {
 NB_MODULE(_native, m) {
     nb::set_leak_warnings(false);  // what Python still holds when it ends is freed with the process
     choose_isa(std::getenv("GSPLAT_EDU_ISA"));
+    bind_struct<Camera>(m, "Camera", &camera_of);
+    bind_struct<Settings>(m, "Settings", &settings_of);
+    bind_struct<SceneArrays>(m, "Scene", [](Arguments a) { return SceneArrays(std::move(a)); });
+    bind_struct<GradientArrays>(m, "Gradients", [](Arguments a) { return GradientArrays(std::move(a)); });
+    bind_struct<ImageArrays>(m, "Images", [](Arguments a) { return ImageArrays(std::move(a)); });
     bind_frame<float>(m, "FrameF32");
     bind_frame<double>(m, "FrameF64");
     m.def("adam_f32", &adam<float>);

@@ -1,6 +1,6 @@
 """What does each rung of the ladder gain, and how does that depend on the number of splats?
 
-    python benchmarks/ladder [--out FILE.json]
+    python benchmarks/ladder [--smoke] [--out FILE.json]
 
 Round splats of 2 px on 256 x 256 pixels, opacities 0.1 to 0.99, float32, one thread. Seconds are those of the process
 on the processor, the best of several rounds; each evaluation of a splat at a pixel is counted by the kernel itself.
@@ -24,12 +24,12 @@ SIZE, COUNTS = 256, (100, 1_000, 10_000, 100_000)
 TRITON_SIZE, TRITON_COUNT = 64, 200
 
 
-def measure(count: int) -> list[dict[str, float | str]]:
+def measure(count: int, size: int, rounds: int) -> list[dict[str, float | str]]:
     """Measure every rung at one number of splats."""
-    splats, rows = scene(count, SIZE), []
+    splats, rows = scene(count, size), []
     for rung in forward.RUNGS:
-        seconds, rendered = forward.seconds(rung, splats, enough=1.0, rounds=7)
-        row: dict[str, float | str] = {"rung": rung, "splats": count, "size": SIZE, "ms": 1e3 * seconds}
+        seconds, rendered = forward.seconds(rung, splats, enough=1.0, rounds=rounds)
+        row: dict[str, float | str] = {"rung": rung, "splats": count, "size": size, "ms": 1e3 * seconds}
         row["ns_per_pixel_splat"] = 1e9 * seconds / (splats.pixels * count)
         rows.append(row | rendered.counts._asdict())
     for row in rows:
@@ -37,13 +37,15 @@ def measure(count: int) -> list[dict[str, float | str]]:
     return rows
 
 
-def triton_row() -> dict[str, float | str] | None:
+def triton_row(smoke: bool) -> dict[str, float | str] | None:
     """Time the naive kernel in Triton, where it is installed, and say where it ran."""
     if importlib.util.find_spec("triton") is None:
         return None
     from ladder.naive_triton import DEVICE, naive_triton, where
 
     size, count = (TRITON_SIZE, TRITON_COUNT) if DEVICE == "cpu" else (SIZE, 10_000)
+    if smoke:
+        size, count = 16, 10
     _, _, seconds = naive_triton(scene(count, size))
     return {"rung": "naive_triton", "where": where(), "splats": count, "size": size, "ms": 1e3 * seconds}
 
@@ -51,14 +53,15 @@ def triton_row() -> dict[str, float | str] | None:
 def main() -> int:
     """Measure, print the table, write the JSON."""
     arguments = hardware.parser("The ladder: naive to fast, forward.").parse_args()
+    size, counts, rounds = (32, (10, 40), 1) if arguments.smoke else (SIZE, COUNTS, 7)
     try:
-        rows = [row for count in COUNTS for row in measure(count)]
+        rows = [row for count in counts for row in measure(count, size, rounds)]
     except BackendUnavailableError as error:
         print(error, file=sys.stderr)
         return 1
-    triton = triton_row()
+    triton = triton_row(arguments.smoke)
     hardware.report({"threads": 1, "rows": rows, "triton": triton}, arguments.out)
-    print(f"one thread, {SIZE} x {SIZE} px; the package counts its pairs only")
+    print(f"one thread, {size} x {size} px; the package counts its pairs only")
     print("  splats rung           ms  ns/px-splat    times     pairs    evaluated     mattered")
     for row in rows:
         print(

@@ -1,45 +1,81 @@
-"""Types of the native module (native/bindings.cpp)."""
+"""Types of the native module (native/bindings.cpp). Arrays are DLPack capsules, tensors or NumPy arrays."""
 
 from collections.abc import Sequence
+
+class Camera:
+    def __init__(
+        self,
+        *,
+        R: object,
+        eye: object,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        x_bounds: Sequence[float],
+        y_bounds: Sequence[float],
+        H: int,
+        W: int,
+    ) -> None: ...
+
+class Settings:
+    def __init__(
+        self, *, z_near: float, background: Sequence[float], sh_degree: int, antialiased: bool
+    ) -> None: ...
+
+class Scene:
+    def __init__(self, **arrays: object) -> None: ...
+
+class Gradients:
+    def __init__(self, *, means2d_norm: object, background: object, **arrays: object) -> None: ...
+
+class Images:
+    def __init__(self, *, image: object, transmittance: object, depth: object) -> None: ...
 
 class FrameF32:
     num_visible: int
     num_pairs: int
     seconds: tuple[float, ...]
-    def __init__(
-        self,
-        n: int,
-        rest: int,
-        scene: Sequence[int],
-        view: Sequence[float],
-        H: int,
-        W: int,
-        sh_degree: int,
-        antialiased: bool,
-        threads: int,
-    ) -> None: ...
-    def composite(self, image: int, transmittance: int, depth: int) -> None: ...
-    def backward(
-        self,
-        n: int,
-        rest: int,
-        scene: Sequence[int],
-        forward: Sequence[int],
-        incoming: Sequence[int],
-        outgoing: Sequence[int],
-        background: int,
-    ) -> None: ...
-    def visible(self, ids: int, radii: int) -> None: ...
+    def __init__(self, *, scene: Scene, camera: Camera, settings: Settings, threads: int) -> None: ...
+    def composite(self, images: Images) -> None: ...
+    def backward(self, *, scene: Scene, images: Images, incoming: Images, gradients: Gradients) -> None: ...
+    def visible(self, *, ids: object, radii: object) -> None: ...
 
 class FrameF64(FrameF32): ...
 
-def adam_f32(arrays: Sequence[int], size: int, numbers: Sequence[float], threads: int) -> None: ...
-def adam_f64(arrays: Sequence[int], size: int, numbers: Sequence[float], threads: int) -> None: ...
+def adam_f32(
+    *,
+    parameter: object,
+    first: object,
+    second: object,
+    gradient: object,
+    rate: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    correction1: float,
+    correction2: float,
+    threads: int,
+) -> None: ...
+def adam_f64(
+    *,
+    parameter: object,
+    first: object,
+    second: object,
+    gradient: object,
+    rate: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    correction1: float,
+    correction2: float,
+    threads: int,
+) -> None: ...
 def loss_f32(
-    arrays: Sequence[int], H: int, W: int, ssim_weight: float, threads: int
+    *, image: object, target: object, gradient: object, ssim_weight: float, threads: int
 ) -> tuple[float, float]: ...
 def loss_f64(
-    arrays: Sequence[int], H: int, W: int, ssim_weight: float, threads: int
+    *, image: object, target: object, gradient: object, ssim_weight: float, threads: int
 ) -> tuple[float, float]: ...
 def isas() -> list[str]: ...
 def isa() -> str: ...

@@ -10,6 +10,8 @@ from types import ModuleType
 from typing import Any
 
 import torch
+from torch import Tensor
+from torch.utils.dlpack import to_dlpack
 
 from gsplat_edu.errors import BackendUnavailableError
 
@@ -30,12 +32,33 @@ SUFFIXES = {torch.float32: "32", torch.float64: "64"}
 """How native names end by scalar type: float for speed, double for proof."""
 
 
+def array(tensor: Tensor) -> object:
+    """Hand a tensor to the native module, which checks it.
+
+    The module is built against no torch. From torch 2.10 on, tensors describe themselves through DLPack's C
+    interface, at no cost; before that, as DLPack capsules (`Tensor.__dlpack__` takes ten times as long).
+    """
+    return tensor if _DESCRIBE_THEMSELVES else to_dlpack(tensor)
+
+
+_DESCRIBE_THEMSELVES = hasattr(torch.Tensor, "__dlpack_c_exchange_api__")
+
+
+def native() -> Any:  # noqa: ANN401
+    """Return the native module, for its structures: Camera, Settings, Scene, Gradients and Images.
+
+    Raises:
+        BackendUnavailableError: it is not there.
+    """
+    if _native is None:
+        raise BackendUnavailableError(f"native kernels: {REASON}")
+    return _native
+
+
 def kernel(name: str, dtype: torch.dtype) -> Any:  # noqa: ANN401
     """Look up a native function or class by its name without the scalar type, "adam_f" for example.
 
     Raises:
         BackendUnavailableError: the native module is not there.
     """
-    if _native is None:
-        raise BackendUnavailableError(f"native kernels: {REASON}")
-    return getattr(_native, name + SUFFIXES[dtype])
+    return getattr(native(), name + SUFFIXES[dtype])

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from gsplat_edu.buffers import empty
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.kernels import REASON, SUFFIXES, kernel
+from gsplat_edu.kernels import REASON, SUFFIXES, array, kernel
 from gsplat_edu.render.backends import unavailable
 from gsplat_edu.validation import check_shape, in_range
 
@@ -143,9 +143,12 @@ class _L1Ssim(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:  # noqa: ANN401
         x, y = image.detach().contiguous(), target.detach().contiguous()
         gradient = empty(x.shape, x)
-        photo = (0, y.data_ptr()) if y.dtype == torch.uint8 else (y.data_ptr(), 0)
         l1_mean, ssim_mean = kernel("loss_f", x.dtype)(
-            (x.data_ptr(), *photo, gradient.data_ptr()), *x.shape[:2], ssim_weight, torch.get_num_threads()
+            image=array(x),
+            target=array(y),
+            gradient=array(gradient),
+            ssim_weight=ssim_weight,
+            threads=torch.get_num_threads(),
         )
         ctx.save_for_backward(gradient)
         return x.new_tensor((1.0 - ssim_weight) * l1_mean + ssim_weight * (1.0 - ssim_mean))

@@ -7,6 +7,7 @@ from gsplat_edu import ArgumentError, kernels
 pytest.importorskip("triton.language", reason="triton is not installed")
 
 from gsplat_edu.render.triton.adam import adam_triton
+from gsplat_edu.train.optimizer import NUMBERS
 
 U = 2.0**-24
 """Half a unit in the last place of float32: the largest relative error of one rounding."""
@@ -57,8 +58,10 @@ def walk(step, start, all_gradients):
 
 
 def natively(parameter, m, v, gradient, numbers):
-    arrays = parameter, m, v, gradient
-    kernels.kernel("adam_f", parameter.dtype)([a.data_ptr() for a in arrays], parameter.numel(), numbers, 1)
+    names = ("parameter", "first", "second", "gradient")
+    arrays = dict(zip(names, map(kernels.array, (parameter, m, v, gradient)), strict=True))
+    named = dict(zip(NUMBERS, numbers, strict=True))
+    kernels.kernel("adam_f", parameter.dtype)(**arrays, **named, threads=1)
 
 
 @pytest.mark.parametrize("shape", [(1,), (7, 3), (1500, 3), (2, 1024)])

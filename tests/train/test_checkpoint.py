@@ -1,10 +1,12 @@
 """A run that is taken up again goes on to the bit; what cannot be read or written says so."""
 
 import dataclasses
+import json
 
 import pytest
 import torch
 
+from checkpoints import Maker, read, write
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.render.api import render
@@ -123,3 +125,101 @@ def test_what_cannot_be_written_leaves_the_last_one_alone(capture, tmp_path):
         "iteration_3.safetensors",
         "iteration_6.safetensors",
     ]
+
+
+def half_moments(tensors, state):
+    tensors |= {k: t.half() for k, t in tensors.items() if k.startswith(("first.", "second."))}
+
+
+def double_gaussians(tensors, state):
+    tensors |= {k: t.double() for k, t in tensors.items() if k.startswith("gaussians.")}
+
+
+def generator_past_its_end(tensors, state):
+    """500 numbers left, from the 600th of 624 on: torch would read behind its block."""
+    words = tensors["density.generator"].numpy().view("<i4")
+    words[2], words[4] = 500, 600
+
+
+def put(tensors, **changes):
+    tensors |= {name.replace("__", "."): value for name, value in changes.items()}
+
+
+HOSTILE = {
+    r"second\.means: is torch.float32 of shape \(0, 3\)": lambda t, s: put(
+        t, second__means=torch.zeros(0, 3)
+    ),
+    r"first\.\w+: is torch.float16": half_moments,
+    r"gaussians\.\w+: is torch.float64": double_gaussians,
+    r"gaussians\.sh_rest: is .* shape \(40, 15, 3\)": lambda t, s: put(
+        t, gaussians__sh_rest=torch.zeros(40, 15, 3)
+    ),
+    r"gaussians\.quats: is .* shape \(3, 4\)": lambda t, s: put(t, gaussians__quats=torch.zeros(3, 4)),
+    "second.quats: holds negative": lambda t, s: t["second.quats"].sub_(1.0),
+    "gaussians: means is missing": lambda t, s: t.pop("gaussians.means"),
+    "first: 'colour' is not known": lambda t, s: put(t, first__colour=torch.zeros(40)),
+    "'secret.x': is not known": lambda t, s: put(t, secret__x=torch.zeros(40)),
+    "density.norm_sums: is": lambda t, s: put(t, density__norm_sums=torch.zeros(2)),
+    "density.times_visible: holds negative": lambda t, s: t["density.times_visible"].sub_(9.0),
+    "density.generator: is torch": lambda t, s: put(t, density__generator=torch.zeros(9, dtype=torch.uint8)),
+    "density.generator: is no state": generator_past_its_end,
+    "density: is_over: has to be": lambda t, s: s["density"].update(is_over="yes"),
+    "iteration: has to be": lambda t, s: s.update(iteration=65),
+    "steps: has to be a whole": lambda t, s: s.update(steps=10**300),
+    "steps: has to be the iteration": lambda t, s: s.update(steps=2),
+    "feed: queue: has to be a whole": lambda t, s: s["feed"].update(queue=[0, 3]),
+    "feed: queue: names": lambda t, s: s["feed"].update(queue=[1, 1]),
+    "feed: generator: bit_generator": lambda t, s: s["feed"]["generator"].update(bit_generator="MT19937"),
+    "feed: generator: state: inc": lambda t, s: s["feed"]["generator"]["state"].update(inc=2**128),
+    "backgrounds: uinteger": lambda t, s: s["backgrounds"].update(uinteger=-1),
+    "backgrounds: has to be an object": lambda t, s: s.update(backgrounds=[1]),
+    "state: feed is missing": lambda t, s: s.pop("feed"),
+    "state: is not JSON": lambda t, s: "[" * 100_000,
+    "state: has to be an object": lambda t, s: "[]",
+    "seconds: has to be": lambda t, s: {"seconds": "NaN"},
+    "seconds: has to be a number": lambda t, s: {"seconds": "true"},
+    "seconds: is missing": lambda t, s: {"seconds": None},
+}
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    make = Maker("adc")
+    run = make()
+    steps(run, 3)
+    return make, read(save_checkpoint(tmp_path_factory.mktemp("tiny"), run, 1.0))
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize("message", HOSTILE)
+def test_a_hostile_checkpoint_is_refused_before_any_of_it_is_used(tiny, tmp_path, message):
+    make, (tensors, metadata) = tiny
+    assert len(tensors["gaussians.means"]) == 40
+    tensors = {name: tensor.clone() for name, tensor in tensors.items()}
+    state = json.loads(metadata["state"])
+    changed = HOSTILE[message](tensors, state)
+    entries = changed if isinstance(changed, dict) and "seconds" in changed else {}
+    entries = metadata | {"state": changed if isinstance(changed, str) else json.dumps(state)} | entries
+    path = tmp_path / "iteration_3.safetensors"
+    write(path, tensors, {key: value for key, value in entries.items() if value is not None})
+    fresh = make()
+    start, numbers = fresh.gaussians, json.dumps(fresh.state()[1])
+    with pytest.raises(CheckpointError, match=rf"iteration_3.safetensors: is damaged \({message}") as raised:
+        load_checkpoint(path, fresh)
+    assert str(raised.value).isprintable()
+    assert fresh.gaussians is start and json.dumps(fresh.state()[1]) == numbers
+    steps(fresh, 1)
+
+
+def test_what_a_training_may_leave_behind_is_taken(tiny, tmp_path):
+    """Gaussians that are not finite wait for the next densification; their moments may not be finite either."""
+    make, (tensors, metadata) = tiny
+    tensors = {name: tensor.clone() for name, tensor in tensors.items()}
+    for name in ("gaussians.means", "first.means", "second.means"):
+        tensors[name][3] = float("nan")
+    path = tmp_path / "iteration_3.safetensors"
+    write(path, tensors, metadata)
+    resumed = make()
+    load_checkpoint(path, resumed)
+    steps(resumed, 1)
+    assert resumed.iteration == 4

@@ -2,7 +2,7 @@
 
     project -> intersect -> composite, and back: composite_backward -> project_backward
 
-The kernels live in `native/`; this module owns the tensors, and hands over addresses of contiguous memory.
+The kernels live in `native/`; this module owns the tensors, and the native module checks each that it is given.
 Nothing of torch's stands between parameters and gradients, so the gradients are the same to the bit on any
 number of threads.
 
@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -23,7 +24,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.constants import Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
-from gsplat_edu.kernels import SUFFIXES, kernel
+from gsplat_edu.kernels import SUFFIXES, array, kernel, native
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 
@@ -104,7 +105,10 @@ def render_covariances(
 
 
 RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
-"""Raw parameters in the order in which the kernels take them."""
+"""Raw parameters, in the order of the renderer's arguments."""
+
+DIRECT = ("means", "cov3ds", "colors", "opacities")
+"""What `render_covariances` takes, in its order."""
 
 
 def _output(call: _Call, background: Tensor, *parameters: Tensor) -> RenderOutput:
@@ -135,39 +139,25 @@ class _Rasterize(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         camera, means = call.camera, parameters[0]
-        x_bounds, y_bounds = camera.jacobian_bounds(call.settings.jacobian_limit)
         kept = [p.detach().contiguous() for p in parameters]
         frame = kernel("FrameF", means.dtype)(
-            len(means),
-            0 if call.direct else parameters[4].shape[1],
-            _scene(kept, call.direct),
-            [
-                *camera.R.ravel(),
-                *camera.eye,
-                camera.fx,
-                camera.fy,
-                camera.cx,
-                camera.cy,
-                Z_NEAR,
-                *background.tolist(),
-                *x_bounds,
-                *y_bounds,
-            ],
-            camera.H,
-            camera.W,
-            call.sh_degree,
-            call.settings.antialiased,
-            torch.get_num_threads(),
+            scene=_scene(kept, call.direct),
+            camera=_camera(camera, call.settings),
+            settings=native().Settings(
+                z_near=Z_NEAR,
+                background=background.tolist(),
+                sh_degree=call.sh_degree,
+                antialiased=call.settings.antialiased,
+            ),
+            threads=torch.get_num_threads(),
         )
         image = empty((camera.H, camera.W, 3), means)
         transmittance = empty((camera.H, camera.W), means)
         depth = empty((camera.H, camera.W) if call.settings.depth else (0,), means)
-        frame.composite(
-            image.data_ptr(), transmittance.data_ptr(), depth.data_ptr() if call.settings.depth else 0
-        )
+        frame.composite(_images(image, transmittance, depth if call.settings.depth else None))
         call.visible = empty((frame.num_visible,), means, torch.int64)
         call.radii = empty((frame.num_visible, 2), means)
-        frame.visible(call.visible.data_ptr(), call.radii.data_ptr())
+        frame.visible(ids=array(call.visible), radii=array(call.radii))
         call.num_pairs = frame.num_pairs
         ctx.set_materialize_grads(False)
         ctx.call, ctx.frame = call, frame
@@ -182,26 +172,52 @@ class _Rasterize(torch.autograd.Function):
         incoming = [None if g is None else g.contiguous() for g in grads]
         if incoming[0] is None:
             incoming[0] = torch.zeros_like(image)
+        if not call.settings.depth:
+            incoming[2] = None
         outgoing = [empty(p.shape, p) for p in kept]
         norms = empty((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
-        # Saved tensors may have been moved since the forward pass: the kernels are told where they are now.
+        # Saved tensors may have moved since the forward pass, so the kernels get them again.
         ctx.frame.backward(
-            len(norms),
-            0 if call.direct else kept[4].shape[1],
-            _scene(kept, call.direct),
-            [image.data_ptr(), transmittance.data_ptr(), depth.data_ptr() if call.settings.depth else 0],
-            [0 if g is None else g.data_ptr() for g in incoming],
-            [*_scene(outgoing, call.direct), norms.data_ptr()],
-            background.data_ptr(),
+            scene=_scene(kept, call.direct),
+            images=_images(image, transmittance, depth if call.settings.depth else None),
+            incoming=_images(*incoming),
+            gradients=native().Gradients(
+                **_arrays(outgoing, call.direct), means2d_norm=array(norms), background=array(background)
+            ),
         )
         call.norms = norms if call.norms is None else call.norms + norms
         return None, background, *outgoing
 
 
-def _scene(parameters: list[Tensor], direct: bool) -> list[int]:
-    """List the nine addresses of a native scene: six raw parameters, or means and three direct ones."""
-    given = [p.data_ptr() for p in parameters]
-    if direct:
-        return [given[0], 0, 0, 0, 0, 0, *given[1:]]
-    return [*given, 0, 0, 0]
+def _arrays(parameters: list[Tensor], direct: bool) -> dict[str, Any]:
+    """Name six raw parameters, or means and three direct ones, as the native structures do."""
+    return dict(zip(DIRECT if direct else RAW, map(array, parameters), strict=True))
+
+
+def _scene(parameters: list[Tensor], direct: bool) -> Any:  # noqa: ANN401
+    return native().Scene(**_arrays(parameters, direct))
+
+
+def _images(image: Tensor, transmittance: Tensor | None, depth: Tensor | None) -> Any:  # noqa: ANN401
+    return native().Images(
+        image=array(image),
+        transmittance=None if transmittance is None else array(transmittance),
+        depth=None if depth is None else array(depth),
+    )
+
+
+def _camera(camera: Camera, settings: RenderSettings) -> Any:  # noqa: ANN401
+    x_bounds, y_bounds = camera.jacobian_bounds(settings.jacobian_limit)
+    return native().Camera(
+        R=np.ascontiguousarray(camera.R, dtype=np.float64),
+        eye=np.ascontiguousarray(camera.eye, dtype=np.float64),
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        x_bounds=x_bounds,
+        y_bounds=y_bounds,
+        H=camera.H,
+        W=camera.W,
+    )

@@ -269,7 +269,7 @@ def _refuse_constant(name: str) -> NoReturn:
 def _parse(text: str, where: str) -> Any:  # noqa: ANN401
     try:
         return json.loads(text, parse_constant=_refuse_constant)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{where}: is not JSON ({error}); mend or remove it") from None
 
 

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
-from gsplat_edu.errors import CheckpointError
+from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.files import written_aside
 from gsplat_edu.train.trainer import Trainer
 
@@ -23,6 +26,12 @@ KEPT = 2
 
 FORMAT = "1"
 """Version of the file's contents."""
+
+LONGEST = 1 << 24
+"""Characters of the JSON in the header: the order of views takes nine of them for each photo."""
+
+MOST_SECONDS = 1e9
+"""s: thirty years of training."""
 
 _NAME = re.compile(r"iteration_(\d+)\.safetensors")
 
@@ -69,37 +78,69 @@ def read_seconds(path: Path) -> float:
     Raises:
         CheckpointError: the file is damaged.
     """
-    try:
-        with _opened(path) as file:
-            return float(json.loads(file.metadata()["seconds"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise _damaged(path, str(error)) from None
+    with _opened(path) as file:
+        return _seconds(file.metadata())
 
 
 def load_checkpoint(path: Path, trainer: Trainer) -> None:
     """Bring a trainer that was made with the same arguments to where the checkpoint was written.
 
     Raises:
-        CheckpointError: the file is damaged, or of another run.
+        CheckpointError: the file is damaged, or of another run. The trainer is as it was.
     """
+    with _opened(path) as file:
+        metadata = file.metadata()
+        _seconds(metadata)
+        trainer.load_state(_tensors(file), _parsed("state", metadata))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a checkpoint; what the block refuses of it is said of the file."""
     try:
-        with _opened(path) as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            trainer.load_state(tensors, json.loads(file.metadata()["state"]))
-    except (KeyError, IndexError, TypeError, ValueError, SafetensorError) as error:
+        with safe_open(path, framework="pt") as file:
+            if (file.metadata() or {}).get("format") != FORMAT:
+                raise CheckpointError(
+                    f"{path}: is no checkpoint of this version of gsplat_edu; start the run again"
+                )
+            yield file
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (ArgumentError, SafetensorError) as error:
         raise _damaged(path, str(error)) from None
 
 
-def _opened(path: Path) -> Any:  # noqa: ANN401 - safetensors has no annotations
+def _tensors(file: Any) -> dict[str, Tensor]:  # noqa: ANN401
+    found = {}
+    for name in file.keys():  # noqa: SIM118
+        try:
+            # A copy: what safetensors returns is the file itself, mapped into memory.
+            found[name] = file.get_tensor(name).clone()
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            # Kinds of tensors that safetensors knows and torch does not, numbers that straddle their places.
+            raise ArgumentError(f"{name[:60]!r}: is no tensor: {str(error)[:200]}") from None
+    return found
+
+
+def _parsed(name: str, metadata: dict[str, str]) -> Any:  # noqa: ANN401
+    text = metadata.get(name)
+    if text is None:
+        raise ArgumentError(f"{name}: is missing")
+    if len(text) > LONGEST:
+        raise ArgumentError(f"{name}: is longer than {LONGEST} characters")
     try:
-        file: Any = safe_open(path, framework="pt")
-        if (file.metadata() or {}).get("format") != FORMAT:
-            raise CheckpointError(
-                f"{path}: is no checkpoint of this version of gsplat_edu; start the run again"
-            )
-    except SafetensorError as error:
-        raise _damaged(path, str(error)) from None
-    return file
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ArgumentError(f"{name}: is not JSON ({error})") from None
+
+
+def _seconds(metadata: dict[str, str]) -> float:
+    seconds = _parsed("seconds", metadata)
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float):
+        raise ArgumentError("seconds: has to be a number")
+    if not 0 <= seconds <= MOST_SECONDS:
+        raise ArgumentError(f"seconds: has to be from 0 to {MOST_SECONDS:g}")
+    return float(seconds)
 
 
 def _damaged(path: Path, reason: str) -> CheckpointError:

@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.views import Photo, View
 
 DEVICE_SHARE = 0.25
@@ -125,11 +127,26 @@ class ViewFeed:
         """Return what a checkpoint keeps: the draws that are outstanding and the generator, as JSON."""
         return {"queue": list(self._queue), "generator": self._generator.bit_generator.state}
 
+    def check_state(self, state: object) -> None:
+        """Check what `load_state` is going to take.
+
+        Raises:
+            ArgumentError: it is not what `state` returns for these views; names the entry.
+        """
+        given = check_entries("feed", state, ("queue", "generator"))
+        queue, count = given["queue"], len(self.views)
+        if not isinstance(queue, list) or len(queue) > (1 if self._order == "random" else count):
+            raise ArgumentError("feed: queue: has to be a list of at most one entry per view")
+        for index in queue:
+            check_whole("feed: queue", index, count - 1)
+        if len(set(queue)) < len(queue):
+            raise ArgumentError("feed: queue: names a view twice")
+        check_numpy_generator("feed: generator", given["generator"], self._generator)
+
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
-        self._queue, self._ahead = [int(index) for index in state["queue"]], None
-        if any(not 0 <= index < len(self.views) for index in self._queue):
-            raise ValueError("it names a view that is not there")
+        """Restore what `state` returned."""
+        self.check_state(state)
+        self._queue, self._ahead = list(state["queue"]), None
         self._generator.bit_generator.state = state["generator"]
 
 

@@ -15,6 +15,13 @@ from torch import Tensor
 from gsplat_edu import kernels
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.train.saved import check_entries, check_not_negative, check_tensor_kind
+
+NUMBERS = ("rate", "beta1", "beta2", "eps", "correction1", "correction2")
+"""What a step takes besides tensors, in the order of the implementations' last argument."""
+
+MOMENTS = ("first", "second")
+"""What Adam keeps of each parameter, decaying means of its gradient and of that squared."""
 
 
 class Adam:
@@ -73,10 +80,17 @@ class Adam:
             if parameter.grad is None:
                 continue
             numbers = (rate, b1, b2, self.eps, 1 - b1**self.steps, 1 - b2**self.steps)
-            if m.shape != parameter.shape:
-                raise ArgumentError(
-                    f"{name}: has shape {tuple(parameter.shape)}, its moments {tuple(m.shape)}; call follow"
-                )
+            for moment in (m, v):
+                if moment.shape != parameter.shape:
+                    raise ArgumentError(
+                        f"{name}: has shape {tuple(parameter.shape)}, its moments {tuple(moment.shape)};"
+                        " call follow"
+                    )
+                if (moment.dtype, moment.device) != (parameter.dtype, parameter.device):
+                    raise ArgumentError(
+                        f"{name}: is {parameter.dtype} on {parameter.device}, its moments are {moment.dtype} on"
+                        f" {moment.device}"
+                    )
             step = _step_on_gpu if _gpu_takes(parameter) else _step_in_torch
             (_step_natively if _native_takes(parameter) else step)(parameter, m, v, numbers)
         for parameter in tensors.values():
@@ -108,6 +122,29 @@ class Adam:
             for name, old in moments.items():
                 moments[name] = torch.cat([old[survivors], old.new_zeros(num_new, *old.shape[1:])])
 
+    def state(self) -> tuple[dict[str, dict[str, Tensor]], int]:
+        """Return the moments, as "first" and "second", and the number of steps taken."""
+        return {name: getattr(self, name) for name in MOMENTS}, self.steps
+
+    def load_state(self, moments: dict[str, dict[str, Tensor]], steps: int, gaussians: Gaussians) -> None:
+        """Restore what `state` returned.
+
+        Raises:
+            ArgumentError: a moment is not of its parameter's dtype and shape, or not there; nothing has changed.
+        """
+        for part in MOMENTS:
+            given = check_entries(part, moments[part], tuple(self.learning_rates))
+            for name, moment in given.items():
+                parameter = getattr(gaussians, name)
+                check_tensor_kind(f"{part}.{name}", moment, parameter.dtype, parameter.shape)
+        for name, moment in moments["second"].items():
+            check_not_negative(f"second.{name}", moment)
+        self.first, self.second = (
+            {name: moment.to(gaussians.means.device) for name, moment in moments[part].items()}
+            for part in MOMENTS
+        )
+        self.steps = steps
+
 
 def _native_takes(parameter: Tensor) -> bool:
     here = (
@@ -132,9 +169,14 @@ def _step_on_gpu(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, 
 def _step_natively(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float, ...]) -> None:
     gradient = parameter.grad
     if gradient is not None:
-        arrays = (parameter, m, v, gradient.to(parameter.dtype).contiguous())
-        step = kernels.kernel("adam_f", parameter.dtype)
-        step([a.data_ptr() for a in arrays], parameter.numel(), numbers, torch.get_num_threads())
+        kernels.kernel("adam_f", parameter.dtype)(
+            parameter=kernels.array(parameter),
+            first=kernels.array(m),
+            second=kernels.array(v),
+            gradient=kernels.array(gradient.to(parameter.dtype).contiguous()),
+            **dict(zip(NUMBERS, numbers, strict=True)),
+            threads=torch.get_num_threads(),
+        )
         torch.autograd.graph.increment_version(parameter)  # so that autograd knows of the change
 
 

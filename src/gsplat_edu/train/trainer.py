@@ -26,7 +26,8 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.feed import ViewFeed
-from gsplat_edu.train.optimizer import Adam
+from gsplat_edu.train.optimizer import MOMENTS, Adam
+from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_tensor_kind, check_whole
 from gsplat_edu.train.schedule import means_rate, sh_degree
 from gsplat_edu.views import View
 
@@ -199,11 +200,11 @@ class Trainer:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return all that a run needs to go on later as if nothing had happened: tensors, and what JSON holds."""
-        parts = {"gaussians": self.gaussians.tensors(), "first": self._optimizer.first}
-        parts["second"] = self._optimizer.second
+        moments, steps = self._optimizer.state()
+        parts = {"gaussians": self.gaussians.tensors(), **moments}
         numbers: dict[str, Any] = {
             "iteration": self.iteration,
-            "steps": self._optimizer.steps,
+            "steps": steps,
             "feed": self._feed.state(),
             "backgrounds": self._backgrounds.bit_generator.state,
         }
@@ -214,21 +215,53 @@ class Trainer:
         }
         return flat, numbers
 
-    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
-        """Go on from what `state` returned, in a trainer made with the same arguments."""
+    def load_state(self, tensors: dict[str, Tensor], numbers: object) -> None:
+        """Resume from what `state` returned, in a trainer made with the same arguments.
 
-        def part(name: str) -> dict[str, Tensor]:
-            return {key.split(".", 1)[1]: t for key, t in tensors.items() if key.startswith(f"{name}.")}
+        All of it is checked before any of it is used.
 
-        device = self.gaussians.means.device
-        self.gaussians = Gaussians(**part("gaussians")).to(device).trainable()
-        for name in ("first", "second"):
-            setattr(self._optimizer, name, {key: tensor.to(device) for key, tensor in part(name).items()})
-        self._optimizer.steps, self.iteration = numbers["steps"], numbers["iteration"]
-        self._feed.load_state(numbers["feed"])
-        self._backgrounds.bit_generator.state = numbers["backgrounds"]
-        if self.density is not None:
-            statistics = {
-                k: t if t.dtype == torch.uint8 else t.to(device) for k, t in part("density").items()
+        Raises:
+            ArgumentError: it is not the state of such a trainer; names the entry. The trainer is as it was.
+        """
+        parts: dict[str, dict[str, Tensor]] = {part: {} for part in ("gaussians", *MOMENTS, "density")}
+        for key, tensor in tensors.items():
+            part, _, name = key.partition(".")
+            if part not in parts:
+                raise ArgumentError(f"{key[:60]!r}: is not known")
+            parts[part][name] = tensor
+        gaussians = self._checked_gaussians(parts["gaussians"])
+        keys = ("iteration", "steps", "feed", "backgrounds", *(["density"] if self.density else []))
+        given = check_entries("state", numbers, keys)
+        iteration = check_whole("iteration", given["iteration"], self.config.iterations)
+        if check_whole("steps", given["steps"], self.config.iterations) != iteration:
+            raise ArgumentError("steps: has to be the iteration")
+        self._feed.check_state(given["feed"])
+        check_numpy_generator("backgrounds", given["backgrounds"], self._backgrounds)
+        optimizer = Adam(gaussians, self._optimizer.learning_rates, eps=self.config.adam_eps)
+        optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, gaussians)
+        if self.density is not None:  # the last that can fail
+            if not isinstance(given["density"], dict):
+                raise ArgumentError("density: has to be an object")
+            device = gaussians.means.device
+            density = {
+                name: tensor if tensor.dtype == torch.uint8 else tensor.to(device)
+                for name, tensor in parts["density"].items()
             }
-            self.density.load_state(statistics, numbers["density"])
+            self.density.load_state(density, given["density"], gaussians)
+        elif parts["density"]:
+            raise ArgumentError("density: is there, but this run has no density control")
+        self.gaussians, self._optimizer, self.iteration = gaussians, optimizer, iteration
+        self._feed.load_state(given["feed"])
+        self._backgrounds.bit_generator.state = given["backgrounds"]
+
+    def _checked_gaussians(self, given: dict[str, Tensor]) -> Gaussians:
+        """Make Gaussians like those that training started from, however many; not finite ones may be among them."""
+        like = self.gaussians.tensors()
+        check_entries("gaussians", given, tuple(like))
+        count = given["means"].shape[0] if given["means"].ndim else 0
+        for name, tensor in like.items():
+            check_tensor_kind(f"gaussians.{name}", given[name], tensor.dtype, (count, *tensor.shape[1:]))
+        cap = self.config.max_gaussians
+        if not count or (cap is not None and count > cap):
+            raise ArgumentError(f"gaussians: are {count}, but have to be from 1 to {cap or 'any number'}")
+        return Gaussians(**given).to(self.gaussians.means.device).trainable()

@@ -21,6 +21,10 @@ from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import replace, split_children
 from gsplat_edu.train.events import Change, DensifyEvent, ResetEvent
 from gsplat_edu.train.optimizer import Adam
+from gsplat_edu.train.saved import check_entries, check_flag, check_statistics, check_torch_generator
+
+STATISTICS = ("norm_sums", "times_visible", "largest_radii")
+"""What is kept of each Gaussian since the last densification."""
 
 
 class AdaptiveDensityControl:
@@ -124,17 +128,17 @@ class AdaptiveDensityControl:
 
     def state(self) -> State:
         """Return the statistics since the last densification, and the generator."""
-        tensors = {
-            "norm_sums": self.norm_sums,
-            "times_visible": self.times_visible,
-            "largest_radii": self.largest_radii,
-            "generator": self.generator.get_state(),
-        }
-        return tensors, {"is_over": self.is_over}
+        statistics = {name: getattr(self, name) for name in STATISTICS}
+        return statistics | {"generator": self.generator.get_state()}, {"is_over": self.is_over}
 
-    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
-        self.norm_sums, self.times_visible = tensors["norm_sums"], tensors["times_visible"]
-        self.largest_radii = tensors["largest_radii"]
+    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any], gaussians: Gaussians) -> None:
+        """Restore what `state` returned; see `DensityStrategy.load_state`."""
+        check_entries("density", tensors, (*STATISTICS, "generator"))
+        statistics = {name: tensors[name] for name in STATISTICS}
+        check_statistics(statistics, gaussians.logit_opacities)
+        check_torch_generator("density.generator", tensors["generator"], self.generator)
+        is_over = check_flag("density: is_over", check_entries("density", numbers, ("is_over",))["is_over"])
         self.generator.set_state(tensors["generator"])
-        self.is_over = bool(numbers["is_over"])
+        for name, tensor in statistics.items():
+            setattr(self, name, tensor)
+        self.is_over = is_over

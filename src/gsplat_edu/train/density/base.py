@@ -40,6 +40,15 @@ class DensityStrategy(Protocol):
         """Return what is needed to go on later as if nothing had happened."""
         ...
 
-    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
-        """Go on from what `state` returned."""
+    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any], gaussians: Gaussians) -> None:
+        """Restore what `state` returned.
+
+        Args:
+            tensors: The tensors, by name.
+            numbers: The rest.
+            gaussians: The Gaussians that training resumes with.
+
+        Raises:
+            ArgumentError: they are not what `state` returns for these Gaussians; nothing has changed.
+        """
         ...

@@ -24,6 +24,7 @@ from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import replace
 from gsplat_edu.train.events import Change, RelocateEvent
 from gsplat_edu.train.optimizer import Adam
+from gsplat_edu.train.saved import check_entries, check_torch_generator
 
 MOST_SHARERS = 51
 """Most Gaussians that may share one place at a time; the sum below loses its digits beyond. (2024's code)"""
@@ -140,9 +141,12 @@ class MCMC:
         """Return the generator."""
         return {"generator": self.generator.get_state()}, {}
 
-    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
-        self.generator.set_state(tensors["generator"])
+    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any], gaussians: Gaussians) -> None:
+        """Restore what `state` returned; see `DensityStrategy.load_state`."""
+        state = check_entries("density", tensors, ("generator",))["generator"]
+        check_entries("density", numbers, ())
+        check_torch_generator("density.generator", state, self.generator)
+        self.generator.set_state(state)
 
 
 def shared_shape(

@@ -1,0 +1,55 @@
+"""Damaged checkpoints: whatever the damage, one line or a training that goes on.
+
+Also run on the build with sanitizers (tools/sanitize.sh): a step follows every checkpoint that was taken.
+"""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from checkpoints import Maker, mutate, step
+from gsplat_edu.errors import CheckpointError
+from gsplat_edu.train.checkpoint import load_checkpoint, read_seconds, save_checkpoint
+
+MUTATIONS = int(os.environ.get("GSPLAT_EDU_FUZZ_CHECKPOINTS", "100"))
+"""Damaged checkpoints per strategy; tools/sanitize.sh has more of them."""
+
+FIRST = int(os.environ.get("GSPLAT_EDU_FUZZ_FIRST", "0"))
+"""Seed of the first."""
+
+
+def as_it_stands(trainer):
+    """Return all that a trainer is, to compare: tensors by identity, numbers by value."""
+    tensors, numbers = trainer.state()
+    kept = {key: tensor.data_ptr() for key, tensor in tensors.items() if key != "density.generator"}
+    return kept, tensors["density.generator"].tolist(), json.dumps(numbers), id(trainer.gaussians)
+
+
+@pytest.mark.usefixtures("as_shipped")
+@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+def test_damaged_checkpoints(tmp_path, strategy):
+    make = Maker(strategy)
+    trainer = make()
+    step(trainer, 3)
+    data = save_checkpoint(tmp_path / "whole", trainer, 1.5).read_bytes()
+    path = tmp_path / "iteration_3.safetensors"
+    fresh, taken = make(), 0
+    before = as_it_stands(fresh)
+    for seed in range(FIRST, FIRST + MUTATIONS):
+        mutate(data, path, np.random.default_rng(seed))
+        try:
+            load_checkpoint(path, fresh)
+            read_seconds(path)
+        except CheckpointError as error:
+            message = str(error)
+            assert str(path) in message and message.isprintable() and len(message) < 600, seed
+            assert as_it_stands(fresh) == before, seed
+        else:
+            taken += 1
+            if fresh.iteration < fresh.config.iterations:
+                step(fresh)
+            fresh = make()
+            before = as_it_stands(fresh)
+    assert 0 < taken < MUTATIONS

@@ -1,0 +1,59 @@
+"""Damaged config.json: `train --resume` ends with 0 or with one line and 2, and what reads runs refuses it in one line."""
+
+import contextlib
+import io
+import json
+import os
+
+import numpy as np
+import pytest
+
+from checkpoints import changed_json, spelled
+from gsplat_edu.cli.main import main
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.errors import SplatError
+from gsplat_edu.runs.folder import RunFolder, render_settings
+from gsplat_edu.runs.source import open_source
+
+MUTATIONS = int(os.environ.get("GSPLAT_EDU_FUZZ_CONFIGS", "50"))
+"""Damaged files."""
+
+FIRST = int(os.environ.get("GSPLAT_EDU_FUZZ_FIRST", "0"))
+"""Seed of the first."""
+
+
+def damaged(data, rng):
+    if rng.random() < 0.3:
+        raw = bytearray(data)
+        for at in rng.integers(0, len(raw), rng.integers(1, 4)):
+            raw[at] = int(rng.choice([rng.integers(0, 256), *b'0123456789"[]{},:-']))
+        return bytes(raw[: int(rng.integers(0, len(raw)))] if rng.random() < 0.1 else raw)
+    return spelled(changed_json(json.loads(data), rng), rng).encode("utf-8", "replace")
+
+
+def resumed(words):
+    """Run the command; return its exit code and what it wrote to an error stream like Python's own."""
+    stream = io.TextIOWrapper(io.BytesIO(), "utf-8", errors="backslashreplace", write_through=True)
+    with contextlib.redirect_stderr(stream), contextlib.redirect_stdout(io.StringIO()):
+        code = main(words)
+    return code, stream.buffer.getvalue().decode()
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_damaged_configs(tmp_path):
+    write_colmap(tmp_path / "egg", *procedural_capture(12, 4, splats=30))
+    out = tmp_path / "run"
+    words = ["train", str(tmp_path / "egg"), "--out", str(out), "--iterations", "3", "--resume"]
+    assert main(words) == 0
+    whole = (out / "config.json").read_bytes()
+    for seed in range(FIRST, FIRST + MUTATIONS):
+        (out / "config.json").write_bytes(damaged(whole, np.random.default_rng(seed)))
+        code, said = resumed(words)
+        assert code in (0, 2), seed
+        assert code == 0 or (said.count("\n") == 1 and said.startswith("gsplat-edu")), (seed, said)
+        try:
+            render_settings(RunFolder(out).read_config())
+            open_source(out)
+        except SplatError as error:
+            assert "\n" not in str(error), seed

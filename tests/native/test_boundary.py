@@ -1,0 +1,223 @@
+"""The native module refuses wrong arguments, whoever calls it, and names the argument."""
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu import _native
+from gsplat_edu.train.initialize import random_ball
+
+N, H, W = 5, 6, 7
+RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
+
+
+def parameters(dtype=torch.float32):
+    return random_ball(N, torch.Generator().manual_seed(0), dtype).tensors()
+
+
+def camera(**changes):
+    fields = {"R": np.eye(3), "eye": np.array([0.0, 0.0, -3.0]), "fx": 9.0, "fy": 9.0, "cx": 3.0, "cy": 3.0}
+    fields |= {"x_bounds": (-9.0, 9.0), "y_bounds": (-float("inf"), float("inf")), "H": H, "W": W}
+    return _native.Camera(**fields | changes)
+
+
+def settings(**changes):
+    fields = {"z_near": 0.05, "background": [0.0, 0.0, 0.0], "sh_degree": 0, "antialiased": False}
+    return _native.Settings(**fields | changes)
+
+
+def scene(**changes):
+    return _native.Scene(**parameters() | changes)
+
+
+def images(**changes):
+    fields = {"image": torch.empty(H, W, 3), "transmittance": torch.empty(H, W), "depth": None}
+    return _native.Images(**fields | changes)
+
+
+def gradients(**changes):
+    extra = {"means2d_norm": torch.empty(N), "background": torch.empty(3)}
+    return _native.Gradients(**parameters() | extra | changes)
+
+
+def frame(**changes):
+    fields = {"scene": scene(), "camera": camera(), "settings": settings(), "threads": 2}
+    return _native.FrameF32(**fields | changes)
+
+
+def visible(**changes):
+    drawn = frame()
+    count = drawn.num_visible
+    assert count == N
+    drawn.visible(**{"ids": torch.empty(count, dtype=torch.int64), "radii": torch.empty(count, 2)} | changes)
+
+
+def backward(**changes):
+    drawn, out = frame(), images()
+    drawn.composite(out)
+    fields = {"scene": scene(), "images": out, "incoming": images(), "gradients": gradients()}
+    drawn.backward(**fields | changes)
+
+
+def adam(**changes):
+    fields = {name: torch.zeros(N, 3) for name in ("parameter", "first", "second", "gradient")}
+    fields |= dict.fromkeys(("rate", "beta1", "beta2", "eps", "correction1", "correction2"), 0.5)
+    _native.adam_f32(**fields | {"threads": 2} | changes)
+
+
+def loss(**changes):
+    fields = {name: torch.zeros(H, W, 3) for name in ("image", "target", "gradient")}
+    return _native.loss_f32(**fields | {"ssim_weight": 0.2, "threads": 2} | changes)
+
+
+CALLS = {
+    camera: ("R", "eye", "fx", "fy", "cx", "cy", "x_bounds", "y_bounds", "H", "W"),
+    settings: ("z_near", "background", "sh_degree", "antialiased"),
+    scene: RAW,
+    images: ("image", "transmittance", "depth"),
+    gradients: (*RAW, "means2d_norm", "background"),
+    frame: ("scene", "camera", "settings", "threads"),
+    visible: ("ids", "radii"),
+    backward: ("scene", "images", "incoming", "gradients"),
+    adam: (*("parameter", "first", "second", "gradient", "rate", "beta1"), "correction2", "threads"),
+    loss: ("image", "target", "gradient", "ssim_weight", "threads"),
+}
+EVERY = [(call, name) for call, names in CALLS.items() for name in names]
+
+
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: call.__name__)
+def test_the_arguments_of_these_tests_are_right(call):
+    call()
+    with pytest.raises(TypeError, match="does not know extra"):
+        call(extra=1)
+
+
+@pytest.mark.parametrize(("call", "name"), EVERY, ids=lambda value: getattr(value, "__name__", value))
+def test_a_missing_or_senseless_argument_is_named(call, name, monkeypatch):
+    with pytest.raises((TypeError, ValueError), match=rf": {name}: "):
+        call(**{name: "nonsense"})
+    monkeypatch.setitem(call.__globals__, "_native", Dropping(_native, name))
+    with pytest.raises(TypeError, match=rf": {name} is missing$"):
+        call()
+
+
+class Dropping:
+    """The native module, whose calls lose one of their arguments on the way."""
+
+    def __init__(self, source, name):
+        self.source, self.name = source, name
+
+    def __getattr__(self, attribute):
+        called = getattr(self.source, attribute)
+
+        def without(*arguments, **fields):
+            fields.pop(self.name, None)
+            result = called(*arguments, **fields)
+            return result if not attribute.startswith("Frame") else Dropping(result, self.name)
+
+        return without if callable(called) else called
+
+
+ARRAYS = {scene: RAW, gradients: CALLS[gradients], images: CALLS[images], adam: CALLS[adam][:4]}
+ARRAYS |= {loss: CALLS[loss][:3], visible: CALLS[visible]}
+EACH_ARRAY = [(call, name) for call, names in ARRAYS.items() for name in names]
+
+
+def right(call, name):
+    """Return a right array of this argument."""
+    if call in (scene, gradients) and name in RAW:
+        return parameters()[name].clone()
+    shapes = {"means2d_norm": (N,), "background": (3,), "ids": (N,), "radii": (N, 2), "depth": (H, W)}
+    shapes |= {"transmittance": (H, W)}
+    if call is adam:
+        return torch.zeros(N, 3)
+    dtype = torch.int64 if name == "ids" else torch.float32
+    return torch.zeros(shapes.get(name, (H, W, 3)), dtype=dtype)
+
+
+def strided(tensor):
+    return torch.stack([tensor, tensor], dim=-1)[..., 0]
+
+
+def unaligned(tensor):
+    # NumPy makes what torch refuses to: an array that begins between two numbers.
+    room = np.zeros(tensor.numel() * tensor.element_size() + 1, np.uint8)
+    return room[1:].view(tensor.numpy().dtype).reshape(tensor.shape)
+
+
+WRONG = {
+    "half": lambda t: t.to(torch.float16),
+    "integers": lambda t: t.to(torch.int32),
+    "empty": lambda t: t[:0],
+    "one more": lambda t: torch.cat([t, t[:1]]),
+    "flat": lambda t: t.reshape(1, -1),
+    "strided": strided,
+    "unaligned": unaligned,
+    "elsewhere": lambda t: t.to("meta"),
+    "absent": lambda t: None,
+    "nine axes": lambda t: t[(None,) * 9],
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize(("call", "name"), EACH_ARRAY, ids=lambda value: getattr(value, "__name__", value))
+def test_an_array_of_another_kind_is_refused(call, name, wrong):
+    given = right(call, name)
+    call(**{name: given})
+    optional = call is images and name != "image" and wrong == "absent"
+    if optional or (wrong in ("strided", "unaligned") and not given.numel()):
+        return  # that is right
+    # The first array sets the size: where only its size is wrong, it is the next one that does not fit.
+    leads = name in ("means", "parameter", "image") and wrong in ("empty", "one more", "flat", "nine axes")
+    with pytest.raises(ValueError, match=r": \w+: has to be" if leads else rf": {name}: has to be"):
+        call(**{name: WRONG[wrong](given)})
+
+
+def test_numpy_arrays_are_taken_and_read_only_ones_only_to_read():
+    arrays = {name: np.zeros((N, 3), np.float32) for name in ("parameter", "first", "second", "gradient")}
+    for name, array in arrays.items():
+        array.flags.writeable = False
+        if name == "gradient":
+            adam(**arrays | {"gradient": array})
+        else:
+            with pytest.raises(ValueError, match=f"adam: {name}: has to be .* writable; got no writable"):
+                adam(**arrays)
+        array.flags.writeable = True
+
+
+def test_a_leaf_is_moved_in_place():
+    leaf = torch.zeros(N, 3, requires_grad=True)
+    adam(parameter=leaf, gradient=torch.ones(N, 3))
+    assert (leaf.detach() < 0).all()
+
+
+def test_a_frame_takes_what_fits_it():
+    cases = (
+        ("scene", _native.Scene(**parameters(torch.float64)), "dtype"),
+        ("scene", _native.Scene(**{name: tensor[:3] for name, tensor in parameters().items()}), "shape"),
+        ("images", images(image=torch.empty(H, W + 1, 3), transmittance=torch.empty(H, W + 1)), "size"),
+        ("images", images(transmittance=None), "needs transmittance"),
+        ("images", images(depth=torch.empty(H, W)), "depth exactly where"),
+        ("incoming", images(depth=torch.empty(H, W)), "not rendered"),
+        (
+            "incoming",
+            _native.Images(image=torch.empty(H, W, 3).double(), transmittance=None, depth=None),
+            "dtype",
+        ),
+    )
+    for name, value, words in cases:
+        with pytest.raises(ValueError, match=f"{name}: .*{words}"):
+            backward(**{name: value})
+    with pytest.raises(ValueError, match="call composite first"):
+        frame().backward(scene=scene(), images=images(), incoming=images(), gradients=gradients())
+    with pytest.raises(ValueError, match="sh_degree is above"):
+        frame(settings=settings(sh_degree=1))
+    with pytest.raises(ValueError, match="H: times W"):
+        camera(H=2**31 - 1, W=2**31 - 1)
+    for name in ("H", "W"):
+        with pytest.raises(ValueError, match=f"Camera: {name}: has to be a whole number"):
+            camera(**{name: 0})
+    with pytest.raises(ValueError, match="sh_rest: has to hold 0, 3, 8 or 15"):
+        scene(sh_rest=torch.zeros(N, 4, 3))
+    with pytest.raises(TypeError, match="by name only"):
+        _native.Scene(*parameters().values())
