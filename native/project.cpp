@@ -14,23 +14,25 @@ void project(const ProjectArgs<T> &args, int64_t block) {
     const int64_t begin = block * BLOCK, end = vmin(begin + BLOCK, args.scene.n);
     uint32_t *visible = args.visible + begin;
     uint32_t count = 0;
-    const T LOG2E = T(1.4426950408889634);
+    constexpr double LOG2E = 1.4426950408889634;
     for (int64_t i = begin; i < end; ++i) {
-        Projected<T> g;
+        Projected g;
         if (!project_shape(args.scene, args.camera, args.settings, i, g)) continue;
+        Shade<T> shade;
         Splat<T> s;
-        s.u = T(args.camera.fx) * g.p[0] / g.p[2] + T(args.camera.cx);
-        s.v = T(args.camera.fy) * g.p[1] / g.p[2] + T(args.camera.cy);
-        const T opacity = g.opacity * g.compensation;
-        const T level = 2 * log_(opacity / T(ALPHA_MIN));
-        s.extent[0] = sqrt_(level * g.a), s.extent[1] = sqrt_(level * g.c);
-        const bool inside = ceil_(s.u - s.extent[0]) <= T(args.camera.W - 1) && floor_(s.u + s.extent[0]) >= 0 &&
-                            ceil_(s.v - s.extent[1]) <= T(args.camera.H - 1) && floor_(s.v + s.extent[1]) >= 0;
-        if (!inside || !project_color(args.scene, args.settings, i, g)) continue;
-        s.a = -g.c / g.det * (LOG2E / 2), s.b = g.b / g.det * LOG2E, s.c = -g.a / g.det * (LOG2E / 2);
-        s.log2_o = log_(opacity) * LOG2E;
-        for (int k = 0; k < 3; ++k) s.color[k] = args.scene.quats ? vmax(g.color[k], T(0)) : g.color[k];
-        s.depth = g.p[2];
+        const double u = args.camera.fx * g.p[0] * g.iz + args.camera.cx, v = args.camera.fy * g.p[1] * g.iz + args.camera.cy;
+        const double log2_o = log_(g.opacity * g.compensation) * LOG2E;
+        const double level = vmax((log2_o - LOG2_ALPHA_MIN) * (2 / LOG2E), 0.0);
+        const double ex = sqrt_(level * g.a), ey = sqrt_(level * g.c);
+        const bool inside = ceil_(u - ex) <= args.camera.W - 1 && floor_(u + ex) >= 0 &&
+                            ceil_(v - ey) <= args.camera.H - 1 && floor_(v + ey) >= 0;
+        if (!inside || !project_color(args.scene, args.settings, i, g, shade)) continue;
+        const double scale = LOG2E / g.det;
+        s.u = T(u), s.v = T(v), s.extent[0] = T(ex), s.extent[1] = T(ey);
+        s.a = T(-g.c * scale / 2), s.b = T(g.b * scale), s.c = T(-g.a * scale / 2);
+        s.log2_o = T(log2_o);
+        for (int k = 0; k < 3; ++k) s.color[k] = args.scene.quats ? vmax(shade.color[k], T(0)) : shade.color[k];
+        s.depth = T(g.p[2]);
         args.splats[i] = s;
         visible[count++] = uint32_t(i);
     }

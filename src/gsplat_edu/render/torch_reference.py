@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, DILATION, SH_OFFSET, Z_NEAR
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.gaussians import Gaussians, check_tensor, cov3d_t
@@ -81,7 +81,7 @@ def render_t(
     cov3ds: Float[Tensor, "N 3 3"],
     colors: Float[Tensor, "N 3"],
     opacities: Float[Tensor, " N"],
-    cam: Camera,
+    cam: CameraLike,
     alpha_min: float = ALPHA_MIN,
     chunk: int = 512,
     track_means2d: bool = False,
@@ -96,7 +96,7 @@ def render_t(
         cov3ds: (N, 3, 3) covariances, world units squared; that they are is not checked here.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
-        cam: The camera; means at depth 0.05 or nearer are culled.
+        cam: The camera, a `Camera` or anything with its members; means at depth 0.05 or nearer are culled.
         alpha_min: Alpha below this is zero. 0 makes the image smooth, for finite differences.
         chunk: Splats evaluated at once, near to far. It bounds the size of a temporary and decides speed.
         track_means2d: Keep the gradient of means2d, for density control.
@@ -107,12 +107,13 @@ def render_t(
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: an entry is NaN or infinite, an opacity is outside 0 to 1, alpha_min is negative, or
-            chunk is not a whole number of at least 1.
+        ArgumentError: an entry is NaN or infinite, an opacity is outside 0 to 1, alpha_min is negative,
+            chunk is not a whole number of at least 1, or `cam` is no camera.
 
     Differentiable in: means, cov3ds, colors, opacities. Not in: the camera.
     Source: Kerbl et al. 2023, eq. 2-5.
     """
+    cam = as_camera("cam", cam)
     _check(means, cov3ds, colors, opacities)
     alpha_min, chunk = in_range("alpha_min", alpha_min, 0.0), whole_number("chunk", chunk, 1)
 
