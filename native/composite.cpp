@@ -1,6 +1,6 @@
 // composite: one tile's splats, near to far, into its pixels.
 //
-//     alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
+//     p = log2_o - s² - t²;   alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 //
 // The tile ends before the first splat that finds every pixel below 1e-4.
 #include "isa.h"
@@ -17,18 +17,20 @@ struct TileState {
 
 // Draws one splat; returns whether a pixel of the rows it touched still lets light through.
 template <class T, bool DEPTH>
-GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileState<T> &tile) {
+GSPLAT_INLINE bool draw(const Splat<T> &s, const Camera &cam, const TileBox &box, int32_t first, int32_t last,
+                        TileState<T> &tile) {
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
-    const T most = vmin(s.log2_o, T(LOG2_ALPHA_MAX));
+    const T x = reference_x(s, cam);
+    RowTerms<T> terms;
+    row_terms(s, box, reference_y(s, cam), terms);
     V brightest = V{};
     for (int column = 0; column < TILE; column += LANES) {
-        const V dx = iota<T>() + splat(T(column + box.x0) - s.u);
-        const V along = splat(s.log2_o) + splat(s.a) * dx * dx, cross = splat(s.b) * dx;
-        V dy = splat(T(first + box.y0) - s.v);
-        for (int row = first; row <= last; ++row, dy += splat(T(1))) {
-            const V p = along + dy * (cross + splat(s.c) * dy);
-            const V alpha = exp2_between(p, T(LOG2_ALPHA_MIN), most);
+        const V dx = iota<T>() + splat(T(column + box.x0) - x);
+        const V across = splat(s.s0) + splat(s.sx) * dx;
+        for (int row = first; row <= last; ++row) {
+            const V q = across + splat(terms.shift[row]);
+            const V alpha = exp2_between(splat(terms.base[row]) - q * q, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
             V t = load<V>(&tile.transmittance[row][column]);
             const V w = t * alpha;
             store(&tile.red[row][column], load<V>(&tile.red[row][column]) + w * splat(s.color[0]));
@@ -74,7 +76,7 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
         }
         if (rows.first[i] > rows.last[i]) continue;
         const Splat<T> &s = args.splats[args.pairs[k].gaussian];
-        if (!draw<T, DEPTH>(s, box, rows.first[i], rows.last[i], tile) && !lets_light_through(tile)) {
+        if (!draw<T, DEPTH>(s, args.camera, box, rows.first[i], rows.last[i], tile) && !lets_light_through(tile)) {
             ++k;
             break;
         }

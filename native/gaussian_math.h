@@ -33,6 +33,26 @@ GSPLAT_INLINE bool is_color(const T *c) {
     return c[0] <= limit && c[1] <= limit && c[2] <= limit && c[0] >= -limit && c[1] >= -limit && c[2] >= -limit;
 }
 
+// The point of the image nearest to a splat's mean.
+template <class T>
+GSPLAT_INLINE T reference_x(const Splat<T> &s, const Camera &cam) {
+    return T(vmin(vmax(s.u, 0.0), double(cam.W - 1)));
+}
+
+template <class T>
+GSPLAT_INLINE T reference_y(const Splat<T> &s, const Camera &cam) {
+    return T(vmin(vmax(s.v, 0.0), double(cam.H - 1)));
+}
+
+// px: how far rounding may move a rim that is found from numbers whose sizes add up to `size`.
+template <class T>
+GSPLAT_INLINE T rim_slack(T size) {
+    return T(RIM_SLACK) + T(sizeof(T) == sizeof(float) ? 0x1p-21 : 0x1p-50) * size;
+}
+
+GSPLAT_INLINE float abs_(float x) { return fabsf(x); }
+GSPLAT_INLINE double abs_(double x) { return fabs(x); }
+
 template <class T>
 GSPLAT_INLINE T dot3(const T *a, const T *b) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -184,6 +204,10 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
     const T check = T(g.a * g.c + g.det + g.p[0] + g.p[1] + z * z + g.opacity * g.compensation);
     return finite(check) && g.det > 0 && g.opacity * g.compensation >= ALPHA_MIN;
 }
+
+// u = fx x/z + cx, and v.
+GSPLAT_INLINE double screen_x(const Projected &g, const Camera &cam) { return cam.fx * g.p[0] * g.iz + cam.cx; }
+GSPLAT_INLINE double screen_y(const Projected &g, const Camera &cam) { return cam.fy * g.p[1] * g.iz + cam.cy; }
 
 // colour = sum_i b_i sh_i + 0.5, before the floor. False where it is not finite.
 template <class T>

@@ -20,16 +20,19 @@ void project(const ProjectArgs<T> &args, int64_t block) {
         if (!project_shape(args.scene, args.camera, args.settings, i, g)) continue;
         Shade<T> shade;
         Splat<T> s;
-        const double u = args.camera.fx * g.p[0] * g.iz + args.camera.cx, v = args.camera.fy * g.p[1] * g.iz + args.camera.cy;
+        const double u = screen_x(g, args.camera), v = screen_y(g, args.camera);
         const double log2_o = log_(g.opacity * g.compensation) * LOG2E;
         const double level = vmax((log2_o - LOG2_ALPHA_MIN) * (2 / LOG2E), 0.0);
         const double ex = sqrt_(level * g.a), ey = sqrt_(level * g.c);
         const bool inside = ceil_(u - ex) <= args.camera.W - 1 && floor_(u + ex) >= 0 &&
                             ceil_(v - ey) <= args.camera.H - 1 && floor_(v + ey) >= 0;
         if (!inside || !project_color(args.scene, args.settings, i, g, shade)) continue;
-        const double scale = LOG2E / g.det;
-        s.u = T(u), s.v = T(v), s.extent[0] = T(ex), s.extent[1] = T(ey);
-        s.a = T(-g.c * scale / 2), s.b = T(g.b * scale), s.c = T(-g.a * scale / 2);
+        // d' Sigma2d^-1 d = (c / det) (dx - b/c dy)² + dy² / c
+        const double sx = sqrt_(LOG2E / 2 * g.c / g.det), sy = -g.b / g.c * sx, ty = sqrt_(LOG2E / 2 / g.c);
+        s.u = u, s.v = v, s.extent[0] = T(ex), s.extent[1] = T(ey);
+        s.sx = T(sx), s.sy = T(sy), s.ty = T(ty);
+        const double dx = double(reference_x(s, args.camera)) - u, dy = double(reference_y(s, args.camera)) - v;
+        s.s0 = T(sx * dx + sy * dy), s.t0 = T(ty * dy);
         s.log2_o = T(log2_o);
         for (int k = 0; k < 3; ++k) s.color[k] = args.scene.quats ? vmax(shade.color[k], T(0)) : shade.color[k];
         s.depth = T(g.p[2]);

@@ -126,6 +126,19 @@ GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
     }
 }
 
+// Moves the moments of h from the reference point to the mean, e away: sum h (x + e)² = sum h x² + 2 e sum h x + e² sum h.
+template <class T>
+GSPLAT_INLINE void moments_about_mean(const Camera &cam, const Projected &g, const T *sums, double *slot) {
+    Splat<T> s;
+    s.u = screen_x(g, cam), s.v = screen_y(g, cam);
+    const double ex = double(reference_x(s, cam)) - s.u, ey = double(reference_y(s, cam)) - s.v;
+    for (int j = 0; j < SLOT; ++j) slot[j] = double(sums[j]);
+    slot[HXX] += ex * (2 * slot[HX] + ex * slot[H]);
+    slot[HYY] += ey * (2 * slot[HY] + ey * slot[H]);
+    slot[HXY] += ey * slot[HX] + ex * slot[HY] + ex * ey * slot[H];
+    slot[HX] += ex * slot[H], slot[HY] += ey * slot[H];
+}
+
 template <class T>
 void one(const ProjectBackwardArgs<T> &args, int64_t i) {
     T sums[SLOT] = {};
@@ -139,7 +152,7 @@ void one(const ProjectBackwardArgs<T> &args, int64_t i) {
         return zero(args, i);
 
     double slot[SLOT];
-    for (int j = 0; j < SLOT; ++j) slot[j] = double(sums[j]);
+    moments_about_mean(args.camera, g, sums, slot);
     const double A = g.c / g.det, B = -g.b / g.det, C = g.a / g.det;
     const double uv[2] = {A * slot[HX] + B * slot[HY], B * slot[HX] + C * slot[HY]};
     const double nx = uv[0] * args.camera.W / 2, ny = uv[1] * args.camera.H / 2;
