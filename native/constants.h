@@ -9,6 +9,7 @@ constexpr double ALPHA_MIN = 0.00392156862745098;
 constexpr double ALPHA_MAX = 0.99;
 constexpr double T_STOP = 0.0001;
 constexpr double DET_FLOOR = 1e-12;
+constexpr double SPLAT_LIMIT = 1000000000000000.0;
 constexpr double COLOR_LIMIT = 1000000.0;
 constexpr double RIM_SLACK = 0.001;
 constexpr double C0 = 0.28209479177387814;

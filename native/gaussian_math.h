@@ -200,9 +200,9 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
     g.a = g.a0 + d, g.b = g.b0, g.c = g.c0 + d;
     g.det = g.det0 + d * (g.a0 + g.c0) + d * d;
     g.compensation = set.antialiased ? sqrt_(vmax(g.det0, DET_FLOOR) / g.det) : 1.0;
-    // In the scene's type, which the gradients are in; z squared, so that depths can still be weighted and added.
-    const T check = T(g.a * g.c + g.det + g.p[0] + g.p[1] + z * z + g.opacity * g.compensation);
-    return finite(check) && g.det > 0 && g.opacity * g.compensation >= ALPHA_MIN;
+    // The mean in the scene's type, which its gradients are in; z squared, so that depths can still be weighted and added.
+    return finite(T(g.p[0] + g.p[1] + z * z)) && g.a + g.c <= SPLAT_LIMIT * SPLAT_LIMIT && finite(g.det) && g.det > 0 &&
+           g.opacity * g.compensation >= ALPHA_MIN;
 }
 
 // u = fx x/z + cx, and v.

@@ -42,6 +42,10 @@ COLOR_LIMIT: Final = 1e6
 """The kernels take a colour beyond this for one that is not finite and leave its Gaussian out. No photo comes near, and
 the gradients of the Gaussians around it would lose all their digits to it. Source: ours."""
 
+SPLAT_LIMIT: Final = 1e15
+"""px: the kernels leave out a Gaussian whose standard deviation on the screen is beyond this. The factors of its exponent,
+the inverse of that, have squares that float32 still holds. Source: ours."""
+
 DET_FLOOR: Final = 1e-12
 """px⁴: floor under the determinant of a screen-space covariance before its dilation, where antialiasing takes
 the root of its ratio to the one after. A Gaussian that is a line on the screen has determinant 0, where the
