@@ -17,16 +17,14 @@ struct TileState {
 
 // Draws one splat; returns whether a pixel of the rows it touched still lets light through.
 template <class T, bool DEPTH>
-GSPLAT_INLINE bool draw(const Splat<T> &s, const Camera &cam, const TileBox &box, int32_t first, int32_t last,
-                        TileState<T> &tile) {
+GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileState<T> &tile) {
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
-    const T x = reference_x(s, cam);
     RowTerms<T> terms;
-    row_terms(s, box, reference_y(s, cam), terms);
+    row_terms(s, box, terms);
     V brightest = V{};
     for (int column = 0; column < TILE; column += LANES) {
-        const V dx = iota<T>() + splat(T(column + box.x0) - x);
+        const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
         const V across = splat(s.s0) + splat(s.sx) * dx;
         for (int row = first; row <= last; ++row) {
             const V q = across + splat(terms.shift[row]);
@@ -76,7 +74,7 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
         }
         if (rows.first[i] > rows.last[i]) continue;
         const Splat<T> &s = args.splats[args.pairs[k].gaussian];
-        if (!draw<T, DEPTH>(s, args.camera, box, rows.first[i], rows.last[i], tile) && !lets_light_through(tile)) {
+        if (!draw<T, DEPTH>(s, box, rows.first[i], rows.last[i], tile) && !lets_light_through(tile)) {
             ++k;
             break;
         }

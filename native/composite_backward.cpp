@@ -21,21 +21,19 @@ struct TileGradient {
 
 // One splat: its sums over the tile into `slot`.
 template <class T, bool WITH_DEPTH>
-GSPLAT_INLINE void undraw(const Splat<T> &s, const Camera &cam, const TileBox &box, int32_t first, int32_t last,
-                          TileGradient<T> &tile, T *slot) {
+GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileGradient<T> &tile, T *slot) {
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
-    const T x = reference_x(s, cam), y = reference_y(s, cam);
     RowTerms<T> terms;
-    row_terms(s, box, y, terms);
+    row_terms(s, box, terms);
     // w g (3) and the moments of h, 1, x, xx, y, xy, in the order of a slot; then yy and w z.
     V sums[8] = {}, hyy = V{}, wz = V{};
     for (int column = 0; column < TILE; column += LANES) {
-        const V dx = iota<T>() + splat(T(column + box.x0) - x);
+        const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
         const V across = splat(s.s0) + splat(s.sx) * dx;
         V wr = V{}, wg = V{}, wb = V{};
         V sum0 = V{}, sum1 = V{}, sum2 = V{};  // h, h dy, h dy²; the factors dx are put in once per splat
-        V dy = splat(T(first + box.y0) - y);
+        V dy = splat(T(first + box.y0) - s.y);
         for (int row = first; row <= last; ++row, dy += splat(T(1))) {
             const V q = across + splat(terms.shift[row]), p = splat(terms.base[row]) - q * q;
             const V alpha = exp2_between(p, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
@@ -110,8 +108,7 @@ void undo_tile(const CompositeBackwardArgs<T> &args, int32_t index) {
         if (k >= stop || rows.first[i] > rows.last[i])
             for (int j = 0; j < SLOT; ++j) slot[j] = 0;
         else
-            undraw<T, WITH_DEPTH>(forward.splats[forward.pairs[k].gaussian], forward.camera, box, rows.first[i], rows.last[i],
-                                  tile, slot);
+            undraw<T, WITH_DEPTH>(forward.splats[forward.pairs[k].gaussian], box, rows.first[i], rows.last[i], tile, slot);
     }
 }
 

@@ -33,17 +33,6 @@ GSPLAT_INLINE bool is_color(const T *c) {
     return c[0] <= limit && c[1] <= limit && c[2] <= limit && c[0] >= -limit && c[1] >= -limit && c[2] >= -limit;
 }
 
-// The point of the image nearest to a splat's mean.
-template <class T>
-GSPLAT_INLINE T reference_x(const Splat<T> &s, const Camera &cam) {
-    return T(vmin(vmax(s.u, 0.0), double(cam.W - 1)));
-}
-
-template <class T>
-GSPLAT_INLINE T reference_y(const Splat<T> &s, const Camera &cam) {
-    return T(vmin(vmax(s.v, 0.0), double(cam.H - 1)));
-}
-
 // px: how far rounding may move a rim that is found from numbers whose sizes add up to `size`.
 template <class T>
 GSPLAT_INLINE T rim_slack(T size) {
@@ -127,7 +116,7 @@ struct Projected {
     double q[4], inverse_q_norm, R[9], s[3];  // unit quaternion, 1 / its length before, rotation, scales
     double r0[3], r1[3];                      // rows of J W M, M = R S
     double a0, b0, c0, det0;                  // covariance on the screen before the dilation
-    double a, b, c, det;                      // and after
+    double a, b, c, det, inverse_det;         // and after
     double opacity, compensation;             // opacity without the compensation of antialiasing, and that factor
 };
 
@@ -175,7 +164,7 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
         if (!unit_quaternion(scene.quats + 4 * i, g)) return false;
         rotation(g.q, g.R);
         for (int k = 0; k < 3; ++k) {
-            g.s[k] = exp_(double(scene.log_scales[3 * i + k]));
+            g.s[k] = double(exp_(scene.log_scales[3 * i + k]));
             g.r0[k] = (g.t0[0] * g.R[k] + g.t0[1] * g.R[3 + k] + g.t0[2] * g.R[6 + k]) * g.s[k];
             g.r1[k] = (g.t1[0] * g.R[k] + g.t1[1] * g.R[3 + k] + g.t1[2] * g.R[6 + k]) * g.s[k];
         }
@@ -184,7 +173,7 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
         const double n0 = g.r0[1] * g.r1[2] - g.r0[2] * g.r1[1], n1 = g.r0[2] * g.r1[0] - g.r0[0] * g.r1[2];
         const double n2 = g.r0[0] * g.r1[1] - g.r0[1] * g.r1[0];
         g.det0 = n0 * n0 + n1 * n1 + n2 * n2;
-        g.opacity = 1 / (1 + exp_(-double(scene.logit_opacities[i])));
+        g.opacity = double(1 / (1 + exp_(-scene.logit_opacities[i])));
     } else {
         double S[9];
         for (int k = 0; k < 9; ++k) S[k] = double(scene.cov3ds[9 * i + k]);
@@ -198,16 +187,27 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
     }
     const double d = DILATION;
     g.a = g.a0 + d, g.b = g.b0, g.c = g.c0 + d;
-    g.det = g.det0 + d * (g.a0 + g.c0) + d * d;
-    g.compensation = set.antialiased ? sqrt_(vmax(g.det0, DET_FLOOR) / g.det) : 1.0;
+    g.det = g.det0 + d * (g.a0 + g.c0) + d * d, g.inverse_det = 1 / g.det;
+    g.compensation = set.antialiased ? sqrt_(vmax(g.det0, DET_FLOOR) * g.inverse_det) : 1.0;
     // The mean in the scene's type, which its gradients are in; z squared, so that depths can still be weighted and added.
     return finite(T(g.p[0] + g.p[1] + z * z)) && g.a + g.c <= SPLAT_LIMIT * SPLAT_LIMIT && finite(g.det) && g.det > 0 &&
            g.opacity * g.compensation >= ALPHA_MIN;
 }
 
-// u = fx x/z + cx, and v.
-GSPLAT_INLINE double screen_x(const Projected &g, const Camera &cam) { return cam.fx * g.p[0] * g.iz + cam.cx; }
-GSPLAT_INLINE double screen_y(const Projected &g, const Camera &cam) { return cam.fy * g.p[1] * g.iz + cam.cy; }
+// The mean on the screen, u = fx x/z + cx and v, and the point of the image nearest to it, as a splat holds that.
+template <class T>
+struct Position {
+    double u, v;
+    T x, y;
+};
+
+template <class T>
+GSPLAT_INLINE Position<T> position(const Projected &g, const Camera &cam) {
+    Position<T> at;
+    at.u = cam.fx * g.p[0] * g.iz + cam.cx, at.v = cam.fy * g.p[1] * g.iz + cam.cy;
+    at.x = T(vmin(vmax(at.u, 0.0), double(cam.W - 1))), at.y = T(vmin(vmax(at.v, 0.0), double(cam.H - 1)));
+    return at;
+}
 
 // colour = sum_i b_i sh_i + 0.5, before the floor. False where it is not finite.
 template <class T>
@@ -216,9 +216,9 @@ GSPLAT_INLINE bool project_color(const Scene<T> &scene, const Settings &set, int
         for (int k = 0; k < 3; ++k) shade.color[k] = scene.colors[3 * i + k];
         return is_color(shade.color);
     }
-    const double distance = sqrt_(dot3(g.offset, g.offset));
-    shade.distance = T(distance);
-    for (int k = 0; k < 3; ++k) shade.dir[k] = T(g.offset[k] / distance);
+    for (int k = 0; k < 3; ++k) shade.dir[k] = T(g.offset[k]);
+    shade.distance = sqrt_(dot3(shade.dir, shade.dir));
+    for (int k = 0; k < 3; ++k) shade.dir[k] /= shade.distance;
     harmonics(set.sh_degree, shade.dir[0], shade.dir[1], shade.dir[2], shade.basis);
     const int rest = (set.sh_degree + 1) * (set.sh_degree + 1) - 1;
     const T *sh = scene.sh_rest + 3 * int64_t(scene.rest) * i;

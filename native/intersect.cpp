@@ -22,7 +22,7 @@ struct Ellipse {
 template <class T>
 GSPLAT_INLINE Ellipse<T> ellipse(const Splat<T> &s) {
     Ellipse<T> e;
-    e.u = T(s.u), e.v = T(s.v), e.ex = s.extent[0], e.ey = s.extent[1];
+    e.u = s.u, e.v = s.v, e.ex = s.extent[0], e.ey = s.extent[1];
     e.inverse_ey = 1 / e.ey;
     e.slant = s.sx * s.sy / (s.sy * s.sy + s.ty * s.ty);
     e.tangent = -s.sy / s.sx;

@@ -48,11 +48,12 @@ struct SceneGrads {
 // One visible Gaussian on the screen, in base 2: alpha = 2^(log2_o - s² - t²), s = s0 + sx dx + sy dy, t = t0 + ty dy.
 //
 // Two squares cannot cancel, which the terms of a polynomial in dx and dy do wherever an ellipse is longer than it is wide.
-// (dx, dy) is the pixel less the reference point, the point of the image nearest to the mean (reference_x, reference_y):
-// a mean far outside takes no digits either. No factor is above sqrt(log2(e) / 2 / 0.3) = 1.55 per px. In float, 64 bytes.
+// (dx, dy) is the pixel less (x, y), the point of the image nearest to the mean: a mean far outside takes no digits either.
+// No factor is above sqrt(log2(e) / 2 / 0.3) = 1.55 per px. In float, 64 bytes: a line of cache.
 template <class T>
 struct Splat {
-    double u, v;                                       // mean, px
+    T u, v;                                            // mean, px
+    T x, y;
     T sx, sy, ty;
     T s0, t0;
     T log2_o;

@@ -20,20 +20,21 @@ void project(const ProjectArgs<T> &args, int64_t block) {
         if (!project_shape(args.scene, args.camera, args.settings, i, g)) continue;
         Shade<T> shade;
         Splat<T> s;
-        const double u = screen_x(g, args.camera), v = screen_y(g, args.camera);
-        const double log2_o = log_(g.opacity * g.compensation) * LOG2E;
-        const double level = vmax((log2_o - LOG2_ALPHA_MIN) * (2 / LOG2E), 0.0);
-        const double ex = sqrt_(level * g.a), ey = sqrt_(level * g.c);
-        const bool inside = ceil_(u - ex) <= args.camera.W - 1 && floor_(u + ex) >= 0 &&
-                            ceil_(v - ey) <= args.camera.H - 1 && floor_(v + ey) >= 0;
+        const Position<T> at = position<T>(g, args.camera);
+        s.u = T(at.u), s.v = T(at.v), s.x = at.x, s.y = at.y;
+        s.log2_o = log_(T(g.opacity * g.compensation)) * T(LOG2E);
+        const T level = vmax((s.log2_o - T(LOG2_ALPHA_MIN)) * T(2 / LOG2E), T(0));
+        s.extent[0] = sqrt_(level * T(g.a)), s.extent[1] = sqrt_(level * T(g.c));
+        const T rim_x = s.extent[0] + rim_slack(abs_(s.u) + s.extent[0]), rim_y = s.extent[1] + rim_slack(abs_(s.v) + s.extent[1]);
+        const bool inside = ceil_(s.u - rim_x) <= T(args.camera.W - 1) && floor_(s.u + rim_x) >= 0 &&
+                            ceil_(s.v - rim_y) <= T(args.camera.H - 1) && floor_(s.v + rim_y) >= 0;
         if (!inside || !project_color(args.scene, args.settings, i, g, shade)) continue;
         // d' Sigma2d^-1 d = (c / det) (dx - b/c dy)² + dy² / c
-        const double sx = sqrt_(LOG2E / 2 * g.c / g.det), sy = -g.b / g.c * sx, ty = sqrt_(LOG2E / 2 / g.c);
-        s.u = u, s.v = v, s.extent[0] = T(ex), s.extent[1] = T(ey);
+        const double inverse_c = 1 / g.c;
+        const double sx = sqrt_(LOG2E / 2 * g.c * g.inverse_det), sy = -g.b * inverse_c * sx, ty = sqrt_(LOG2E / 2 * inverse_c);
         s.sx = T(sx), s.sy = T(sy), s.ty = T(ty);
-        const double dx = double(reference_x(s, args.camera)) - u, dy = double(reference_y(s, args.camera)) - v;
+        const double dx = double(at.x) - at.u, dy = double(at.y) - at.v;
         s.s0 = T(sx * dx + sy * dy), s.t0 = T(ty * dy);
-        s.log2_o = T(log2_o);
         for (int k = 0; k < 3; ++k) s.color[k] = args.scene.quats ? vmax(shade.color[k], T(0)) : shade.color[k];
         s.depth = T(g.p[2]);
         args.splats[i] = s;

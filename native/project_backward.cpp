@@ -14,7 +14,7 @@ struct ShapeGradient {
 
 // From the moments of h. With K = Sigma2d^-1, dL/dSigma2d = -K G K, G the gradient of K; and antialiasing's share.
 GSPLAT_INLINE ShapeGradient shape_gradient(const Projected &g, const Settings &set, const double *slot) {
-    const double A = g.c / g.det, B = -g.b / g.det, C = g.a / g.det;
+    const double A = g.c * g.inverse_det, B = -g.b * g.inverse_det, C = g.a * g.inverse_det;
     const double gA = -slot[HXX] / 2, gB = -slot[HXY] / 2, gC = -slot[HYY] / 2;  // gB: half of dL/dB, one of two places
     const double m00 = gA * A + gB * B, m01 = gA * B + gB * C, m10 = gB * A + gC * B, m11 = gB * B + gC * C;
     ShapeGradient d{-(A * m00 + B * m10), -2 * (A * m01 + B * m11), -(B * m01 + C * m11)};
@@ -129,9 +129,8 @@ GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
 // Moves the moments of h from the reference point to the mean, e away: sum h (x + e)² = sum h x² + 2 e sum h x + e² sum h.
 template <class T>
 GSPLAT_INLINE void moments_about_mean(const Camera &cam, const Projected &g, const T *sums, double *slot) {
-    Splat<T> s;
-    s.u = screen_x(g, cam), s.v = screen_y(g, cam);
-    const double ex = double(reference_x(s, cam)) - s.u, ey = double(reference_y(s, cam)) - s.v;
+    const Position<T> at = position<T>(g, cam);
+    const double ex = double(at.x) - at.u, ey = double(at.y) - at.v;
     for (int j = 0; j < SLOT; ++j) slot[j] = double(sums[j]);
     slot[HXX] += ex * (2 * slot[HX] + ex * slot[H]);
     slot[HYY] += ey * (2 * slot[HY] + ey * slot[H]);
@@ -153,7 +152,7 @@ void one(const ProjectBackwardArgs<T> &args, int64_t i) {
 
     double slot[SLOT];
     moments_about_mean(args.camera, g, sums, slot);
-    const double A = g.c / g.det, B = -g.b / g.det, C = g.a / g.det;
+    const double A = g.c * g.inverse_det, B = -g.b * g.inverse_det, C = g.a * g.inverse_det;
     const double uv[2] = {A * slot[HX] + B * slot[HY], B * slot[HX] + C * slot[HY]};
     const double nx = uv[0] * args.camera.W / 2, ny = uv[1] * args.camera.H / 2;
     args.grads.means2d_norm[i] = T(sqrt_(nx * nx + ny * ny));

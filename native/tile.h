@@ -25,9 +25,9 @@ struct RowTerms {
 };
 
 template <class T>
-GSPLAT_INLINE void row_terms(const Splat<T> &s, const TileBox &box, T y, RowTerms<T> &terms) {
+GSPLAT_INLINE void row_terms(const Splat<T> &s, const TileBox &box, RowTerms<T> &terms) {
     for (int row = 0; row < TILE; ++row) {
-        const T dy = T(row + box.y0) - y, t = s.t0 + s.ty * dy;
+        const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;
         terms.base[row] = s.log2_o - t * t, terms.shift[row] = s.sy * dy;
     }
 }
@@ -57,7 +57,7 @@ GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t c
     T u[BATCH], v[BATCH], sx[BATCH], sy[BATCH], ty[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
     for (uint32_t i = 0; i < BATCH; ++i) {
         const Splat<T> &s = splats[pairs[i < count ? i : 0].gaussian];
-        u[i] = T(s.u - box.x0), v[i] = T(s.v - box.y0);
+        u[i] = s.u - T(box.x0), v[i] = s.v - T(box.y0);
         sx[i] = s.sx, sy[i] = s.sy, ty[i] = s.ty, ex[i] = s.extent[0], ey[i] = s.extent[1];
         drop[i] = s.log2_o - T(LOG2_ALPHA_MIN);
     }
