@@ -17,7 +17,7 @@ from torch import Tensor
 from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, DILATION, SH_OFFSET, Z_NEAR
 from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.gaussians import Gaussians, check_tensor, cov3d_t
+from gsplat_edu.gaussians import Gaussians, check_tensor, quat_to_R_t
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.sh import basis_terms, num_coefficients
@@ -37,7 +37,7 @@ class _Screen(NamedTuple):
     """The visible splats in the image, near to far."""
 
     means2d: Float[Tensor, "M 2"]
-    conics: Float[Tensor, "M 3"]  # inverse of the dilated 2D covariance: xx, xy, yy, px^-2
+    ellipses: Float[Tensor, "M 3"]  # A, m, C: d' Sigma2d^-1 d = A (dx - m dy)² + C dy², Sigma2d dilated
     visible: Int64[Tensor, " M"]
     depths: Float[Tensor, " M"]
     variances: Float[Tensor, "M 2"]  # xx and yy of the dilated 2D covariance, px^2
@@ -145,8 +145,8 @@ def render_dense(
     gaussians.check_finite()
     degree = min(settings.sh_degree, gaussians.sh_degree)
     colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
-    cov3ds = cov3d_t(gaussians.log_scales, gaussians.quats)
-    screen = _project(gaussians.means, cov3ds, camera, settings.jacobian_limit)
+    factors = quat_to_R_t(gaussians.quats) * torch.exp(gaussians.log_scales)[:, None, :]
+    screen = _project(gaussians.means, factors, camera, settings.jacobian_limit, factored=True)
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     opacities = gaussians.opacities[screen.visible]
@@ -190,13 +190,13 @@ def _composite(
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
     """Mix C channels on zero, near to far; returns them and the final transmittance."""
     # Empty sums tie the image to the inputs, so that backward gives zeros when nothing is visible.
-    tie = sum(tensor[:0].sum() for tensor in (screen.means2d, screen.conics, colors, opacities))
+    tie = sum(tensor[:0].sum() for tensor in (screen.means2d, screen.ellipses, colors, opacities))
     dtype, device = colors.dtype, colors.device
     image = torch.zeros(cam.H, cam.W, colors.shape[1], dtype=dtype, device=device) + tie
     T = torch.ones(cam.H, cam.W, dtype=dtype, device=device)
     for start in range(0, len(screen.visible), chunk):
         part = slice(start, start + chunk)
-        alpha = _alpha(screen.means2d[part], screen.conics[part], opacities[part], cam, alpha_min)
+        alpha = _alpha(screen.means2d[part], screen.ellipses[part], opacities[part], cam, alpha_min)
         T_after = T * torch.cumprod(1.0 - alpha, dim=0)
         T_before = torch.cat([T[None], T_after[:-1]], dim=0)
         image = image + torch.einsum("nyx,nc->yxc", T_before * alpha, colors[part])
@@ -229,10 +229,13 @@ def _check(
 
 def _project(
     means: Float[Tensor, "N 3"],
-    cov3ds: Float[Tensor, "N 3 3"],
+    shapes: Float[Tensor, "N 3 3"],
     cam: Camera,
     jacobian_limit: float | None = None,
+    *,
+    factored: bool = False,
 ) -> _Screen:
+    """Project; `shapes` are covariances, or where `factored` M = R S of Sigma = M M', which keeps thin ones' digits."""
     R = torch.tensor(cam.R, dtype=means.dtype, device=means.device)
     means_cam = (means - torch.tensor(cam.eye, dtype=means.dtype, device=means.device)) @ R.T
     visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]
@@ -244,26 +247,34 @@ def _project(
     x_z, y_z = (x / z).clamp(x_low, x_high), (y / z).clamp(y_low, y_high)
     rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
     JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
-    cov2d = JW @ cov3ds[visible] @ JW.mT
-    a, b, c = cov2d[:, 0, 0] + DILATION, cov2d[:, 0, 1], cov2d[:, 1, 1] + DILATION
-    det = a * c - b * b
-    conics = torch.stack([c, -b, a], dim=-1) / det[:, None]
-    det_before = cov2d[:, 0, 0] * cov2d[:, 1, 1] - b * b
+    if factored:
+        rows_of_M = JW @ shapes[visible]
+        cov2d = rows_of_M @ rows_of_M.mT
+        # |r0 x r1|² = a c - b² without the cancellation.
+        normal = torch.linalg.cross(rows_of_M[:, 0], rows_of_M[:, 1])
+        det_before = (normal * normal).sum(dim=-1)
+    else:
+        cov2d = JW @ shapes[visible] @ JW.mT
+        det_before = cov2d[:, 0, 0] * cov2d[:, 1, 1] - cov2d[:, 0, 1] ** 2
+    a0, b, c0 = cov2d[:, 0, 0], cov2d[:, 0, 1], cov2d[:, 1, 1]
+    a, c = a0 + DILATION, c0 + DILATION
+    det = det_before + DILATION * (a0 + c0) + DILATION * DILATION
+    ellipses = torch.stack([c / det, b / c, 1 / c], dim=-1)
     compensation = torch.sqrt(det_before.clamp(min=DET_FLOOR) / det)
-    return _Screen(means2d, conics, visible, z, torch.stack([a, c], dim=-1), compensation)
+    return _Screen(means2d, ellipses, visible, z, torch.stack([a, c], dim=-1), compensation)
 
 
 def _alpha(
     means2d: Float[Tensor, "k 2"],
-    conics: Float[Tensor, "k 3"],
+    ellipses: Float[Tensor, "k 3"],
     opacities: Float[Tensor, " k"],
     cam: Camera,
     alpha_min: float,
 ) -> Float[Tensor, "k H W"]:
     u, v = (axis[:, None, None] for axis in means2d.unbind(-1))
-    A, B, C = (axis[:, None, None] for axis in conics.unbind(-1))
+    A, m, C = (axis[:, None, None] for axis in ellipses.unbind(-1))
     dx = torch.arange(cam.W, dtype=means2d.dtype, device=means2d.device) - u
     dy = torch.arange(cam.H, dtype=means2d.dtype, device=means2d.device)[:, None] - v
-    power = -0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy
+    power = -0.5 * A * (dx - m * dy) ** 2 - 0.5 * C * dy * dy
     alpha = (opacities[:, None, None] * torch.exp(power)).clamp(max=ALPHA_MAX)
     return alpha * (alpha >= alpha_min)
