@@ -47,6 +47,10 @@ GSPLAT_INLINE T dot3(const T *a, const T *b) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
+GSPLAT_INLINE void cross3(const double *a, const double *b, double *out) {
+    out[0] = a[1] * b[2] - a[2] * b[1], out[1] = a[2] * b[0] - a[0] * b[2], out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
 // R(q) of a unit quaternion (w, x, y, z), row by row.
 template <class T>
 GSPLAT_INLINE void rotation(const T *q, T *R) {
@@ -114,7 +118,7 @@ struct Projected {
     bool clamped[2];                          // whether they were
     double t0[3], t1[3];                      // rows of J W
     double q[4], inverse_q_norm, R[9], s[3];  // unit quaternion, 1 / its length before, rotation, scales
-    double r0[3], r1[3];                      // rows of J W M, M = R S
+    double r0[3], r1[3], n[3];                // rows of J W M, M = R S, and their cross product
     double a0, b0, c0, det0;                  // covariance on the screen before the dilation
     double a, b, c, det, inverse_det;         // and after
     double opacity, compensation;             // opacity without the compensation of antialiasing, and that factor
@@ -169,10 +173,12 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
             g.r1[k] = (g.t1[0] * g.R[k] + g.t1[1] * g.R[3 + k] + g.t1[2] * g.R[6 + k]) * g.s[k];
         }
         g.a0 = dot3(g.r0, g.r0), g.b0 = dot3(g.r0, g.r1), g.c0 = dot3(g.r1, g.r1);
-        // |r0 x r1|² = a0 c0 - b0² without the cancellation.
-        const double n0 = g.r0[1] * g.r1[2] - g.r0[2] * g.r1[1], n1 = g.r0[2] * g.r1[0] - g.r0[0] * g.r1[2];
-        const double n2 = g.r0[0] * g.r1[1] - g.r0[1] * g.r1[0];
-        g.det0 = n0 * n0 + n1 * n1 + n2 * n2;
+        // |n|² = a0 c0 - b0² without the cancellation; nor is n taken from r0 and r1, which are as good as parallel for a needle.
+        double flat[3];
+        cross3(g.t0, g.t1, flat);
+        for (int k = 0; k < 3; ++k)
+            g.n[k] = g.s[(k + 1) % 3] * g.s[(k + 2) % 3] * (g.R[k] * flat[0] + g.R[3 + k] * flat[1] + g.R[6 + k] * flat[2]);
+        g.det0 = dot3(g.n, g.n);
         g.opacity = double(1 / (1 + exp_(-scene.logit_opacities[i])));
     } else {
         double S[9];

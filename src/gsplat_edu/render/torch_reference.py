@@ -145,8 +145,8 @@ def render_dense(
     gaussians.check_finite()
     degree = min(settings.sh_degree, gaussians.sh_degree)
     colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
-    factors = quat_to_R_t(gaussians.quats) * torch.exp(gaussians.log_scales)[:, None, :]
-    screen = _project(gaussians.means, factors, camera, settings.jacobian_limit, factored=True)
+    R, scales = quat_to_R_t(gaussians.quats), torch.exp(gaussians.log_scales)
+    screen = _project(gaussians.means, R * scales[:, None, :], camera, settings.jacobian_limit, factors=(R, scales))
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     opacities = gaussians.opacities[screen.visible]
@@ -233,9 +233,9 @@ def _project(
     cam: Camera,
     jacobian_limit: float | None = None,
     *,
-    factored: bool = False,
+    factors: tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]] | None = None,
 ) -> _Screen:
-    """Project; `shapes` are covariances, or where `factored` M = R S of Sigma = M M', which keeps thin ones' digits."""
+    """Project; `shapes` are covariances, or M = R S of Sigma = M M' where the factors are given: thin ones keep digits."""
     R = torch.tensor(cam.R, dtype=means.dtype, device=means.device)
     means_cam = (means - torch.tensor(cam.eye, dtype=means.dtype, device=means.device)) @ R.T
     visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]
@@ -247,11 +247,13 @@ def _project(
     x_z, y_z = (x / z).clamp(x_low, x_high), (y / z).clamp(y_low, y_high)
     rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
     JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
-    if factored:
+    if factors is not None:
         rows_of_M = JW @ shapes[visible]
         cov2d = rows_of_M @ rows_of_M.mT
-        # |r0 x r1|² = a c - b² without the cancellation.
-        normal = torch.linalg.cross(rows_of_M[:, 0], rows_of_M[:, 1])
+        # |n|² = a c - b² without the cancellation, n the cross product of the rows of J W R S, by way of that of J W.
+        axes, (s0, s1, s2) = factors[0][visible], factors[1][visible].unbind(-1)
+        normal = torch.linalg.cross(JW[:, 0], JW[:, 1])[:, None, :] @ axes
+        normal = normal[:, 0] * torch.stack([s1 * s2, s2 * s0, s0 * s1], dim=-1)
         det_before = (normal * normal).sum(dim=-1)
     else:
         cov2d = JW @ shapes[visible] @ JW.mT
