@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, LAMBDA_FLOOR, T_STOP, TILE, Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussian_math import project_cov3d
@@ -21,6 +21,10 @@ from gsplat_edu.validation import ArrayLike, first_index, float64_array, in_rang
 Extent = Literal["box3sigma", "exact"]
 Stop = Literal["box", "tile", "none"]
 Box = tuple[slice, slice]
+
+RESOLVED = 16 * np.finfo(np.float64).eps
+"""Smallest ratio of the variances across and along an ellipse whose inverse is still a number to rely on. A float64
+covariance holds its smaller variance to about eps times the larger one; at sixteen times that, digits are left."""
 
 COV_TOLERANCE = 1e-6
 """How far a covariance may be from symmetric and positive, as a fraction of its trace: room for float32."""
@@ -35,7 +39,7 @@ class Projection(NamedTuple):
 
 
 def render_gaussians(
-    cam: Camera,
+    cam: CameraLike,
     means: ArrayLike,
     cov3ds: ArrayLike,
     colors: ArrayLike,
@@ -53,7 +57,8 @@ def render_gaussians(
     image = sum_i T_i alpha_i c_i + T_final bg,  T_i = product over j nearer than i of (1 - alpha_j)
 
     Args:
-        cam: The camera; pixels are sampled at integer coordinates.
+        cam: The camera: a `Camera`, or anything with its members (`CameraLike`); pixels are sampled at integer
+            coordinates.
         means: (N, 3) centres, world units.
         cov3ds: (N, 3, 3) covariances, world units squared, symmetric and positive semi-definite.
         colors: (N, 3) any range.
@@ -71,10 +76,13 @@ def render_gaussians(
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: NaN or infinite numbers, an opacity outside 0 to 1, a covariance that is not one.
+        ArgumentError: NaN or infinite numbers, an opacity outside 0 to 1, a covariance that is not one, `cam` is no
+            camera, or a Gaussian in front of it whose ellipse float64 cannot hold: off the range of its numbers,
+            or so thin for its length that its inverse is noise. The message has the Gaussian's number.
 
     Source: Kerbl et al. 2023, eq. 2-5; Zwicker et al. 2001 for the projection.
     """
+    cam = as_camera("cam", cam)
     means, cov3ds, colors, opacities = _checked(means, cov3ds, colors, opacities)
     bg, z_near = float64_array("bg", bg, (3,)), in_range("z_near", z_near, 0.0)
     one_of("extent", extent, ("box3sigma", "exact"))
@@ -88,6 +96,11 @@ def render_gaussians(
         T = transmittance[box]
         if T.size == 0 or (stop == "box" and T.max() < T_STOP):
             continue
+        if np.linalg.det(cov2d) <= RESOLVED * np.trace(cov2d) ** 2:
+            raise ArgumentError(
+                f"cov3ds[{i}]: is {np.sqrt(np.trace(cov2d)):.2g} px long on the screen and too thin for its inverse "
+                "to be more than rounding in float64; leave this Gaussian out or make it smaller"
+            )
         alpha = _alpha(mean2d, cov2d, opacities[i], box)
         if stop == "tile":
             alpha = np.where(_in_live_tile(padded, box), alpha, 0.0)
@@ -111,10 +124,13 @@ def _checked(
     opacities = float64_array("opacities", opacities, ("N",), sizes)
     if np.any(outside := (opacities < 0) | (opacities > 1)):
         raise ArgumentError(f"opacities{first_index(outside)}: is outside 0 to 1")
-    trace = np.abs(np.trace(cov3ds, axis1=1, axis2=2))
+    with np.errstate(over="ignore"):
+        trace = np.abs(np.trace(cov3ds, axis1=1, axis2=2))
     skew = np.abs(cov3ds - np.swapaxes(cov3ds, 1, 2)).max(axis=(1, 2), initial=0.0)
-    smallest = np.linalg.eigvalsh(cov3ds)[:, 0]
-    if np.any(improper := (skew > COV_TOLERANCE * trace) | (smallest < -COV_TOLERANCE * trace)):
+    # Of the covariance over its trace, which neither overflows nor fails to converge.
+    unit = np.where(trace > 0, trace, 1.0)
+    smallest = np.linalg.eigvalsh(cov3ds / unit[:, None, None])[:, 0]
+    if np.any(improper := (skew > COV_TOLERANCE * trace) | (smallest < -COV_TOLERANCE)):
         raise ArgumentError(f"cov3ds{first_index(improper)}: is not symmetric and positive semi-definite")
     return means, cov3ds, colors, opacities
 
@@ -130,13 +146,22 @@ def project(
 
     Sigma2d = J W Sigma W' J' + 0.3 I
     """
-    means_cam = cam.world_to_cam(means)
-    index = np.flatnonzero(means_cam[:, 2] > z_near)
-    index = index[np.argsort(means_cam[index, 2], kind="stable")]
-    u, v, _ = cam.project(means_cam[index])
-    cov2d = project_cov3d(
-        cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit
-    ) + DILATION * np.eye(2)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is named below
+        means_cam = cam.world_to_cam(means)
+        fits = np.isfinite(means_cam).all(axis=1)
+        if not fits.all():
+            raise ArgumentError(f"means{first_index(~fits)}: is too far from the camera for float64")
+        index = np.flatnonzero(means_cam[:, 2] > z_near)
+        index = index[np.argsort(means_cam[index, 2], kind="stable")]
+        u, v, _ = cam.project(means_cam[index])
+        cov2d = project_cov3d(
+            cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit
+        ) + DILATION * np.eye(2)
+        # As _box and _alpha use it: the determinant, and the squares of distances.
+        fits = np.isfinite(u * u + v * v + np.trace(cov2d, axis1=1, axis2=2) ** 2)
+    if not fits.all():
+        i = index[np.argmin(fits)]
+        raise ArgumentError(f"means[{i}], cov3ds[{i}]: are too large on the screen for float64")
     return Projection(index, np.stack([u, v], axis=-1), cov2d)
 
 
