@@ -26,7 +26,8 @@ def written_aside(path: Path) -> Iterator[Path]:
         OSError: the folder cannot be made or written to. What stood under `path` before is untouched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    prefix = f".{path.stem}.{os.getpid()}-"  # the writer's process: remove_leftovers asks whether it still runs
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
     os.close(handle)
     aside = Path(name)
     try:
@@ -51,14 +52,33 @@ def named_failure(path: Path) -> Iterator[None]:
         raise
 
 
-_LEFTOVER = re.compile(r"\..+\.[a-z0-9_]{8}\.[a-z]+")  # as mkstemp names them in written_aside
+_LEFTOVER = re.compile(r"\..*\.(\d+)-[a-z0-9_]{8}(?:\.[^.]+)?")  # temporary names of written_aside
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove what `written_aside` left behind in a folder and below when its process was killed."""
-    for path in folder.rglob(".*"):
-        if path.is_file() and _LEFTOVER.fullmatch(path.name):
+def remove_leftovers(folder: Path, *, below: bool = True) -> None:
+    """Remove temporary files of `written_aside` whose process was killed; those of a running process stay.
+
+    Args:
+        folder: Where to look; it need not exist.
+        below: Look in all folders below as well.
+    """
+    for path in folder.rglob(".*") if below else folder.glob(".*"):
+        match = _LEFTOVER.fullmatch(path.name)
+        if match and path.is_file() and not path.is_symlink() and not _runs(int(match[1])):
             path.unlink(missing_ok=True)
+
+
+def _runs(pid: int) -> bool:
+    """Say whether a process is running; on Windows, where asking with signal 0 would end it, always."""
+    if os.name == "nt" or pid == os.getpid():
+        return True
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def check_folder(name: str, path: Path) -> None:

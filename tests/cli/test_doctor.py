@@ -1,5 +1,7 @@
 import dataclasses
 import os
+import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +48,7 @@ def test_a_clean_capture_fits_on_a_screen_and_ends_with_advice(doctor, capture):
     lines = said.splitlines()
     assert code == 0 and len(lines) <= 24 and "warning" not in said
     assert "COLMAP: 24 photos of 64x48; 200 points" in said
-    assert lines[-4] == "what to do:" and lines[-3] == f"  1. train: gsplat-edu train {folder} --out RUN"
+    assert lines[-4] == "what to do:" and lines[-3] == f"  1. train: gsplat-edu train {folder} --out out/capture"
 
 
 def test_faults_are_named_and_the_exit_code_stays_0(doctor, capture, tmp_path):
@@ -119,6 +121,60 @@ def run(capture, tmp_path_factory):
     dataset = load_dataset(folder, DataSettings(test_every=6))
     made.write_cameras(dataset.train, dataset.test)
     return made
+
+
+def pasted(said):
+    """The commands of an output, as a shell would split them."""
+    lines = [line.partition("gsplat-edu ") for line in said.splitlines()]
+    return [shlex.split(words) for _, found, words in lines if found]
+
+
+def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
+    """CAPTURE and RUN stood for names, and those with a blank or a quote were not quoted."""
+    monkeypatch.chdir(tmp_path)
+    place = Path("it's a $(place) & more")
+    shutil.copytree(capture[0], place / "capture one")
+    shutil.copytree(run.path, place / "run; one")
+    config = run.read_config()
+    data = config["data"] | {"path": str((place / "capture one").resolve()), "resolution": 40.0}
+    RunFolder(place / "run; one").write_config(config | {"data": data, "train": {"iterations": 30}})
+    said = [doctor(place / "capture one", "--no-forecast")[1], doctor(place / "run; one")[1]]
+    commands = [words for text in said for words in pasted(text)]
+    assert {words[0] for words in commands} >= {"train", "render"} and len(commands) >= 5
+    for words in commands:
+        parsed = command_line.build_parser(words).parse_args(words)
+        assert parsed.command == words[0]
+        # what is there, or the folder that the command before would make
+        assert (str(place) in words[1] and Path(words[1]).exists()) or words == ["doctor", "out/capture one"]
+        assert "RUN" not in words and "CAPTURE" not in words
+    renders = next(words for words in commands if words[0] == "render")
+    assert command_line.main([*renders, "--frames", "2"]) == 0 and Path("orbit.mp4").is_file()
+    longer = next(words for words in commands if "30000" in words)
+    assert longer[longer.index("--resolution") + 1] == "40"
+    assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_30000").is_dir()
+
+
+def test_a_proposed_folder_is_a_new_one(doctor, capture, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out" / "capture").mkdir(parents=True)
+    assert f"train {capture[0]} --out out/capture_2" in doctor(capture[0], "--no-forecast")[1]
+
+
+def test_an_exposure_jump_is_named_before_and_after_training(doctor, capture, run, tmp_path):
+    """A photo 0.7 stops brighter: the warning was gone once a scene fitted it."""
+    _, views, points, colors = capture
+    jumped = [
+        View(v.camera, np.clip(v.image * (1.25 if i == 3 else 1.0), 0, 255).astype(np.uint8), name=v.name)
+        for i, v in enumerate(views)
+    ]
+    write_colmap(tmp_path / "capture", jumped, points, colors)
+    shutil.copytree(run.path, tmp_path / "run")
+    config = run.read_config()
+    data = config["data"] | {"path": str(tmp_path / "capture")}
+    RunFolder(tmp_path / "run").write_config(config | {"data": data})
+    for said in (doctor(tmp_path / "capture", "--no-forecast")[1], doctor(tmp_path / "run")[1]):
+        lines = [line for line in said.splitlines() if line.startswith("warning    exposure")]
+        assert any("view_003.png" in line for line in lines), said
 
 
 def test_a_run_is_judged(doctor, run):

@@ -1,4 +1,9 @@
 import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
 
 import cv2
 import numpy as np
@@ -51,6 +56,7 @@ def test_a_run_is_rendered_as_an_orbit_into_its_folder(made, cli, capsys):
     printed = capsys.readouterr().out
     path = folder.renders / "orbit.mp4"
     assert printed.splitlines()[-1].startswith(f"wrote {path}: 3 images of ") and "32x24" in printed
+    assert printed.startswith("the cameras stand all round: a full circle\n")
     video = cv2.VideoCapture(str(path))
     frames = [video.read() for _ in range(4)]
     assert [read for read, _ in frames] == [True] * 3 + [False]
@@ -89,9 +95,10 @@ def test_a_datasets_cameras_a_size_and_a_background_can_be_asked_for(made, cli, 
     assert image.shape == (48, 64, 3) and (image[0, 0] == 255).all()
 
 
-def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path):
+def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, capsys):
     bare = made[2]
     assert cli(["render", str(bare), "--frames", "2", "--size", "40", "--out", "frames"]) == 0
+    assert "does not say from where it was photographed: a full circle" in capsys.readouterr().out
     image = pixels(tmp_path / "frames" / "frame_0001.png").astype(int).sum(axis=2)
     assert image.shape == (40, 40) and image[15:25, 15:25].min() > 0
     assert cli(["render", str(bare), "--frames", "2", "--size", "40"]) == 0
@@ -109,16 +116,57 @@ def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path):
         (["BARE", "--fps", "-1"], "--fps: is -1"),
         (["BARE", "--backend", "abacus"], "backend 'abacus'"),
         (["BARE", "--dataset", "."], "is no capture"),
+        (["BARE", "--out", "x.gif"], "x.gif: GIF is not written here; give a video (.mp4) or a folder of PNGs"),
     ],
 )
-def test_mistakes_are_one_line(made, cli, capsys, arguments, says):
+def test_mistakes_are_one_line(made, cli, capsys, tmp_path, arguments, says):
     words = [str(made[2]) if word == "BARE" else word for word in arguments]
     assert cli(["render", *words]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and says in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cameras_of_one_side_get_no_full_circle(made, cli, capsys, tmp_path):
+    """Three cameras of six, 60 degrees apart: half of the frames of a full circle would show what no photo saw."""
+    folder, _, bare, views = made
+    run = RunFolder(tmp_path / "run")
+    run.write_config(folder.read_config() | {"origin": [0.0, 0.0, 0.0]})
+    save_ply(run.scene(1), load_ply(bare))
+    run.write_cameras(views[:3], [])
+    assert cli(["render", str(run.path), "--frames", "4", "--out", "frames"]) == 0
+    assert "the cameras cover 1" in (said := capsys.readouterr().out), said
+    assert "degrees: the path swings over those, no farther\n" in said
 
 
 def test_help_shows_an_example(cli, capsys):
     with pytest.raises(SystemExit):
         cli(["render", "--help"])
     assert "example: gsplat-edu render " in capsys.readouterr().out
+
+
+@pytest.mark.own_process
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_a_render_that_is_ended_leaves_no_temporary_file(made, cli, tmp_path, number):
+    """SIGTERM left one; what SIGKILL leaves goes with the next render."""
+    (tmp_path / ".mine.original.mp4").write_text("a user's own hidden file")
+    program = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
+    words = ["render", str(made[2]), "--size", "64", "--out", str(tmp_path / "x.mp4")]
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *words, "--frames", "3000"],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while process.poll() is None and not list(tmp_path.glob(".x.*.mp4")):
+        time.sleep(0.05)
+    process.send_signal(number)
+    said = process.communicate()[1]
+    left = {path.name for path in tmp_path.iterdir()} - {".mine.original.mp4"}
+    if number == signal.SIGKILL:
+        assert len(left) == 1
+        assert cli([*words, "--frames", "2"]) == 0
+        left = {path.name for path in tmp_path.iterdir()} - {".mine.original.mp4", "x.mp4"}
+    else:
+        assert process.returncode == 130 and said.count("\n") == 1, said
+    assert left == set()

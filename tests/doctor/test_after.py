@@ -10,7 +10,7 @@ import torch
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
-from gsplat_edu.doctor.finding import Severity
+from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.gaussians import Gaussians
@@ -45,7 +45,7 @@ def noisy(image, sigma, seed):
 
 def trained(gaussians, views, **changes):
     train, test = (residuals(gaussians, part, RENDER, BACKGROUND) for part in (views[4:], views[:4]))
-    run = Trained(Path("runs/a"), gaussians, 3.5, train, test, 7000, 7000)
+    run = Trained(Path("runs/a"), gaussians, 3.5, train, test, 30_000, 30_000)
     return replace(run, **changes)
 
 
@@ -191,7 +191,7 @@ def test_splats_larger_than_all(scene, share, is_named):
 
 
 @pytest.mark.parametrize(
-    ("reached", "planned", "is_named"), [(7000, 7000, False), (7000, None, False), (70, 7000, True)]
+    ("reached", "planned", "is_named"), [(30_000, 30_000, False), (30_000, None, False), (70, 7000, True)]
 )
 def test_a_training_that_did_not_end(scene, reached, planned, is_named):
     gaussians, views = scene
@@ -203,3 +203,58 @@ def test_an_empty_scene_is_no_obstacle(scene):
     gaussians, views = scene
     empty = gaussians.map(lambda tensor: tensor[:0])
     assert "splats" in warnings(trained(empty, views))
+
+
+def evaluations(reached, gain, count=8):
+    """A log whose test PSNR rises to that of the scene, 34 dB; its last quarter gains so many decibels."""
+    iterations = [reached * i // count for i in range(1, count)]
+    return [{"iteration": i, "loss": 0.1, "psnr": None} for i in iterations] + [
+        {"iteration": i, "psnr": 34.0 - gain - 3.0 * (0.75 - i / reached) * (i < 0.75 * reached)} for i in iterations
+    ]
+
+
+@pytest.mark.parametrize(
+    ("reached", "gain", "severity", "says"),
+    [
+        (1500, 1.0, Severity.WARNING, "1,500 iterations; the recipe has 30,000, and the test views' PSNR was still rising"),
+        (1500, None, Severity.WARNING, "1,500 iterations; the recipe has 30,000"),
+        (1500, -1.0, Severity.NOTE, "but the test views' PSNR no longer rises"),
+        (30_000, 1.0, None, ""),
+    ],
+)
+def test_a_short_training_is_not_fine(scene, reached, gain, severity, says):
+    """1,500 of 30,000 iterations were "length: fine", and "a better scene needs better photos"."""
+    gaussians, views = scene
+    log = [] if gain is None else evaluations(reached, gain)
+    run = trained(gaussians, views, reached=reached, planned=reached, log=log, capture=Path("a b/$c"))
+    measured = np.mean([view.psnr for view in run.test])
+    assert abs(measured - 34.0) < 0.5, "or the gains above are others"
+    diagnosis = examine_run(run)
+    found = [finding for finding in diagnosis.findings if finding.name == "short training"]
+    assert [finding.severity for finding in found] == ([] if severity is None else [severity])
+    assert ("length" in diagnosis.fine) is (severity is None)
+    if found:
+        assert found[0].sentence.endswith(says)
+    advice = " ".join([*diagnosis.advice, *diagnosis.otherwise])
+    longer = "gsplat-edu train 'a b/$c' --iterations 30000 --out out/a_30000"
+    assert (longer in advice) is (severity is Severity.WARNING)
+    assert ("better photos" in advice) is (severity is not Severity.WARNING)
+
+
+@pytest.mark.parametrize(("factor", "rising"), [(0.8, True), (1.0, False)])
+def test_without_test_views_the_loss_says_whether_it_still_falls(scene, factor, rising):
+    gaussians, views = scene
+    log = [{"iteration": i, "loss": 0.1 * (factor if i > 900 else 1.0)} for i in range(10, 1001, 10)]
+    run = trained(gaussians, views, test=[], reached=1000, planned=1000, log=log)
+    assert run.rising is rising
+    assert replace(run, log=[]).rising is None
+
+
+def test_what_the_photos_show_before_training_is_not_gone_after_it(scene):
+    """A scene fits photos of differing exposure; its renders are then as bright as they are."""
+    gaussians, views = scene
+    before = Finding("exposure", Severity.WARNING, "1 of 12 photos", "fix it", ("a.jpg (+0.6)",))
+    diagnosis = examine_run(trained(gaussians, views, beforehand=[before]))
+    (found,) = (finding for finding in diagnosis.findings if finding.name == "exposure")
+    assert found.images == before.images and found.severity is Severity.WARNING
+    assert found.sentence.startswith("1 of 12 photos; the scene fits them") and "exposure" not in diagnosis.fine

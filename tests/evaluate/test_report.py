@@ -1,14 +1,17 @@
 import base64
 import io
+import shlex
+import shutil
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import gsplat_edu.evaluate.report as report_module
 from gsplat_edu.evaluate.figures import run_curves_figure, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, summarize
-from gsplat_edu.evaluate.report import Picture, Report, machine_facts, write_report
+from gsplat_edu.evaluate.report import SCRIPT, Picture, Report, machine_facts, verdict, write_report
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
@@ -18,13 +21,14 @@ class Page(HTMLParser):
 
     def __init__(self, path):
         super().__init__()
-        self.open, self.references, self.words, self.tags = [], [], [], []
+        self.open, self.references, self.words, self.tags, self.handlers = [], [], [], [], []
         self.feed(path.read_text("utf-8"))
         self.close()
         assert self.open == []
 
     def handle_starttag(self, tag, attributes):
         self.tags.append(tag)
+        self.handlers += [key for key, _ in attributes if key.startswith("on")]
         self.references += [
             value for key, value in attributes if key in ("src", "href", "xlink:href", "data")
         ]
@@ -75,7 +79,9 @@ def test_a_page_is_whole_and_needs_nothing_else(tmp_path):
     write_report(path, full_report())
     page = Page(path)
     assert path.read_text("utf-8").startswith("<!DOCTYPE html>")
-    assert "script" not in page.tags and "link" not in page.tags
+    # one script, our own, which a policy can name by its hash; no handler in an attribute of ours
+    assert page.tags.count("script") == 1 and f"<script>{SCRIPT}</script>" in path.read_text("utf-8")
+    assert "link" not in page.tags and not page.handlers
     assert page.references and all(r.startswith(("data:", "#")) for r in page.references)
     assert "url(http" not in path.read_text("utf-8")
     assert page.tags.count("svg") == 1 and page.tags.count("img") == 3 * 8
@@ -83,8 +89,8 @@ def test_a_page_is_whole_and_needs_nothing_else(tmp_path):
         "<run> & co",
         "a<b>\"c'&d",
         "<script>alert(1)</script> note",
-        "1234",
-        "61.5",
+        "1,234",
+        "1 min 2 s",
         "data.background",
     ):
         assert said in page.text, said
@@ -109,7 +115,125 @@ def test_pictures_are_render_photo_and_difference(tmp_path):
     assert Image.open(io.BytesIO(Picture.of("b", big, big).panels[0][1])).size == (640, 360)
     write_report(tmp_path / "r.html", Report("t", {}, scores=[score("a", 20.0)], pictures=[picture("a", 50)]))
     sources = Page(tmp_path / "r.html").references
-    assert base64.b64decode(sources[0].removeprefix("data:image/jpeg;base64,")) == render
+    assert base64.b64decode(sources[0].removeprefix("data:image/jpeg;base64,")) == photo
+    assert base64.b64decode(sources[1].removeprefix("data:image/jpeg;base64,")) == render
+
+
+@pytest.mark.parametrize(("step", "times"), [(0, 16), (3, 16), (15, 16), (16, 8), (60, 4), (127, 2), (128, 1), (200, 1)])
+def test_differences_are_bright_enough_to_see_and_say_by_how_much(step, times):
+    """The difference of a good render, a few steps of 255, was black."""
+    title, data = Picture.of(
+        "a", np.full((30, 40, 3), step, np.uint8), np.zeros((30, 40, 3), np.uint8)
+    ).panels[2]
+    assert title == ("difference" if times == 1 else f"difference, {times} times as bright")
+    assert np.array(Image.open(io.BytesIO(data))).mean() == pytest.approx(step * times, abs=1)
+
+
+def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
+    """The evaluation at the end is in the metrics, not in the log."""
+    drawn = []
+    monkeypatch.setattr(report_module, "run_curves_figure", lambda log: drawn.append(log))
+    log = [{"iteration": i, "loss": 0.1} for i in (1, 2, 3)] + [{"iteration": 2, "psnr": 20.0}]
+    metrics = {"test": {"psnr": 25.0, "num_images": 1}, "iterations": 3}
+    for lines in (log, [*log, {"iteration": 3, "psnr": 24.0}]):
+        write_report(tmp_path / "r.html", Report("t", metrics, lines))
+        evaluations = [(line["iteration"], line["psnr"]) for line in drawn.pop() if "psnr" in line]
+        assert evaluations == [(2, 20.0), (3, 25.0)]
+
+
+@pytest.mark.parametrize(
+    ("test", "train", "says"),
+    [
+        (31.0, 32.0, ["held out are matched at 31.0 dB", "look very close to them", "1.0 dB below the training photos;"]),
+        (26.0, 25.5, ["26.0 dB", "look close to them", "0.5 dB above the training photos"]),
+        (21.0, 29.5, ["soft or partly wrong", "8.5 dB below", "so the scene has overfitted to those"]),
+        (15.0, None, ["15.0 dB", "look wrong in places"]),
+        (None, 30.0, ["trained on are matched at 30.0 dB", "no photo was held out"]),
+        (None, None, ["Nothing was judged"]),
+    ],
+)
+def test_the_verdict_is_a_sentence_from_the_numbers(tmp_path, test, train, says):
+    metrics = {"iterations": 1500}
+    metrics |= {k: {"psnr": v, "num_images": 2} for k, v in (("test", test), ("train", train)) if v is not None}
+    scores = [score("<i>low</i>", 12.5), score("high", 40.0)] if test is not None else []
+    sentence = verdict(metrics, scores)
+    assert all(words in sentence for words in says), sentence
+    assert sentence.count(". ") == 0 and sentence.endswith(".") and sentence[0].isupper()
+    if scores:
+        assert "the worst is <i>low</i> at 12.5 dB" in sentence and sentence.startswith("After 1,500 iterations ")
+    write_report(tmp_path / "r.html", Report("t", metrics, scores=scores))
+    assert sentence in Page(tmp_path / "r.html").text and "<i>" not in (tmp_path / "r.html").read_text()
+
+
+def test_the_page_is_linked_or_the_command_that_makes_it_is_named(tmp_path):
+    folder = tmp_path / "a run's <folder>"
+    write_report(folder / "report.html", Report("t", {"exports": [{"path": str(tmp_path / "gone.html")}]}))
+    page = Page(folder / "report.html")
+    (command,) = (words for words in page.words if words.startswith("gsplat-edu"))
+    assert shlex.split(command) == ["gsplat-edu", "convert", str(folder), str(folder / "page.html")]
+    (tmp_path / "my page.html").write_text("")
+    write_report(folder / "report.html", Report("t", {"exports": [{"path": str(tmp_path / "my page.html")}]}))
+    assert Page(folder / "report.html").references == ["../my%20page.html"]
+    (folder / "page.html").write_text("")
+    write_report(folder / "report.html", Report("t", {}))
+    assert Page(folder / "report.html").references == ["page.html"]
+
+
+def test_the_machine_is_stated_once_and_the_configuration_is_folded(tmp_path):
+    config = {"machine": machine_facts(), "train": {"seed": 1}}
+    write_report(tmp_path / "r.html", Report("t", {}, config=config))
+    page = Page(tmp_path / "r.html")
+    assert page.text.count(machine_facts()["torch"]) == 1 and "machine." not in page.text
+    text = (tmp_path / "r.html").read_text()
+    assert text.index("<details>") < text.index("train.seed") < text.index("</details>")
+    write_report(tmp_path / "r.html", Report("t", {}, config={"machine": {"processor": "<another>"}}))
+    text = Page(tmp_path / "r.html").text
+    assert "Machine of the training processor <another>" in text and "Machine of this report" in text
+
+
+@pytest.mark.parametrize("width", [1440, 390])
+def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_path, width):
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed")
+    scores = [score("a_rather_long_folder_name/with_a_photo_0001.jpg", 20.0), score('" onload="alert(1)', 30.0)]
+    pictures = [picture(each.name, 150) for each in scores]
+    config = {"data": {"path": "/a/very/long/path" * 9}}
+    metrics = {"test": summarize(scores), "train": summarize(scores), "num_gaussians": 1234567}
+    write_report(tmp_path / "r.html", Report("t", metrics, config=config, scores=scores, pictures=pictures))
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        context = browser.new_context(viewport={"width": width, "height": 800}, has_touch=True)
+        tab, complaints = context.new_page(), []
+        tab.on("console", lambda message: complaints.append(message.text))
+        tab.on("dialog", lambda dialog: complaints.append(dialog.message))
+        tab.goto((tmp_path / "r.html").as_uri())
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width
+        tab.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width
+        # a number has one line: its cell is as high as one
+        heights = tab.evaluate("[...document.querySelectorAll('td.n')].map((e) => e.getClientRects()[0].height)")
+        lines = tab.evaluate(
+            "[...document.querySelectorAll('td.n')].map((e) => {const r = document.createRange();"
+            " r.selectNodeContents(e); return r.getClientRects().length; })"
+        )
+        assert len(heights) == 18 and set(lines) == {1}
+        at = "getComputedStyle(document.querySelector('.pair')).getPropertyValue('--at')"
+        slider = tab.locator(".pair input").first
+        slider.focus()
+        assert tab.evaluate(at) == "50%"
+        tab.keyboard.press("ArrowRight")
+        assert tab.evaluate(at) == "51%"
+        box = slider.bounding_box()
+        tab.touchscreen.tap(box["x"] + 0.2 * box["width"], box["y"] + 0.5 * box["height"])
+        assert abs(float(tab.evaluate(at).rstrip("%")) - 20) < 4
+        # the photo, 200, is left of the line and the render, 150, right of it
+        shot = np.array(Image.open(io.BytesIO(tab.locator(".pair").first.screenshot())))
+        row = shot[shot.shape[0] // 2, :, 0].astype(int)
+        assert abs(row[int(0.1 * len(row))] - 200) < 4 and abs(row[int(0.6 * len(row))] - 150) < 4
+        assert complaints == []
+        browser.close()
 
 
 def test_nothing_to_show_is_a_page_too(tmp_path):

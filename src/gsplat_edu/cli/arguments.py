@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 from gsplat_edu.errors import SplatError
@@ -85,7 +88,8 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
         Exit code: 0; 2 for bad input or a file that cannot be written; 130 when interrupted.
     """
     try:
-        command()
+        with _terminable():
+            command()
     except KeyboardInterrupt as interruption:
         print(f"{program}: {str(interruption) or 'interrupted'}", file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -95,3 +99,20 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
         print(f"{program}: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
     return 0
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does, so that it removes its temporary files."""
+    if threading.current_thread() is not threading.main_thread():  # only the main one may set handlers
+        yield
+        return
+
+    def end(number: int, frame: object) -> NoReturn:
+        raise KeyboardInterrupt("terminated")
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -15,7 +16,8 @@ from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.before import examine
-from gsplat_edu.doctor.finding import Diagnosis, advice_lines, diagnosis_lines, table_lines
+from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosis_lines, table_lines
+from gsplat_edu.doctor.looks import check_exposure
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.errors import ArgumentError, DatasetError
@@ -128,8 +130,47 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     section = config.get("train")
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
-    trained = Trained(folder.path, gaussians, extent, train, test, reached, planned)
+    capture = arguments.dataset or Path(config["data"]["path"])
+    trained = Trained(
+        folder.path,
+        gaussians,
+        extent,
+        train,
+        test,
+        reached,
+        planned,
+        log=folder.log(),
+        capture=capture,
+        options=_options(config),
+        beforehand=_exposure_beforehand(capture, console),
+    )
     return examine_run(trained), view_lines(trained) if arguments.all_views else ()
+
+
+def _options(config: dict[str, Any]) -> tuple[str, ...]:
+    """Return the options of a run that a longer one should have too: what it reads, and how much it may hold."""
+    section = config.get("train")
+    train = section if isinstance(section, dict) else {}
+    named = {
+        "--resolution": config["data"].get("resolution"),
+        "--points": config["data"].get("points"),
+        "--strategy": train.get("strategy"),
+        "--max-gaussians": train.get("max_gaussians"),
+    }
+    given = ((flag, f"{value:g}" if isinstance(value, float) else str(value)) for flag, value in named.items() if value)
+    flags = ("--antialiased",) if train.get("antialiased") else ()
+    return (*(word for pair in given for word in pair), *flags)
+
+
+def _exposure_beforehand(capture: Path, console: Console) -> list[Finding]:
+    """Look at the photos' exposure as before training; where they cannot be compared there is nothing to say."""
+    with _bar(console) as bar:
+        task = bar.add_task("photos", total=None)
+        try:
+            survey = prepare(capture, lambda done, total: bar.update(task, completed=done, total=total))
+        except DatasetError:
+            return []
+        return check_exposure(survey) if len(survey.shots) > 1 else []
 
 
 def _bar(console: Console) -> Progress:

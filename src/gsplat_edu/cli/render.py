@@ -19,8 +19,9 @@ from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.images import write_frames
-from gsplat_edu.evaluate.paths import orbit_of_scene, orbit_path, resized
+from gsplat_edu.evaluate.following import path_along
+from gsplat_edu.evaluate.images import check_output, write_frames
+from gsplat_edu.evaluate.paths import orbit_of_scene, resized
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import SOG_META, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
@@ -50,12 +51,14 @@ class Shot:
         cameras: One per image.
         names: File names of the images in a folder; None numbers them.
         settings: How to render.
+        says: What path the cameras take, and why; "" where they are the dataset's.
     """
 
     gaussians: Gaussians
     cameras: Sequence[Camera]
     names: Sequence[str] | None
     settings: RenderSettings
+    says: str = ""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,13 +72,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="render from the run's cameras, or from those of the dataset PATH",
     )
     parser.add_argument(
-        "--orbit", action="store_true", help="render an orbit around what the cameras look at (default)"
+        "--orbit",
+        action="store_true",
+        help="render a path that shows the scene from where it was photographed: a full circle if the cameras stand all"
+        " round, else only as far as they go (default)",
     )
 
     def number(flag: str, default: int | None, text: str) -> None:
         parser.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
 
-    number("--frames", 120, "frames of the orbit (default: 120)")
+    number("--frames", 120, "frames of the path (default: 120)")
     number(
         "--size",
         None,
@@ -86,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         metavar="DIR|X.mp4",
-        help="folder of PNGs, or a video (default: renders/ in the run, out/ for a scene file)",
+        help="folder of PNGs, or a video that browsers play, VP9 in MP4 (default: renders/ in the run, out/ for a scene file)",
     )
     parser.add_argument(
         "--white-background", action="store_true", help="render over white (default: the run's background)"
@@ -101,6 +107,8 @@ def run(arguments: argparse.Namespace) -> None:
         whole_number(f"--{name}", getattr(arguments, name), 1)
     if arguments.size is not None:
         whole_number("--size", arguments.size, 1)
+    if arguments.out is not None:
+        check_output(arguments.out)
     folder = RunFolder(arguments.source)
     orbit = arguments.orbit or arguments.dataset is None
     if folder.exists():
@@ -116,6 +124,8 @@ def run(arguments: argparse.Namespace) -> None:
     else:
         raise ArgumentError(f"{arguments.source}: is not there; give the folder of a run, or a scene file")
     console = Console(highlight=False, markup=False)
+    if shot.says:
+        console.print(shot.says, soft_wrap=True)
     started = time.perf_counter()
     frames = track(
         _frames(replace(shot, gaussians=shot.gaussians.to(device_of(backend))), backend),
@@ -159,7 +169,8 @@ def _file_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
     cameras = orbit_of_scene(
         scene.gaussians, arguments.frames, arguments.size or SCENE_SIZE, scene.up or WORLD_UP
     )
-    return Shot(scene.gaussians, cameras, None, settings)
+    says = "a scene file does not say from where it was photographed: a full circle; --dataset PATH follows the photos"
+    return Shot(scene.gaussians, cameras, None, settings, says)
 
 
 def _dataset_shot(
@@ -183,14 +194,15 @@ def _shot(
     orbit: bool,
 ) -> Shot:
     cameras = [camera for _, camera in named]
-    names = None
+    names, says = None, ""
     if orbit:
-        cameras = orbit_path(cameras, arguments.frames, _depth(gaussians, cameras[0]))
+        path = path_along(cameras, arguments.frames, _depth(gaussians, cameras[0]))
+        cameras, says = path.cameras, path.says
     else:
         names = image_file_names([name for name, _ in named])
     if arguments.size is not None:
         cameras = [resized(camera, arguments.size) for camera in cameras]
-    return Shot(gaussians, cameras, names, settings)
+    return Shot(gaussians, cameras, names, settings, says)
 
 
 def _settings(settings: RenderSettings, arguments: argparse.Namespace) -> RenderSettings:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, counted
+from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, command, counted, new_run
 from gsplat_edu.doctor.residuals import Residual
+from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.train.config import RECIPE_ITERATIONS
 
 POOR = 20.0
 """Mean PSNR of the training views, dB, below which a scene explains nothing well: a tenth of the range is wrong in the
@@ -23,9 +26,12 @@ error."""
 UNEXPLAINED_SPREAD = 3.0
 """It has to be so many standard deviations below as well, by the median absolute deviation."""
 
-GAP = 5.0
-"""Decibels between training and test views from which the scene knows its photos by heart. After 2,000 iterations a
-capture of 97 photos had 2, one of 11 had 9, and one of 50 with random start points 12."""
+RISING = 0.1
+"""Decibels that the test views' PSNR has to gain over the last quarter of a training for more of it to be worth the time."""
+
+FALLING = 0.97
+"""A loss still falls if its mean over the last tenth of a training is below this times that of the tenth that ends a
+quarter before the end. Used where no views were held out."""
 
 JUMP = 0.5
 """Difference of a photo's brightness to the scene's from which it is told, stops. Photos in which half the scene is in
@@ -59,6 +65,10 @@ class Trained:
         test: Residuals of the views held out.
         reached: Iterations that were taken.
         planned: Iterations that were meant to be taken; None where the run does not say.
+        log: Lines of the run's log.
+        capture: The capture it was trained on; None where nobody knows.
+        options: Further options of the training that a longer one should have, as words of a command.
+        beforehand: What the doctor finds in the photos' exposure without looking at the scene.
     """
 
     path: Path
@@ -68,6 +78,34 @@ class Trained:
     test: Sequence[Residual]
     reached: int
     planned: int | None
+    log: Sequence[Mapping[str, Any]] = ()
+    capture: Path | None = None
+    options: tuple[str, ...] = ()
+    beforehand: Sequence[Finding] = ()
+
+    @property
+    def rising(self) -> bool | None:
+        """Whether the scene was still getting better when the training ended; None where nothing says so."""
+        scores = _pairs(self.log, "psnr", self.reached)
+        if self.test:
+            scores = [pair for pair in scores if pair[0] < self.reached] + [(self.reached, _mean(self.test))]
+        earlier = [value for iteration, value in scores if iteration <= 0.75 * self.reached]
+        if earlier and self.test:
+            return scores[-1][1] - max(earlier[-2:]) >= RISING
+        losses = _pairs(self.log, "loss", self.reached)
+        last, before = (
+            [value for iteration, value in losses if low < iteration / self.reached <= high]
+            for low, high in ((0.9, 1.0), (0.65, 0.75))
+        )
+        return float(np.mean(last)) < FALLING * float(np.mean(before)) if last and before else None
+
+
+def _pairs(log: Sequence[Mapping[str, Any]], key: str, reached: int) -> list[tuple[int, float]]:
+    """Return iteration and value of the lines that have both, in order."""
+    pairs = ((line.get("iteration"), line.get(key)) for line in log)
+    return sorted(
+        (i, float(v)) for i, v in pairs if isinstance(i, int) and i <= reached and isinstance(v, int | float)
+    )
 
 
 def examine_run(run: Trained) -> Diagnosis:
@@ -91,12 +129,29 @@ def examine_run(run: Trained) -> Diagnosis:
         findings += found
         if not found:
             fine.append(name)
-    otherwise = (
-        f"look at it: gsplat-edu render {run.path} --orbit --out orbit.mp4",
-        f"a smaller file: gsplat-edu convert {run.path} scene.spz --min-opacity {FAINT}",
-        "a better scene needs better photos: gsplat-edu doctor CAPTURE tells of them",
+    return Diagnosis(_facts(run), tuple(findings), tuple(fine), _otherwise(run))
+
+
+def _otherwise(run: Trained) -> tuple[str, ...]:
+    """Return advice for scenes with little to mend."""
+    longer = run.reached < RECIPE_ITERATIONS and run.rising is not False
+    return (
+        f"look at it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}",
+        f"a smaller file: {command('convert', run.path, 'scene.spz', '--min-opacity', str(FAINT))}",
+        _train_longer(run) if longer else f"a better scene needs better photos{_what_photos_lack(run)}",
     )
-    return Diagnosis(_facts(run), tuple(findings), tuple(fine), otherwise)
+
+
+def _what_photos_lack(run: Trained) -> str:
+    return "" if run.capture is None else f"; what these lack: {command('doctor', run.capture)}"
+
+
+def _train_longer(run: Trained) -> str:
+    if run.capture is None:
+        return f"train for {RECIPE_ITERATIONS:,} iterations, as the recipe does"
+    name = f"{run.path.resolve().name}_{RECIPE_ITERATIONS}"
+    words = ("train", run.capture, "--iterations", str(RECIPE_ITERATIONS), *run.options, "--out", new_run(name))
+    return f"train for longer: {command(*words)}"
 
 
 def view_lines(run: Trained) -> list[str]:
@@ -123,18 +178,28 @@ def _mean(views: Sequence[Residual]) -> float:
 
 
 def _length(run: Trained) -> list[Finding]:
-    if run.planned is None or run.reached >= run.planned:
+    if run.planned is not None and run.reached < run.planned:
+        what = f"the scene is that of iteration {run.reached:,} of {run.planned:,}"
+        advice = "let the training finish: repeat its command with --resume"
+        return [Finding("unfinished", Severity.WARNING, what, advice)]
+    if run.reached >= RECIPE_ITERATIONS:
         return []
-    what = f"the scene is that of iteration {run.reached:,} of {run.planned:,}"
-    advice = "let the training end: the command that began it, with --resume"
-    return [Finding("unfinished", Severity.WARNING, what, advice)]
+    what = f"{run.reached:,} iterations; the recipe has {RECIPE_ITERATIONS:,}"
+    if run.rising is False:
+        held = "the test views' PSNR no longer rises" if run.test else "the loss no longer falls"
+        advice = f"more iterations alone will not help much, better photos may{_what_photos_lack(run)}"
+        return [Finding("short training", Severity.NOTE, f"{what}, but {held}", advice)]
+    if run.rising:
+        what += ", and " + ("the test views' PSNR was still rising" if run.test else "the loss was still falling")
+    return [Finding("short training", Severity.WARNING, what, _train_longer(run))]
 
 
 def _fit(run: Trained) -> list[Finding]:
     if not run.train or _mean(run.train) >= POOR:
         return []
     what = f"the views of training have {_mean(run.train):.1f} dB in the mean: not even they are explained"
-    advice = "check poses and intrinsics (gsplat-edu doctor CAPTURE), then train for more iterations"
+    place = "" if run.capture is None else f": {command('doctor', run.capture)}"
+    advice = f"check poses and intrinsics{place}"
     return [Finding("poor fit", Severity.WARNING, what, advice)]
 
 
@@ -166,7 +231,7 @@ def _gap(run: Trained) -> list[Finding]:
     if not run.train or not run.test:
         return []
     gap = _mean(run.train) - _mean(run.test)
-    if gap < GAP:
+    if gap < OVERFITTED:
         return []
     what = f"test views are {gap:.1f} dB below those of training: the scene knows its {len(run.train)} photos by heart"
     advice = "take more photos, from between those there are; with these, stop earlier or cap --max-gaussians"
@@ -178,12 +243,19 @@ def _exposure(run: Trained) -> list[Finding]:
     # A scene that is not finished is too dark for all of them.
     usual = float(np.median([view.stops for view in views])) if views else 0.0
     off = sorted((v for v in views if abs(v.stops - usual) > JUMP), key=lambda v: -abs(v.stops - usual))
-    if not off:
-        return []
     names = tuple(f"{view.name} ({view.stops - usual:+.1f})" for view in off)
     what = f"{counted(len(off), 'photo')}, in stops against the scene"
     advice = "take out the photos whose exposure jumps, or make them even: the scene explains them with fog"
-    return [Finding("exposure", Severity.WARNING, what, advice, names)]
+    found = [Finding("exposure", Severity.WARNING, what, advice, names)] if off else []
+    # A scene that fits photos of differing exposure hides that they differ: what the photos themselves show counts too.
+    named = {view.name for view in off}
+    hidden = "the scene fits them all the same, by fog or by colours that change with the view"
+    found += [
+        replace(before, sentence=f"{before.sentence}; {hidden}")
+        for before in run.beforehand
+        if not before.images or any(image.rpartition(" (")[0] not in named for image in before.images)
+    ]
+    return found
 
 
 def _floaters(run: Trained) -> list[Finding]:
@@ -209,7 +281,7 @@ def _splats(run: Trained) -> list[Finding]:
         what = (
             f"{100 * faint:.0f} % of the splats have an opacity below {FAINT}: they cost time and hardly show"
         )
-        advice = f"leave out faint splats: gsplat-edu convert {run.path} scene.ply --min-opacity {FAINT}"
+        advice = f"leave out faint splats: {command('convert', run.path, 'scene.ply', '--min-opacity', str(FAINT))}"
         found.append(Finding("faint splats", Severity.NOTE, what, advice))
     sizes = run.gaussians.scales.amax(dim=1)
     huge = float(((sizes > run.extent) & (run.gaussians.opacities >= FAINT)).double().mean())

@@ -17,7 +17,7 @@ from gsplat_edu.doctor.cameras import (
 )
 from gsplat_edu.doctor.cloud import check_cloud
 from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable, is_missing
-from gsplat_edu.doctor.finding import Diagnosis, Finding
+from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.looks import check_blur, check_exposure, check_twins
 from gsplat_edu.doctor.survey import Survey
 
@@ -93,11 +93,18 @@ def _stand(survey: Survey) -> str:
 
 def _otherwise(survey: Survey) -> tuple[str, ...]:
     """Return advice for captures with little to mend."""
-    train = f"train: gsplat-edu train {survey.path} --out RUN"
-    short = "a first run of --iterations 3000 tells in minutes whether the poses are right"
+    place = survey.path.resolve()
+    name = place.name if place.is_dir() else place.parent.name  # transforms.json is in its capture's folder
+    out, short = new_run(name), new_run(f"{name}_3000")
     cloud = (
         ()
         if len(survey.points)
         else ("start points help: add those of structure from motion with --points X.ply",)
     )
-    return (train, *cloud, short, "judge the run afterwards: gsplat-edu doctor RUN")
+    return (
+        f"train: {command('train', survey.path, '--out', out)}",
+        *cloud,
+        "a short run shows in minutes whether the poses are right: "
+        + command("train", survey.path, "--iterations", "3000", "--out", short),
+        f"judge the run afterwards: {command('doctor', out)}",
+    )

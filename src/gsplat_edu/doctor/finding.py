@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from pathlib import Path
 
 ADVICE = 3
 """Pieces of advice a diagnosis ends with: more than three are not followed."""
@@ -76,6 +78,21 @@ class Diagnosis:
         slight = [finding.advice for finding in self.findings if finding.severity is Severity.NOTE]
         given = grave if self.hopeless else [*grave, *self.otherwise[:1], *slight, *self.otherwise[1:]]
         return list(dict.fromkeys(given))[:ADVICE]
+
+
+def command(*words: str | Path) -> str:
+    """Write a command of ours so that it can be pasted into a shell, whatever the names of files hold."""
+    # a file whose name begins with a dash would be taken for an option
+    spelled = [f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word) for word in words]
+    return shlex.join(["gsplat-edu", *spelled])
+
+
+def new_run(name: str) -> Path:
+    """Propose a folder for a run, out/NAME or out/NAME_2 and so on: one that is not there yet."""
+    proposed, copy = Path("out") / name, 2
+    while proposed.exists():
+        proposed, copy = Path("out") / f"{name}_{copy}", copy + 1
+    return proposed
 
 
 def counted(number: int, word: str) -> str:

@@ -26,7 +26,7 @@ SVG_FACTS = ("Creator", "Date", "Format", "Type")
 
 RUN_CURVES = (
     ("loss", "training loss", "loss of the iteration's view"),
-    ("psnr", "evaluations", "PSNR of the test views (dB)"),
+    ("psnr", "held-out views", "PSNR of the test views (dB)"),
     ("num_gaussians", "density control", "number of Gaussians"),
     ("ms", "speed", "ms per iteration"),
 )

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import to_bytes
-from gsplat_edu.files import written_aside
+from gsplat_edu.evaluate.video import encode_video
+from gsplat_edu.files import remove_leftovers, written_aside
 from gsplat_edu.validation import ArrayLike, check_shape, in_range
 
 SEPARATOR_WIDTH = 4
@@ -21,6 +21,11 @@ SEPARATOR_WIDTH = 4
 SEPARATOR_GREY = 128
 
 VIDEO_SUFFIX = ".mp4"
+
+NOT_WRITTEN = frozenset(
+    ".3gp .apng .avi .avif .bmp .flv .gif .jpeg .jpg .m4v .mkv .mov .mpeg .mpg .ogv .png .tif .tiff .webm .webp .wmv".split()
+)
+"""Suffixes of pictures and videos that are not written: nobody means a folder by them."""
 
 Frame = UInt8[np.ndarray, "H W 3"]
 
@@ -67,15 +72,36 @@ def side_by_side(images: Sequence[ArrayLike]) -> Frame:
     return np.concatenate(row, axis=1)
 
 
+def check_output(out: Path) -> None:
+    """Refuse a name that frames are not written to, before any is rendered.
+
+    Args:
+        out: As for `write_frames`.
+
+    Raises:
+        ArgumentError: it has the suffix of another format, is a folder but names a video, or the reverse.
+    """
+    formats = f"give a video ({VIDEO_SUFFIX}) or a folder of PNGs"
+    suffix = out.suffix.lower()
+    if suffix in NOT_WRITTEN and not out.is_dir():
+        raise ArgumentError(f"{out}: {suffix[1:].upper()} is not written here; {formats}")
+    if suffix == VIDEO_SUFFIX and out.is_dir():
+        raise ArgumentError(f"{out}: is a folder; {formats} under another name")
+    if suffix != VIDEO_SUFFIX and out.exists() and not out.is_dir():
+        raise ArgumentError(f"{out}: is a file; {formats}")
+
+
 def write_frames(
     out: Path, frames: Iterable[ArrayLike], fps: float = 30.0, names: Sequence[str] | None = None
 ) -> list[Path]:
     """Write frames as a video, or as PNGs in a folder.
 
+    Temporary files that a killed process left there are removed.
+
     Args:
-        out: A file that ends in .mp4 (video, mp4v), or a folder; it is made.
-        frames: (H, W, 3) each, uint8 or float from 0 to 1. They are taken one at a time. A video's are of one
-            size; an odd last row or column is cut off, which video formats ask for.
+        out: A file that ends in .mp4 (VP9, see `gsplat_edu.evaluate.video`), or a folder; it is made.
+        frames: (H, W, 3) each, uint8 or float from 0 to 1; taken one at a time. Those of a video have one size; an
+            odd side gets a copy of its last row or column.
         fps: Frames per second of a video.
         names: File names in a folder, one per frame; frame_0000.png and so on where None.
 
@@ -83,16 +109,17 @@ def write_frames(
         The files that were written.
 
     Raises:
-        ArgumentError: there are no frames, the sizes differ, the folder's name is a file, or the video cannot be
-            encoded here.
+        ArgumentError: there are no frames, the sizes differ, the name is of another format (see `check_output`), or
+            the video cannot be encoded here.
         OSError: a file cannot be written.
     """
+    check_output(out)
     if out.suffix.lower() == VIDEO_SUFFIX:
+        remove_leftovers(out.parent, below=False)
         with written_aside(out) as aside:
-            _encode(aside, out, frames, in_range("fps", fps, 0.0, open_low=True))
+            encode_video(aside, out, frames, in_range("fps", fps, 0.0, open_low=True))
         return [out]
-    if out.exists() and not out.is_dir():
-        raise ArgumentError(f"{out}: is a file; give a folder, or a name that ends in {VIDEO_SUFFIX}")
+    remove_leftovers(out, below=False)
     written = []
     for index, frame in enumerate(frames):
         written.append(out / (f"frame_{index:04d}.png" if names is None else names[index]))
@@ -100,39 +127,3 @@ def write_frames(
     if not written:
         raise ArgumentError("frames: is empty; give at least one")
     return written
-
-
-def _encode(aside: Path, out: Path, frames: Iterable[ArrayLike], fps: float) -> None:
-    writer: cv2.VideoWriter | None = None
-    size = (0, 0)
-    try:
-        for index, frame in enumerate(frames):
-            picture = to_bytes(frame)
-            if writer is None:
-                size = picture.shape[:2]
-                writer = _writer(aside, out, size, fps)
-            if picture.shape[:2] != size:
-                raise ArgumentError(
-                    f"{out}: frame {index} is {picture.shape[1]}x{picture.shape[0]}, but the first is"
-                    f" {size[1]}x{size[0]}; write a folder instead"
-                )
-            height, width = size[0] // 2 * 2, size[1] // 2 * 2
-            writer.write(np.ascontiguousarray(picture[:height, :width, ::-1]))  # OpenCV's order is BGR
-    finally:
-        if writer is not None:
-            writer.release()
-    if writer is None:
-        raise ArgumentError("frames: is empty; give at least one")
-
-
-def _writer(aside: Path, out: Path, size: tuple[int, int], fps: float) -> cv2.VideoWriter:
-    height, width = size[0] // 2 * 2, size[1] // 2 * 2
-    if not height or not width:
-        raise ArgumentError(f"{out}: frames of {size[1]}x{size[0]} are too small for a video; write a folder")
-    fourcc = cv2.VideoWriter.fourcc(*"mp4v")
-    writer = cv2.VideoWriter(str(aside), fourcc, fps, (width, height))
-    if not writer.isOpened():
-        raise ArgumentError(
-            f"{out}: OpenCV cannot encode mp4 at {width}x{height}, {fps:g} fps, here; write a folder of PNGs"
-        )
-    return writer

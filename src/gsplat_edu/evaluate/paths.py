@@ -1,4 +1,4 @@
-"""Camera paths to show a scene: orbits around what the cameras looked at."""
+"""Orbits around a scene that came without cameras, and what cameras have in common."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import WORLD_UP, Camera, look_at, point_nearest_axes, scaled_intrinsics
+from gsplat_edu.camera import WORLD_UP, Camera, scaled_intrinsics
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
@@ -43,47 +43,6 @@ ORBIT_MARGIN = 1.1
 
 MOST_EXTENT = 2.0
 """An orbit's extent is at most this many medians of the distance: beyond lies the background of a capture."""
-
-
-def orbit_path(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> list[Camera]:
-    """Make a closed orbit around what cameras look at, in whatever frame they stand.
-
-    The centre c is the point closest to all optical axes, min_c sum_i |(I - f_i f_i') (c - e_i)|^2. Up is the
-    direction most level for all cameras, min_u sum_i (r_i . u)^2 with r their right axes, or the mean of their up
-    directions where those do not fix it. Radius and elevation are the cameras' medians.
-
-    Args:
-        cameras: At least one. The first lends intrinsics and size, and the side from which the orbit starts.
-        frames: Cameras of the orbit, at least one; the first is not repeated at the end.
-        depth: Distance of the centre in front of the mean camera, world units, where the axes fix no point: one
-            camera, parallel ones, or cameras that look outwards.
-
-    Returns:
-        The cameras of the orbit; each has the centre at its principal point.
-
-    Raises:
-        ArgumentError: there is no camera, frames is not a whole number of at least 1, or depth is not positive.
-    """
-    if not cameras:
-        raise ArgumentError("cameras: is empty; give at least one")
-    frames = whole_number("frames", frames, 1)
-    depth = in_range("depth", depth, 0.0, open_low=True)
-    eyes = np.stack([camera.eye for camera in cameras])
-    up = common_up(cameras)
-    centre = _point_looked_at(cameras, depth)
-    offsets = eyes - centre
-    distances = np.linalg.norm(offsets, axis=1)
-    radius = float(np.median(distances))  # not 0: most cameras have the centre in front of them
-    away = distances > 0
-    sines = np.clip(offsets[away] @ up / distances[away], -1.0, 1.0)
-    elevation = float(np.median(np.arcsin(sines)))
-    # the orbit starts where the first camera stands; where that is straight above, on the side of its levellest axis
-    levellest = cameras[0].R[int(np.argmin(np.abs(cameras[0].R @ up)))]
-    start = _unit(_level(offsets[0] / radius, up), _level(levellest, up))
-    eyes_on_orbit = _circle(centre, up, start, radius, elevation, frames)
-    first = cameras[0]
-    intrinsics = (first.fx, first.fy, first.cx, first.cy, first.H, first.W)
-    return [Camera(look_at(eye, centre, up), eye, *intrinsics) for eye in eyes_on_orbit]
 
 
 def orbit_of_scene(gaussians: Gaussians, frames: int, size: int, up: ArrayLike = WORLD_UP) -> list[Camera]:
@@ -154,19 +113,6 @@ def common_up(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
     up: Vector = vectors[:, 0] if vectors[:, 0] @ mean > 0 else -vectors[:, 0]
     # the right axes have to span a plane, and the plane has to be the ground: some cameras may be held upright
     return up if values[1] > SPREAD and values[1] > 4 * values[0] and up @ mean > 0.7 else mean
-
-
-def _point_looked_at(cameras: Sequence[Camera], depth: float) -> Vector:
-    forwards = np.stack([camera.R[2] for camera in cameras])
-    eyes = np.stack([camera.eye for camera in cameras])
-    point = point_nearest_axes(cameras, PARALLEL)
-    if point is not None:
-        ahead = np.sum((point - eyes) * forwards, axis=1)
-        # most cameras have it in front, and do not stand in it
-        if np.median(ahead) > 1e-9 * np.abs(eyes).max():
-            return point
-    in_front: Vector = eyes.mean(axis=0) + depth * _unit(forwards.sum(axis=0), forwards[0])
-    return in_front
 
 
 def _circle(

@@ -1,0 +1,148 @@
+"""Videos that browsers play: VP9 in an MP4 file, its index in front of the frames.
+
+docs/decisions/0009-vp9-in-mp4.md says why it is not H.264.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.metrics import to_bytes
+from gsplat_edu.validation import ArrayLike
+
+FOURCC = "vp09"
+
+BT709, BT601 = 1, 6
+"""Codes of ISO/IEC 23091-2 for colour primaries, transfer function and matrix: sRGB's primaries are those of BT.709, and
+swscale, through which OpenCV converts to YUV, has the matrix of BT.601."""
+
+CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+"""Boxes on the way to the tables of an MP4 file's index."""
+
+VISUAL_ENTRY = 8 + 8 + 78
+"""Bytes of a sample description table in front of its codec's boxes: version and count, the one entry's header, and the
+fields that every visual entry has."""
+
+
+def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: float) -> None:
+    """Write frames as VP9, yuv420p, in an MP4 file. Equal frames give equal bytes.
+
+    An odd width or height is padded with a copy of the last column or row: chroma has half the resolution.
+
+    Args:
+        path: The file to write.
+        shown: What messages call it.
+        frames: (H, W, 3) each, of one size, uint8 or float from 0 to 1; taken one at a time.
+        fps: Frames per second.
+
+    Raises:
+        ArgumentError: there are no frames, their sizes differ, or OpenCV cannot encode VP9 here.
+        OSError: the file cannot be written.
+    """
+    writer: cv2.VideoWriter | None = None
+    size = (0, 0)
+    try:
+        for index, frame in enumerate(frames):
+            picture = to_bytes(frame)
+            if writer is None:
+                size = picture.shape[:2]
+                writer = _writer(path, shown, size, fps)
+            if picture.shape[:2] != size:
+                raise ArgumentError(
+                    f"{shown}: frame {index} is {picture.shape[1]}x{picture.shape[0]}, but the first is"
+                    f" {size[1]}x{size[0]}; write a folder instead"
+                )
+            padding = ((0, size[0] % 2), (0, size[1] % 2), (0, 0))
+            bgr = np.pad(picture, padding, mode="edge")[..., ::-1]  # OpenCV's order
+            writer.write(np.ascontiguousarray(bgr))
+    finally:
+        if writer is not None:
+            writer.release()
+    if writer is None:
+        raise ArgumentError("frames: is empty; give at least one")
+    path.write_bytes(streamable(path.read_bytes()))
+
+
+def _writer(path: Path, shown: Path, size: tuple[int, int], fps: float) -> cv2.VideoWriter:
+    height, width = (side + side % 2 for side in size)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), fps, (width, height))
+    if not writer.isOpened():
+        raise ArgumentError(
+            f"{shown}: OpenCV cannot encode VP9 at {width}x{height}, {fps:g} fps, here; write a folder of PNGs"
+        )
+    return writer
+
+
+def streamable(data: bytes) -> bytes:
+    """Put an MP4 file's index in front of its frames, and name the colours of its VP9 track.
+
+    With the index behind the frames a player has to fetch the whole file first. Without the colours' names browsers assume
+    BT.709's matrix, which turns (30, 220, 30) into (15, 190, 23).
+
+    Args:
+        data: The file.
+
+    Returns:
+        The file, of the same length.
+
+    Raises:
+        ArgumentError: it is not an MP4 file with an index, or too large for the index's 32-bit offsets.
+    """
+    boxes = {kind: (start, end) for kind, start, _, end in _boxes(data, 0, len(data))}
+    if not {b"ftyp", b"moov", b"mdat"} <= set(boxes):
+        raise ArgumentError("video: is not an MP4 file with an index; OpenCV's encoder failed, write a folder")
+    (_, front), (start, end) = boxes[b"ftyp"], boxes[b"moov"]
+    index = bytearray(data[start:end])
+    _name_colours(index)
+    if start > boxes[b"mdat"][0]:
+        _shift_offsets(index, end - start)
+    return data[:front] + index + data[front:start] + data[end:]
+
+
+def _boxes(data: bytes | bytearray, start: int, end: int) -> Iterator[tuple[bytes, int, int, int]]:
+    """Yield kind, start, start of the content, and end of the boxes of a stretch of an MP4 file."""
+    while start + 8 <= end:
+        length, kind = struct.unpack_from(">I4s", data, start)
+        header = 8
+        if length == 1:  # too long for 32 bits
+            (length,), header = struct.unpack_from(">Q", data, start + 8), 16
+        if length < header or start + length > end:
+            return
+        yield kind, start, start + header, start + length
+        start += length
+
+
+def _tables(index: bytearray, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """Yield kind, start of the content and end of all boxes of an index that hold no others."""
+    for kind, _, content, stop in _boxes(index, start, end):
+        if kind in CONTAINERS:
+            yield from _tables(index, content, stop)
+        elif kind == b"stsd":
+            yield from _tables(index, content + VISUAL_ENTRY, stop)
+        else:
+            yield kind, content, stop
+
+
+def _shift_offsets(index: bytearray, shift: int) -> None:
+    """Add what stands in front of the frames now to where the index says they are."""
+    for kind, content, _ in list(_tables(index, 0, len(index))):
+        if kind in (b"stco", b"co64"):
+            (count,) = struct.unpack_from(">I", index, content + 4)
+            form = f">{count}{'I' if kind == b'stco' else 'Q'}"
+            offsets = [offset + shift for offset in struct.unpack_from(form, index, content + 8)]
+            if kind == b"stco" and max(offsets, default=0) >= 2**32:
+                raise ArgumentError("video: is larger than 4 GiB; write a folder, or fewer or smaller frames")
+            struct.pack_into(form, index, content + 8, *offsets)
+
+
+def _name_colours(index: bytearray) -> None:
+    """Set the bytes of vpcC for primaries, transfer function and matrix; 4 of version and flags, 3 of format precede."""
+    for kind, content, _ in list(_tables(index, 0, len(index))):
+        if kind == b"vpcC":
+            index[content + 7 : content + 10] = bytes((BT709, BT709, BT601))

@@ -1,0 +1,236 @@
+"""Paths stay where the cameras were: every frame near a real view, smooth, closed; a full circle only of one."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.following import path_along, point_looked_at
+
+SUBJECT = np.array([3.0, -20.0, 7.0])
+UP = np.array([0.0, -1.0, 0.0])
+FRAMES = [np.eye(3), Rotation.random(random_state=1).as_matrix()]
+
+
+def placed(eye, target, up=UP):
+    return Camera(look_at(eye, target, up), eye, 80, 85, 30.5, 22.0, 48, 64)
+
+
+def around(azimuths, elevations, radius=2.5, frame=FRAMES[0], jitter=0.0):
+    """Cameras at azimuths and elevations in degrees around the subject; they look past it by about `jitter` degrees."""
+    rng = np.random.default_rng(0)
+    cameras = []
+    for azimuth, elevation in zip(np.radians(azimuths), np.radians(elevations), strict=True):
+        level = np.array([math.sin(azimuth), 0.0, -math.cos(azimuth)])
+        offset = radius * (math.cos(elevation) * level + math.sin(elevation) * UP)
+        aim = radius * math.radians(jitter) * rng.normal(size=3)
+        cameras.append(placed(SUBJECT + frame @ offset, SUBJECT + frame @ aim, frame @ UP))
+    return cameras
+
+
+def seen_from(path, frame=FRAMES[0]):
+    """Azimuth and elevation of a path's cameras around the subject, degrees, and their distance."""
+    offsets = np.stack([camera.eye - SUBJECT for camera in path.cameras]) @ frame
+    distances = np.linalg.norm(offsets, axis=1)
+    return (
+        np.degrees(np.arctan2(offsets[:, 0], -offsets[:, 2])),
+        np.degrees(np.arcsin(offsets @ UP / distances)),
+        distances,
+    )
+
+
+def off(path, cameras):
+    """Largest angle from the view of a frame to the nearest real one, degrees."""
+    axes = np.stack([camera.R[2] for camera in cameras])
+    cosines = np.stack([camera.R[2] for camera in path.cameras]) @ axes.T
+    return np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0))).max()
+
+
+def steps(path):
+    """How far each frame is from the next, the last from the first: place, and turn of the view."""
+    pairs = list(zip(path.cameras, path.cameras[1:] + path.cameras[:1], strict=True))
+    return np.array([(np.linalg.norm(b.eye - a.eye), np.linalg.norm(b.R - a.R)) for a, b in pairs])
+
+
+def check_smooth(cameras, depth=1.0):
+    """Four times the frames have a quarter of the step, anywhere on a smooth closed path; a jump would stay."""
+    few, many = (steps(path_along(cameras, frames, depth)).max(axis=0) for frames in (40, 160))
+    assert (many <= 0.35 * few + 1e-9).all()
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("count", [5, 8, 24])
+def test_cameras_all_round_get_a_full_circle(frame, count):
+    cameras = around(np.arange(count) * 360 / count, [20] * count, frame=frame)
+    path = path_along(cameras, 40)
+    assert "full circle" in path.says and len(path.cameras) == 40
+    azimuths, elevations, distances = seen_from(path, frame)
+    np.testing.assert_allclose(np.sort(np.diff(np.unwrap(np.radians(azimuths)))), math.radians(9) * np.sign(
+        np.unwrap(np.radians(azimuths))[-1] - np.radians(azimuths[0])), atol=1e-6)
+    np.testing.assert_allclose(elevations, 20, atol=1e-5)
+    np.testing.assert_allclose(distances, 2.5, rtol=1e-6)
+    np.testing.assert_allclose(path.cameras[0].eye, cameras[0].eye, atol=1e-5)
+    assert off(path, cameras) <= 180 / count + 1e-3, "half of the angle between neighbours"
+    check_smooth(cameras)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize(("extent", "count"), [(20, 4), (90, 12), (200, 40), (270, 30)])
+def test_an_arc_is_never_left(frame, extent, count):
+    """Two rows, 20 degrees apart; neighbours in a row are at most 2 extent / (count - 1) apart."""
+    azimuths = np.linspace(-extent / 2, extent / 2, count)
+    cameras = around(azimuths, [10, 30] * (count // 2), frame=frame, jitter=1)
+    path = path_along(cameras, 60)
+    assert "full circle" not in path.says
+    if extent > 20:
+        assert f"cover {extent} degrees" in path.says or f"cover {extent - 1} degrees" in path.says or (
+            f"cover {extent + 1} degrees" in path.says)
+    seen, elevations, distances = seen_from(path, frame)
+    # the centre is that of jittered axes: 1 degree each, less in the mean
+    assert np.abs(seen).max() <= extent / 2 + 1 and np.ptp(seen) > 0.85 * extent
+    # m + 0.85 s of a variable with two values is beyond them by 16 % of their distance at most, 3 degrees
+    assert elevations.min() > 10 - 4 and elevations.max() < 30 + 4
+    np.testing.assert_allclose(distances, 2.5, rtol=0.03)
+    between = 2 * extent / (count - 1)
+    assert off(path, cameras) < math.hypot(between / 2, 10) + 2
+    check_smooth(cameras)
+
+
+def test_a_hole_in_the_circle_is_not_crossed():
+    """Two sides of a thing were photographed, 100 degrees between them: the path stays on the side with more photos."""
+    cameras = around([*np.linspace(-50, 50, 15), *np.linspace(150, 210, 5)], [15] * 20)
+    azimuths, *_ = seen_from(path_along(cameras, 50))
+    assert np.abs(azimuths).max() <= 50
+
+
+def test_the_path_follows_distance_and_height():
+    """Near and low on one side, far and high on the other, as one walks around a statue on a slope."""
+    azimuths = np.arange(36) * 10.0
+    swing = np.cos(np.radians(azimuths))
+    cameras = [
+        around([a], [15 + 10 * s], radius=3 + s)[0] for a, s in zip(azimuths, swing, strict=True)
+    ]
+    found, elevations, distances = seen_from(path_along(cameras, 72))
+    # a Gaussian of 15 degrees takes exp(-0.26²/2) = 3.4 % off a swing of one period; ln r is not quite a cosine
+    np.testing.assert_allclose(elevations, 15 + 10 * np.cos(np.radians(found)), atol=0.5)
+    np.testing.assert_allclose(distances, 3 + np.cos(np.radians(found)), atol=0.12)
+
+
+def test_outliers_do_not_move_the_path():
+    good = around(np.linspace(0, 80, 24), [20] * 24, jitter=1)
+    far = [placed(SUBJECT + 20 * (camera.eye - SUBJECT), SUBJECT) for camera in around([200, 300], [5, 5])]
+    past = [placed(camera.eye, camera.eye - (SUBJECT - camera.eye)) for camera in around([150, 250, 330], [0] * 3)]
+    cameras = [*far, *good, *past]
+    assert np.linalg.norm(point_looked_at(cameras) - SUBJECT) < 0.05
+    azimuths, elevations, distances = seen_from(path_along(cameras, 40))
+    assert azimuths.min() > -2 and azimuths.max() < 82
+    assert np.abs(elevations - 20).max() < 2 and np.abs(distances - 2.5).max() < 0.1
+
+
+def grid(frame, turns=(0.0,), jitter=0.0, pitch=0.0):
+    """Parallel cameras on a grid of 6 by 4 world units, 1 apart; rows are turned about the view as given."""
+    rng = np.random.default_rng(0)
+    cameras = []
+    for row in range(5):
+        for column in range(7):
+            aim = np.array([*(jitter * rng.normal(size=2)), 1.0]) + np.array([0, pitch, 0])
+            turn = turns[row % len(turns)]
+            up = np.array([math.sin(turn), -math.cos(turn), 0.0])
+            eye = frame @ np.array([column - 3.0, row - 2.0, 0.0])
+            cameras.append(placed(eye, eye + frame @ aim, frame @ up))
+    return cameras
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("turns", [(0.0,), (0.0, math.pi)])
+@pytest.mark.parametrize("jitter", [0.0, 0.03])
+def test_cameras_that_look_one_way_get_a_loop_between_them(frame, turns, jitter):
+    """A wall, or fields from the air, strips flown to and fro. Views turn by 12 degrees at most; the jitter is 2 to 3."""
+    cameras = grid(frame, turns, jitter)
+    for depth in (1.0, 4.0, 100.0):
+        path = path_along(cameras, 40, depth)
+        assert "look one way" in path.says
+        eyes = np.stack([camera.eye for camera in path.cameras]) @ frame
+        assert np.abs(eyes[:, :2]).max() <= 3 + 1e-9
+        assert np.abs(eyes[:, 2]).max() < 0.5 and np.ptp(eyes[:, 0]) > 2
+        assert off(path, cameras) < 12 + 3
+        check_smooth(cameras, depth)
+
+
+def test_aerial_photos_that_look_down_on_one_place():
+    """From 80 to 90 degrees of elevation azimuth says nothing: the path is a loop above the place."""
+    cameras = around(np.arange(20) * 130.0, np.linspace(80, 89, 20))
+    path = path_along(cameras, 30)
+    _, elevations, _ = seen_from(path)
+    assert elevations.min() > 79 and "loop" in path.says
+    assert off(path, cameras) < 5
+    check_smooth(cameras)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.5])
+@pytest.mark.parametrize(("extent", "closed"), [(360, True), (120, False)])
+def test_a_panorama_turns_on_the_spot(radius, extent, closed):
+    angles = np.radians(np.arange(0, extent, 10))
+    ahead = [np.array([math.sin(a), 0.0, math.cos(a)]) for a in angles]
+    cameras = [placed(SUBJECT + radius * f, SUBJECT + (radius + 1) * f) for f in ahead]
+    path = path_along(cameras, 36, 3.0)
+    assert ("round and round" in path.says) is closed
+    assert max(np.linalg.norm(camera.eye - SUBJECT) for camera in path.cameras) <= radius + 1e-9
+    assert off(path, cameras) <= 5 + 1e-6, "half of the angle between neighbours"
+    turned = np.degrees(np.arccos(np.clip([c.R[2] @ ahead[0] for c in path.cameras], -1, 1)))
+    assert turned.max() > (170 if closed else 90)
+    check_smooth(cameras, 3.0)
+
+
+def test_a_walk_is_followed():
+    """Along a corridor, round a corner and on: photos ahead, half a unit and 10 degrees apart at most."""
+    places = [(0.0, 0.0, 0.5 * i) for i in range(20)]
+    places += [(0.5 * i, 0.0, 10.0) for i in range(20)]
+    ways = [0.0] * 15 + list(np.radians(np.linspace(0, 90, 10))) + [math.pi / 2] * 15
+    cameras = [
+        placed(np.array(p), np.array(p) + (math.sin(w), 0.0, math.cos(w))) for p, w in zip(places, ways, strict=True)
+    ]
+    path = path_along(cameras, 80, 2.0)
+    eyes, real = (np.stack([camera.eye for camera in group]) for group in (path.cameras, cameras))
+    distances = np.linalg.norm(eyes[:, None] - real, axis=2).min(axis=1)
+    assert distances.max() < 0.5 and off(path, cameras) < 10
+    assert np.linalg.norm(np.ptp(eyes, axis=0)) > 12, "nearly all of it, which is 10 by 10"
+    check_smooth(cameras, 2.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_cameras_get_a_small_loop(count):
+    """Parallel ones 0.2 apart, 4 units from the scene: half axes are 0.03 of 4 at least, 0.1 times 1.2 at most."""
+    R = FRAMES[1]
+    cameras = [Camera(R, R[0] * 0.2 * i, 50, 50, 10, 10, 21, 21) for i in range(count)]
+    path = path_along(cameras, 12, 4.0)
+    middle = R[0] * 0.1 * (count - 1)
+    away = [np.linalg.norm(camera.eye - middle) for camera in path.cameras]
+    assert 0.11 < max(away) <= 0.25
+    assert off(path, cameras) < math.degrees(0.25 / 4) + 0.1
+    check_smooth(cameras, 4.0)
+
+
+def test_two_cameras_that_look_at_one_thing():
+    cameras = around([0, 40], [10, 10])
+    path = path_along(cameras, 20, 2.0)
+    azimuths, *_ = seen_from(path)
+    assert azimuths.min() > -5 and azimuths.max() < 45 and off(path, cameras) < 22
+    check_smooth(cameras, 2.0)
+
+
+def test_equal_cameras_are_no_obstacle():
+    cameras = around([0, 0, 0, 0], [10] * 4)
+    assert off(path_along(cameras, 5, 2.0), cameras) < 3
+
+
+def test_no_camera_or_no_frame_is_refused():
+    with pytest.raises(ArgumentError, match="number of cameras: is 0"):
+        path_along([], 3)
+    with pytest.raises(ArgumentError, match="frames: is 0"):
+        path_along(around([0], [0]), 0)
+    with pytest.raises(ArgumentError, match="depth: "):
+        path_along(around([0], [0]), 3, 0.0)

@@ -1,0 +1,126 @@
+"""Videos: the whole picture at any size, equal bytes, and a browser that plays them in the right colours."""
+
+import base64
+import shutil
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.images import write_frames
+from gsplat_edu.evaluate.video import streamable
+
+COLOURS = np.array([(220, 30, 30), (30, 220, 30), (30, 30, 220), (200, 200, 100)], dtype=np.uint8)
+
+PLAY = """async ([kind, data, frames]) => {
+  const video = document.querySelector("video");
+  const on = (name) => new Promise((done, failed) => {
+    video.addEventListener(name, done, { once: true });
+    video.addEventListener("error", () => failed(new Error(video.error.message)), { once: true });
+  });
+  const ready = on("canplaythrough");
+  video.src = `data:${kind};base64,${data}`;
+  await ready;
+  const shown = [];
+  for (let i = 0; i < frames; i++) {
+    const sought = on("seeked");
+    video.currentTime = (i + 0.5) / 10;
+    await sought;
+    const canvas = document.createElement("canvas");
+    canvas.width = video.videoWidth; canvas.height = video.videoHeight;
+    const context = canvas.getContext("2d");
+    context.drawImage(video, 0, 0);
+    shown.push([0.25, 0.75].flatMap((y) => [0.25, 0.75].map((x) =>
+      [...context.getImageData(x * canvas.width, y * canvas.height, 1, 1).data].slice(0, 3))));
+  }
+  video.currentTime = 0;
+  const ended = on("ended");
+  await video.play();
+  await ended;
+  return { size: [video.videoWidth, video.videoHeight], time: video.currentTime, duration: video.duration, shown };
+}"""
+
+
+def quarters(height, width, turn):
+    """Four colours, one in each quarter of the picture, turned on by a place per frame."""
+    image = np.zeros((height, width, 3), dtype=np.uint8)
+    for i, colour in enumerate(np.roll(COLOURS, turn, axis=0)):
+        rows = slice(None, height // 2) if i < 2 else slice(height // 2, None)
+        image[rows, slice(None, width // 2) if i % 2 == 0 else slice(width // 2, None)] = colour
+    return image
+
+
+def boxes(data):
+    found, start = [], 0
+    while start < len(data):
+        length, kind = struct.unpack_from(">I4s", data, start)
+        found.append(kind)
+        start += length
+    return found
+
+
+@pytest.mark.parametrize(("height", "width"), [(33, 47), (48, 33), (33, 48), (32, 48), (1, 9)])
+def test_the_whole_picture_is_in_it(tmp_path, height, width):
+    """Odd heights and widths were cut. The last row and column are white here, and still there."""
+    frames = [np.zeros((height, width, 3), dtype=np.uint8) for _ in range(3)]
+    for i, frame in enumerate(frames):
+        frame[:] = 60 + 40 * i
+        frame[-1], frame[:, -1] = 255, 255
+    path = tmp_path / "v.mp4"
+    assert write_frames(path, frames, fps=10) == [path] and list(tmp_path.iterdir()) == [path]
+    video = cv2.VideoCapture(str(path))
+    size = video.get(cv2.CAP_PROP_FRAME_HEIGHT), video.get(cv2.CAP_PROP_FRAME_WIDTH)
+    assert size == (height + height % 2, width + width % 2)
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
+    for frame in frames:
+        read, shown = video.read()
+        assert read
+        assert np.abs(shown[: height - 2, : width - 2, ::-1].astype(int) - frame[: height - 2, : width - 2]).max(initial=0) < 20
+        # in white, lossy, in chroma of half the resolution and 16..235: nearer to white than to the grey beside it
+        assert shown[height - 1 :].min() > 200 and shown[:, width - 1 :].min() > 200
+    assert not video.read()[0]
+
+
+def test_equal_frames_give_equal_bytes_and_the_index_is_in_front(tmp_path):
+    rng = np.random.default_rng(0)
+    noise = [cv2.GaussianBlur(rng.integers(0, 256, (96, 128, 3)).astype(np.uint8), (0, 0), 3) for _ in range(12)]
+    first, second = (write_frames(tmp_path / name, noise)[0].read_bytes() for name in ("a.mp4", "b.mp4"))
+    assert first == second
+    kinds = boxes(first)
+    assert kinds.index(b"moov") < kinds.index(b"mdat")
+    # profile 0 (8 bits, 4:2:0), limited range, matrix of BT.601
+    entry = first[first.index(b"vpcC") + 4 :]
+    assert entry[4] == 0 and entry[6] == 0x82 and tuple(entry[7:10]) == (1, 1, 6)
+    assert streamable(first) == first, "done already"
+
+
+def test_what_is_no_video_is_refused():
+    for data in (b"", b"GIF89a", struct.pack(">I4s", 8, b"ftyp")):
+        with pytest.raises(ArgumentError, match="is not an MP4 file with an index"):
+            streamable(data)
+
+
+@pytest.mark.parametrize(("height", "width"), [(63, 95), (720, 1280)])
+def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width):
+    """Chromium refused MPEG-4 Part 2. It takes the colours of untagged videos of any size for BT.709's."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed")
+    frames = [quarters(height, width, i) for i in range(4)]
+    (path,) = write_frames(tmp_path / "v.mp4", frames, fps=10)
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=flags)
+        tab = browser.new_page()
+        tab.set_content("<video muted playsinline></video>")
+        data = base64.b64encode(path.read_bytes()).decode()
+        played = tab.evaluate(PLAY, ["video/mp4", data, len(frames)])
+        browser.close()
+    assert played["size"] == [width + width % 2, height + height % 2]
+    assert played["duration"] == pytest.approx(0.4, abs=0.01) and played["time"] == pytest.approx(0.4, abs=0.01)
+    for i, shown in enumerate(played["shown"]):
+        # one step of YUV in limited range is up to 2.3 of RGB, and quantization a few; a wrong matrix is 30 off
+        assert np.abs(np.array(shown) - np.roll(COLOURS, i, axis=0)).max() <= 8
