@@ -14,6 +14,7 @@ import urllib.error
 import urllib.request
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 import gsplat_edu.cli.main as command_line
@@ -158,6 +159,8 @@ def test_a_person_at_a_screen_has_the_browser_opened(made, tmp_path):
         (["empty"], "empty: is no run (it has no config.json)"),
         (["notes.txt"], "notes.txt: its name ends like no scene format"),
         (["cut.ply"], "cut.ply: "),
+        (["desk.html"], "desk.html: is a page already; open it in a browser: file://"),
+        (["gone.html"], "gone.html: is not there"),
         (["unfinished"], "unfinished: holds no scene"),
         (["nowhere", "--port", "70000"], "--port: is 70000"),
         (["nowhere", "--port", "many"], "argument --port: 'many' is not a whole number"),
@@ -169,6 +172,7 @@ def test_what_cannot_be_shown_costs_one_line(tmp_path, monkeypatch, capsys, word
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.txt").write_text("notes")
+    (tmp_path / "desk.html").write_bytes(page.html(Scene(splats_on(np.zeros((1, 3)), np.zeros((1, 3))))))
     (tmp_path / "cut.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement ver")
     RunFolder(tmp_path / "unfinished").write_config({"render": {}})
     default = [] if "--port" in words else ["--port", "0"]

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
+from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.evaluate.figures import run_curves_figure, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
 from gsplat_edu.files import written_aside
@@ -127,10 +128,11 @@ def write_report(path: Path, report: Report) -> None:
     Raises:
         OSError: the file cannot be written. What stood there before is untouched.
     """
-    curves = run_curves_figure(report.log)
+    figure = run_curves_figure(report.log)
+    curves = svg_element(figure) if figure else ""
     sections = [
         _headline(report.metrics),
-        _section("Curves", svg_element(curves) if curves else ""),
+        _section("Curves", curves),
         _views(report.scores, report.pictures),
         _exports(report.metrics.get("exports")),
         _section("Notes", _list(report.notes)),
@@ -138,8 +140,9 @@ def write_report(path: Path, report: Report) -> None:
         _section("Machine", _facts(report.machine)),
     ]
     title = html.escape(report.title)
+    policy = policy_element(content_policy(styles=[STYLE], markup=curves))
     page = (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n{policy}\n<title>{title}</title>\n'
         f'<meta name="viewport" content="width=device-width">\n<style>{STYLE}</style>\n</head>\n<body>\n'
         f"<h1>{title}</h1>\n{''.join(sections)}</body>\n</html>\n"
     )

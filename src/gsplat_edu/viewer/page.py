@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import hashlib
 import html as html_text
 import json
 import math
@@ -22,6 +21,7 @@ from typing import Any
 
 from gsplat_edu import constants
 from gsplat_edu.camera import Camera
+from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.io.quantize import check_expansion
@@ -107,6 +107,11 @@ def html(
     return b"".join(_pieces(title, scene, views, settings))
 
 
+def policy() -> str:
+    """Return the Content-Security-Policy of every page: its scripts, its style, and a worker that sorts."""
+    return content_policy(map(_web, SCRIPTS), [_web("style.css")], workers=True)
+
+
 def read(path: Path) -> Scene:
     """Read the scene back that a page draws: positions and scales to the bit, the rest as the page has it.
 
@@ -186,8 +191,7 @@ def _filled(template: str, title: str, facts: dict[str, Any]) -> str:
     scripts = [_web(name) for name in SCRIPTS]
     texts = {
         "title": html_text.escape(title),
-        "policy": f"default-src 'none'; script-src {' '.join(map(_hash, scripts))}; style-src {_hash(style)};"
-        " worker-src blob:; base-uri 'none'; form-action 'none'",
+        "policy": policy_element(policy()),
         "style": style,
         # "<" as an escape: no text in JSON can end the element that it stands in
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
@@ -205,10 +209,6 @@ def _text_element(name: str, text: str) -> str:
 
 def _web(name: str) -> str:
     return (files("gsplat_edu.viewer") / "web" / name).read_text("utf-8")
-
-
-def _hash(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def _shader(name: str) -> str:
