@@ -48,7 +48,8 @@ def run(arguments: argparse.Namespace) -> None:
     # first of all: a port that is taken is no reason to wait for the scene
     with PageServer(b"", arguments.host, arguments.port, policy=page.policy()) as server:
         source = open_source(arguments.source)
-        server.page = page.html(source.scene, source.cameras, source.settings, _title(arguments.source))
+        title = _title(arguments.source)
+        server.page = page.html(source.scene, source.cameras, source.settings, title, source.held_out)
         cameras = f", {len(source.cameras)} cameras" if source.cameras else ""
         console.print(
             f"{source.path}: {len(source.scene.gaussians):,} Gaussians{cameras}, {len(server.page):,} bytes",

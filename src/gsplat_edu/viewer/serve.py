@@ -291,15 +291,19 @@ def url_of(host: str, port: int) -> str:
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
-def exposure(host: str, what: str) -> str | None:
+def exposure(host: str, what: str, token: bool = False) -> str | None:
     """Return the sentence that warns of a server which others can reach; None where only this computer can.
 
     Args:
         host: Where it listens.
         what: What it lets them do.
+        token: Whether its URL has a token, without which it answers nobody.
     """
     if is_loopback(host):
         return None
+    if token:
+        who = "whoever can reach this computer and has the URL"
+        return f"warning: listening at {host}: {who} {what}; the connection is not encrypted"
     return f"warning: listening at {host}: whoever can reach this computer {what}; there is no password"
 
 
