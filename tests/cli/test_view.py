@@ -85,8 +85,11 @@ def test_a_run_is_shown_with_its_cameras_and_settings_until_ctrl_c(made):
     folder, _ = made
     with viewing(folder.path, "--port", "0", "--no-open") as (printed, url):
         source = open_source(folder.path)
-        assert len(source.cameras) == 6 and source.settings.background == ORANGE
-        assert fetched(url) == page.html(source.scene, source.cameras, source.settings, "egg & spoon")
+        assert len(source.cameras) == 6 and len(source.held_out) == 2
+        assert source.settings.background == ORANGE
+        assert fetched(url) == page.html(
+            source.scene, source.cameras, source.settings, "egg & spoon", source.held_out
+        )
         with pytest.raises(urllib.error.HTTPError) as refused:
             fetched(f"{url}config.json")
         assert refused.value.code == 404

@@ -100,14 +100,16 @@ def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path
             client.scene.add_icosphere(f"/ball{channel}", 0.03, color=color, position=tuple(place))
         client.scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
 
+        top = 180  # the notice ends above
+
         def middle(channel):
-            """Column and row of the middle of what is of one colour, beside the panel and the notice."""
+            """Column and row of the middle of what is of one colour, beside the panel and below the notice."""
             shown = np.asarray(Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB"), dtype=float)[
-                150:
+                top:
             ]
             ball = shown[..., channel] > 40 + 1.5 * np.delete(shown, channel, axis=2).max(axis=2)
-            ball[:100, 350:] = False
-            return None if ball.sum() < 20 else np.argwhere(ball).mean(axis=0)[::-1] + np.array([0, 150])
+            ball[: 300 - top, 350:] = False
+            return None if ball.sum() < 20 else np.argwhere(ball).mean(axis=0)[::-1] + np.array([0, top])
 
         for channel, (column, row, _) in where.items():
             until(lambda channel=channel: middle(channel) is not None, "the ball")

@@ -82,7 +82,7 @@ class Controls {
   }
 
   turn(dx, dy) {
-    const angle = (this.flying ? Math.PI : this.view.turn) / Math.min(this.canvas.clientWidth, this.canvas.clientHeight);
+    const angle = (this.flying ? Math.PI : this.view.turn) / Math.max(this.canvas.clientWidth, this.canvas.clientHeight);
     if (this.flying) this.view.look(dx * angle, dy * angle);
     else this.view.orbit(dx * angle, dy * angle);
   }

@@ -64,7 +64,7 @@ class Region {
     return Math.exp(-Math.max(0, distance - allowed) / SOFTNESS);
   }
 
-  // Radians for a drag across the shorter side of the window: narrow captures turn slowly.
+  // Radians for a drag across the longer side of the window: narrow captures turn slowly.
   turn() {
     if (this.directions.length < 2) return this.eyes.length ? LEAST_TURN : MOST_TURN;
     let widest = 1;
