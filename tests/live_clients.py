@@ -81,20 +81,26 @@ def training(capture, out, *words):
         made.ended()
 
 
+OWN = object()
+"""The origin of the view's own page."""
+
+
 class Client:
     """What a browser's half of viser does, as far as it matters here: a WebSocket of MessagePack."""
 
-    def __init__(self, view, origin="http://localhost"):
+    def __init__(self, view, origin=OWN, url=None, **headers):
         self.socket = websockets.sync.client.connect(
-            view.url.replace("http", "ws"),
+            (url or view.url).replace("http", "ws", 1),
             subprotocols=[f"viser-v{viser.__version__}"],
-            origin=origin,
+            origin=view.url.partition("/?")[0] if origin is OWN else origin,
+            additional_headers=headers,
             compression=None,
             max_size=None,
             open_timeout=PATIENCE,
         )
         self.buttons, self.text, self.shared = {}, "", []
         self.pictures = []
+        self.lists, self.moved = {}, {}
 
     def __enter__(self):
         return self
@@ -112,6 +118,14 @@ class Client:
     def press(self, label):
         until(lambda: label in self.listened().buttons, label)
         self.send("GuiUpdateMessage", uuid=self.buttons[label], updates={"value": True})
+
+    def options(self, label):
+        """Return what a list offers."""
+        return until(lambda: self.listened().lists.get(label), label)[1]
+
+    def choose(self, label, option):
+        assert option in self.options(label)
+        self.send("GuiUpdateMessage", uuid=self.lists[label][0], updates={"value": option})
 
     def listened(self):
         """Take in what has come so far."""
@@ -135,6 +149,10 @@ class Client:
             if label is not None:
                 self.buttons = {name: uuid for name, uuid in self.buttons.items() if uuid != message["uuid"]}
                 self.buttons[label] = message["uuid"]
+        elif message["type"] == "GuiDropdownMessage":
+            self.lists[message["props"]["label"]] = (message["uuid"], list(message["props"]["options"]))
+        elif message["type"].startswith("SetCamera") and not message.get("initial"):
+            self.moved[message["type"]] = message
         elif message["type"].startswith("ShareUrl"):
             self.shared.append(message)
 

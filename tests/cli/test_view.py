@@ -14,6 +14,7 @@ import urllib.error
 import urllib.request
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 import gsplat_edu.cli.main as command_line
@@ -84,8 +85,11 @@ def test_a_run_is_shown_with_its_cameras_and_settings_until_ctrl_c(made):
     folder, _ = made
     with viewing(folder.path, "--port", "0", "--no-open") as (printed, url):
         source = open_source(folder.path)
-        assert len(source.cameras) == 6 and source.settings.background == ORANGE
-        assert fetched(url) == page.html(source.scene, source.cameras, source.settings, "egg & spoon")
+        assert len(source.cameras) == 6 and len(source.held_out) == 2
+        assert source.settings.background == ORANGE
+        assert fetched(url) == page.html(
+            source.scene, source.cameras, source.settings, "egg & spoon", source.held_out
+        )
         with pytest.raises(urllib.error.HTTPError) as refused:
             fetched(f"{url}config.json")
         assert refused.value.code == 404
@@ -158,6 +162,8 @@ def test_a_person_at_a_screen_has_the_browser_opened(made, tmp_path):
         (["empty"], "empty: is no run (it has no config.json)"),
         (["notes.txt"], "notes.txt: its name ends like no scene format"),
         (["cut.ply"], "cut.ply: "),
+        (["desk.html"], "desk.html: is a page already; open it in a browser: file://"),
+        (["gone.html"], "gone.html: is not there"),
         (["unfinished"], "unfinished: holds no scene"),
         (["nowhere", "--port", "70000"], "--port: is 70000"),
         (["nowhere", "--port", "many"], "argument --port: 'many' is not a whole number"),
@@ -169,6 +175,7 @@ def test_what_cannot_be_shown_costs_one_line(tmp_path, monkeypatch, capsys, word
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.txt").write_text("notes")
+    (tmp_path / "desk.html").write_bytes(page.html(Scene(splats_on(np.zeros((1, 3)), np.zeros((1, 3))))))
     (tmp_path / "cut.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement ver")
     RunFolder(tmp_path / "unfinished").write_config({"render": {}})
     default = [] if "--port" in words else ["--port", "0"]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -43,6 +45,16 @@ def test_what_a_format_leaves_out_is_said(tmp_path):
     scene = random_scene(3)
     assert losses("a.ply", scene) == []
     assert "up to degree 0; those up to 3 are left out" in losses("a.splat", scene)[0]
+
+
+@pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_antialiasing_is_kept_or_said_to_be_lost(tmp_path, suffix, antialiased):
+    scene = replace(random_scene(3, 0), antialiased=antialiased)
+    write_scene(tmp_path / f"a{suffix}", scene)
+    kept = read_scene(tmp_path / f"a{suffix}").antialiased
+    said = [note for note in losses(f"a{suffix}", scene) if "antialiasing" in note]
+    assert len(said) == (0 if bool(kept) == antialiased else 1)
 
 
 def test_a_sog_in_a_folder_is_named_by_either(tmp_path):

@@ -8,6 +8,7 @@ import torch
 
 from gsplat_edu.errors import SceneFormatError, ShapeError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply, read, save_ply, write
 from gsplat_edu.io.scene import Scene
 
@@ -312,6 +313,47 @@ def test_what_has_no_property_travels_in_comments(tmp_path, antialiased, up):
     assert scene.antialiased is antialiased
     assert scene.up == (None if up is None else pytest.approx(up, abs=1e-15))
     assert_equal(scene.gaussians, random_gaussians(3, 3))
+
+
+@pytest.mark.parametrize(
+    ("lines", "antialiased"),
+    [
+        (["SplatRenderMode: mip"], True),  # Brush
+        (["Exported from Brush", "SH degree: 3", "SplatRenderMode: default"], False),
+        (["antialiased 1"], True),  # Postshot
+        (["antialiased 0"], False),
+        (["gsplat_edu antialiased 1"], True),  # this package before it wrote the other two
+        (["  SPLATRENDERMODE:  MIP  "], True),
+        (["antialiased 1", "SplatRenderMode: default"], False),  # the last one wins
+        (["SplatRenderMode: default", "antialiased 1"], True),
+        (["SplatRenderMode: 2dgs"], None),
+        (["antialiased 2", "antialiased", "antialiased 1 2", "not antialiased 1"], None),
+        ([], None),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
+def test_antialiasing_as_other_programs_say_it(tmp_path, suffix, lines, antialiased):
+    path = tmp_path / f"scene{suffix}"
+    write_scene(path, Scene(random_gaussians(3, 3)))
+    comment = "".join(f"comment {line}\n" for line in lines).encode()
+    path.write_bytes(path.read_bytes().replace(b"element", comment + b"element", 1))
+    assert read_scene(path).antialiased is antialiased
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
+@pytest.mark.parametrize(
+    ("antialiased", "lines"),
+    [
+        (True, [b"comment SplatRenderMode: mip", b"comment antialiased 1"]),
+        (False, [b"comment SplatRenderMode: default", b"comment antialiased 0"]),
+        (None, []),
+    ],
+)
+def test_antialiasing_is_written_as_other_programs_read_it(tmp_path, suffix, antialiased, lines):
+    path = tmp_path / f"scene{suffix}"
+    write_scene(path, Scene(random_gaussians(3, 3), antialiased))
+    header = path.read_bytes().partition(b"end_header\n")[0]
+    assert [line for line in header.splitlines() if line.startswith(b"comment")] == lines
 
 
 @pytest.mark.parametrize("said", ["up 1 2", "up a b c", "up 0 0 0", "up nan 0 0", "up inf 0 0"])

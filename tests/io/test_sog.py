@@ -13,6 +13,7 @@ from PIL import Image
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, quat_to_R_t
 from gsplat_edu.io import sog
+from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.sog_palette import _picked, codebook, nearest_in_codebook, palette
@@ -103,7 +104,20 @@ def test_antialiasing_and_up_are_kept(tmp_path, antialiased, up):
     back = sog.read(tmp_path / "a.sog")
     assert back.antialiased is antialiased
     assert back.up == up if up is None else back.up == pytest.approx(up, abs=1e-15)
-    assert ("antialias" in json.loads(unzipped(tmp_path / "a.sog")["meta.json"])) == (antialiased is not None)
+    meta = json.loads(unzipped(tmp_path / "a.sog")["meta.json"])
+    assert meta.get("antialias") is antialiased
+    assert meta.get("model") == ("antialiased" if antialiased else None)  # for PlayCanvas' splat-transform
+
+
+@pytest.mark.parametrize(
+    ("model", "antialiased"), [("antialiased", True), ("default", False), ("2dgs", None), (7, None)]
+)
+def test_the_model_of_splat_transform_says_antialiasing(tmp_path, model, antialiased):
+    folder = tmp_path / "scene"
+    write_scene(folder / "meta.json", Scene(random_scene(3, 0).gaussians))
+    meta = json.loads((folder / "meta.json").read_bytes())
+    (folder / "meta.json").write_text(json.dumps({**meta, "model": model}))
+    assert read_scene(folder).antialiased is antialiased
 
 
 def test_the_same_scene_is_the_same_bytes_in_a_zip_and_in_a_folder(tmp_path):

@@ -17,14 +17,16 @@ def test_a_scene_of_a_run_has_the_runs_cameras_and_settings(tmp_path, by_file):
     assert source.scene.antialiased is True and source.settings.antialiased
     assert source.settings.background == (1.0, 0.5, 0.0)
     np.testing.assert_allclose(source.scene.up, RUN_UP, atol=1e-12)
+    # the run's file has the training views first; here they are in the capture's order
     assert [name for name, _ in source.cameras] == [
+        "0.00.jpg",
         "1.26.jpg",
         "2.51.jpg",
         "3.77.jpg",
         "5.03.jpg",
-        "0.00.jpg",
     ]
-    for (_, found), camera in zip(source.cameras, cameras, strict=True):
+    assert source.held_out == {"0.00.jpg"}
+    for (_, found), camera in zip(source.cameras, [cameras[-1], *cameras[:-1]], strict=True):
         np.testing.assert_array_equal(found.eye, camera.eye)
 
 
@@ -35,7 +37,7 @@ def test_far_from_zero_both_stand_around_the_runs_origin(tmp_path):
     assert source.origin == origin
     # the file holds float32 numbers near 16384, 2^-10 apart; half of that and what the sum was rounded to
     torch.testing.assert_close(source.scene.gaussians.means, gaussians.means, rtol=0, atol=2**-10)
-    np.testing.assert_allclose(source.cameras[0][1].eye, cameras[0].eye, atol=1e-11)
+    np.testing.assert_allclose(source.cameras[1][1].eye, cameras[0].eye, atol=1e-11)
 
 
 def test_a_file_alone_is_rendered_as_it_says(tmp_path):
@@ -50,7 +52,7 @@ def test_a_file_alone_is_rendered_as_it_says(tmp_path):
 
 def test_probes_are_spread_over_the_cameras_and_small(tmp_path):
     source = open_source(make_run(tmp_path / "run")[0].path)
-    assert [name for name, _ in source.probes(2, 30)] == ["1.26.jpg", "3.77.jpg"]
+    assert [name for name, _ in source.probes(2, 30)] == ["0.00.jpg", "2.51.jpg"]
     assert [(camera.W, camera.H) for _, camera in source.probes(9, 30)] == [(30, 20)] * 5
     assert source.probes(9, 100)[0][1] is source.cameras[0][1]
 

@@ -21,6 +21,7 @@ from gsplat_edu.cli.train_options import options_from
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.folder import RunFolder, render_settings
@@ -84,13 +85,15 @@ def test_a_run_folder_holds_what_it_should(finished):
 
 def test_the_saved_scene_gives_the_same_images_to_the_bit(capture, tmp_path):
     """What was trained, against what was written, read and rendered at every training camera."""
-    words = ["train", str(capture), "--out", str(tmp_path / "run"), *SHORT]
+    words = ["train", str(capture), "--out", str(tmp_path / "run"), *SHORT, "--antialiased"]
     parsed = build_parser(words).parse_args(words)
     run = CaptureRun(options_from(parsed))
     trainer = run.start()
     run.train()
     run.finish()
-    loaded = load_ply(run.folder.latest_scene()[0])
+    scene = read_scene(run.folder.latest_scene()[0])
+    assert scene.antialiased is True, "the file itself says so, for other programs"
+    loaded = scene.gaussians
     settings = render_settings(run.folder.read_config())
     cameras = {name: camera for name, _, camera in run.folder.read_cameras()}
     for view in run.dataset.train:

@@ -55,7 +55,8 @@ class Visit:
     def camera(self):
         """The camera of the screen."""
         found = self.tab.evaluate("viewer.camera()")
-        found.pop("name", None)
+        for other in ("name", "held_out"):
+            found.pop(other, None)
         return Camera(**found)
 
     def picture(self, camera):

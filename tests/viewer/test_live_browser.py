@@ -100,19 +100,30 @@ def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path
             client.scene.add_icosphere(f"/ball{channel}", 0.03, color=color, position=tuple(place))
         client.scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
 
+        top = 180  # the notice ends above
+
         def middle(channel):
-            """Column and row of the middle of what is of one colour, beside the panel and the notice."""
+            """Column and row of the middle of what is of one colour, beside the panel and below the notice."""
             shown = np.asarray(Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB"), dtype=float)[
-                150:
+                top:
             ]
             ball = shown[..., channel] > 40 + 1.5 * np.delete(shown, channel, axis=2).max(axis=2)
-            ball[:100, 350:] = False
-            return None if ball.sum() < 20 else np.argwhere(ball).mean(axis=0)[::-1] + np.array([0, 150])
+            ball[: 300 - top, 350:] = False
+            return None if ball.sum() < 20 else np.argwhere(ball).mean(axis=0)[::-1] + np.array([0, top])
 
         for channel, (column, row, _) in where.items():
             until(lambda channel=channel: middle(channel) is not None, "the ball")
             # light from above moves the middle of what counts as coloured by a part of the radius, 6 to 9 px
             np.testing.assert_allclose(middle(channel), (column, row), atol=3)
+        # chosen from the list, a camera has the red ball, put before its eye, in the middle of the window
+        chosen = made.run.dataset.test[0].camera
+        before = tuple(chosen.eye + 2.5 * chosen.R[2])
+        client.scene.add_icosphere("/ball0", 0.03, color=(1.0, 0.0, 0.0), position=before)
+        made.view._move(client, chosen, None)
+        half = (camera.W / 2 * scale, camera.H / 2 * scale)
+        until(
+            lambda: (found := middle(0)) is not None and np.abs(found - half).max() < 3, "the camera chosen"
+        )
     assert tab.complaints == []
 
 
@@ -125,7 +136,9 @@ def commanded(capture, out, *words):
         watchdog = threading.Timer(5 * PATIENCE, process.kill)  # so that no pipe is read for ever
         watchdog.start()
         while not (
-            found := re.fullmatch(r"live view: (http://127\.0\.0\.1:\d+/)\n", process.stdout.readline())
+            found := re.fullmatch(
+                r"live view: (http://127\.0\.0\.1:\d+/\?token=[\w-]{22})\n", process.stdout.readline()
+            )
         ):
             assert process.poll() is None, process.stderr.read()
         yield process, found[1]
@@ -171,9 +184,11 @@ def test_a_person_watches_pauses_steps_and_ends_a_training(capture, tmp_path, br
         assert "viser" not in printed and "Websocket" not in printed
         errors = [text for text in tab.complaints if "WebSocket" not in text]  # the server is gone by now
         assert errors == []
-        assert [one for one in tab.asked if not one.startswith((url, f"blob:{url}"))] == [], (
-            "it asks nobody else"
-        )
+        own = url.partition("?")[0]
+        asked = [
+            one if one.startswith("blob:") else f"{one}/" for one in tab.asked
+        ]  # a socket's has no slash
+        assert [one for one in asked if not one.startswith((own, f"blob:{own}"))] == [], "it asks nobody else"
     alone = Training(capture, tmp_path / "alone", *words)
     with alone.view:
         alone.run.start()
@@ -195,7 +210,7 @@ def test_after_the_training_the_view_stays_until_ctrl_c_and_all_is_well(capture,
             printed, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, complaints) == (0, "")
         assert printed.startswith(
-            "warning: listening at 0.0.0.0: whoever can reach this computer sees the training"
+            "warning: listening at 0.0.0.0: whoever can reach this computer and has the URL sees the training"
         )
         assert printed.endswith("the live view stays until its last browser is closed, or Ctrl-C\n")
 

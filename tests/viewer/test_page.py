@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.camera import Camera, look_at
 from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.viewer import page, page_data
+from gsplat_edu.viewer.page_start import looked_at
 
 NASTY = 'a </script><script>alert(1)</script> {{facts}} "&" äöü 兎 🐕'
 
@@ -293,8 +295,57 @@ def test_the_start_looks_at_the_scene_with_up_upwards(random_gaussians, gaussian
 
 def test_the_start_is_the_first_camera(random_gaussians, three_views, camera):
     facts = facts_of(page.html(Scene(random_gaussians(30)), three_views))
-    assert facts["start"]["camera"] == {k: v for k, v in facts["cameras"][0].items() if k != "name"}
+    first = {k: v for k, v in facts["cameras"][0].items() if k not in ("name", "held_out")}
+    assert facts["start"]["camera"] == first and facts["start"]["index"] == 0
     assert facts["start"]["camera"]["eye"] == camera.eye.tolist()
     assert [one["name"] for one in facts["cameras"]] == [name for name, _ in three_views]
     # the cameras look at points at most 0.1 apart
     assert np.abs(facts["start"]["pivot"]).max() < 0.2
+
+
+def test_the_start_is_the_first_camera_that_was_trained_on(random_gaussians, three_views):
+    facts = facts_of(page.html(Scene(random_gaussians(3)), three_views, held_out={"first", "third <b>"}))
+    assert [one["held_out"] for one in facts["cameras"]] == [True, False, True]
+    assert facts["start"]["index"] == 1 and facts["start"]["camera"]["eye"] == facts["cameras"][1]["eye"]
+    everything = {name for name, _ in three_views}
+    assert (
+        facts_of(page.html(Scene(random_gaussians(3)), three_views, held_out=everything))["start"]["index"]
+        == 0
+    )
+    assert facts_of(page.html(Scene(random_gaussians(3))))["start"]["index"] == -1
+
+
+def facing_one_way(turn):
+    """Cameras side by side whose axes spread, by an angle or towards each other: they cross at random or behind."""
+    cameras = []
+    for i in range(-4, 5):
+        eye = np.array([0.3 * i, 0.02 * (-1) ** i, 0.0])
+        ahead = np.array([np.sin(turn * i), 0.0, np.cos(turn * i)])
+        cameras.append(Camera(look_at(eye, eye + ahead), eye, 200.0, 200.0, 80.0, 60.0, 120, 160))
+    return cameras
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.001, 0.05, -0.05, 0.2])
+def test_where_cameras_face_one_way_the_pivot_lies_at_what_they_see(turn):
+    """Where their axes cross (at 6, behind them, or nowhere) is no place to turn around."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform((-30, -30, 9.5), (30, 30, 10.5), (4000, 3))
+    cameras = facing_one_way(turn)
+    pivot = looked_at(cameras, 4, points)
+    np.testing.assert_allclose(pivot[:2], cameras[4].eye[:2], atol=1e-9)
+    if turn == -0.05:  # they do look at one point, 6 ahead: either will do
+        assert 5 < pivot[2] < 10.6
+    else:
+        assert 9.5 < pivot[2] < 10.5
+
+
+def test_where_cameras_stand_around_something_the_pivot_is_its_centre():
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    eyes = [np.array([3 * np.cos(a), -1.0, 3 * np.sin(a)]) for a in angles]
+    cameras = [Camera(look_at(eye, (0, 0, 0)), eye, 200.0, 200.0, 80.0, 60.0, 120, 160) for eye in eyes]
+    cameras[3] = Camera(look_at(eyes[3], (9, 0, 9)), eyes[3], 200.0, 200.0, 80.0, 60.0, 120, 160)
+    surface = np.random.default_rng(0).normal(size=(900, 3))
+    surface /= np.linalg.norm(surface, axis=1, keepdims=True)
+    # although one of them looks away, and its surface is nearer than the centre
+    np.testing.assert_allclose(looked_at(cameras, 0, surface), 0, atol=1e-6)
+    assert looked_at(cameras[:1], 0, np.zeros((0, 3))) @ cameras[0].R[2] > cameras[0].eye @ cameras[0].R[2]

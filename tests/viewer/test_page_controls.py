@@ -1,9 +1,15 @@
 """Mouse, fingers and keys of a page, in a real browser."""
 
+import time
+
 import numpy as np
 import pytest
+import torch
 
 from gsplat_edu.camera import Camera
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.viewer import page
 
 SIZE = (640, 400)
 MIDDLE = (400, 250)  # beside the panel
@@ -48,8 +54,8 @@ def test_a_drag_orbits_about_the_point_ahead(tour):
     moved = before.R @ (after.eye - before.eye)
     # what is in front goes with the pointer, right and down: the camera goes left and up
     assert moved[0] < -0.2 and moved[1] < -0.1
-    # half a turn for a drag across the shorter side, 400 px
-    angles = np.pi / 400 * np.array([50, 20])
+    # half a turn for a drag across the longer side, 640 px: the cameras stand all around
+    angles = np.pi / 640 * np.array([50, 20])
     between = np.arccos(after.R[2] @ before.R[2])
     assert max(angles) * 0.9 < between < np.hypot(*angles)
 
@@ -99,7 +105,7 @@ def test_keys_move_along_the_cameras_axes_while_they_are_held(tour):
         assert steps[axis] > 0.01, key
         np.testing.assert_allclose(np.delete(steps, axis), 0, atol=1e-9)
         np.testing.assert_array_equal(after.R, before.R)
-        tour.tab.wait_for_selector("#rate:has-text('at rest')")
+        tour.tab.wait_for_selector("#rate:empty", state="attached")
         np.testing.assert_array_equal(tour.camera().eye, after.eye)
 
 
@@ -143,8 +149,8 @@ def test_the_captures_cameras(tour, three_views):
     assert marked() == ["first"]
     tour.tab.click("text='second'")
     assert stands_at(tour, second) and marked() == ["second"]
-    # its image, 200 x 160, fills the height of the window
-    assert tour.camera().fx == pytest.approx(second.fx * SIZE[1] / 160)
+    # its image, 200 x 160, fills the width of the window, 640 x 400, and is cut above and below
+    assert tour.camera().fx == pytest.approx(second.fx * SIZE[0] / 200)
     tour.tab.keyboard.press("ArrowRight")
     assert stands_at(tour, third)
     tour.tab.keyboard.press("ArrowRight")
@@ -158,6 +164,192 @@ def test_the_captures_cameras(tour, three_views):
     drag(tour, 10, 0)
     tour.tab.keyboard.press("ArrowLeft")
     assert stands_at(tour, third)
+
+
+def test_a_window_of_any_shape_shows_nothing_that_the_camera_did_not_see(tour, three_views):
+    for width, height in ((390, 844), (900, 200), SIZE):
+        tour.tab.set_viewport_size({"width": width, "height": height})
+        for index, (_, camera) in enumerate(three_views):
+            tour.tab.evaluate(f"viewer.goTo({index})")
+            shown = tour.camera()
+            scale = shown.fx / camera.fx
+            assert width == shown.W and height == shown.H
+            assert shown.fy == pytest.approx(scale * camera.fy)
+            # the window's edges, in the photo's pixels: within the photo, and at two opposite edges of it
+            columns = (np.array([-0.5, width - 0.5]) - shown.cx) / scale + camera.cx
+            rows = (np.array([-0.5, height - 0.5]) - shown.cy) / scale + camera.cy
+            inside = np.array(
+                [columns[0] + 0.5, camera.W - 0.5 - columns[1], rows[0] + 0.5, camera.H - 0.5 - rows[1]]
+            )
+            assert inside.min() > -1e-9 and np.sum(inside < 1e-9) >= 2
+
+
+def test_held_out_cameras_are_marked_and_the_start_is_none_of_them(
+    visit, tmp_path, random_gaussians, three_views
+):
+    page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views, held_out={"first"})
+    seen = visit().open(tmp_path / "a.html").ready()
+    seen.tab.click("summary")
+    names = seen.tab.locator("#cameras button").all_inner_texts()
+    assert names == ["first held out", "second", "third <b>"]
+    assert seen.tab.locator("#cameras button[aria-current=true]").all_inner_texts() == ["second"]
+    assert stands_at(seen, three_views[1][1])
+    seen.tab.keyboard.press("ArrowLeft")
+    assert stands_at(seen, three_views[0][1])
+    seen.tab.keyboard.press("r")
+    assert stands_at(seen, three_views[1][1])
+
+
+def forward_cameras():
+    """Eleven cameras side by side that face one way, and look at what lies 4 ahead."""
+    eyes = [(0.2 * i, 0.05 * (i % 3), 0.0) for i in range(-5, 6)]
+    return [
+        (f"{i:02}", Camera(np.eye(3), eye, 250.0, 250.0, 160.0, 100.0, 200, 320))
+        for i, eye in enumerate(eyes)
+    ]
+
+
+@pytest.fixture
+def forward(show, random_gaussians):
+    gaussians = random_gaussians(60)
+    gaussians.means[:, 2] += 4.0
+    return show(gaussians, forward_cameras(), width=SIZE[0], height=SIZE[1])
+
+
+def off_the_cameras(visit):
+    """Angle, in degrees, between the direction of the view from its pivot and the nearest camera's."""
+    centre, eye = pivot(visit), visit.camera().eye
+
+    def unit(a):
+        return a / np.linalg.norm(a)
+
+    cosines = [unit(eye - centre) @ unit(camera.eye - centre) for _, camera in forward_cameras()]
+    return np.degrees(np.arccos(min(max(cosines), 1.0)))
+
+
+def test_a_drag_of_a_quarter_of_the_window_stays_near_what_was_captured(forward):
+    distance = np.linalg.norm(forward.camera().eye - pivot(forward))
+    assert 3 < distance < 5, "the pivot is what the cameras see, although their axes cross nowhere"
+    for dx, dy in ((160, 0), (-160, 0), (0, 100), (0, -100), (160, 100)):
+        for steps in (1, 20):
+            forward.tab.keyboard.press("r")
+            after = drag(forward, dx, dy, steps=steps)
+            # 6 free degrees, and some more that get ever harder
+            assert 0.5 < off_the_cameras(forward) < 15
+            assert np.linalg.norm(after.eye - pivot(forward)) == pytest.approx(distance)
+    moved = off_the_cameras(forward)
+    for _ in range(4):
+        drag(forward, 160, 100, steps=4)
+    assert moved < off_the_cameras(forward) < 35, "whoever insists gets on, slowly"
+
+
+def test_who_has_flown_outside_can_orbit_there(forward):
+    forward.tab.evaluate(
+        "viewer.view.camera = {...viewer.view.camera, eye: [4, 0, 4]}; viewer.view.look(-1.5, 0)"
+    )
+    before = off_the_cameras(forward)
+    assert before > 25
+    drag(forward, -60, 0)
+    drag(forward, 60, 0)
+    assert abs(off_the_cameras(forward) - before) < 20
+
+
+def on_the_screen(visit, point):
+    camera = visit.camera()
+    return np.array(camera.project(camera.world_to_cam(point))[:2])
+
+
+@pytest.fixture
+def wall(show):
+    """A near ball to the right of a far wall of balls: hard to hit by chance, and with something behind it."""
+    x, y = np.meshgrid(np.linspace(-4, 4, 15), np.linspace(-3, 3, 11))
+    means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 6.0)], axis=1)
+    means = np.concatenate([means, [[0.8, 0.3, 2.0]]])
+    count = len(means)
+    gaussians = Gaussians(
+        means=torch.tensor(means, dtype=torch.float32),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scales=torch.tensor([[-1.0] * 3] * (count - 1) + [[-2.5] * 3]),
+        sh0=torch.zeros(count, 1, 3),
+        sh_rest=torch.zeros(count, 0, 3),
+        logit_opacities=torch.full((count,), 3.0),
+    )
+    view = ("a", Camera(np.eye(3), (0.0, 0.0, 0.0), 250.0, 250.0, 160.0, 100.0, 200, 320))
+    return show(gaussians, [view], width=SIZE[0], height=SIZE[1], has_touch=True)
+
+
+def click_twice(visit, by, x, y, pause):
+    """Click or tap twice, so many seconds apart by the events' own clock, however slow this computer is."""
+    session = visit.tab.context.new_cdp_session(visit.tab)
+    began = time.time()
+    for moment in (began, began + pause):
+        for pressed in (True, False):
+            at = {"timestamp": moment + (0.0 if pressed else 0.05)}
+            if by == "mouse":
+                kind = {
+                    "type": "mousePressed" if pressed else "mouseReleased",
+                    "button": "left",
+                    "clickCount": 1,
+                }
+                session.send("Input.dispatchMouseEvent", {**kind, **at, "x": x, "y": y})
+            else:
+                places = [{"x": x, "y": y, "id": 0}] if pressed else []
+                kind = {"type": "touchStart" if pressed else "touchEnd", "touchPoints": places}
+                session.send("Input.dispatchTouchEvent", {**kind, **at})
+    session.detach()
+    visit.tab.wait_for_timeout(1000 * pause + 500)  # until the last of these moments is past
+
+
+@pytest.mark.parametrize("by", ["mouse", "finger"])
+def test_a_double_click_or_tap_sets_the_pivot_on_the_surface_there(wall, by):
+    before = wall.camera()
+    column, row = on_the_screen(wall, (0.8, 0.3, 2.0)) + 0.5
+    click_twice(wall, by, column, row, pause=0.3)
+    wall.tab.wait_for_function("element('point').style.left !== ''")
+    found = pivot(wall)
+    # the ball's sigma is 0.08, and half of its opacity lies before its middle or in it
+    np.testing.assert_allclose(found, (0.8, 0.3, 2.0), atol=0.1)
+    np.testing.assert_array_equal(wall.camera().eye, before.eye)
+    np.testing.assert_array_equal(wall.camera().R, before.R)
+    after = drag(wall, 0, 30)
+    np.testing.assert_allclose(pivot(wall), found)
+    assert not np.array_equal(after.R, before.R)
+    # the point stays where it is in the window, and no camera moves about another
+    np.testing.assert_allclose(on_the_screen(wall, found) + 0.5, (column, row), atol=1)
+    wall.tab.wait_for_selector("#point", state="hidden")
+    wall.tab.keyboard.press("r")
+    assert np.linalg.norm(pivot(wall) - found) > 0.5, "the start has its own"
+
+
+def test_one_click_or_two_far_apart_set_nothing(wall):
+    before = pivot(wall)
+    wall.tab.mouse.click(450, 250)
+    wall.tab.mouse.click(300, 250)
+    for by in ("mouse", "finger"):
+        click_twice(wall, by, 450, 250, pause=0.6)
+    drag(wall, 20, 0)
+    drag(wall, -20, 0)
+    np.testing.assert_allclose(pivot(wall), before)
+
+
+@pytest.mark.parametrize(
+    ("options", "shown"), [({}, "mouse"), ({"has_touch": True, "is_mobile": True}, "touch")]
+)
+def test_the_help_is_for_what_the_visitor_has(show, random_gaussians, options, shown):
+    seen = show(random_gaussians(9), width=390, height=600, **options)
+    seen.tab.click("#help-button")
+    visible = seen.tab.locator("#help tr:visible")
+    assert visible.count() > 3
+    assert {row.get_attribute("class") for row in visible.all()} == {shown}
+    text = seen.tab.inner_text("#help")
+    assert ("double tap" in text, "W A S D" in text) == (shown == "touch", shown == "mouse")
+
+
+def test_words_that_a_visitor_knows(tour):
+    tour.tab.wait_for_selector("#rate:empty", state="attached")
+    text = tour.tab.inner_text("#panel")
+    assert "reflections" in text and "harmonics" not in text and "rest" not in text
+    assert tour.tab.locator("#degree option").all_inner_texts() == ["off", "1 of 3", "2 of 3", "full"]
 
 
 def test_back_to_the_start(tour, three_views):

@@ -13,8 +13,15 @@ from PIL import Image
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.viewer import page
-from gsplat_edu.viewer.serve import PageServer, exposure, free_port, is_loopback, url_of
+from gsplat_edu.viewer import page, serve
+from gsplat_edu.viewer.serve import (
+    PageServer,
+    exposure,
+    free_port,
+    is_loopback,
+    names_this_computer,
+    url_of,
+)
 
 PAGE = b"<!doctype html><title>page</title>" + bytes(range(256)) * 8192  # two MB: more than one write
 NAMES = ("--host", "--port")
@@ -154,6 +161,80 @@ def test_what_is_no_request_hurts_nobody(server, capsys, request_):
     assert capsys.readouterr() == ("", ""), "the terminal stays clean"
 
 
+def cut_off(server, first, more, pieces):
+    """Send a request that never ends, and say whether the server closed the connection before it had all of it."""
+    with socket.create_connection(server.server_address[:2], timeout=PATIENCE) as connection:
+        try:
+            connection.sendall(first)
+            for _ in range(pieces):
+                connection.sendall(more)
+                time.sleep(0.01)
+            return False
+        except (BrokenPipeError, ConnectionResetError):
+            return True
+
+
+@pytest.mark.parametrize("first", [b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\nX: "])
+def test_a_request_that_trickles_in_is_cut_off(server, monkeypatch, capsys, first):
+    """A byte every 10 ms for 20 s, where 0.2 s are allowed; each read by itself is quick."""
+    monkeypatch.setattr(serve, "REQUEST_SECONDS", 0.2)
+    assert cut_off(server, first, b"a", 2000)
+    monkeypatch.undo()
+    assert ask(server)[2] == PAGE
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_request_without_end_is_cut_off(server):
+    # 100 headers of 60 KB: as many as http.server takes, and a hundred times what is allowed
+    assert cut_off(server, b"GET / HTTP/1.1\r\n", b"X: " + b"a" * 60_000 + b"\r\n", 90)
+
+
+def test_more_connections_than_there_is_room_for_are_closed(server, monkeypatch):
+    """Those that wait hold their threads; the next one is not answered; once they are gone there is room again."""
+    server._room = threading.Semaphore(3)
+    waiting = [socket.create_connection(server.server_address[:2], timeout=10) for _ in range(3)]
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while server._room._value:
+            assert time.monotonic() < deadline, "their threads"
+            time.sleep(0.01)
+        assert ask_raw(server, b"") == b""
+        with pytest.raises((http.client.BadStatusLine, ConnectionError)):
+            ask(server)
+    finally:
+        for connection in waiting:
+            connection.close()
+    while server._room._value < 3:
+        assert time.monotonic() < deadline, "room again"
+        time.sleep(0.01)
+    assert ask(server)[2] == PAGE
+
+
+@pytest.mark.parametrize(
+    ("header", "bound", "is_ours"),
+    [
+        ("localhost:8080", "0.0.0.0", True),
+        ("192.168.0.7:8080", "0.0.0.0", True),
+        ("[fe80::1]:8080", "::", True),
+        ("desktop", "0.0.0.0", True),
+        ("desktop.lan:80", "0.0.0.0", True),
+        ("desktop.local", "192.168.0.7", True),
+        ("scenes.example.org", "scenes.example.org", True),
+        ("evil.example.org", "0.0.0.0", False),
+        ("evil.example.org:8080", "192.168.0.7", False),
+        ("1.2.3.4.example.org", "0.0.0.0", False),
+        ("192.168.0.7", "127.0.0.1", False),
+        ("desktop", "127.0.0.1", False),
+        ("localhost", "127.0.0.1", True),
+        ("", "0.0.0.0", False),
+        ("a b", "0.0.0.0", False),
+        ("localhost:8080/", "0.0.0.0", False),
+    ],
+)
+def test_names_that_a_page_from_elsewhere_could_have_are_turned_away(header, bound, is_ours):
+    assert names_this_computer(header, bound) is is_ours
+
+
 def test_a_browser_that_goes_away_in_the_middle_hurts_nobody(server, capsys):
     for _ in range(3):
         with socket.create_connection(server.server_address[:2], timeout=10) as connection:
@@ -165,6 +246,8 @@ def test_a_browser_that_goes_away_in_the_middle_hurts_nobody(server, capsys):
 
 def test_a_browser_draws_the_page_without_complaint(server, browser, random_gaussians):
     server.page = page.html(Scene(random_gaussians(300)), settings=RenderSettings(background=ORANGE))
+    server.policy = page.policy()
+    assert ask(server)[1]["Content-Security-Policy"] == f"{page.policy()}; frame-ancestors 'none'"
     complaints, urls = [], []
     tab = browser.new_page(viewport={"width": 320, "height": 240})
     tab.on("console", lambda message: complaints.append(message.text))
@@ -184,11 +267,12 @@ def test_a_browser_draws_the_page_without_complaint(server, browser, random_gaus
     assert [one for one in urls if not one.startswith((server.url, "blob:", "data:"))] == []
 
 
-def test_bound_to_every_address_any_name_will_do():
+def test_bound_to_every_address_names_of_the_local_network_will_do():
     with PageServer(PAGE, "0.0.0.0") as open_to_all:
         thread = threading.Thread(target=open_to_all.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         assert ask(open_to_all, Host="my-desktop.lan")[2] == PAGE
+        assert ask(open_to_all, Host="evil.example.org")[0] == 403
         open_to_all.shutdown()
         thread.join(10)
     assert open_to_all.url == f"http://127.0.0.1:{open_to_all.server_port}/"

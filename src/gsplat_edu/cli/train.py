@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
             view = live.LiveView(capture, interrupted, host, live.PORT if port is None else port)
             closing.enter_context(view)
             say(f"live view: {view.url}")
-            if warning := exposure(host, "sees the training and can pause it"):
+            if warning := exposure(host, "sees the training and can pause it", token=True):
                 say(warning)
         with _bar(console, "{task.fields[state]}") as bar:
             _train(capture, bar, interrupted, ends, callbacks if view is None else [*callbacks, view.show])

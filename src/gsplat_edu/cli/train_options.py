@@ -98,7 +98,8 @@ def _add_view(group: argparse._ArgumentGroup) -> None:
         "--view",
         action="store_true",
         help="show the training in the browser while it runs, with pause and single step; it takes at most a fifth of"
-        " the time and changes no bit. Afterwards the scene is shown until the last browser is closed, or Ctrl-C",
+        " the time and changes no bit. The URL that is printed holds a token: only who has it gets in. Afterwards the"
+        " scene is shown until the last browser is closed, or Ctrl-C",
     )
     group.add_argument(
         "--view-host", metavar="ADDRESS", help="where to listen (default: 127.0.0.1, for this computer only)"

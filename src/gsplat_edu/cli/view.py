@@ -12,8 +12,9 @@ from pathlib import Path
 from rich.console import Console
 
 from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.errors import ArgumentError
 from gsplat_edu.runs.source import open_source
-from gsplat_edu.viewer import page
+from gsplat_edu.viewer import export, page
 from gsplat_edu.viewer.serve import LOOPBACK, PageServer, exposure
 
 EXAMPLE = "example: gsplat-edu view runs/plush"
@@ -43,11 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C, which is how it ends."""
     console = Console(highlight=False, markup=False)
-    with PageServer(
-        b"", arguments.host, arguments.port
-    ) as server:  # a port that is taken is no reason to wait
+    _check_is_no_page(arguments.source)
+    # first of all: a port that is taken is no reason to wait for the scene
+    with PageServer(b"", arguments.host, arguments.port, policy=page.policy()) as server:
         source = open_source(arguments.source)
-        server.page = page.html(source.scene, source.cameras, source.settings, _title(arguments.source))
+        title = _title(arguments.source)
+        server.page = page.html(source.scene, source.cameras, source.settings, title, source.held_out)
         cameras = f", {len(source.cameras)} cameras" if source.cameras else ""
         console.print(
             f"{source.path}: {len(source.scene.gaussians):,} Gaussians{cameras}, {len(server.page):,} bytes",
@@ -63,6 +65,12 @@ def run(arguments: argparse.Namespace) -> None:
             server.serve_forever()
         except KeyboardInterrupt:
             console.print("ended")
+
+
+def _check_is_no_page(path: Path) -> None:
+    """Refuse a page, which needs no program but a browser."""
+    if path.suffix.lower() == export.PAGE and path.is_file():
+        raise ArgumentError(f"{path}: is a page already; open it in a browser: {path.resolve().as_uri()}")
 
 
 def _title(path: Path) -> str:

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
+from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.evaluate.figures import run_curves_figure, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
 from gsplat_edu.files import written_aside
@@ -176,13 +177,14 @@ def write_report(path: Path, report: Report) -> None:
     Raises:
         OSError: the file cannot be written. What stood there before is untouched.
     """
-    curves = run_curves_figure(_with_last(report.log, report.metrics))
+    figure = run_curves_figure(_with_last(report.log, report.metrics))
+    curves = svg_element(figure) if figure else ""
     config = {key: value for key, value in report.config.items() if key != "machine"}
     sections = [
         f'<p class="verdict">{html.escape(verdict(report.metrics, report.scores))}</p>\n',
         _page_link(path, report.metrics.get("exports")),
         _headline(report.metrics),
-        _section("Curves", _table(svg_element(curves)) if curves else ""),
+        _section("Curves", _table(curves) if curves else ""),
         _views(report.scores, report.pictures),
         _exports(report.metrics.get("exports")),
         _section("Notes", _list(report.notes)),
@@ -190,8 +192,9 @@ def write_report(path: Path, report: Report) -> None:
         *_machines(report),
     ]
     title = html.escape(report.title)
+    policy = policy_element(content_policy(scripts=[SCRIPT], styles=[STYLE], markup=curves))
     page = (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n{policy}\n<title>{title}</title>\n'
         f'<meta name="viewport" content="width=device-width">\n<style>{STYLE}</style>\n</head>\n<body>\n'
         f"<h1>{title}</h1>\n{''.join(sections)}<script>{SCRIPT}</script>\n</body>\n</html>\n"
     )

@@ -68,13 +68,17 @@ def write(path: Path, scene: Scene) -> None:
     _write(path, scene.gaussians, ORIGIN, comments(scene))
 
 
-def save_ply(path: str | Path, gaussians: Gaussians, origin: ArrayLike = ORIGIN) -> None:
+def save_ply(
+    path: str | Path, gaussians: Gaussians, origin: ArrayLike = ORIGIN, antialiased: bool | None = None
+) -> None:
     """Write Gaussians as a scene PLY.
 
     Args:
         path: The file; parent folders are made.
         gaussians: N Gaussians, raw parameters; written as float32.
         origin: (3,) added to the means in float64: where the scene's zero lies in the capture's own frame.
+        antialiased: Whether the Gaussians were trained to be rendered with antialiasing; a comment says so. The file
+            does not say where None.
 
     Raises:
         ShapeError: the origin is not of shape (3,).
@@ -82,7 +86,7 @@ def save_ply(path: str | Path, gaussians: Gaussians, origin: ArrayLike = ORIGIN)
         OSError: the file cannot be written. What stood there before is untouched.
     """
     gaussians.check_finite()
-    _write(Path(path), gaussians, origin, [])
+    _write(Path(path), gaussians, origin, comments(Scene(gaussians, antialiased)))
 
 
 def _write(path: Path, gaussians: Gaussians, origin: ArrayLike, extra: list[str]) -> None:

@@ -31,6 +31,11 @@ GENERATOR = "gsplat-edu"
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}", re.ASCII)
 """A file's name that leads nowhere else: no slash, no drive, no leading dot."""
 
+ANTIALIASED_MODEL = "antialiased"
+
+MODELS = ("default", ANTIALIASED_MODEL)
+"""Models of splats that say whether to render with antialiasing."""
+
 LARGEST_FLOAT = float(str(np.finfo(np.float32).max))
 """Largest float32 in its fewest digits: a little more than itself, and read as it."""
 
@@ -113,7 +118,9 @@ def to_json(meta: Meta) -> bytes:
     """Write a meta.json: the same bytes for the same scene.
 
     Numbers of codebooks have the fewest digits from which the same float32 is read. The direction that is up stands
-    in asset.extras.up, where other readers do not look.
+    in asset.extras.up, where other readers do not look. Antialiasing is said twice: by "antialias" of the
+    specification, and by "model", which PlayCanvas' splat-transform reads and writes since 3.2 and leaves out where
+    the model is the default.
     """
     asset: dict[str, object] = {"generator": GENERATOR}
     if meta.up is not None:
@@ -121,6 +128,8 @@ def to_json(meta: Meta) -> bytes:
     document: dict[str, object] = {"version": VERSION, "asset": asset, "count": meta.count}
     if meta.antialiased is not None:
         document["antialias"] = meta.antialiased
+        if meta.antialiased:
+            document["model"] = ANTIALIASED_MODEL
     low, high = meta.span
     document["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": meta.means}
     document["scales"] = {"codebook": _short(meta.scales), "files": meta.log_scales}
@@ -170,6 +179,8 @@ def _checked(path: Path, document: dict[str, object]) -> Meta:
     antialiased = document.get("antialias")
     if not (antialiased is None or isinstance(antialiased, bool)):
         _refuse(path, "antialias, which is neither true nor false")
+    if antialiased is None and document.get("model") in MODELS:
+        antialiased = document["model"] == ANTIALIASED_MODEL
     keys = ("means.mins", "means.maxs")
     low, high = (_numbers(path, key, _at(document, key), 3, LARGEST_LOG) for key in keys)
     harmonics = None

@@ -35,10 +35,12 @@ class Source:
     Args:
         path: The scene's file.
         scene: The scene.
-        cameras: Name and camera of each view of its capture, in the same frame; none where they are not known.
+        cameras: Name and camera of each view of its capture, in the same frame, in the order of their names, which
+            is the capture's; none where they are not known.
         settings: How it is to be rendered.
         origin: What was subtracted from the coordinates of the file and its cameras: that of the run, where its
             capture lies far from zero.
+        held_out: Names of the views that were not trained on.
     """
 
     path: Path
@@ -46,6 +48,7 @@ class Source:
     cameras: tuple[NamedCamera, ...]
     settings: RenderSettings
     origin: tuple[float, float, float] = ORIGIN
+    held_out: frozenset[str] = frozenset()
 
     def probes(self, most: int, longest: int) -> list[NamedCamera]:
         """Choose cameras to look at the scene from: its own, evenly over the list, or an orbit.
@@ -121,10 +124,13 @@ def _of_run(folder: RunFolder, path: Path) -> Source:
     x, y, z = float64_array("config.json: origin", config.get("origin", ORIGIN), (3,)).tolist()
     gaussians = load_ply(path, (x, y, z))
     cameras: tuple[NamedCamera, ...] = ()
+    held_out: frozenset[str] = frozenset()
     if folder.cameras.is_file():
-        cameras = tuple((name, camera) for name, _, camera in folder.read_cameras((x, y, z)))
+        known = sorted(folder.read_cameras((x, y, z)), key=lambda entry: entry[0])
+        cameras = tuple((name, camera) for name, _, camera in known)
+        held_out = frozenset(name for name, split, _ in known if split == "test")
     scene = Scene(gaussians, settings.antialiased, scene_up([camera for _, camera in cameras]))
-    return Source(path, scene, cameras, settings, (x, y, z))
+    return Source(path, scene, cameras, settings, (x, y, z), held_out)
 
 
 def scene_up(cameras: Sequence[Camera]) -> tuple[float, float, float]:

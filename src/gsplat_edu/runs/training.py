@@ -293,7 +293,7 @@ class CaptureRun:
         if lost := len(trainer.gaussians) - len(gaussians):
             self._say(f"{lost} Gaussians are NaN or infinite, and are left out of the scene")
         path = self.folder.scene(trainer.iteration)
-        save_ply(path, gaussians, dataset.origin)
+        save_ply(path, gaussians, dataset.origin, self.options.render_settings.antialiased)
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         if export is not None:
             facts["exports"] = export(open_source(path))

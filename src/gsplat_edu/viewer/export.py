@@ -92,7 +92,7 @@ def write(path: Path, source: Source) -> None:
         OSError: it cannot be written. What stood there before is untouched.
     """
     if path.suffix.lower() == PAGE:
-        page.write(path, source.scene, source.cameras, source.settings)
+        page.write(path, source.scene, source.cameras, source.settings, source.held_out)
     else:
         write_scene(path, source.scene)
 

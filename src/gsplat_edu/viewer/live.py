@@ -5,7 +5,7 @@ trains reads it between two steps, where nothing else touches the Gaussians, and
 nothing, so the training has the bits of one that nobody watches.
 
 viser opens one TCP port, for the files of its client and the WebSocket. Its tunnel to a public server is closed here,
-and pages from elsewhere, which a browser would let connect, are turned away.
+and `gsplat_edu.viewer.live_guard` checks who asks.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import functools
 import logging
 import math
 import queue
-import re
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -26,19 +25,22 @@ import numpy as np
 import rich
 import torch
 import viser
-import websockets.asyncio.server
-from jaxtyping import Float, Float64
+import viser.transforms
+from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera, point_nearest_axes
+from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError, SplatError
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.evaluate.paths import PARALLEL, common_up
+from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.gaussian_math import quat_to_R
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.validation import ArrayLike, in_range, whole_number
-from gsplat_edu.viewer.serve import LOCAL_NAME, LOOPBACK, free_port, is_loopback, url_of
+from gsplat_edu.viewer.live_guard import Guard
+from gsplat_edu.viewer.page_start import looked_at
+from gsplat_edu.viewer.serve import LOOPBACK, free_port, url_of
+from gsplat_edu.views import View
 
 PORT = 8080
 
@@ -131,7 +133,7 @@ class LiveView:
         ArgumentError: the address is none of this computer's, or the port is taken or out of range.
 
     Attributes:
-        url: Where a browser finds the view.
+        url: Where a browser finds the view; its token lets the browser in.
     """
 
     def __init__(
@@ -148,8 +150,8 @@ class LiveView:
         self._seen_at = -math.inf
         self._said = ""
         with ExitStack() as closing:
-            self._server = _server(host, port, closing)
-            self.url = url_of(host, self._server.get_port())
+            self._server, token = _server(host, port, closing)
+            self.url = f"{url_of(host, self._server.get_port())}?token={token}"
             self._set_scene()
             self._add_panel()
             self._closing = closing.pop_all()
@@ -301,11 +303,14 @@ class LiveView:
 
     def _set_scene(self) -> None:
         cameras = [view.camera for view in self._capture.dataset.train]
+        self._up = common_up(cameras)
         first, start = cameras[0], self._server.initial_camera
-        self._server.scene.set_up_direction(common_up(cameras))
+        pivot = looked_at(cameras, 0, self._capture.dataset.points)
+        self._distance = float((pivot - first.eye) @ first.R[2])
+        self._server.scene.set_up_direction(self._up)
         start.position = first.eye
-        start.look_at = _subject(cameras, self._capture.dataset.points)
-        start.fov = 2.0 * math.atan(first.H / 2 / first.fy)
+        start.look_at = first.eye + self._distance * first.R[2]
+        start.fov = _vertical_fov(first)
 
     def _add_panel(self) -> None:
         gui = self._server.gui
@@ -317,6 +322,35 @@ class LiveView:
         self._width = gui.add_slider("Width, px", low, high, step=20, initial_value=START_WIDTH)
         self._pause.on_click(lambda event: self._commands.put(self._toggle))
         self._step.on_click(lambda event: self._commands.put(self._step_once))
+        dataset = self._capture.dataset
+        start = dataset.train[0].camera
+        reset = gui.add_button("Back to the start")
+        reset.on_click(lambda event: self._send(event.client, start, self._up))
+        views = _named(dataset.train, dataset.test)
+        cameras = gui.add_dropdown("Camera", list(views), initial_value=dataset.train[0].name)
+        cameras.on_update(lambda event: self._send(event.client, views[event.target.value].camera))
+
+    def _send(
+        self, browser: viser.ClientHandle | None, camera: Camera, up: Float64[np.ndarray, "3"] | None = None
+    ) -> None:
+        """Ask for a browser to be moved to a camera; to what is up for all of them where its own was turned away."""
+        if browser is not None:
+            self._commands.put(functools.partial(self._move, browser, camera, up))
+
+    def _move(self, browser: viser.ClientHandle, camera: Camera, up: Float64[np.ndarray, "3"] | None) -> None:
+        seen = browser.camera
+        if not seen.update_timestamp:  # it has not said yet where it stands
+            return
+        with warnings.catch_warnings(), browser.atomic():  # viser warns where the browser has just gone
+            warnings.simplefilter("ignore")
+            seen.fov = _vertical_fov(camera)
+            seen.position = camera.eye
+            seen.look_at = camera.eye + self._distance * camera.R[2]
+            if up is None:
+                seen.wxyz = viser.transforms.SO3.from_matrix(camera.R.T).wxyz
+            else:
+                seen.up_direction = up
+        browser.flush()
 
     def _toggle(self) -> None:
         self._left = 0 if self._left == math.inf else math.inf
@@ -333,21 +367,22 @@ class _Server(viser.ViserServer):
         return None
 
 
-def _server(host: str, port: int, closing: ExitStack) -> viser.ViserServer:
-    """Start viser's server; `closing` gets what ends it.
+def _server(host: str, port: int, closing: ExitStack) -> tuple[viser.ViserServer, str]:
+    """Start viser's server; `closing` gets what ends it. Return the server and its token.
 
     viser takes the next free port where one is taken, and waits for ever for one that cannot be had.
     """
     wanted = free_port(host, port, NAMES)
     closing.enter_context(_silence())
-    with _only_pages_from(host):
+    guard = Guard(host, wanted)
+    with guard.installed():
         server = _Server(host=host, port=wanted, label="gsplat-edu", verbose=False)
-    closing.callback(server.stop)
+        closing.callback(server.stop)
     if server.get_port() != wanted:
         raise ArgumentError(
             f"{NAMES[1]}: {wanted} was taken this moment; give another, or 0 for any that is free"
         )
-    return server
+    return server, guard.token
 
 
 @contextmanager
@@ -364,34 +399,14 @@ def _silence() -> Iterator[None]:
         logger.setLevel(before[1])
 
 
-@contextmanager
-def _only_pages_from(host: str) -> Iterator[None]:
-    """Let the server that is started meanwhile refuse WebSockets of pages that are not its own.
-
-    Browsers let any page connect to any server, and viser does not ask where one comes from. Where others can reach the
-    server, its own pages may have any name, and all are let in.
-    """
-    serve = websockets.asyncio.server.serve
-    if is_loopback(host):
-        own = re.compile(f"http://{LOCAL_NAME}", re.IGNORECASE)
-        limited = functools.partial(serve, origins=[own])
-        websockets.asyncio.server.serve = limited  # type: ignore[assignment, misc]
-    try:
-        yield
-    finally:
-        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+def _named(train: Sequence[View], test: Sequence[View]) -> dict[str, View]:
+    """Return the views by the names that the list shows, in the capture's order."""
+    names = {view.name: view for view in train} | {f"{view.name} (held out)": view for view in test}
+    return dict(sorted(names.items(), key=lambda item: item[1].name))
 
 
-def _subject(cameras: Sequence[Camera], points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "3"]:
-    """Return the point on the first camera's axis that orbits go around: as far away as what all cameras look at."""
-    first = cameras[0]
-    centre = point_nearest_axes(cameras, PARALLEL)
-    depths = first.world_to_cam(points)[:, 2] if centre is None else first.world_to_cam(centre[None])[:, 2]
-    ahead = depths[depths > 0]
-    subject: Float64[np.ndarray, "3"] = (
-        first.eye + (float(np.median(ahead)) if ahead.size else 1.0) * first.R[2]
-    )
-    return subject
+def _vertical_fov(camera: Camera) -> float:
+    return 2.0 * math.atan(camera.H / 2 / camera.fy)
 
 
 def _psnr(trainer: Trainer) -> float:

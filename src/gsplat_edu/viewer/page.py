@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import base64
 import gzip
-import hashlib
 import html as html_text
 import json
 import math
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from gsplat_edu import constants
 from gsplat_edu.camera import Camera
+from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.io.quantize import check_expansion
@@ -34,7 +34,7 @@ from gsplat_edu.viewer.page_start import start_of
 FORMAT = "gsplat-edu page"
 VERSION = 1
 
-SCRIPTS = ("scene.js", "camera.js", "draw.js", "sorter.js", "controls.js", "panel.js", "main.js")
+SCRIPTS = ("scene.js", "region.js", "camera.js", "draw.js", "sorter.js", "controls.js", "panel.js", "main.js")
 """Scripts of the page, in the order in which they are loaded: they share one scope."""
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
@@ -68,21 +68,27 @@ FACTS_OPEN, SPLATS_OPEN, CLOSE = (
 
 
 def write(
-    path: Path, scene: Scene, views: Sequence[NamedCamera] = (), settings: RenderSettings | None = None
+    path: Path,
+    scene: Scene,
+    views: Sequence[NamedCamera] = (),
+    settings: RenderSettings | None = None,
+    held_out: Collection[str] = (),
 ) -> None:
     """Write the page; the file's name without its suffix is the title.
 
     Args:
         path: The file; parent folders are made.
         scene: The scene; it may be empty.
-        views: Name and camera of each place to look from; the page begins at the first one.
+        views: Name and camera of each place to look from, as the list shows them; the page begins at the first one
+            that was not held out.
         settings: How to draw; as scene files are drawn where None (`gsplat_edu.runs.source.file_settings`).
+        held_out: Names of the views that judge the scene: the list marks them.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
         OSError: the file cannot be written. What stood there before is untouched.
     """
-    pieces = _pieces(path.stem, scene, views, settings)
+    pieces = _pieces(path.stem, scene, views, settings, held_out)
     with written_aside(path) as aside, aside.open("wb") as file:
         file.writelines(pieces)
 
@@ -92,6 +98,7 @@ def html(
     views: Sequence[NamedCamera] = (),
     settings: RenderSettings | None = None,
     title: str = "scene",
+    held_out: Collection[str] = (),
 ) -> bytes:
     """Return the page as `write` writes it.
 
@@ -100,11 +107,17 @@ def html(
         views: As for `write`.
         settings: As for `write`.
         title: What stands above the picture.
+        held_out: As for `write`.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
     """
-    return b"".join(_pieces(title, scene, views, settings))
+    return b"".join(_pieces(title, scene, views, settings, held_out))
+
+
+def policy() -> str:
+    """Return the Content-Security-Policy of every page: its scripts, its style, and a worker that sorts."""
+    return content_policy(map(_web, SCRIPTS), [_web("style.css")], workers=True)
 
 
 def read(path: Path) -> Scene:
@@ -134,11 +147,15 @@ def read(path: Path) -> Scene:
 
 
 def _pieces(
-    title: str, scene: Scene, views: Sequence[NamedCamera], settings: RenderSettings | None
+    title: str,
+    scene: Scene,
+    views: Sequence[NamedCamera],
+    settings: RenderSettings | None,
+    held_out: Collection[str],
 ) -> Iterator[bytes]:
     """Yield the file, so that its parts need not be in memory together."""
     scene.gaussians.check_finite()
-    facts = _facts(title, scene, views, settings or file_settings(scene))
+    facts = _facts(title, scene, views, settings or file_settings(scene), held_out)
     head, tail = _web("index.html").split("{{splats}}\n")
     yield _filled(head, title, facts).encode("utf-8", errors="replace")  # a file's name may be no text at all
     compressed = memoryview(gzip.compress(page_data.packed(scene.gaussians), 6, mtime=0))
@@ -148,9 +165,14 @@ def _pieces(
 
 
 def _facts(
-    title: str, scene: Scene, views: Sequence[NamedCamera], settings: RenderSettings
+    title: str,
+    scene: Scene,
+    views: Sequence[NamedCamera],
+    settings: RenderSettings,
+    held_out: Collection[str],
 ) -> dict[str, Any]:
-    start = start_of(scene, [camera for _, camera in views])
+    first = next((i for i, (name, _) in enumerate(views) if name not in held_out), 0)
+    start = start_of(scene, [camera for _, camera in views], first)
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -170,8 +192,11 @@ def _facts(
             "camera": _camera(start.camera),
             "pivot": start.pivot.tolist(),
             "up": start.up.tolist(),
+            "index": start.index,
         },
-        "cameras": [{"name": name, **_camera(camera)} for name, camera in views],
+        "cameras": [
+            {"name": name, "held_out": name in held_out, **_camera(camera)} for name, camera in views
+        ],
     }
 
 
@@ -186,8 +211,7 @@ def _filled(template: str, title: str, facts: dict[str, Any]) -> str:
     scripts = [_web(name) for name in SCRIPTS]
     texts = {
         "title": html_text.escape(title),
-        "policy": f"default-src 'none'; script-src {' '.join(map(_hash, scripts))}; style-src {_hash(style)};"
-        " worker-src blob:; base-uri 'none'; form-action 'none'",
+        "policy": policy_element(policy()),
         "style": style,
         # "<" as an escape: no text in JSON can end the element that it stands in
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
@@ -205,10 +229,6 @@ def _text_element(name: str, text: str) -> str:
 
 def _web(name: str) -> str:
     return (files("gsplat_edu.viewer") / "web" / name).read_text("utf-8")
-
-
-def _hash(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def _shader(name: str) -> str:

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
-from gsplat_edu.camera import WORLD_UP, Camera, point_nearest_axes
-from gsplat_edu.evaluate.paths import PARALLEL, common_up, orbit_of_scene
+from gsplat_edu.camera import WORLD_UP, Camera
+from gsplat_edu.doctor.geometry import INWARD, Geometry
+from gsplat_edu.evaluate.paths import common_up, orbit_of_scene
 from gsplat_edu.io.scene import Scene
 
 SIDE = 800
@@ -17,6 +18,9 @@ SIDE = 800
 
 ORBIT = 4
 """Cameras of the orbit that its centre is found from."""
+
+MIDDLE = 0.5
+"""Part of a camera's image, along each side, in which what it looks at is sought."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,27 +31,59 @@ class Start:
         camera: The camera.
         pivot: (3,) point that orbits go around.
         up: (3,) direction that is up, of length 1.
+        index: Which of the capture's cameras it is; -1 where it is none of them.
     """
 
     camera: Camera
     pivot: Float64[np.ndarray, "3"]
     up: Float64[np.ndarray, "3"]
+    index: int
 
 
-def start_of(scene: Scene, cameras: Sequence[Camera]) -> Start:
-    """Choose the first view: the first camera, or where an orbit around the scene begins.
+def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
+    """Choose the first view: a camera, or where an orbit around the scene begins.
 
     Args:
         scene: The scene; it may be empty.
         cameras: Those of its capture, if any.
+        index: Which of them.
     """
     up = np.array(scene.up or WORLD_UP, dtype=np.float64)
     up = common_up(cameras) if scene.up is None and cameras else up / np.linalg.norm(up)
-    zero = np.zeros(3)
+    if cameras:
+        opaque = scene.gaussians.logit_opacities > 0
+        means = scene.gaussians.means[opaque].double().numpy(force=True)
+        return Start(cameras[index], looked_at(cameras, index, means), up, index)
     if len(scene.gaussians):
         orbit = orbit_of_scene(scene.gaussians, ORBIT, SIDE, up)
     else:
-        orbit = [Camera.looking_at((0.0, 0.0, -1.0), zero, SIDE, SIDE, SIDE, SIDE)]
-    found = [point_nearest_axes(axes, PARALLEL) for axes in (cameras, orbit) if axes]
-    pivot = next((point for point in found if point is not None), zero)
-    return Start(cameras[0] if cameras else orbit[0], pivot, up)
+        orbit = [Camera.looking_at((0.0, 0.0, -1.0), np.zeros(3), SIDE, SIDE, SIDE, SIDE)]
+    centre = Geometry(orbit, np.zeros((0, 3))).centre
+    return Start(orbit[0], np.zeros(3) if centre is None else centre, up, -1)
+
+
+def looked_at(
+    cameras: Sequence[Camera], index: int, points: Float[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "3"]:
+    """Find what an orbit from a camera should go around.
+
+    Cameras that stand around something look at its centre. Where they face one way, or wander, their axes cross at
+    random or nowhere: there it is the median depth of the points in the middle of the camera's image.
+
+    Args:
+        cameras: At least one.
+        index: Which of them the orbit begins at.
+        points: (N, 3) what there is to look at; may be empty.
+
+    Returns:
+        (3,) a point in front of the camera, on its axis unless the cameras stand around it.
+    """
+    camera, geometry = cameras[index], Geometry(cameras, np.asarray(points, dtype=np.float64))
+    centre = geometry.centre if geometry.arrangement == INWARD else None
+    if centre is not None and camera.world_to_cam(centre[None])[0, 2] > 0:
+        return centre
+    x, y, z = camera.world_to_cam(geometry.points).T
+    across, down = 0.5 * MIDDLE * camera.W / camera.fx, 0.5 * MIDDLE * camera.H / camera.fy
+    depths = z[(z > 0) & (abs(x) < across * z) & (abs(y) < down * z)]
+    depth = float(np.median(depths)) if depths.size else geometry.depth
+    return np.asarray(camera.eye + (depth if depth > 0 else 1.0) * camera.R[2])

@@ -2,6 +2,8 @@
 // forward).
 "use strict";
 
+const ORBIT_STEP = Math.PI / 180;
+
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const plus = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
@@ -14,9 +16,10 @@ function turned(vector, axis, angle) {
   return vector.map((value, i) => value * cos + around[i] * sin + axis[i] * along);
 }
 
-// What a camera shows, in a window of another shape: its whole image, as large as fits, in the middle.
+// What a camera shows, in a window of another shape: the middle of its image, as large as the window, and nothing
+// outside of it, which the camera did not see.
 function fitted(camera, width, height) {
-  const scale = Math.min(width / camera.W, height / camera.H);
+  const scale = Math.max(width / camera.W, height / camera.H);
   const moved = (middle, from, to) => (middle + 0.5) * scale - 0.5 + 0.5 * (to - from * scale);
   return {
     ...camera,
@@ -29,6 +32,12 @@ function fitted(camera, width, height) {
   };
 }
 
+// The point at a depth that a camera sees at column u and row v.
+function pointAt(camera, u, v, depth) {
+  const ray = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1];
+  return ray.reduce((at, step, i) => plus(at, camera.R[i], step * depth), camera.eye);
+}
+
 // Bounds of x/z and y/z in the Jacobian, as Camera.jacobian_bounds has them; without a limit, all a float holds.
 function ratioBounds(camera, limit) {
   if (limit === null) return { low: [-3e38, -3e38], high: [3e38, 3e38] };
@@ -39,21 +48,26 @@ function ratioBounds(camera, limit) {
   return { low: bounds(-1), high: bounds(1) };
 }
 
-// Where the visitor stands and looks, and the point ahead that orbits go around.
+// Where the visitor stands and looks, and the point that orbits go around.
 class View {
-  constructor({ camera, pivot, up }) {
+  // start: camera, pivot and up of the first view. eyes: where the capture's cameras stand.
+  constructor({ camera, pivot, up }, eyes) {
     this.start = camera;
     this.pivot = pivot;
     this.up = up;
+    this.region = new Region(eyes);
     this.goTo(camera);
     this.pace = this.distance; // flying covers it in two seconds
+    this.region.around(this.focus);
+    this.turn = this.region.turn();
   }
 
   goTo(camera) {
     this.camera = camera;
     const towards = plus(this.pivot, camera.eye, -1);
     const ahead = dot(camera.R[2], towards);
-    this.distance = ahead > 0 ? ahead : Math.hypot(...towards) || 1;
+    this.focus = plus(camera.eye, camera.R[2], ahead > 0 ? ahead : Math.hypot(...towards) || 1);
+    this.allowed = null;
   }
 
   reset() {
@@ -61,40 +75,81 @@ class View {
   }
 
   centre() {
-    return plus(this.camera.eye, this.camera.R[2], this.distance);
+    return this.focus;
   }
 
-  // Turns the head by angles to the right and downwards; not over the zenith, where left and right change places.
-  look(right, down) {
+  get distance() {
+    return Math.hypot(...plus(this.focus, this.camera.eye, -1));
+  }
+
+  // Lets orbits go around another point; the picture stays.
+  orbitAround(point) {
+    this.focus = point;
+    this.allowed = null;
+  }
+
+  // The camera's axes after turning the head by angles to the right and downwards; not over the zenith, where left and
+  // right change places.
+  turnedHead(right, down) {
     const level = this.camera.R.map((row) => turned(row, this.up, -right));
     const R = level.map((row) => turned(row, level[0], -down));
     const steepness = (rows) => Math.abs(dot(rows[2], this.up));
-    const allowed = steepness(R) < 0.999 || steepness(R) < steepness(level);
-    this.camera = { ...this.camera, R: allowed ? R : level };
+    return steepness(R) < 0.999 || steepness(R) < steepness(level) ? R : level;
   }
 
-  // Turns about the point ahead.
+  // Turns the head.
+  look(right, down) {
+    const { distance } = this;
+    this.camera = { ...this.camera, R: this.turnedHead(right, down) };
+    this.orbitAround(plus(this.camera.eye, this.camera.R[2], distance));
+  }
+
+  // Turns about the focus, in steps so small that a fast drag is slowed down where a slow one is.
   orbit(right, down) {
-    const centre = this.centre();
-    this.look(right, down);
-    this.camera = { ...this.camera, eye: plus(centre, this.camera.R[2], -this.distance) };
+    if (this.allowed === null) {
+      this.region.around(this.focus);
+      // who has flown or panned outside is not held there
+      this.allowed = Math.max(this.region.margin, this.region.distance(plus(this.camera.eye, this.focus, -1)));
+    }
+    const steps = Math.max(1, Math.ceil(Math.hypot(right, down) / ORBIT_STEP));
+    for (let i = 0; i < steps; ++i) this.orbitStep(right / steps, down / steps);
+  }
+
+  orbitStep(right, down) {
+    const offset = plus(this.camera.eye, this.focus, -1);
+    const before = this.region.distance(offset);
+    let [R, around] = this.orbited(offset, right, down);
+    if (this.region.distance(around) > before) {
+      const share = this.region.share(before, this.allowed);
+      [R, around] = this.orbited(offset, share * right, share * down);
+    }
+    this.camera = { ...this.camera, R, eye: plus(this.focus, around) };
+  }
+
+  // Axes, and where the eye stands from the focus: turned with the axes.
+  orbited(offset, right, down) {
+    const R = this.turnedHead(right, down);
+    const seen = this.camera.R.map((row) => dot(row, offset));
+    return [R, [0, 1, 2].map((i) => R[0][i] * seen[0] + R[1][i] * seen[1] + R[2][i] * seen[2])];
   }
 
   // Moves by world units along the camera's axes (right, down, forward).
   move(steps) {
-    const eye = steps.reduce((at, step, i) => plus(at, this.camera.R[i], step), this.camera.eye);
-    this.camera = { ...this.camera, eye };
+    const shifted = (point) => steps.reduce((at, step, i) => plus(at, this.camera.R[i], step), point);
+    this.camera = { ...this.camera, eye: shifted(this.camera.eye) };
+    this.orbitAround(shifted(this.focus));
   }
 
   // Moves with the picture: a drag by so many pixels of a window whose camera is `shown`.
   pan(dx, dy, shown) {
-    this.move([(-dx * this.distance) / shown.fx, (-dy * this.distance) / shown.fy, 0]);
+    const depth = Math.abs(dot(this.camera.R[2], plus(this.focus, this.camera.eye, -1)));
+    this.move([(-dx * depth) / shown.fx, (-dy * depth) / shown.fy, 0]);
   }
 
-  // Goes nearer (factor below 1) or farther; the point ahead stays.
+  // Goes nearer to the focus (factor below 1) or farther.
   zoom(factor) {
     const distance = Math.min(Math.max(this.distance * factor, 1e-3 * this.pace), 1e3 * this.pace);
-    this.move([0, 0, this.distance - distance]);
-    this.distance = distance;
+    const offset = plus(this.camera.eye, this.focus, -1);
+    this.camera = { ...this.camera, eye: plus(this.focus, offset, distance / this.distance) };
   }
 }

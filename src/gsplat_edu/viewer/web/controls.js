@@ -1,12 +1,14 @@
 // Mouse, fingers and keys move the view.
 "use strict";
 
-const TURN = Math.PI; // radians for a drag across the shorter side of the window
 const WHEEL = 0.0015; // logarithm of the distance per pixel of scrolling
 const LINE = 16; // pixels, where a wheel counts in lines
 const PINCH = 8; // a pinch on a touchpad comes as a slow wheel with Ctrl
 const PACE = 0.5; // of the start's distance, per second
 const HURRY = 4; // with Shift
+const TAP = 10; // pixels that a finger may move in a tap
+const TAP_PAUSE = 400; // milliseconds between the two taps of a double one
+const TAP_APART = 30; // pixels between them
 
 // Along (right, down, forward).
 const STEPS = {
@@ -20,12 +22,14 @@ const STEPS = {
 
 class Controls {
   // actions: moved() after every move, awake() where a held key is about to move, shown() for the camera on the screen,
-  // and what keys ask for: fly(), reset(), help(), step(by).
+  // orbitAround(x, y) for a double click or tap, and what keys ask for: fly(), reset(), help(), step(by).
   constructor(canvas, view, actions) {
     Object.assign(this, { canvas, view, actions, flying: false, pointers: new Map(), held: new Set(), hurried: false });
+    this.lastTap = null;
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
-    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => this.release(event));
+    canvas.addEventListener("pointerup", (event) => this.release(event));
+    canvas.addEventListener("pointercancel", (event) => this.pointers.delete(event.pointerId));
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     addEventListener("keydown", (event) => this.keyDown(event));
@@ -37,12 +41,24 @@ class Controls {
     this.canvas.focus();
     this.canvas.setPointerCapture(event.pointerId);
     const pans = event.button !== 0 || event.shiftKey;
-    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, pans });
+    const [x, y] = [event.clientX, event.clientY];
+    this.pointers.set(event.pointerId, { x, y, pans, taps: !pans && !this.pointers.size, began: { x, y } });
     event.preventDefault();
   }
 
   release(event) {
+    const pointer = this.pointers.get(event.pointerId);
     this.pointers.delete(event.pointerId);
+    if (pointer?.taps && !this.pointers.size) this.tap(event);
+    else this.lastTap = null;
+  }
+
+  // Notes a click or tap, and acts on the second of two. The browser's own double click comes from no finger everywhere.
+  tap({ clientX: x, clientY: y, timeStamp }) {
+    const last = this.lastTap;
+    const isSecond = last && timeStamp - last.timeStamp < TAP_PAUSE && Math.hypot(x - last.x, y - last.y) < TAP_APART;
+    this.lastTap = isSecond ? null : { x, y, timeStamp };
+    if (isSecond) this.actions.orbitAround(x, y);
   }
 
   drag(event) {
@@ -50,6 +66,7 @@ class Controls {
     if (!pointer) return;
     const before = this.grip();
     [pointer.x, pointer.y] = [event.clientX, event.clientY];
+    if (Math.hypot(pointer.x - pointer.began.x, pointer.y - pointer.began.y) > TAP) pointer.taps = false;
     const after = this.grip();
     const [dx, dy] = [after.x - before.x, after.y - before.y];
     if (this.pointers.size > 1 || pointer.pans) this.pan(dx, dy);
@@ -65,7 +82,7 @@ class Controls {
   }
 
   turn(dx, dy) {
-    const angle = TURN / Math.min(this.canvas.clientWidth, this.canvas.clientHeight);
+    const angle = (this.flying ? Math.PI : this.view.turn) / Math.max(this.canvas.clientWidth, this.canvas.clientHeight);
     if (this.flying) this.view.look(dx * angle, dy * angle);
     else this.view.orbit(dx * angle, dy * angle);
   }

@@ -4,6 +4,9 @@
 // less than 1e-4 of the light is left; here nothing stops, which nobody can see.
 "use strict";
 
+const SOLID = 0.15; // half the opacity of a pixel that shows a surface, at least
+const SURFACE_STEPS = 10; // halvings of the depth's logarithm, from a factor of 2: down to 0.07 %
+
 class Renderer {
   constructor(canvas, splats, facts) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
@@ -82,14 +85,16 @@ class Renderer {
     [this.width, this.height] = [width, height];
   }
 
-  // Draws the splats in the order that was set: image = alpha colour + (1 - alpha) image, at first the background.
-  draw(camera, settings) {
+  // Draws the splats in the order that was set: image = alpha colour + (1 - alpha) image, at first the background;
+  // those up to a camera depth.
+  draw(camera, settings, background = [...settings.background, 1], farthest = 3e38) {
     const gl = this.gl;
     this.resize(camera.W, camera.H);
     gl.viewport(0, 0, camera.W, camera.H);
-    gl.clearBufferfv(gl.COLOR, 0, [...settings.background, 1]);
+    gl.clearBufferfv(gl.COLOR, 0, background);
     gl.useProgram(this.program);
     this.setUniforms(camera, settings);
+    gl.uniform1f(gl.getUniformLocation(this.program, "farthest"), farthest);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.vertices);
@@ -117,6 +122,33 @@ class Renderer {
     gl.uniform2f(place("size"), camera.W, camera.H);
     gl.uniform2fv(place("ratio_low"), low);
     gl.uniform2fv(place("ratio_high"), high);
+  }
+
+  // Camera depth of what is seen at a pixel: where half of its opacity has been met. null where little is there. The
+  // image has to be drawn again afterwards.
+  surface(camera, settings, column, row) {
+    const gl = this.gl;
+    const { near } = this.facts;
+    gl.enable(gl.SCISSOR_TEST); // so that only this pixel costs anything
+    gl.scissor(column, camera.H - 1 - row, 1, 1);
+    const pixel = new Float32Array(4);
+    const opacity = (farthest) => {
+      this.draw(camera, settings, [0, 0, 0, 0], farthest);
+      gl.readPixels(column, camera.H - 1 - row, 1, 1, gl.RGBA, gl.FLOAT, pixel);
+      return pixel[3];
+    };
+    const half = 0.5 * opacity(3e38);
+    let [low, high] = [near, 2 * near];
+    if (half >= SOLID) {
+      while (opacity(high) < half) [low, high] = [high, 2 * high];
+      for (let i = 0; i < SURFACE_STEPS; ++i) {
+        const middle = Math.sqrt(low * high);
+        if (opacity(middle) < half) low = middle;
+        else high = middle;
+      }
+    }
+    gl.disable(gl.SCISSOR_TEST);
+    return half >= SOLID ? high : null;
   }
 
   // Copies the image onto the canvas.

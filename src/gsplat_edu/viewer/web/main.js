@@ -12,8 +12,9 @@ class Viewer {
     this.canvas = element("canvas");
     this.renderer = new Renderer(this.canvas, splats, facts);
     this.sorter = new Sorter(splats.means, facts.near, (order) => this.renderer.setOrder(order));
-    this.view = new View(facts.start);
-    this.cameraIndex = facts.cameras.length ? 0 : -1;
+    const eyes = facts.cameras.map(({ eye }) => eye);
+    this.view = new View(facts.start, eyes);
+    this.cameraIndex = facts.start.index;
     this.exact = null; // the camera that setCamera was given, until somebody moves
     this.lost = false;
     this.frameAsked = 0;
@@ -33,6 +34,7 @@ class Viewer {
       moved: () => this.moved(-1),
       awake: () => this.askFrame(),
       shown: () => this.camera(),
+      orbitAround: (x, y) => this.orbitAround(x, y),
       help: () => this.panel.help(),
       fly: () => this.panel.flying((this.controls.flying = !this.controls.flying)),
       reset: () => this.reset(),
@@ -69,7 +71,21 @@ class Viewer {
 
   reset() {
     this.view.reset();
-    this.moved(this.facts.cameras.length ? 0 : -1);
+    this.moved(this.facts.start.index);
+  }
+
+  // Lets orbits go around what is seen at a place of the window, in CSS pixels; nothing changes where nothing is seen.
+  orbitAround(x, y) {
+    const camera = this.camera();
+    const { left, top, width, height } = this.canvas.getBoundingClientRect();
+    const column = Math.min(camera.W - 1, Math.max(0, Math.floor(((x - left) / width) * camera.W)));
+    const row = Math.min(camera.H - 1, Math.max(0, Math.floor(((y - top) / height) * camera.H)));
+    const depth = this.lost ? null : this.renderer.surface(camera, this.settings, column, row);
+    if (depth !== null) {
+      this.view.orbitAround(pointAt(camera, column, row, depth));
+      this.panel.point(x, y);
+    }
+    this.askFrame();
   }
 
   goTo(index) {

@@ -1,6 +1,8 @@
 // What stands around the picture: facts, buttons, the capture's cameras, messages.
 "use strict";
 
+const POINT_SHOWN = 800; // milliseconds
+
 const element = (id) => document.getElementById(id);
 
 function say(text) {
@@ -24,7 +26,12 @@ class Panel {
 
   fillDegrees(actions) {
     const select = element("degree");
-    for (let degree = 0; degree <= this.facts.sh_degree; ++degree) select.add(new Option(degree, degree));
+    const most = this.facts.sh_degree;
+    for (let degree = 0; degree <= most; ++degree) {
+      const name = degree === 0 ? "off" : degree === most ? "full" : `${degree} of ${most}`;
+      select.add(new Option(name, degree));
+    }
+    select.parentElement.hidden = most === 0;
     select.value = Math.min(this.facts.settings.sh_degree, this.facts.sh_degree);
     select.addEventListener("change", () => {
       actions.degree(Number(select.value));
@@ -36,9 +43,15 @@ class Panel {
     const { cameras } = this.facts;
     element("cameras").hidden = cameras.length === 0;
     element("cameras").querySelector("summary").textContent = `cameras (${cameras.length})`;
-    this.buttons = cameras.map(({ name }, index) => {
+    this.buttons = cameras.map(({ name, held_out }, index) => {
       const button = document.createElement("button");
       button.textContent = name;
+      if (held_out) {
+        const mark = document.createElement("small");
+        mark.textContent = "held out";
+        mark.title = "This photo was not trained on; it judges the scene.";
+        button.append(" ", mark);
+      }
       button.addEventListener("click", () => actions.goTo(index));
       return button;
     });
@@ -68,7 +81,17 @@ class Panel {
     element("rate").textContent = `${framesPerSecond.toFixed(0)} frames/s`;
   }
 
+  // Nothing is drawn while nothing moves: there is no rate.
   atRest() {
-    element("rate").textContent = "at rest";
+    element("rate").textContent = "";
+  }
+
+  // Shows for a moment where the point is that orbits go around.
+  point(x, y) {
+    const mark = element("point");
+    [mark.style.left, mark.style.top] = [`${x}px`, `${y}px`];
+    mark.hidden = false;
+    clearTimeout(this.pointShown);
+    this.pointShown = setTimeout(() => (mark.hidden = true), POINT_SHOWN);
   }
 }

@@ -22,6 +22,7 @@ uniform vec2 size;
 uniform vec2 ratio_low;  // bounds of x/z and y/z in the Jacobian
 uniform vec2 ratio_high;
 uniform bool antialiased;
+uniform float farthest;  // camera depth up to which splats are drawn
 
 layout(location = 0) in uint splat;
 
@@ -76,7 +77,7 @@ void main() {
     ivec2 place = texel(int(splat));
     vec3 offset = texelFetch(means, place, 0).xyz - eye;
     vec3 p = R * offset;
-    if (!(p.z > Z_NEAR)) return;
+    if (!(p.z > Z_NEAR && p.z <= farthest)) return;
 
     vec4 q = vec4(texelFetch(quats, place, 0));
     float length2 = dot(q, q);

@@ -1,0 +1,102 @@
+"""The policy of pages and reports, in a real browser: what we wrote works, what somebody slipped in does not run."""
+
+import numpy as np
+import pytest
+
+from gsplat_edu.content_policy import content_policy
+from gsplat_edu.evaluate.report import Picture, Report, write_report
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.viewer import page
+
+INJECTED = (
+    "<script>window.ran = 'script'</script>"
+    '<img src="data:," onerror="window.ran = \'handler\'">'
+    '<a id="link" href="javascript:window.ran=1">link</a>'
+    "<style>body { color: rgb(1, 2, 3) }</style>"
+    '<iframe srcdoc="<script>parent.ran = 1</script>"></iframe>'
+)
+
+
+def written_page(path, random_gaussians, three_views):
+    page.write(path, Scene(random_gaussians(30)), three_views)
+
+
+def written_report(path, *_):
+    photo = np.full((24, 32, 3), 90, np.uint8)
+    log = [{"iteration": i, "loss": 1 / i, "num_gaussians": 10 * i} for i in range(1, 40)]
+    pictures = [Picture.of("a", photo, photo // 2)]
+    write_report(path, Report("run", {"test": {"num_images": 1, "psnr": 20.0}}, log, pictures=pictures))
+
+
+@pytest.mark.parametrize("write", [written_page, written_report])
+def test_what_we_wrote_works_and_nothing_complains(visit, tmp_path, write, random_gaussians, three_views):
+    write(tmp_path / "a.html", random_gaussians, three_views)
+    seen = visit().open(tmp_path / "a.html")
+    if write is written_page:
+        seen.ready()
+        return  # tests/viewer/test_page_drawing.py compares the pictures, worker and all
+    figure = seen.tab.locator("svg").first
+    assert figure.is_visible()
+    strokes = figure.locator("path").evaluate_all(
+        "paths => paths.map((path) => getComputedStyle(path).stroke)"
+    )
+    assert len({stroke for stroke in strokes if stroke != "none"}) >= 2, "the curves have their colours"
+
+
+@pytest.mark.parametrize("write", [written_page, written_report])
+def test_what_somebody_slipped_in_does_not_run(browser, tmp_path, write, random_gaussians, three_views):
+    path = tmp_path / "a.html"
+    write(path, random_gaussians, three_views)
+    document = path.read_text("utf-8")
+    assert document.count("<body>") == 1
+    path.write_text(document.replace("<body>", f"<body>{INJECTED}"), "utf-8")
+    tab = browser.new_page()
+    refusals = []
+    tab.on("console", lambda message: refusals.append(message.text))
+    tab.goto(path.as_uri())
+    tab.evaluate("document.getElementById('link').click()")
+    tab.wait_for_timeout(300)
+    assert tab.evaluate("window.ran") is None
+    assert tab.evaluate("getComputedStyle(document.body).color") != "rgb(1, 2, 3)"
+    assert len([text for text in refusals if "Content Security Policy" in text]) >= 4
+    # and with no policy all of it runs: the test can fail
+    start = document.index('<meta http-equiv="Content-Security-Policy"')
+    unguarded = document[:start] + document[document.index(">", start) + 1 :]
+    path.write_text(unguarded.replace("<body>", f"<body>{INJECTED}"), "utf-8")
+    tab.goto(path.as_uri())
+    tab.wait_for_function("window.ran !== undefined")
+    tab.close()
+
+
+def test_nothing_leaves_the_page(visit, tmp_path):
+    """Not by a request of its own scripts either."""
+    script = (
+        "fetch('http://127.0.0.1:9/').catch(() => { document.title = 'refused' });"
+        "new Image().src = 'http://127.0.0.1:9/a.png';"
+    )
+    path = tmp_path / "a.html"
+    policy = content_policy([script]).replace('"', "&quot;")
+    path.write_text(
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}"><title>a</title><script>{script}</script>'
+    )
+    seen = visit()
+    seen.open(path)
+    seen.tab.wait_for_function("document.title === 'refused'")
+    refused = [text for text in seen.complaints if "Content Security Policy" in text]
+    assert len(refused) >= 2
+    seen.complaints.clear()
+    seen.requests.clear()  # Chromium lists requests that it refused
+
+
+def test_a_policy_allows_what_it_is_given_and_no_more():
+    rules = dict(rule.split(" ", 1) for rule in content_policy().split("; "))
+    assert {rules[name] for name in ("default-src", "script-src", "style-src", "worker-src")} == {"'none'"}
+    assert rules["img-src"] == "data: blob:" and rules["connect-src"] == "'none'"
+    # sha256sum of "a": the known answer
+    known = "'sha256-ypeBEsobvcr6wjGzmiPcTaeG7/gUfE5yuYB3ha/uSLs='"
+    rules = dict(rule.split(" ", 1) for rule in content_policy(["a"], ["a"], workers=True).split("; "))
+    assert rules["script-src"] == rules["style-src"] == known and rules["worker-src"] == "blob:"
+    markup = '<svg><style>a</style><path style="a"/><path style="b &amp; c"/></svg>'
+    styles = dict(rule.split(" ", 1) for rule in content_policy(markup=markup).split("; "))["style-src"]
+    first, keyword, second, third = styles.split(" ")
+    assert (first, keyword, second) == (known, "'unsafe-hashes'", known) and third.startswith("'sha256-")
