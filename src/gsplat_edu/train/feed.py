@@ -30,10 +30,10 @@ class ViewFeed:
     def next(self) -> tuple[View, Photo]:
         """Draw a view, and begin to read the photo of the one after it."""
         index = self._following()
-        self._queue.pop(0)
         ahead, self._ahead = self._ahead, None
         view = self.views[index]
         photo = ahead[1].result() if ahead and ahead[0] == index else view.read()
+        self._queue.pop(0)  # not before: a photo that cannot be read is still due
         following = self._following()
         if self.views[following].on_disk:
             self._ahead = following, self._reader.submit(self.views[following].read)

@@ -83,6 +83,7 @@ class Trainer:
         gaussians: The Gaussians as they stand.
         iteration: Steps taken so far.
         last: The last rendered image, its photo and its mask, for whoever wants to look.
+        last_name: The name of their view.
     """
 
     def __init__(
@@ -108,6 +109,7 @@ class Trainer:
         self.config, self.extent, self.density = config, extent, density
         self.iteration = 0
         self.last: tuple[Tensor, Tensor, np.ndarray[Any, Any] | None] | None = None
+        self.last_name = ""
         self._render, self._callbacks = render, tuple(callbacks)
         self._photos: dict[View, tuple[Tensor, Tensor | None]] = {}
         self._feed = ViewFeed(views, config.view_order, config.seed)
@@ -141,6 +143,7 @@ class Trainer:
     def _step(self) -> StepEvent:
         iteration, config = self.iteration, self.config
         view, photo = self._feed.next()
+        self.last_name = view.name
         background = config.background
         if config.random_background:
             background = tuple(self._backgrounds.uniform(size=3).tolist())
