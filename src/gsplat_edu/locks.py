@@ -17,7 +17,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.files import check_folder
 
 LOCK = ".lock"
-"""Name of the lock in its folder. The file is removed at the end; one that a killed process left behind locks nothing."""
+"""Name of the lock in its folder. It is removed at the end; one that a killed process left locks nothing."""
 
 _FAR = 1 << 30
 """Byte that is locked on Windows, where nobody can read a locked one: far behind what the file says."""

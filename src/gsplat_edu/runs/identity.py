@@ -35,8 +35,8 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     length, wanted = (_section(folder, config, "train").get("iterations") for config in (old, new))
     if isinstance(length, int) and isinstance(wanted, int) and wanted < length:
         raise CheckpointError(
-            f"--resume: {folder.path} was begun with iterations = {length}, not {wanted}: a run can be extended, but not"
-            " shortened; give as many or more, or end it earlier with --time-limit"
+            f"--resume: {folder.path} was begun with iterations = {length}, not {wanted}: a run can be extended,"
+            " not shortened; give as many or more, or end it earlier with --time-limit"
         )
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))

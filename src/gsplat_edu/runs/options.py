@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.errors import ArgumentError
@@ -69,3 +72,10 @@ class RunOptions:
             jacobian_limit=config.jacobian_limit,
             depth=False,
         )
+
+    @property
+    def renderer(self) -> Callable[..., Any]:
+        """Renders the scene with these settings; takes Gaussians and a camera."""
+        from gsplat_edu.render.api import render  # it imports torch
+
+        return functools.partial(render, settings=self.render_settings, backend=self.backend)

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.data.dataset import load_dataset, scene_extent
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.evaluate.metrics import Renderer, score_views, summarize
+from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
+from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.gaussians import Gaussians
@@ -31,7 +31,13 @@ from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
-from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_seconds, save_checkpoint
+from gsplat_edu.train.checkpoint import (
+    checkpoint_iteration,
+    list_checkpoints,
+    load_checkpoint,
+    read_seconds,
+    save_checkpoint,
+)
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.trainer import Callback, Trainer
@@ -53,11 +59,6 @@ def document(options: RunOptions) -> dict[str, Any]:
         "backend": options.backend,
         "machine": machine_facts(),
     }
-
-
-def renderer(options: RunOptions) -> Renderer:
-    """Return what renders a run's scene once it is trained."""
-    return functools.partial(render, settings=options.render_settings, backend=options.backend)
 
 
 Export = Callable[[Source], list[dict[str, Any]]]
@@ -273,9 +274,7 @@ class CaptureRun:
         for view in self.dataset.test:
             if stop():
                 return
-            scores += score_views(
-                self.trainer.gaussians, [view], renderer(options), options.config.background
-            )
+            scores += score_views(self.trainer.gaussians, [view], options.renderer, options.config.background)
         if not scores:
             return
         means = summarize(scores)
@@ -307,7 +306,7 @@ class CaptureRun:
             self.folder,
             Judged(dataset.test, dataset.train, self.options.config.background, dataset.notes),
             gaussians,
-            renderer(self.options),
+            self.options.renderer,
             facts,
             progress,
         )
