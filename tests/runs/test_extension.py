@@ -22,7 +22,7 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.config import TrainConfig, recipe
 
-BASE = ["--eval-every", "0", "--save-every", "5", "--densify-start", "2", "--densify-every", "4"]
+BASE = ["--eval-every", "0", "--save-every", "5", "--densify-start", "1", "--densify-every", "4"]
 BASE += ["--grad-threshold", "5e-5"]
 VIEWS = 6
 
@@ -41,7 +41,8 @@ def capture(tmp_path_factory):
     write_colmap(folder, *procedural_capture(24, VIEWS, splats=60))
     (folder / "masks").mkdir()
     for photo in (folder / "images").iterdir():
-        Image.new("L", Image.open(photo).size, 255).save(folder / "masks" / photo.name)
+        with Image.open(photo) as file:
+            Image.new("L", file.size, 255).save(folder / "masks" / photo.name)
     return folder
 
 
@@ -230,7 +231,7 @@ def test_antialiasing_that_does_not_match_is_told(capture, finished, tmp_path):
         (False, ["--antialiased"], "was trained without antialiasing, this run trains with"),
         (True, ["--antialiased"], None),
     ):
-        path = tmp_path / "scene.glb"
+        path = tmp_path / "scene.spz"
         write_scene(path, Scene(gaussians, antialiased))
         run = CaptureRun(
             options(capture, tmp_path / "run", "--iterations", "2", "--from", str(path), *words),
@@ -261,7 +262,8 @@ def test_what_does_not_go_with_a_scene_is_one_line(capture, finished, tmp_path, 
 
 
 def changed(path):
-    pixels = np.array(Image.open(path))
+    with Image.open(path) as file:
+        pixels = np.array(file)
     Image.fromarray(255 - pixels).save(path)
 
 
@@ -314,7 +316,7 @@ def test_a_photo_that_changes_in_mid_run_ends_it_with_its_state_saved(capture, t
     before = [photo.read_bytes() for photo in photos]
 
     def stop():
-        if trainer.iteration == 7:
+        if trainer.iteration == 7 and photos[0].read_bytes() == before[0]:
             for photo in photos:
                 changed(photo)
         for photo in photos:

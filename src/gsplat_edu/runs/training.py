@@ -102,8 +102,8 @@ class CaptureRun:
                 raise CheckpointError(
                     f"--out: {folder.path} holds a run already; add --resume to go on with it, or name another folder"
                 )
-            check_options(folder, document(options))
             self._check_start()
+            check_options(folder, document(options))
             if (before := folder.read_config().get("backend")) != options.backend:
                 self._say(
                     f"{folder.path}: was begun on the backend {before}; {options.backend} rounds differently"
@@ -126,7 +126,8 @@ class CaptureRun:
 
     def _check_start(self) -> None:
         """Refuse to resume a run from points with a scene; without --from, the scene of its config.json is used."""
-        stored = self.folder.read_config().get("data", {}).get("scene")
+        data = self.folder.read_config().get("data")
+        stored = data.get("scene") if isinstance(data, dict) else None
         if stored is None and self.options.scene is not None:
             raise CheckpointError(
                 f"--resume: {self.folder.path} was begun from points, not --from {self.options.scene};"
