@@ -83,6 +83,6 @@ def test_the_command_line_prints_the_name_that_was_asked_for(tmp_path, capsys):
     assert run_command("gsplat-edu render", command, debug=False) == 2
     error = capsys.readouterr().err
     assert error.startswith(
-        f"gsplat-edu render: {tmp_path / 'file' / 'scene.ply'}: not a directory; check the name"
+        f"gsplat-edu render: {tmp_path / 'file' / 'scene.ply'}: file exists; choose another place"
     )
     assert "Errno" not in error

@@ -80,6 +80,7 @@ _ADVICE = {
     errno.EDQUOT: "make room, or choose another place",
     errno.ENOENT: "check the name",
     errno.ENOTDIR: "check the name",
+    errno.EEXIST: "choose another place",
     errno.EISDIR: "give the name of a file",
     errno.ENAMETOOLONG: "choose a shorter name",
 }

@@ -155,7 +155,7 @@ def test_a_copy_of_the_capture_is_the_same_and_a_changed_photo_is_named(made, ru
 def test_renders_of_views_that_are_not_its_own_are_removed_and_no_other_file(run, cli):
     """As an evaluation by an older version left them: of another dataset, in the run's folder."""
     folder = run.renders / "test"
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for name in ("stray_1.png", "stray_2.png", "mine.png", "notes.txt"):
         (folder / name).write_text("x")
     run.write_metrics({"test_views": [{"name": "stray/1.jpg"}, {"name": "stray_2.png"}, {"name": 7}, None]})
