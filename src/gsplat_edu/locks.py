@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.files import check_folder
+from gsplat_edu.files import check_folder, named_failure
 
 LOCK = ".lock"
 """Name of the lock in its folder. It is removed at the end; one that a killed process left locks nothing."""
@@ -53,8 +53,9 @@ def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> It
             return
         try:
             facts = {"pid": os.getpid(), "host": socket.gethostname(), "since": _now(), "what": what}
-            os.ftruncate(handle, 0)
-            os.write(handle, json.dumps(facts).encode())
+            with named_failure(path):
+                os.ftruncate(handle, 0)
+                os.write(handle, json.dumps(facts).encode())
             yield
         finally:
             _release(handle, path)

@@ -33,7 +33,9 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     """
     old = folder.read_config()
     length, wanted = (_section(folder, config, "train").get("iterations") for config in (old, new))
-    if isinstance(length, int) and isinstance(wanted, int) and wanted < length:
+    if not isinstance(length, int) or not isinstance(wanted, int):
+        raise CheckpointError(f"{folder.config}: train: iterations: is no whole number; mend the file")
+    if wanted < length:
         raise CheckpointError(
             f"--resume: {folder.path} was begun with iterations = {length}, not {wanted}: a run can be extended,"
             " not shortened; give as many or more, or end it earlier with --time-limit"

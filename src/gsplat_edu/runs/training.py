@@ -32,7 +32,6 @@ from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
 from gsplat_edu.train.checkpoint import (
-    checkpoint_iteration,
     list_checkpoints,
     load_checkpoint,
     read_seconds,
@@ -66,7 +65,7 @@ Export = Callable[[Source], list[dict[str, Any]]]
 
 
 class CaptureRun:
-    """A run of training on a capture.
+    """A run of training on a capture. Its folder is not locked; see `gsplat_edu.locks.locked`.
 
     Args:
         options: The run.
@@ -160,7 +159,6 @@ class CaptureRun:
                     f"--resume: {folder.path} was begun from another scene than {options.scene} is now;"
                     " resume with that one, or name another --out"
                 )
-            self._extend()
         else:  # config.json comes last: it says that the run has begun
             folder.write_cameras(dataset.train, dataset.test, dataset.origin)
             folder.write_photos(photo_digests(dataset))
@@ -179,6 +177,7 @@ class CaptureRun:
             callbacks=[self._record, *callbacks],
         )
         self._take_up()
+        self._extend()
         return self.trainer
 
     def _start_cloud(self) -> tuple[Gaussians, str | None]:
@@ -202,10 +201,8 @@ class CaptureRun:
         before = stored["train"].get("iterations")
         if before == wanted:
             return
-        checkpoints = list_checkpoints(self.folder.checkpoints)
-        done = checkpoint_iteration(checkpoints[-1]) if checkpoints else 0
         history = stored.get("history")
-        entry = {"iteration": done, "iterations_before": before, "iterations": wanted}
+        entry = {"iteration": self.trainer.iteration, "iterations_before": before, "iterations": wanted}
         train = {**stored["train"], "iterations": wanted}
         past = history if isinstance(history, list) else []
         self.folder.write_config(stored | {"train": train, "history": [*past, entry]})

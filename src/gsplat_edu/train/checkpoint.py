@@ -63,13 +63,6 @@ def list_checkpoints(folder: Path) -> list[Path]:
     return [path for _, path in sorted(found)]
 
 
-def checkpoint_iteration(path: Path) -> int:
-    """Return the iteration that the name of a listed checkpoint says."""
-    match = _NAME.fullmatch(path.name)
-    assert match is not None
-    return int(match[1])
-
-
 def read_seconds(path: Path) -> float:
     """Return the wall time of the training up to a checkpoint.
 
