@@ -14,7 +14,7 @@ import zstandard
 from PIL import Image
 
 from gsplat_edu.cli.main import build_parser
-from gsplat_edu.cli.train_options import options_from
+from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.viewer.live import LiveView
 

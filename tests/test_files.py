@@ -1,10 +1,13 @@
+import errno
 import os
 import stat
+import tempfile
 
 import pytest
 
 from gsplat_edu import ArgumentError
-from gsplat_edu.files import check_writable, written_aside
+from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.files import check_writable, described, written_aside
 
 
 def test_parents_are_made_and_the_file_appears_whole(tmp_path):
@@ -44,3 +47,42 @@ def test_check_writable_says_why_not(tmp_path):
         check_writable("--out", tmp_path / "folder.png")
     check_writable("--out", tmp_path / "new" / "x.png")
     assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_an_error_names_the_file_that_was_asked_for_and_the_reason_in_words(tmp_path, monkeypatch):
+    def refuse(*words, **options):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".scene.ab12cd34.ply"))
+
+    for name in ("mkstemp", None):
+        if name is not None:
+            monkeypatch.setattr(tempfile, name, refuse)
+        else:
+            monkeypatch.undo()
+        with pytest.raises(OSError) as caught, written_aside(tmp_path / "scene.ply") as aside:
+            raise PermissionError(errno.EACCES, "Permission denied", str(aside))
+        said = described(caught.value)
+        assert said.startswith(f"{tmp_path / 'scene.ply'}: permission denied; choose another place")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_are_described_without_numbers():
+    assert described(OSError(errno.ENOSPC, "No space left on device", "a.png")) == (
+        "a.png: no space left on device; make room, or choose another place"
+    )
+    assert described(OSError(errno.EXDEV, "Invalid cross-device link", "a", None, "b")).startswith("a to b: ")
+    assert described(OSError("the socket is gone")) == "the socket is gone"
+    assert described(OSError(errno.EIO, "Input/output error")) == "input/output error"
+
+
+def test_the_command_line_prints_the_name_that_was_asked_for(tmp_path, capsys):
+    def command():
+        (tmp_path / "file").write_text("")
+        with written_aside(tmp_path / "file" / "scene.ply"):
+            pass
+
+    assert run_command("gsplat-edu render", command, debug=False) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(
+        f"gsplat-edu render: {tmp_path / 'file' / 'scene.ply'}: file exists; choose another place"
+    )
+    assert "Errno" not in error

@@ -12,7 +12,8 @@ import argparse
 import sys
 
 from gsplat_edu.cli.arguments import OneLineParser, run_command
-from gsplat_edu.cli.sphere import add_options, options_from, run_sphere
+from gsplat_edu.cli.options.demo import add_arguments
+from gsplat_edu.cli.sphere import options_from, run_sphere
 from gsplat_edu.train.events import DensifyEvent, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
@@ -46,7 +47,7 @@ def main() -> int:
         description="Learn a sphere from 24 renders of it and judge the result with a held-out camera.",
         epilog="example: python train/train_3d.py --iters 100 --size 48 --out out/quick.png",
     )
-    add_options(parser)
+    add_arguments(parser)
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     arguments = parser.parse_args()
     return run_command("train_3d.py", lambda: train(arguments), arguments.debug)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import tempfile
@@ -25,31 +26,66 @@ def written_aside(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be made or written to. What stood under `path` before is untouched.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     prefix = f".{path.stem}.{os.getpid()}-"  # the writer's process: remove_leftovers asks whether it still runs
-    handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
+    with named_failure(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
     os.close(handle)
     aside = Path(name)
     try:
-        with named_failure(path):
+        with named_failure(path, aside):
             yield aside
-        umask = os.umask(0)
-        os.umask(umask)
-        aside.chmod(0o666 & ~umask)  # mkstemp makes files that only their owner can read
-        aside.replace(path)
+            umask = os.umask(0)
+            os.umask(umask)
+            aside.chmod(0o666 & ~umask)  # mkstemp makes files that only their owner can read
+            aside.replace(path)
     finally:
         aside.unlink(missing_ok=True)
 
 
 @contextmanager
-def named_failure(path: Path) -> Iterator[None]:
-    """Give an OSError that names no file, as that of a full disk does, the name of the file being written."""
+def named_failure(path: Path, aside: Path | None = None) -> Iterator[None]:
+    """Let an OSError name the file that was to be written, not a temporary one beside it, or none at all.
+
+    Args:
+        path: The file.
+        aside: Its temporary name; None if an error inside of the block is always about the file, whatever it names.
+    """
     try:
         yield
     except OSError as error:
-        if error.filename is None and error.errno is not None:
+        named = error.filename
+        if error.errno is not None and (aside is None or named is None or str(named) == str(aside)):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def described(error: OSError) -> str:
+    """Say in words what an OSError says in numbers: the file that the user knows, and the reason."""
+    if error.strerror is None:
+        return str(error)
+    reason = error.strerror[:1].lower() + error.strerror[1:]
+    if error.filename is None:
+        return reason
+    names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
+    return (
+        f"{' to '.join(names) or error.filename}: {reason}; {_ADVICE.get(error.errno or 0, 'check the file')}"
+    )
+
+
+_ADVICE = {
+    errno.EACCES: "choose another place, or change its permissions",
+    errno.EPERM: "choose another place, or change its permissions",
+    errno.EROFS: "choose another place",
+    errno.ENOSPC: "make room, or choose another place",
+    errno.EDQUOT: "make room, or choose another place",
+    errno.ENOENT: "check the name",
+    errno.ENOTDIR: "check the name",
+    errno.EEXIST: "choose another place",
+    errno.EISDIR: "give the name of a file",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+"""What to do about an error."""
 
 
 _LEFTOVER = re.compile(r"\..*\.(\d+)-[a-z0-9_]{8}(?:\.[^.]+)?")  # temporary names of written_aside

@@ -1,4 +1,5 @@
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.identity import photo_digests
 from splats import splats_on
 
 
@@ -82,6 +84,84 @@ def test_a_dataset_that_moved_is_named(made, cli, capsys, tmp_path):
     np.testing.assert_allclose(
         moved.read_metrics()["test"]["ssim"], folder.read_metrics()["test"]["ssim"], atol=1e-4
     )
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """As many views of the same names, from elsewhere: what only the cameras tell apart."""
+    views, points, colors = procedural_capture(size=32, count=6)
+    folder = tmp_path_factory.mktemp("other") / "capture"
+    write_colmap(folder, [rotated(view) for view in views], points, colors)
+    return folder
+
+
+def rotated(view):
+    camera = view.camera
+    values = {field.name: getattr(camera, field.name) for field in dataclasses.fields(camera)}
+    return type(view)(type(camera)(**(values | {"eye": camera.eye * 1.1})), view.image, name=view.name)
+
+
+@pytest.fixture
+def run(made, tmp_path):
+    shutil.copytree(made[0].path, tmp_path / "run")
+    return RunFolder(tmp_path / "run")
+
+
+def test_another_dataset_is_scored_apart_or_not_at_all(run, other, cli, capsys, tmp_path):
+    assert cli(["eval", str(run.path)]) == 0
+    before = contents(run.path)
+    capsys.readouterr()
+    assert cli(["eval", str(run.path), "--dataset", str(other)]) == 2
+    error = capsys.readouterr().err
+    assert "is not the capture of" in error and "other cameras: view_00" in error and "--out FOLDER" in error
+    assert error.count("\n") == 1 and contents(run.path) == before
+    words = ["eval", str(run.path), "--dataset", str(other), "--out", str(tmp_path / "apart")]
+    for _ in range(2):  # an evaluation may be done again
+        assert cli(words) == 0
+        assert "it is scored apart" in capsys.readouterr().out.replace("\n", " ")
+    assert contents(run.path) == before
+    apart = RunFolder(tmp_path / "apart")
+    assert apart.read_metrics()["evaluated"] == {"run": str(run.path), "dataset": str(other)}
+    assert apart.read_metrics()["test"]["psnr"] < run.read_metrics()["test"]["psnr"]
+    assert apart.report.is_file() and len(list((apart.renders / "test").iterdir())) == 2
+
+
+def test_an_evaluation_apart_overwrites_nothing_else(run, cli, capsys, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    for place, says in ((run.path, "holds a run"), (tmp_path / "mine", "holds other files")):
+        before = contents(place)
+        assert cli(["eval", str(run.path), "--out", str(place)]) == 2
+        error = capsys.readouterr().err
+        assert says in error and error.count("\n") == 1 and contents(place) == before
+
+
+def test_a_copy_of_the_capture_is_the_same_and_a_changed_photo_is_named(made, run, cli, capsys, tmp_path):
+    dataset = load_dataset(made[1], DataSettings(test_every=3))
+    run.write_photos(photo_digests(dataset))
+    copy = tmp_path / "copy"
+    shutil.copytree(made[1], copy, copy_function=shutil.copyfile)
+    assert cli(["eval", str(run.path), "--dataset", str(copy)]) == 0
+    (copy / "images" / "view_002.png").write_bytes((copy / "images" / "view_003.png").read_bytes())
+    capsys.readouterr()
+    assert cli(["eval", str(run.path), "--dataset", str(copy)]) == 2
+    assert "1 of 6 have changed since the run began, first view_002.png" in capsys.readouterr().err
+
+
+def test_renders_of_views_that_are_not_its_own_are_removed_and_no_other_file(run, cli):
+    """As an evaluation by an older version left them: of another dataset, in the run's folder."""
+    folder = run.renders / "test"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("stray_1.png", "stray_2.png", "mine.png", "notes.txt"):
+        (folder / name).write_text("x")
+    run.write_metrics({"test_views": [{"name": "stray/1.jpg"}, {"name": "stray_2.png"}, {"name": 7}, None]})
+    assert cli(["eval", str(run.path)]) == 0
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["mine.png", "notes.txt", "view_000.png", "view_003.png"]
 
 
 def test_what_is_no_run_is_one_line(cli, capsys, tmp_path):

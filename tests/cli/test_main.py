@@ -49,7 +49,7 @@ def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
         (["--cap", "3"], "--k0: is 400, more than --cap 3"),
         (["--seed", "-1"], "--seed: is -1"),
         (["--seed", "99999999999999999999999"], "--seed: is 99999999999999999999999"),
-        (["--iter", "3"], "unrecognized arguments: --iter 3"),
+        (["--iter", "3"], "unrecognized argument --iter: did you mean --iters? see gsplat-edu demo --help"),
         (
             ["--backend", "abacus"],
             "backend 'abacus': not in this version of gsplat_edu; use auto or one of: cuda, cpu, torch",
@@ -57,7 +57,7 @@ def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
         (["--out", "sphere.jpg"], "--out: 'sphere.jpg' has to end in .png"),
         (["--out", "taken/sphere.png"], "--out: cannot write taken/sphere.png"),
         (["--out", "folder.png"], "--out: folder.png is a folder"),
-        (["--itres", "3"], "unrecognized arguments: --itres 3"),
+        (["--itres", "3"], "unrecognized argument --itres: did you mean --iters?"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, says, tmp_path, monkeypatch, capsys):

@@ -8,7 +8,7 @@ from PIL import Image
 
 from gsplat_edu.cli.arguments import bytes_text, seconds_text
 from gsplat_edu.cli.main import build_parser, main
-from gsplat_edu.cli.train_options import options_from
+from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.train.config import TrainConfig, recipe

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from gsplat_edu.cli.main import build_parser, main
-from gsplat_edu.cli.train_options import options_from
+from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap

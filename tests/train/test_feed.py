@@ -48,8 +48,13 @@ def in_memory(count, **kinds):
     return [View(camera, p.image, alpha=p.alpha, mask=p.mask) for p in photos(count, **kinds)]
 
 
+def draw(feed, background):
+    view, photo = feed.next()
+    return view, feed.target(view, photo, background)
+
+
 def drawn(feed, count, background=WHITE):
-    targets = [feed.next(background) for _ in range(count)]
+    targets = [draw(feed, background) for _ in range(count)]
     feed._reader.shutdown()  # what is being read ahead is counted too
     return targets
 
@@ -109,7 +114,7 @@ def test_every_draw_has_its_own_background():
     view = in_memory(1, alpha=True)[0]
     feed = ViewFeed([view], "shuffled", 0, None)
     for color in (WHITE, (0.0, 0.5, 1.0)):
-        assert np.array_equal(feed.next(color)[1].image.numpy(), view.read().over(color))
+        assert np.array_equal(draw(feed, color)[1].image.numpy(), view.read().over(color))
 
 
 @pytest.mark.parametrize(("H", "W"), [(1, 3), (37, 500), (5, AT_ONCE + 1), (0, 4)])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import itertools
 import math
 import re
 import signal
@@ -14,6 +16,8 @@ from contextlib import contextmanager
 from typing import Any, NoReturn
 
 from gsplat_edu.errors import SplatError
+from gsplat_edu.files import described
+from gsplat_edu.render.settings import BACKENDS
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -28,17 +32,30 @@ class OneLineParser(argparse.ArgumentParser):
     def __init__(self, **options: Any) -> None:  # noqa: ANN401
         super().__init__(allow_abbrev=False, **options)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
+        """Refuse an unknown option before argparse misses others, and say which one is spelled alike."""
+        words = sys.argv[1:] if args is None else list(args)
+        if self._subparsers is None:  # else the words belong to a command, whose parser gets them next
+            for word in itertools.takewhile(lambda word: word != "--", words):
+                flag = word.partition("=")[0]
+                if flag.startswith("--") and flag not in self._option_string_actions:
+                    self.error(self._unknown(flag))
+        return super().parse_known_args(words, namespace)
+
+    def _unknown(self, flag: str) -> str:
+        known = [option for option in self._option_string_actions if option.startswith("--")]
+        alike = difflib.get_close_matches(flag, known, n=1)
+        meant = f"did you mean {alike[0]}?" if alike else "it is not known"
+        return f"unrecognized argument {flag}: {meant}"
+
     def error(self, message: str) -> NoReturn:
         """Print the line and exit with 2."""
-        self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+        end = "" if message.endswith("?") else ";"
+        self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message}{end} see {self.prog} --help\n")
 
 
 def add_backend(parser: argparse._ActionsContainer) -> None:
     """Add the option --backend."""
-    from gsplat_edu.render.backends import (
-        BACKENDS,  # it imports torch, which the line for --help can do without
-    )
-
     names = ", ".join(("auto", *BACKENDS))
     parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
 
@@ -49,6 +66,21 @@ def whole_number_text(text: str) -> int:
         return int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+
+
+def numbers_text(count: int) -> Callable[[str], tuple[float, ...]]:
+    """Return a reader of so many finite numbers with commas between them."""
+
+    def read(text: str) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != count or not all(map(math.isfinite, numbers)):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {count} numbers with commas between them")
+        return numbers
+
+    return read
 
 
 def seconds_text(text: str) -> float:
@@ -96,7 +128,8 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
     except (SplatError, OSError) as error:
         if debug:
             traceback.print_exc()
-        print(f"{program}: {error}", file=sys.stderr)
+        said = described(error) if isinstance(error, OSError) else str(error)
+        print(f"{program}: {said}", file=sys.stderr)
         return EXIT_BAD_INPUT
     return 0
 

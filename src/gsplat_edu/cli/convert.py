@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,61 +13,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.cli.arguments import numbers_text
 from gsplat_edu.cli.exporting import check_and_say
-from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.cli.options.convert import MOVES
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.viewer import export
-
-EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
-
-MOVES = "scale=S, rotate=AXIS:DEGREES (x:90), move=X,Y,Z or matrix=FILE (12 or 16 numbers, rows first)"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
-    parser.add_argument("sources", type=Path, nargs="+", metavar="IN", help="scene file, or folder of a run")
-    parser.add_argument(
-        "out",
-        type=Path,
-        metavar="OUT",
-        help="file to write: its suffix is the format, .ply .compressed.ply .splat .spz .sog .glb or .html"
-        " (a page that draws the scene); FOLDER/meta.json is a SOG in a folder",
-    )
-    parser.add_argument("--merge", action="store_true", help="join several IN into one scene")
-    parser.add_argument(
-        "--sh-degree",
-        type=whole_number_text,
-        default=SH_MAX_DEGREE,
-        metavar="N",
-        help="highest degree of harmonics to keep (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--min-opacity", type=float, default=0.0, metavar="A", help="leave out splats of lower opacity"
-    )
-    parser.add_argument(
-        "--crop",
-        type=_numbers(6),
-        metavar="X0,Y0,Z0,X1,Y1,Z1",
-        help="keep splats whose centre lies in the box, in the coordinates of IN; --crop=-1,... where it"
-        " begins with a minus",
-    )
-    parser.add_argument(
-        "--transform",
-        action="append",
-        default=[],
-        metavar="KIND=VALUE",
-        help=f"move the scene, after --crop; {MOVES}; several are done in their order",
-    )
-    parser.add_argument(
-        "--verify",
-        action="store_true",
-        help=f"read OUT again and compare renders of both, from {export.VIEWS} of the run's cameras or an orbit",
-    )
-    add_backend(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -151,7 +104,7 @@ def _similarity(text: str) -> Similarity:
             case "scale":
                 return Similarity.of_matrix(np.hstack([float(value) * np.eye(3), np.zeros((3, 1))]))
             case "move":
-                return Similarity(np.eye(3), 1.0, np.array(_numbers(3)(value)))
+                return Similarity(np.eye(3), 1.0, np.array(numbers_text(3)(value)))
             case "rotate":
                 axis, _, degrees = value.partition(":")
                 turn = (
@@ -170,18 +123,3 @@ def _similarity(text: str) -> Similarity:
     except (ValueError, argparse.ArgumentTypeError):
         pass
     raise ArgumentError(f"--transform: {text!r} cannot be read; give {MOVES}")
-
-
-def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
-    """Return a reader of so many finite numbers with commas between them."""
-
-    def read(text: str) -> tuple[float, ...]:
-        try:
-            numbers = tuple(float(part) for part in text.split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != count or not np.isfinite(numbers).all():
-            raise argparse.ArgumentTypeError(f"{text!r} is not {count} numbers with commas between them")
-        return numbers
-
-    return read

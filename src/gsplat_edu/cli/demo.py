@@ -7,19 +7,12 @@ import argparse
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gsplat_edu.cli.sphere import add_options, options_from, run_sphere
+from gsplat_edu.cli.sphere import options_from, run_sphere
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
-EXAMPLE = "example: gsplat-edu demo --iters 100 --size 48 --out out/quick.png"
-
 LOSS_EVERY = 20
 """Iterations between two looks at the loss, each of which waits for a GPU."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    add_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:

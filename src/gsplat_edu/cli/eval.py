@@ -5,45 +5,69 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gsplat_edu.cli.arguments import add_backend
+from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.io.ply import load_ply
+from gsplat_edu.locks import locked
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
-from gsplat_edu.runs.evaluation import Judged, evaluate_run
+from gsplat_edu.runs.evaluation import EVALUATED, Judged, evaluate_run
 from gsplat_edu.runs.folder import RunFolder, render_settings
-
-EXAMPLE = "example: gsplat-edu eval out/plush"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a run")
-    parser.add_argument(
-        "--dataset",
-        type=Path,
-        metavar="PATH",
-        help="the dataset's folder, where it is not where the run had it",
-    )
-    add_backend(parser)
+from gsplat_edu.runs.identity import difference
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Score every view, print a line per split, and say what was written."""
     console = Console(highlight=False, markup=False)
-    backend = resolve_backend(arguments.backend)
-    folder = RunFolder(arguments.run_folder)
-    config = folder.read_config()
+
+    def say(sentence: str) -> None:
+        console.print(sentence, soft_wrap=True)
+
+    folder, into = RunFolder(arguments.run_folder), None
+    if arguments.out is not None:
+        into = RunFolder(arguments.out)
+        _check_apart(into)
+    name, place = ("RUN", folder.path) if into is None else ("--out", into.path)
+    with locked(name, place, "gsplat-edu eval", say):
+        _evaluate(arguments, folder, into, console, say)
+
+
+def _check_apart(out: RunFolder) -> None:
+    """Refuse to write over anything but an earlier evaluation of the same kind."""
+    if out.exists():
+        raise ArgumentError(f"--out: {out.path} holds a run; name a folder for this evaluation alone")
+    if out.path.is_dir() and any(out.path.iterdir()) and EVALUATED not in out.read_metrics():
+        raise ArgumentError(f"--out: {out.path} holds other files; name a new folder")
+
+
+def _evaluate(
+    arguments: argparse.Namespace,
+    folder: RunFolder,
+    into: RunFolder | None,
+    console: Console,
+    say: Callable[[str], None],
+) -> None:
+    backend, config = resolve_backend(arguments.backend), folder.read_config()
     settings = dataclasses.replace(render_settings(config), depth=False)
     scene, iteration = folder.latest_scene()
     dataset = run_dataset(config, arguments.dataset)
+    facts: dict[str, Any] = {"iterations": iteration}
+    if into is not None:
+        facts[EVALUATED] = {"run": str(folder.path.resolve()), "dataset": str(dataset.path.resolve())}
+    if found := difference(folder, dataset):
+        what = f"{dataset.path} is not the capture of {folder.path}: {found}"
+        if into is None:
+            raise ArgumentError(
+                f"{what}; name its own with --dataset, or add --out FOLDER to score this one apart"
+            )
+        say(f"{what}; it is scored apart, in {into.path}")
     gaussians = load_ply(scene, dataset.origin).to(device_of(backend))  # the frame its cameras stand in
     judged = Judged(dataset.test, dataset.train, settings.background, dataset.notes)
     with Progress(
@@ -61,14 +85,16 @@ def run(arguments: argparse.Namespace) -> None:
             judged,
             gaussians,
             functools.partial(render, settings=settings, backend=backend),
-            {"iterations": iteration},
+            facts,
             lambda split, score: bar.advance(task),
+            into,
         )
     console.print(*score_lines(result.test, result.train), sep="\n", soft_wrap=True)
-    wrote = [str(folder.metrics)]
+    written = into or folder
+    wrote = [str(written.metrics)]
     if result.test:
-        wrote.append(f"{folder.renders / 'test'}/")
-    console.print(f"wrote {', '.join([*wrote, str(folder.report)])}", soft_wrap=True)
+        wrote.append(f"{written.renders / 'test'}/")
+    say(f"wrote {', '.join([*wrote, str(written.report)])}")
 
 
 def score_lines(test: Sequence[ImageScore], train: Sequence[ImageScore]) -> list[str]:

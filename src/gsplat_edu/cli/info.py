@@ -20,8 +20,6 @@ from gsplat_edu.io import ply
 from gsplat_edu.io.formats import SOG_META, format_of, read_scene, stored_bytes
 from gsplat_edu.runs.folder import RunFolder
 
-EXAMPLE = "example: gsplat-edu info captures/plush"
-
 PERCENTILES = (1, 25, 50, 75, 99)
 
 BINS = 40
@@ -38,11 +36,6 @@ HIGHLIGHTS = {
 """Settings of a run that are shown, by the section of config.json; what is None is not. report.html has them all."""
 
 Fact = tuple[str, str]
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's argument."""
-    parser.add_argument("path", type=Path, metavar="PATH", help="dataset folder, run folder or scene file")
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
+from gsplat_edu.render.settings import check_backend
 
 COMMANDS = {
     "demo": "learn a sphere from 24 renders of it and judge the result with a held-out camera",
@@ -21,7 +23,7 @@ COMMANDS = {
     "doctor": "say what is wrong with a capture before training or with a run after it, and what to do",
     "info": "say what a dataset, a run or a scene file holds, on one screen",
 }
-"""Commands and what they do; each is a module `gsplat_edu.cli.NAME` with EXAMPLE, add_arguments and run."""
+"""Commands and what they do; each is a module `gsplat_edu.cli.NAME` with `run`, and one in `gsplat_edu.cli.options`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,13 +43,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.print_help()
             return EXIT_BAD_INPUT
         return run_command(f"gsplat-edu {parsed.command}", lambda: parsed.run(parsed), parsed.debug)
-    except KeyboardInterrupt:  # while a command was still being imported
+    except KeyboardInterrupt:  # while the options were still being imported
         print("gsplat-edu: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
 
 
 def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Build the parser of a command line; only commands that it names are imported, since torch takes seconds."""
+    """Build the parser of a command line; only the options of commands that it names are imported."""
     parser = OneLineParser(prog="gsplat-edu", description="3D Gaussian Splatting on the computer you have.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('gsplat-edu')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
@@ -55,9 +57,19 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=summary, description=summary)
         if name not in words:
             continue
-        module = importlib.import_module(f"gsplat_edu.cli.{name}")
-        command.epilog = module.EXAMPLE
-        module.add_arguments(command)
+        options = importlib.import_module(f"gsplat_edu.cli.options.{name}")
+        command.epilog = options.EXAMPLE
+        options.add_arguments(command)
         command.add_argument("--debug", action="store_true", help="print the traceback of an error")
-        command.set_defaults(run=module.run)
+        command.set_defaults(run=functools.partial(_run, name))
     return parser
+
+
+def _run(name: str, arguments: argparse.Namespace) -> None:
+    """Check the options, then import the command, which takes seconds where it needs torch, and run it."""
+    if "backend" in arguments:
+        check_backend(arguments.backend)
+    options = importlib.import_module(f"gsplat_edu.cli.options.{name}")
+    if hasattr(options, "check"):
+        options.check(arguments)
+    importlib.import_module(f"gsplat_edu.cli.{name}").run(arguments)

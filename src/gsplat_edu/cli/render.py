@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsplat_edu.camera import WORLD_UP, Camera
-from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.cli.options.render import RUNS_CAMERAS, SCENE_SIZE
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.following import path_along
@@ -32,14 +32,6 @@ from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
 from gsplat_edu.runs.source import file_settings, relative_to
 from gsplat_edu.validation import whole_number
-
-EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"
-
-SCENE_SIZE = 512
-"""px: images of a scene that came without cameras."""
-
-RUNS_CAMERAS = ""
-"""What --dataset is without a path."""
 
 
 @dataclass(frozen=True)
@@ -59,45 +51,6 @@ class Shot:
     names: Sequence[str] | None
     settings: RenderSettings
     says: str = ""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    parser.add_argument("source", type=Path, metavar="RUN|SCENE", help="folder of a run, or a scene file")
-    parser.add_argument(
-        "--dataset",
-        nargs="?",
-        const=RUNS_CAMERAS,
-        metavar="PATH",
-        help="render from the run's cameras, or from those of the dataset PATH",
-    )
-    parser.add_argument(
-        "--orbit",
-        action="store_true",
-        help="render a path that shows the scene from where it was photographed: a full circle if the cameras stand all"
-        " round, else only as far as they go (default)",
-    )
-
-    def number(flag: str, default: int | None, text: str) -> None:
-        parser.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
-
-    number("--frames", 120, "frames of the path (default: 120)")
-    number(
-        "--size",
-        None,
-        f"longer side of the images in px (default: the cameras'; {SCENE_SIZE} for a scene file)",
-    )
-    number("--fps", 30, "frames per second of a video (default: 30)")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR|X.mp4",
-        help="folder of PNGs, or a video that browsers play, VP9 in MP4 (default: renders/ in the run, out/ for a scene file)",
-    )
-    parser.add_argument(
-        "--white-background", action="store_true", help="render over white (default: the run's background)"
-    )
-    add_backend(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -7,61 +7,13 @@ import shlex
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from gsplat_edu.cli.arguments import whole_number_text
-from gsplat_edu.sfm.mapping import CAMERA_MODELS, MAPPERS
-from gsplat_edu.sfm.reconstruct import MATCHERS, SfmOptions, reconstruct
-
-EXAMPLE = "example: gsplat-edu sfm holiday.mp4 captures/holiday --frames 200"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options."""
-    parser.add_argument("source", type=Path, metavar="PHOTOS", help="a folder of photos, or a video")
-    parser.add_argument(
-        "out", type=Path, metavar="OUT", help="folder of the capture; work is kept in OUT/sfm"
-    )
-
-    def number(flag: str, text: str, default: int) -> None:
-        parser.add_argument(
-            flag, type=whole_number_text, metavar="N", default=default, help=f"{text} (default: {default})"
-        )
-
-    def choice(flag: str, text: str, names: tuple[str, ...]) -> None:
-        parser.add_argument(
-            flag, metavar="NAME", default="auto", help=f"{text}: {', '.join(names)} (default: auto)"
-        )
-
-    number("--frames", "frames taken from a video, at most", SfmOptions.frames)
-    choice("--matcher", "which photos are compared", MATCHERS)
-    choice("--mapper", "how poses are found", MAPPERS)
-    choice("--camera-model", "how the lens bends light", CAMERA_MODELS)
-    number("--max-features", "features of a photo, at most", SfmOptions.max_features)
-    number("--max-image-size", "longest side at which features are found, px", SfmOptions.max_image_size)
-    number("--threads", "threads of COLMAP, 0 for all", SfmOptions.threads)
-
-
-def options_from(arguments: argparse.Namespace) -> SfmOptions:
-    """Turn what `add_arguments` parsed into options.
-
-    Raises:
-        ArgumentError: one is out of range.
-    """
-    return SfmOptions(
-        arguments.source,
-        arguments.out,
-        arguments.frames,
-        arguments.matcher,
-        arguments.mapper,
-        arguments.camera_model,
-        arguments.max_features,
-        arguments.max_image_size,
-        arguments.threads,
-    )
+from gsplat_edu.cli.options.sfm import options_from
+from gsplat_edu.locks import locked
+from gsplat_edu.sfm.reconstruct import reconstruct
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -72,7 +24,7 @@ def run(arguments: argparse.Namespace) -> None:
     def say(sentence: str) -> None:
         console.print(sentence, soft_wrap=True)
 
-    with stage_bars(console) as progress:
+    with locked("OUT", options.out, "gsplat-edu sfm", say), stage_bars(console) as progress:
         try:
             reconstruct(options, say, progress)
         except KeyboardInterrupt:

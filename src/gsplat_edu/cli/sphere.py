@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.cli.options.demo import CHAPTER, REDUCED
+from gsplat_edu.cli.options.demo import Budget as Budget
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
@@ -33,22 +34,6 @@ from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Callback, Renderer, Trainer, TrainResult
 from gsplat_edu.validation import whole_number
-
-
-class Budget(NamedTuple):
-    """How long to train, up to how many Gaussians, at which image size."""
-
-    iters: int
-    cap: int
-    size: int
-
-
-CHAPTER = Budget(iters=800, cap=1600, size=128)
-"""The chapter's run."""
-
-REDUCED = Budget(iters=300, cap=800, size=64)
-"""What the dense backend torch trains by default: about a twentieth of the chapter's work."""
-
 
 MAX_SEED = 2**63 - 1
 """What torch's generators take."""
@@ -103,35 +88,8 @@ class Summary(NamedTuple):
     final_l1: float
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the run's options to a command line."""
-
-    def number(flag: str, default: int, text: str) -> None:
-        parser.add_argument(
-            flag, type=whole_number_text, metavar="N", default=default, help=f"{text} (default: {default})"
-        )
-
-    for name, text in (
-        ("iters", "training iterations"),
-        ("cap", "largest number of Gaussians"),
-        ("size", "height and width of the images in px"),
-    ):
-        default = f"(default: {getattr(CHAPTER, name)}; {getattr(REDUCED, name)} on the dense backend torch)"
-        parser.add_argument(f"--{name}", type=whole_number_text, metavar="N", help=f"{text} {default}")
-    number("--k0", 400, "Gaussians at the start")
-    number("--seed", 9, "seed of the start, the splits and the view order")
-    add_backend(parser)
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="X.png",
-        default=Path("out/sphere.png"),
-        help="figure of the held-out camera; X_curves.png and X.ply go beside it (default: %(default)s)",
-    )
-
-
 def options_from(arguments: argparse.Namespace) -> tuple[SphereOptions, str | None]:
-    """Turn what `add_options` parsed into options, with the budget of the backend that will run.
+    """Turn parsed options into those of a run, with the budget of the backend that will run.
 
     That the files can be written is found out here, before anything is trained. Their folder is made.
 

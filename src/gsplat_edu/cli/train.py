@@ -17,15 +17,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
+from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.cli.sfm import stage_bars
-from gsplat_edu.cli.train_options import add_arguments as add_arguments
-from gsplat_edu.cli.train_options import given_from, limits_from, options_from
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.doctor.pace import Pace
-from gsplat_edu.doctor.plan import Plan, plan
+from gsplat_edu.doctor.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
+from gsplat_edu.locks import locked
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.sfm.reconstruct import SfmOptions, needs_poses, reconstruct
@@ -34,10 +34,11 @@ from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
 from gsplat_edu.viewer.serve import exposure
 
-EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
-
 LINES = 20
 """Lines that tell of the training where there is no terminal to draw a bar on."""
+
+NAME_WIDTH = 20
+"""Characters of a view's name on the progress line."""
 
 PSNR_EVERY = 20
 """Iterations between two looks at the last view's loss and PSNR, which cost a few milliseconds each."""
@@ -53,6 +54,13 @@ def run(arguments: argparse.Namespace) -> None:
     live = _live(arguments)
     for path in arguments.export:
         check_target("--export", path)
+    with locked("--out", arguments.out, "gsplat-edu train", say):
+        _run(arguments, console, say, live)
+
+
+def _run(
+    arguments: argparse.Namespace, console: Console, say: Callable[[str], None], live: ModuleType | None
+) -> None:
     chosen = _planned(arguments, console, say)
     with interruptible() as interrupted, ExitStack() as closing:
         capture = CaptureRun(chosen.options, say)
@@ -134,7 +142,8 @@ def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None
 def _planned(arguments: argparse.Namespace, console: Console, say: Callable[[str], None]) -> Plan:
     """Find poses where there are none, and choose what the limits leave open."""
     options = _with_poses(options_from(arguments), console, say)
-    limits, given = limits_from(arguments), given_from(arguments)
+    limits = Limits(arguments.max_memory, arguments.time_limit)
+    given = [name for name in PLANNED if getattr(arguments, name) is not None]
     chosen = plan(options, limits, given, rescale=not arguments.no_rescale)
     for sentence in chosen.sentences:
         say(sentence)
@@ -192,11 +201,12 @@ def _train(
         iterations = trainer.config.iterations  # a limit of time may have made them more
         if event.iteration % PSNR_EVERY == 0 or trainer.iteration == iterations:
             speed = bar.tasks[-1].speed or 0.0
-            state = f"loss {event.loss:.3f}  PSNR {_psnr(trainer):.1f}  {event.num_gaussians} Gaussians"
-            bar.update(task, state=f"{state}  {speed:.0f} it/s")
+            state = f"loss {event.loss:.3f}  PSNR {_psnr(trainer):.1f} of {_short(trainer.last_name)}"
+            bar.update(task, state=f"{state}  {event.num_gaussians} Gaussians  {speed:.0f} it/s")
         bar.update(task, completed=trainer.iteration, total=iterations)
         if bar.disable and trainer.iteration % max(iterations // LINES, 1) == 0:
-            figures = f"loss {event.loss:.4f}, PSNR {_psnr(trainer):.2f} dB, {event.num_gaussians} Gaussians"
+            figures = f"loss {event.loss:.4f}, PSNR {_psnr(trainer):.2f} dB of {trainer.last_name}"
+            figures += f", {event.num_gaussians} Gaussians"
             bar.console.print(f"iteration {trainer.iteration}/{iterations}: {figures}", soft_wrap=True)
 
     def loaded(done: int, total: int) -> None:
@@ -208,6 +218,11 @@ def _train(
     bar.remove_task(photos)
     bar.reset(task, total=iterations, completed=trainer.iteration, visible=True)
     capture.train(ends)
+
+
+def _short(name: str) -> str:
+    """Return the end of a view's name, which tells views apart."""
+    return name if len(name) <= NAME_WIDTH else f"...{name[3 - NAME_WIDTH :]}"
 
 
 def _psnr(trainer: Trainer) -> float:

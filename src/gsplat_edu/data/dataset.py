@@ -25,11 +25,11 @@ from gsplat_edu.data.capture import (
     photo_file,
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
-from gsplat_edu.data.images import ImageStore
+from gsplat_edu.data.images import ImageStore, PhotoFile
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
+from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.errors import ArgumentError, DatasetError
-from gsplat_edu.validation import float64_array, in_range, whole_number
 from gsplat_edu.views import View
 
 TEST_EVERY = 8
@@ -48,44 +48,6 @@ UNEVEN = 1.5
 """Ratio of the two focal lengths beyond which the user is told: pixels of real cameras are all but square."""
 
 
-@dataclass(frozen=True)
-class DataSettings:
-    """How a capture is read.
-
-    Args:
-        resolution: None: as the photos are. Below 32: a factor to divide both sizes by, 2 for half. From 32 on:
-            the longest side in px; nothing is enlarged.
-        test_every: Every n-th view by sorted name is for testing, 0 for none; a split that the capture has of
-            its own is then dissolved. None: the capture's own split if it has one, else every 8th.
-        background: (r, g, b), 0 to 1: photos with alpha are put over it when read. None keeps the alpha, for a
-            background that is chosen later.
-        image_memory: Bytes of decoded photos kept in memory; the others are read again when they are needed.
-
-    Raises:
-        ArgumentError: a value is not one of these, or the split would leave no view to train on.
-    """
-
-    resolution: float | None = None
-    test_every: int | None = None
-    background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
-    image_memory: int = 4 * 2**30
-
-    def __post_init__(self) -> None:
-        if self.resolution is not None and (in_range("resolution", self.resolution, 1.0) > 1e6):
-            raise ArgumentError("resolution: is above 1e6; give a factor below 32, or the longest side in px")
-        if self.test_every is not None and whole_number("test_every", self.test_every, 0) == 1:
-            raise ArgumentError(
-                "test_every: is 1, which leaves no view to train on; give 0 for none, or 2 and more"
-            )
-        if self.background is not None:
-            r, g, b = (
-                in_range(f"background[{i}]", value, 0.0, 1.0)
-                for i, value in enumerate(float64_array("background", self.background, (3,)))
-            )
-            object.__setattr__(self, "background", (r, g, b))
-        whole_number("image_memory", self.image_memory, 0)
-
-
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """A capture, ready to train on.
@@ -100,6 +62,7 @@ class Dataset:
         origin: (3,) what was subtracted from all coordinates; zero unless they were beyond 1e4.
         notes: Sentences the user wants to read: what was skipped, rescaled, undistorted or made up.
         images: Where the photos are kept.
+        files: Name and files of each photo, sorted by name.
     """
 
     path: Path
@@ -111,6 +74,7 @@ class Dataset:
     origin: Float64[np.ndarray, "3"]
     notes: tuple[str, ...]
     images: ImageStore
+    files: tuple[tuple[str, PhotoFile], ...] = ()
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Decode every photo once, several at a time, and keep those within the budget.
@@ -139,7 +103,10 @@ class Dataset:
 
 
 def load_dataset(
-    path: str | Path, settings: DataSettings = DataSettings(), *, points: Path | None = None
+    path: str | Path,
+    settings: DataSettings = DataSettings(),  # noqa: B008 - it is frozen
+    *,
+    points: Path | None = None,
 ) -> Dataset:
     """Load a capture. Photos are opened for their sizes only; their pixels are read when asked for.
 
@@ -171,7 +138,10 @@ def load_dataset(
         )
     train, test = _split(path, views, [frame.part for frame in frames], settings.test_every, notes)
     start = cloud or _random_start(capture, [view.camera for view in views], notes, origin)
-    return Dataset(path, capture.layout, train, test, start.points, start.colors, origin, tuple(notes), store)
+    files = tuple((frame.name, source) for frame, (source, _, _) in zip(frames, made, strict=True))
+    return Dataset(
+        path, capture.layout, train, test, start.points, start.colors, origin, tuple(notes), store, files
+    )
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 
 from gsplat_edu.data.lens import Lens, bands, undistortion
+from gsplat_edu.data.watch import FileWatch
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.views import Photo
 
@@ -198,6 +199,7 @@ class ImageStore:
         largest = max((source.lens.W * source.lens.H for source in sources), default=1)
         self.workers = max(1, min(os.cpu_count() or 1, AT_ONCE // largest))
         """How many photos to decode at once."""
+        self.watch = FileWatch()
         self._kept: dict[PhotoFile, Photo] = {}
         self._nbytes = 0
         self._lock = threading.Lock()
@@ -215,13 +217,14 @@ class ImageStore:
         """Return a photo, from memory where it was kept.
 
         Raises:
-            DatasetError: as for `develop`.
+            DatasetError: as for `develop`, or a file has changed since it was first read.
         """
         with self._lock:
             kept = self._kept.get(source)
         if kept is not None:
             return kept
-        photo = develop(source)  # outside the lock: this is what takes long
+        with self.watch.unchanged(source.path, source.mask):
+            photo = develop(source)  # outside the lock: this is what takes long
         with self._lock:
             if source not in self._kept and self._nbytes + photo.nbytes <= self.budget:
                 self._kept[source] = photo

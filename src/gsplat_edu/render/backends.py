@@ -9,10 +9,8 @@ import torch
 
 from gsplat_edu import kernels
 from gsplat_edu.errors import BackendUnavailableError
-
-BACKENDS = ("cuda", "cpu", "torch")
-"""All backends, the fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, every splat at
-every pixel."""
+from gsplat_edu.render.settings import BACKENDS as BACKENDS
+from gsplat_edu.render.settings import check_backend
 
 
 def resolve_backend(name: str, device: torch.device | None = None) -> str:
@@ -31,10 +29,7 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
     if name == "auto":
         on_gpu = torch.cuda.is_available() if device is None else device.type == "cuda"
         name = "cuda" if on_gpu and not interpreted() else "cpu"
-    if name not in BACKENDS:
-        raise BackendUnavailableError(
-            f"backend {name!r}: not in this version of gsplat_edu; use auto or one of: {', '.join(BACKENDS)}"
-        )
+    check_backend(name)
     reason = unavailable(name)
     if reason:
         raise BackendUnavailableError(f"backend {name!r}: {reason}")

@@ -5,7 +5,27 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.errors import BackendUnavailableError
 from gsplat_edu.validation import float64_array, in_range, whole_number
+
+BACKENDS = ("cuda", "cpu", "torch")
+"""All backends, the fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, every splat at
+every pixel."""
+
+
+def check_backend(name: str) -> None:
+    """Check that a backend's name is known; `gsplat_edu.render.backends` says whether it runs here.
+
+    Args:
+        name: "auto", or a backend by name.
+
+    Raises:
+        BackendUnavailableError: there is no such backend.
+    """
+    if name not in ("auto", *BACKENDS):
+        raise BackendUnavailableError(
+            f"backend {name!r}: not in this version of gsplat_edu; use auto or one of: {', '.join(BACKENDS)}"
+        )
 
 
 @dataclass(frozen=True)

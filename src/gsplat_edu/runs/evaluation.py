@@ -20,6 +20,9 @@ from gsplat_edu.views import View
 
 Image = UInt8[np.ndarray, "H W 3"]
 
+EVALUATED = "evaluated"
+"""Key of a metrics.json that belongs to no run's folder: which run was scored, on which dataset."""
+
 Progress = Callable[[str, ImageScore], None]
 """Is told of every scored view: its split and its score."""
 
@@ -63,6 +66,7 @@ def evaluate_run(
     render: Renderer,
     facts: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
+    into: RunFolder | None = None,
 ) -> Evaluation:
     """Score a scene and write metrics.json, renders/test/NAME.png (render | photo) and report.html.
 
@@ -75,6 +79,7 @@ def evaluate_run(
         render: Renders Gaussians from a camera, over the background of `judged`.
         facts: Single numbers for metrics.json: "iterations", "seconds".
         progress: Is told of every scored view.
+        into: Where files are written; the run's folder, whose other metrics stay, if None.
 
     Returns:
         The scores and the metrics.
@@ -84,8 +89,10 @@ def evaluate_run(
         DatasetError: a photo cannot be read.
         OSError: a file cannot be written.
     """
-    earlier, config, log = folder.read_metrics(), folder.read_config(), folder.log()
-    gallery = _Gallery(folder, judged.test, progress)
+    config, log, into = folder.read_config(), folder.log(), into or folder
+    before = into.read_metrics()
+    earlier = before if into.path == folder.path else {}
+    gallery = _Gallery(into, judged.test, progress)
 
     def tell(view: View, score: ImageScore, image: Image, truth: Image) -> None:
         if progress is not None:
@@ -103,10 +110,11 @@ def evaluate_run(
     }
     title = f"{folder.path.resolve().name}: 3D Gaussian Splatting"
     write_report(
-        folder.report,
+        into.report,
         Report(title, metrics, log, config, scores=test, pictures=gallery.pictures, notes=judged.notes),
     )
-    folder.write_metrics(metrics)  # last: it says that the run has been judged
+    gallery.remove_others(before)
+    into.write_metrics(metrics)  # last: it says that the run has been judged
     return Evaluation(test, train, metrics)
 
 
@@ -118,8 +126,21 @@ class _Gallery:
         self._files = {
             id(view): folder.renders / "test" / name for view, name in zip(views, names, strict=True)
         }
+        self._folder = folder.renders / "test"
         self._progress = progress
         self.pictures: list[Picture] = []
+
+    def remove_others(self, metrics: dict[str, Any]) -> None:
+        """Remove renders of an earlier evaluation, by its metrics, that are of none of these views."""
+        scores = metrics.get("test_views", [])
+        known = (
+            [score.get("name") for score in scores if isinstance(score, dict)]
+            if isinstance(scores, list)
+            else []
+        )
+        names = image_file_names([name for name in known if isinstance(name, str)])
+        for path in {self._folder / name for name in names} - set(self._files.values()):
+            path.unlink(missing_ok=True)
 
     def add(self, view: View, score: ImageScore, image: Image, truth: Image) -> None:
         save_png(self._files[id(view)], side_by_side([image, truth]))

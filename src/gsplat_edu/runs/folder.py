@@ -5,9 +5,12 @@
     metrics.json                                  the judgement: {"test": {...}, "train": {...}, "num_gaussians": ...}
     cameras.json                                  the cameras, as Inria's viewers read them
     point_cloud/iteration_N/point_cloud.ply       the scene after N iterations
+    photos.json                                   size and digest of every photo's file when the run began
     checkpoints/                                  what a run is continued from
     renders/                                      pictures
     report.html                                   the run on one page
+    .lock                                         the process that is writing here (`gsplat_edu.locks`); one that was
+                                                  killed leaves the file behind, which then locks nothing
 
 Scenes and cameras.json stand in the capture's own frame: training may have moved the origin, and config.json's
 `origin` says where to.
@@ -65,6 +68,11 @@ class RunFolder:
         return self.path / "cameras.json"
 
     @property
+    def photos(self) -> Path:
+        """Size and digest of every photo's file."""
+        return self.path / "photos.json"
+
+    @property
     def renders(self) -> Path:
         """Folder of pictures."""
         return self.path / "renders"
@@ -119,6 +127,18 @@ class RunFolder:
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Write the judgement; errors as for `write_config`."""
         write_json(self.metrics, metrics)
+
+    def read_photos(self) -> dict[str, Any] | None:
+        """Read what was known of the photos when the run began; None if it was begun by a version that kept nothing.
+
+        Raises:
+            CheckpointError: the file is damaged.
+        """
+        return _read_object(self.photos) if self.photos.is_file() else None
+
+    def write_photos(self, photos: dict[str, Any]) -> None:
+        """Write what is known of the photos; errors as for `write_config`."""
+        write_json(self.photos, photos)
 
     def log(self) -> list[dict[str, Any]]:
         """Read the log: the objects of its lines; none where there is no log.

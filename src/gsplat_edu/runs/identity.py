@@ -1,34 +1,45 @@
-"""Whether a run that is taken up again is the run that was begun."""
+"""Checks that a resumed run matches its configuration and capture."""
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
 
 SAME = ("train", "render", "data")
 """What of config.json a resumed run has to share with the one it goes on from."""
 
-MAY_DIFFER = {"data": ("path", "points", "image_memory")}
-"""What in them may be another all the same: files may have been moved, if they hold the same."""
+MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("iterations",)}
+"""What may differ all the same: files may have been moved, if their contents are equal, and a run may be extended."""
 
 MOVED = 1e-9
 """Part of a coordinate by which a camera may differ where an origin was subtracted and added again."""
 
 
 def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
-    """Compare what a run was begun with and what it is to go on with.
+    """Compare the options that a run was begun with and those it is resumed with.
 
     Raises:
         CheckpointError: they differ, or config.json is damaged; names the option.
     """
     old = folder.read_config()
+    length, wanted = (_section(folder, config, "train").get("iterations") for config in (old, new))
+    if not isinstance(length, int) or not isinstance(wanted, int):
+        raise CheckpointError(f"{folder.config}: train: iterations: is no whole number; mend the file")
+    if wanted < length:
+        raise CheckpointError(
+            f"--resume: {folder.path} was begun with iterations = {length}, not {wanted}: a run can be extended,"
+            " not shortened; give as many or more, or end it earlier with --time-limit"
+        )
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))
         for key in sorted({*before, *now} - set(MAY_DIFFER.get(section, ()))):
@@ -47,28 +58,73 @@ def fingerprint(dataset: Dataset) -> str:
     return digest.hexdigest()
 
 
-def check_capture(folder: RunFolder, dataset: Dataset) -> None:
-    """Compare the capture with the one a run was begun on: views, splits, cameras, and the fingerprint.
+def photo_digests(dataset: Dataset) -> dict[str, Any]:
+    """Return what photos.json holds: by view, size and digest of the photo's file, and of its mask's.
+
+    Files that were not read yet are hashed, several at a time.
+    """
+    used = {view.name for view in (*dataset.train, *dataset.test)}
+    files = [(name, source) for name, source in dataset.files if name in used]
+
+    def entry(source: PhotoFile) -> dict[str, Any] | None:
+        photo = dataset.images.watch.digest(source.path)
+        mask = None if source.mask is None else dataset.images.watch.digest(source.mask)
+        facts = None if photo is None else dataclasses.asdict(photo)
+        return facts if facts is None or mask is None else facts | {"mask": dataclasses.asdict(mask)}
+
+    with ThreadPoolExecutor(dataset.images.workers) as pool:
+        entries = pool.map(entry, [source for _, source in files])
+        return {name: facts for (name, _), facts in zip(files, entries, strict=True)}
+
+
+def difference(folder: RunFolder, dataset: Dataset) -> str | None:
+    """Say how a capture differs from the one that a run was begun with; None if nothing does.
+
+    Compared are the views, their splits and cameras, and the files of the photos. A capture that was moved or copied
+    is the same: places and times do not count. Runs of older versions keep less, and then less is compared.
 
     Raises:
-        CheckpointError: they differ; names the first view that does.
+        CheckpointError: a file of the run is damaged.
     """
-    advice = "resume with the capture it was begun with, or name another --out"
-    known = folder.read_cameras(dataset.origin)
     here = [(view, "train") for view in dataset.train] + [(view, "test") for view in dataset.test]
-    if len(known) != len(here):
-        raise CheckpointError(
-            f"--resume: {folder.path} was begun with {len(known)} views, the capture has {len(here)}; {advice}"
-        )
-    for (name, split, camera), (view, part) in zip(known, here, strict=True):
+    known = folder.read_cameras(dataset.origin) if folder.cameras.is_file() else None
+    if known is not None and len(known) != len(here):
+        return f"the run was begun with {len(known)} views, this capture has {len(here)}"
+    for (name, split, camera), (view, part) in zip(known or (), here, strict=known is not None):
         if (name, split) != (view.name, part) or not _alike(camera, view.camera):
-            raise CheckpointError(
-                f"--resume: {folder.path} was begun with other cameras: {view.name} differs; {advice}"
-            )
-    if folder.read_config().get("fingerprint") != fingerprint(dataset):
+            return f"other cameras: {view.name} differs"
+    then = folder.read_photos()
+    if then is not None:
+        now = photo_digests(dataset)
+        if changed := [name for name in now if then.get(name) != now[name]]:
+            return f"other photos: {len(changed)} of {len(now)} have changed since the run began, first {changed[0]}"
+    elif _comparable(config := folder.read_config()) and config.get("fingerprint") != fingerprint(dataset):
+        return "other photos or start points"
+    return None
+
+
+def check_capture(folder: RunFolder, dataset: Dataset) -> None:
+    """Compare the capture with the one a run was begun on: views, splits, cameras, photos and start points.
+
+    Raises:
+        CheckpointError: they differ; names the first view that does. Or a file of the run is damaged.
+    """
+    if not folder.cameras.is_file():
+        folder.read_cameras()  # says what is missing
+    found = difference(folder, dataset)
+    if found is None and folder.read_config().get("fingerprint") != fingerprint(dataset):
+        found = "other start points" if folder.photos.is_file() else "other photos or start points"
+    if found is not None:
         raise CheckpointError(
-            f"--resume: {folder.path} was begun with other photos or start points; {advice}"
+            f"--resume: {folder.path} was begun with another capture: {found}; "
+            "resume with the capture it was begun with, or name another --out"
         )
+
+
+def _comparable(config: dict[str, Any]) -> bool:
+    """Say whether the fingerprint is of the capture alone: it covers the start points, which may be given apart."""
+    data = config.get("data")
+    return "fingerprint" in config and isinstance(data, dict) and data.get("points") is None
 
 
 def _alike(a: Camera, b: Camera) -> bool:

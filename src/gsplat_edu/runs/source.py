@@ -93,13 +93,19 @@ def open_source(path: str | Path) -> Source:
         return _of_run(folder, folder.latest_scene()[0])
     if not path.exists():
         raise ArgumentError(f"{path}: is not there; give a scene file or the folder of a run")
-    above = path.absolute().parents
-    if path.name == "point_cloud.ply" and len(above) >= SCENE_LEVELS and above[1].name == "point_cloud":
-        folder = RunFolder(above[SCENE_LEVELS - 1])
-        if folder.exists():
-            return _of_run(folder, path)
+    if (run := run_of(path)) is not None:
+        return _of_run(run, path)
     scene = read_scene(path)
     return Source(path, scene, (), file_settings(scene))
+
+
+def run_of(path: Path) -> RunFolder | None:
+    """Return the run that a scene file was written by; None if it lies in no run's folder."""
+    above = path.absolute().parents
+    if path.name != "point_cloud.ply" or len(above) < SCENE_LEVELS or above[1].name != "point_cloud":
+        return None
+    folder = RunFolder(above[SCENE_LEVELS - 1])
+    return folder if folder.exists() else None
 
 
 def file_settings(scene: Scene) -> RenderSettings:

@@ -12,108 +12,52 @@ import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.evaluate.metrics import Renderer, score_views, summarize
+from gsplat_edu.data.dataset import load_dataset, scene_extent
+from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
+from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.files import check_folder, remove_leftovers
+from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
-from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
-from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.runs.identity import check_capture, check_options, fingerprint
+from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
+from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.source import Source, open_source
-from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_seconds, save_checkpoint
-from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
+from gsplat_edu.train.checkpoint import (
+    list_checkpoints,
+    load_checkpoint,
+    read_seconds,
+    save_checkpoint,
+)
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.trainer import Callback, Trainer
-from gsplat_edu.validation import whole_number
 
 
-@dataclass(frozen=True)
-class RunOptions:
-    """One run of training.
-
-    Args:
-        data: The capture.
-        out: The run's folder.
-        config: The recipe.
-        data_settings: How the capture is read.
-        points: A PLY to start from; the capture's own points where None.
-        backend: Rendering backend, by its own name.
-        eval_every: Iterations between judgements by the test views; 0 judges at the end only.
-        save_every: Iterations between checkpoints; 0 writes one at the end only, or when the run is stopped.
-        time_limit: Seconds of training after which the run ends; None for none.
-        resume: Go on from the folder's last checkpoint.
-
-    Raises:
-        ArgumentError: a number is out of range.
-    """
-
-    data: Path
-    out: Path
-    config: TrainConfig
-    data_settings: DataSettings
-    points: Path | None = None
-    backend: str = "cpu"
-    eval_every: int = 1_000
-    save_every: int = 500
-    time_limit: float | None = None
-    resume: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in ("eval_every", "save_every"):
-            whole_number(name, getattr(self, name), 0)
-        if self.time_limit is not None and self.time_limit <= 0:
-            raise ArgumentError("time_limit: has to be above 0 seconds")
-
-    @property
-    def folder(self) -> RunFolder:
-        """The run's folder."""
-        return RunFolder(self.out)
-
-    @property
-    def render_settings(self) -> RenderSettings:
-        """How the scene is rendered once it is trained."""
-        config = self.config
-        return RenderSettings(
-            background=config.background,
-            sh_degree=config.sh_degree,
-            antialiased=config.antialiased,
-            jacobian_limit=config.jacobian_limit,
-            depth=False,
-        )
-
-    @property
-    def renderer(self) -> Renderer:
-        """Renders the scene so."""
-        return functools.partial(render, settings=self.render_settings, backend=self.backend)
-
-    def document(self) -> dict[str, Any]:
-        """Return what config.json holds."""
-        data = dataclasses.asdict(self.data_settings)
-        return {
-            "version": version("gsplat-edu"),
-            "data": {
-                "path": str(self.data.resolve()),
-                **data,
-                "points": None if self.points is None else str(self.points.resolve()),
-            },
-            "train": dataclasses.asdict(self.config),
-            "render": dataclasses.asdict(self.render_settings),
-            "backend": self.backend,
-            "machine": machine_facts(),
-        }
+def document(options: RunOptions) -> dict[str, Any]:
+    """Return what config.json holds of a run's options."""
+    data = dataclasses.asdict(options.data_settings)
+    return {
+        "version": version("gsplat-edu"),
+        "data": {
+            "path": str(options.data.resolve()),
+            **data,
+            "points": None if options.points is None else str(options.points.resolve()),
+            "scene": None if options.scene is None else str(scene_file(options.scene).resolve()),
+        },
+        "train": dataclasses.asdict(options.config),
+        "render": dataclasses.asdict(options.render_settings),
+        "backend": options.backend,
+        "machine": machine_facts(),
+    }
 
 
 Export = Callable[[Source], list[dict[str, Any]]]
@@ -121,7 +65,7 @@ Export = Callable[[Source], list[dict[str, Any]]]
 
 
 class CaptureRun:
-    """A run of training on a capture.
+    """A run of training on a capture. Its folder is not locked; see `gsplat_edu.locks.locked`.
 
     Args:
         options: The run.
@@ -157,7 +101,8 @@ class CaptureRun:
                 raise CheckpointError(
                     f"--out: {folder.path} holds a run already; add --resume to go on with it, or name another folder"
                 )
-            check_options(folder, options.document())
+            self._check_start()
+            check_options(folder, document(options))
             if (before := folder.read_config().get("backend")) != options.backend:
                 self._say(
                     f"{folder.path}: was begun on the backend {before}; {options.backend} rounds differently"
@@ -178,10 +123,26 @@ class CaptureRun:
             self._say(f"{folder.path}: holds no run to resume; starting at the beginning")
         return False
 
+    def _check_start(self) -> None:
+        """Refuse to resume a run from points with a scene; without --from, the scene of its config.json is used."""
+        data = self.folder.read_config().get("data")
+        stored = data.get("scene") if isinstance(data, dict) else None
+        if stored is None and self.options.scene is not None:
+            raise CheckpointError(
+                f"--resume: {self.folder.path} was begun from points, not --from {self.options.scene};"
+                " leave that out, or name another --out"
+            )
+        if (
+            stored is not None
+            and self.options.scene is None
+            and not list_checkpoints(self.folder.checkpoints)
+        ):
+            self.options = dataclasses.replace(self.options, scene=Path(str(stored)))
+
     def start(
         self, progress: Callable[[int, int], None] | None = None, callbacks: Sequence[Callback] = ()
     ) -> Trainer:
-        """Read the photos, make the trainer, and bring it to where the run was left.
+        """Read the photos, make the trainer, and load the last checkpoint where there is one.
 
         Args:
             progress: Told how many photos of how many have been read.
@@ -189,19 +150,22 @@ class CaptureRun:
         """
         options, dataset, folder = self.options, self.dataset, self.folder
         dataset.preload(progress)
+        gaussians, digest = self._start_cloud()
         if folder.exists():
             remove_leftovers(folder.path)
             check_capture(folder, dataset)
+            if digest is not None and folder.read_config().get("start") != digest:
+                raise CheckpointError(
+                    f"--resume: {folder.path} was begun from another scene than {options.scene} is now;"
+                    " resume with that one, or name another --out"
+                )
         else:  # config.json comes last: it says that the run has begun
             folder.write_cameras(dataset.train, dataset.test, dataset.origin)
+            folder.write_photos(photo_digests(dataset))
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
-            folder.write_config(options.document() | facts)
+            folder.write_config(document(options) | facts | ({"start": digest} if digest else {}))
         extent = scene_extent([view.camera for view in dataset.train])
-        gaussians = from_points(dataset.points, dataset.colors, options.config).to(device_of(options.backend))
-        if len(gaussians) < len(dataset.points):
-            self._say(
-                f"the start cloud has {len(dataset.points)} points; {len(gaussians)} of them are taken, the cap"
-            )
+        gaussians = gaussians.to(device_of(options.backend))
         self._log = LogWriter(folder.log_file)
         self.trainer = Trainer(
             gaussians,
@@ -213,7 +177,39 @@ class CaptureRun:
             callbacks=[self._record, *callbacks],
         )
         self._take_up()
+        self._extend()
         return self.trainer
+
+    def _start_cloud(self) -> tuple[Gaussians, str | None]:
+        """Make the Gaussians that training starts from, and a digest of them if they come from a scene."""
+        options, dataset = self.options, self.dataset
+        if options.scene is not None:
+            gaussians, notes = scene_start(options.scene, options.config, dataset.origin)
+            for note in notes:
+                self._say(note)
+            return gaussians, scene_digest(gaussians)
+        gaussians = from_points(dataset.points, dataset.colors, options.config)
+        if len(gaussians) < len(dataset.points) and not self.folder.exists():
+            self._say(
+                f"the capture has {len(dataset.points)} points to start from; {len(gaussians)} are used, the cap"
+            )
+        return gaussians, None
+
+    def _extend(self) -> None:
+        """Write to config.json that the run is longer than it was, before the first of the new iterations."""
+        stored, wanted = self.folder.read_config(), self.options.config.iterations
+        before = stored["train"].get("iterations")
+        if before == wanted:
+            return
+        history = stored.get("history")
+        entry = {"iteration": self.trainer.iteration, "iterations_before": before, "iterations": wanted}
+        train = {**stored["train"], "iterations": wanted}
+        past = history if isinstance(history, list) else []
+        self.folder.write_config(stored | {"train": train, "history": [*past, entry]})
+        self._say(
+            f"{self.folder.path}: extended from {before} to {wanted} iterations; milestones and rates stay those of"
+            f" {before}"
+        )
 
     def _take_up(self) -> None:
         checkpoints = list_checkpoints(self.folder.checkpoints)
@@ -234,12 +230,12 @@ class CaptureRun:
         Returns:
             Whether `stop` ended it.
         """
-        limit, asked = self.options.time_limit, False
+        limit, asked, whole = self.options.time_limit, False, self.trainer.iteration
         self._began = time.perf_counter() - self.seconds
 
         def ends() -> bool:
-            nonlocal asked
-            asked = stop()
+            nonlocal asked, whole
+            asked, whole = stop(), self.trainer.iteration
             if not asked:
                 self._judge_and_save_where_due(stop)
                 asked = stop()
@@ -248,6 +244,13 @@ class CaptureRun:
         try:
             if limit is None or self.seconds < limit:
                 self.trainer.run(ends)
+        except DatasetError as error:
+            if whole != self.trainer.iteration:
+                raise  # in the middle of an iteration: the last checkpoint is the state to resume from
+            self.save()
+            raise DatasetError(
+                f"{error}; saved after {whole} iterations, --resume continues from there"
+            ) from None
         finally:
             self._log.close()
         self.seconds = self._elapsed()

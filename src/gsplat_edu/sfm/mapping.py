@@ -13,19 +13,6 @@ from gsplat_edu.data.lens import straightened
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call
 
-MAPPERS = ("auto", "incremental", "global")
-
-CAMERA_MODELS = (
-    "auto",
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "OPENCV_FISHEYE",
-)
-
 ENOUGH = 0.8
 """Share of the photos that hang together by matches that have to have a pose for the first way to be the last."""
 

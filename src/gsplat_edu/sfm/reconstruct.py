@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,12 @@ from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, require_colmap
-from gsplat_edu.sfm.mapping import CAMERA_MODELS, MAPPERS, attempts, map_photos, no_overlap
+from gsplat_edu.sfm.mapping import attempts, map_photos, no_overlap
+from gsplat_edu.sfm.options import SfmOptions as SfmOptions
 from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, is_photo, photo_files
 from gsplat_edu.sfm.result import PARTS, build_capture, note_published, publish, published
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
-from gsplat_edu.validation import one_of, whole_number
-
-MATCHERS = ("auto", "exhaustive", "sequential", "nearest")
 
 EXHAUSTIVE = 150
 """Photos up to which every pair is matched: 11,175 pairs, ten minutes on two cores."""
@@ -46,48 +44,6 @@ INLIERS = 15
 
 NAMED = 12
 """Photos that a sentence names; more are counted."""
-
-
-@dataclass(frozen=True)
-class SfmOptions:
-    """One structure from motion.
-
-    Args:
-        source: A folder of photos, or a video.
-        out: Folder of the capture. The work is kept in its folder sfm/.
-        frames: How many frames of a video are taken, at most.
-        matcher: "exhaustive": every pair. "sequential": each photo with those that follow. "nearest": those, the ones
-            that look alike, and the ones taken close by. "auto": exhaustive up to 150 photos, else nearest; for
-            videos nearest.
-        mapper: "incremental", "global", or "auto": the former, and the other one where it does not do.
-        camera_model: COLMAP's name of the lens model; "auto": OPENCV, or SIMPLE_RADIAL where photos are few.
-        max_features: Most SIFT features of a photo.
-        max_image_size: Longest side at which features are found, px. The capture has the photos at full size.
-        threads: Threads of COLMAP; 0 for all.
-
-    Raises:
-        ArgumentError: a value is out of range.
-    """
-
-    source: Path
-    out: Path
-    frames: int = 150
-    matcher: str = "auto"
-    mapper: str = "auto"
-    camera_model: str = "auto"
-    max_features: int = 8192
-    max_image_size: int = 1600
-    threads: int = 0
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        whole_number("frames", self.frames, 3)
-        one_of("matcher", self.matcher, MATCHERS)
-        one_of("mapper", self.mapper, MAPPERS)
-        one_of("camera_model", self.camera_model, CAMERA_MODELS)
-        whole_number("max_features", self.max_features, 100)
-        whole_number("max_image_size", self.max_image_size, 64)
-        whole_number("threads", self.threads, 0)
 
 
 Say = Callable[[str], None]

@@ -77,25 +77,25 @@ class ViewFeed:
         self._kept: dict[View, Target] = {}
         self._room = _free_bytes(device) if room is None else room
 
-    def next(self, background: Color) -> tuple[View, Target]:
+    def next(self) -> tuple[View, Photo | None]:
         """Draw a view, and begin to read the photo of the one after it.
 
-        Args:
-            background: Behind this photo, where it is not opaque; the feed's own if it has one.
+        Returns:
+            view: The view; it stays due if reading its photo fails.
+            photo: Its photo; None if its target is kept on the GPU.
         """
         index = self._following()
-        self._queue.pop(0)
         ahead, self._ahead = self._ahead, None
         view = self.views[index]
-        target = self._kept.get(view)
-        if target is None:
+        photo = None
+        if view not in self._kept:
             photo = ahead[1].result() if ahead and ahead[0] == index else self._read(view)
-            target = self._target(view, photo, background)
+        self._queue.pop(0)  # not before: a photo that cannot be read is still due
         following = self._following()
         after = self.views[following]
         if after.on_disk and after not in self._kept:
             self._ahead = following, self._reader.submit(self._read, after)
-        return view, target
+        return view, photo
 
     def _read(self, view: View) -> Photo:
         """Read a photo and put it over the background if that is known; a photo in memory only once."""
@@ -107,8 +107,16 @@ class ViewFeed:
             self._flat[view] = flat
         return flat
 
-    def _target(self, view: View, photo: Photo, background: Color) -> Target:
-        """Bring a photo to where the Gaussians are; keep it there if it stays as it is and there is room."""
+    def target(self, view: View, photo: Photo | None, background: Color) -> Target:
+        """Bring what `next` returned to where the Gaussians are; keep it there if it stays as it is and there is room.
+
+        Args:
+            view: The view.
+            photo: Its photo, or None.
+            background: Behind the photo where it is not opaque; the feed's own if it has one.
+        """
+        if photo is None:
+            return self._kept[view]
         mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(self._device)
         target = Target(torch.from_numpy(photo.over(background)).to(self._device), mask)
         if self._device.type != "cpu" and photo.alpha is None and target.nbytes <= self._room:

@@ -81,6 +81,48 @@ def from_points(points: ArrayLike, colors: ArrayLike, config: TrainConfig) -> Ga
     )
 
 
+def from_gaussians(gaussians: Gaussians, config: TrainConfig) -> tuple[Gaussians, list[str]]:
+    """Make trained Gaussians the start of another run.
+
+    Those with a NaN or infinite parameter or a zero quaternion are left out, since no gradient repairs them. Harmonics
+    above the run's degree are cut off; missing ones are zero.
+
+    Args:
+        gaussians: Raw parameters, relative to the run's origin.
+        config: SH degree, and the cap.
+
+    Returns:
+        Gaussians of the configuration's SH degree, float32; and sentences that say what was changed.
+
+    Raises:
+        ArgumentError: none is left, or more than the cap.
+    """
+    whole = gaussians.finite_rows() & (gaussians.quats.abs().amax(dim=1) > 0)
+    notes = []
+    if broken := len(gaussians) - int(whole.sum()):
+        notes.append(
+            f"{broken} of {len(gaussians)} Gaussians are NaN, infinite or without rotation: left out"
+        )
+    kept = gaussians.map(lambda tensor: tensor.detach()[whole].float().contiguous())
+    if not len(kept):
+        raise ArgumentError("holds no Gaussian to start from; give another scene")
+    if config.max_gaussians is not None and len(kept) > config.max_gaussians:
+        raise ArgumentError(
+            f"holds {len(kept)} Gaussians, more than --max-gaussians {config.max_gaussians}; raise that, or thin it out"
+            " with `gsplat-edu convert --min-opacity`"
+        )
+    wanted, stored = (config.sh_degree + 1) ** 2 - 1, kept.sh_rest.shape[1]
+    if stored > wanted:
+        notes.append(
+            f"harmonics up to degree {kept.sh_degree} are stored; those above --sh-degree are cut off"
+        )
+    elif stored < wanted:
+        notes.append(f"harmonics up to degree {kept.sh_degree} are stored; the others start at zero")
+    rest = torch.zeros(len(kept), wanted, 3)
+    rest[:, : min(stored, wanted)] = kept.sh_rest[:, :wanted]
+    return Gaussians(**(kept.tensors() | {"sh_rest": rest})), notes
+
+
 def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> DensityStrategy | None:
     """Make the density strategy that a configuration names; None for none.
 

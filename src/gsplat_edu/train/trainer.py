@@ -114,6 +114,7 @@ class Trainer:
         gaussians: The Gaussians as they stand.
         iteration: Steps taken so far.
         last: The last rendered image, its photo and its mask, for whoever wants to look.
+        last_name: The name of their view.
     """
 
     def __init__(
@@ -139,6 +140,7 @@ class Trainer:
         self.config, self.extent, self.density = config, extent, density
         self.iteration = 0
         self.last: tuple[Tensor, Tensor, Tensor | None] | None = None
+        self.last_name = ""
         self._render, self._callbacks = render, tuple(callbacks)
         behind, device = None if config.random_background else config.background, gaussians.means.device
         self._feed = ViewFeed(views, config.view_order, config.seed, behind, device)
@@ -171,10 +173,12 @@ class Trainer:
 
     def _step(self) -> StepEvent:
         iteration, config = self.iteration, self.config
+        view, photo = self._feed.next()
+        self.last_name = view.name
         background = config.background
         if config.random_background:
             background = tuple(self._backgrounds.uniform(size=3).tolist())
-        view, target = self._feed.next(background)
+        target = self._feed.target(view, photo, background)
         settings = RenderSettings(
             background=background,
             sh_degree=sh_degree(config, iteration),

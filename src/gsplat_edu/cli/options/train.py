@@ -10,12 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
-from gsplat_edu.data.dataset import DataSettings
-from gsplat_edu.doctor.plan import PLANNED, Limits
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.render.backends import resolve_backend
-from gsplat_edu.runs.training import RunOptions
-from gsplat_edu.train.config import ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
+from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.train.config import FROM_SCENE, ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
+
+EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
+
+FOR_POINTS = ("start_opacity", "start_scale", "mcmc_start_opacity", "mcmc_start_scale")
+"""Fields of the recipe that only a start from points uses."""
 
 NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background")
 """Fields of the recipe that have their options spelled out below; the others are made from `TrainConfig`."""
@@ -30,7 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a capture: COLMAP, transforms.json or Blender; or photos or a video, whose poses are found first",
     )
     parser.add_argument("--out", type=Path, metavar="RUN", required=True, help="folder of the run")
-    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint in RUN")
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue from the last checkpoint in RUN; with more --iterations than before, the run is extended: its"
+        " milestones and rates stay those of the shorter run",
+    )
     _add_budget(parser.add_argument_group("budget"))
     _add_view(parser.add_argument_group("live view"))
     _add_data(parser.add_argument_group("photos"))
@@ -131,8 +140,17 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
         metavar="SIZE",
         help="decoded photos kept in memory, for example 500MB; others are read again (default: 4GiB)",
     )
-    group.add_argument(
+    start = group.add_mutually_exclusive_group()
+    start.add_argument(
         "--points", type=Path, metavar="X.ply", help="start from these points, not the capture's"
+    )
+    start.add_argument(
+        "--from",
+        dest="scene",
+        type=Path,
+        metavar="SCENE|RUN",
+        help="start from the Gaussians of a trained scene, or of a run's latest one, not from points; all harmonics"
+        f" are in use from the first iteration, and --means-rate is {FROM_SCENE['means_rate']:g} unless given",
     )
 
 
@@ -168,33 +186,39 @@ def _number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
 
 
+def check(arguments: argparse.Namespace) -> None:
+    """Check what can be checked without importing torch or reading a photo.
+
+    Raises:
+        ArgumentError: an option is out of range.
+        CheckpointError: the config.json of a run to resume is damaged.
+        DatasetError: there is nothing under DATA.
+    """
+    _options(arguments, arguments.backend)
+    if not arguments.data.exists():
+        raise DatasetError(
+            f"{arguments.data}: is not there; name the folder of a capture, of photos, or a video"
+        )
+    for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):
+        if path is not None and not path.exists():
+            raise ArgumentError(f"{flag}: {path} is not there; check the name, or leave the option out")
+
+
 def options_from(arguments: argparse.Namespace) -> RunOptions:
     """Turn what `add_arguments` parsed into the options of a run.
 
     Raises:
         ArgumentError: an option is out of range.
         BackendUnavailableError: the backend does not run here.
+        CheckpointError: the config.json of a run to resume is damaged.
     """
-    changes: dict[str, Any] = {}
-    for field in fields(TrainConfig):
-        given = getattr(arguments, field.name, None)
-        if given is not None and field.name not in ("iterations", "background"):
-            changes[field.name] = None if field.name == "jacobian_limit" and given == "none" else given
-    if arguments.white_background or arguments.background:
-        changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
-    for strategy, names in ONLY_FOR.items():
-        if strategy != arguments.strategy and (idle := [name for name in names if name in changes]):
-            flag = f"--{idle[0].replace('_', '-')}"
-            raise ArgumentError(
-                f"{flag}: is looked at by --strategy {strategy} only; leave it out or choose that"
-            )
-    iterations = RECIPE_ITERATIONS if arguments.iterations is None else arguments.iterations
-    config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
-    planned = limits_from(arguments).memory is not None or (
-        arguments.time_limit is not None and arguments.iterations is None
-    )
-    if config.strategy == "mcmc" and config.max_gaussians is None and not planned:
-        raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
+    from gsplat_edu.render.backends import resolve_backend  # it imports torch
+
+    return _options(arguments, resolve_backend(arguments.backend))
+
+
+def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
+    config = _config(arguments)
     settings = DataSettings(
         resolution=arguments.resolution,
         test_every=arguments.test_every,
@@ -207,7 +231,8 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
         config=config,
         data_settings=settings,
         points=arguments.points,
-        backend=resolve_backend(arguments.backend),
+        scene=arguments.scene,
+        backend=backend,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
         time_limit=arguments.time_limit,
@@ -215,11 +240,44 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
     )
 
 
-def limits_from(arguments: argparse.Namespace) -> Limits:
-    """Return what the run may take."""
-    return Limits(arguments.max_memory, arguments.time_limit)
+def _config(arguments: argparse.Namespace) -> TrainConfig:
+    changes: dict[str, Any] = {}
+    for field in fields(TrainConfig):
+        given = getattr(arguments, field.name, None)
+        if given is not None and field.name not in ("iterations", "background"):
+            changes[field.name] = None if field.name == "jacobian_limit" and given == "none" else given
+    if arguments.white_background or arguments.background:
+        changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
+    for strategy, names in ONLY_FOR.items():
+        if strategy != arguments.strategy and (idle := [name for name in names if name in changes]):
+            flag = f"--{idle[0].replace('_', '-')}"
+            raise ArgumentError(
+                f"{flag}: only --strategy {strategy} uses it; leave it out or choose that strategy"
+            )
+    planned = arguments.max_memory is not None or (
+        arguments.time_limit is not None and arguments.iterations is None
+    )
+    if _starts_from_scene(arguments):
+        if idle := [name for name in FOR_POINTS if name in changes]:
+            flag = f"--{idle[0].replace('_', '-')}"
+            raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
+        if planned and not arguments.resume:
+            raise ArgumentError(
+                "--from: a start from a scene cannot be planned for --max-memory or --time-limit;"
+                " give --iterations, and --max-gaussians for less memory"
+            )
+        changes = FROM_SCENE | changes
+    iterations = RECIPE_ITERATIONS if arguments.iterations is None else arguments.iterations
+    config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
+    if config.strategy == "mcmc" and config.max_gaussians is None and not planned:
+        raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
+    return config
 
 
-def given_from(arguments: argparse.Namespace) -> list[str]:
-    """Return the names of those settings a plan may choose that the user gave."""
-    return [name for name in PLANNED if getattr(arguments, name) is not None]
+def _starts_from_scene(arguments: argparse.Namespace) -> bool:
+    """Say whether the run starts from a scene, by its options or, where it is resumed, by its config.json."""
+    folder = RunFolder(arguments.out)
+    if arguments.scene is not None or not (arguments.resume and folder.exists()):
+        return arguments.scene is not None
+    data = folder.read_config().get("data")
+    return isinstance(data, dict) and data.get("scene") is not None

@@ -1,0 +1,13 @@
+"""The options of `gsplat-edu info`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLE = "example: gsplat-edu info captures/plush"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's argument."""
+    parser.add_argument("path", type=Path, metavar="PATH", help="dataset folder, run folder or scene file")

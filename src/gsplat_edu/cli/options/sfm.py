@@ -1,0 +1,61 @@
+"""The options of `gsplat-edu sfm`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, SfmOptions
+
+EXAMPLE = "example: gsplat-edu sfm holiday.mp4 captures/holiday --frames 200"
+
+
+def check(arguments: argparse.Namespace) -> None:
+    """Refuse what is out of range; raises as `options_from` does."""
+    options_from(arguments)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.add_argument("source", type=Path, metavar="PHOTOS", help="a folder of photos, or a video")
+    parser.add_argument(
+        "out", type=Path, metavar="OUT", help="folder of the capture; work is kept in OUT/sfm"
+    )
+
+    def number(flag: str, text: str, default: int) -> None:
+        parser.add_argument(
+            flag, type=whole_number_text, metavar="N", default=default, help=f"{text} (default: {default})"
+        )
+
+    def choice(flag: str, text: str, names: tuple[str, ...]) -> None:
+        parser.add_argument(
+            flag, metavar="NAME", default="auto", help=f"{text}: {', '.join(names)} (default: auto)"
+        )
+
+    number("--frames", "frames taken from a video, at most", SfmOptions.frames)
+    choice("--matcher", "which photos are compared", MATCHERS)
+    choice("--mapper", "how poses are found", MAPPERS)
+    choice("--camera-model", "how the lens bends light", CAMERA_MODELS)
+    number("--max-features", "features of a photo, at most", SfmOptions.max_features)
+    number("--max-image-size", "longest side at which features are found, px", SfmOptions.max_image_size)
+    number("--threads", "threads of COLMAP, 0 for all", SfmOptions.threads)
+
+
+def options_from(arguments: argparse.Namespace) -> SfmOptions:
+    """Turn what `add_arguments` parsed into options.
+
+    Raises:
+        ArgumentError: one is out of range.
+    """
+    return SfmOptions(
+        arguments.source,
+        arguments.out,
+        arguments.frames,
+        arguments.matcher,
+        arguments.mapper,
+        arguments.camera_model,
+        arguments.max_features,
+        arguments.max_image_size,
+        arguments.threads,
+    )

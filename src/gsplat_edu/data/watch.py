@@ -1,0 +1,88 @@
+"""Which files photos were read from, so that none changes unnoticed while it is in use."""
+
+from __future__ import annotations
+
+import hashlib
+import stat
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsplat_edu.errors import DatasetError
+
+Stamp = tuple[int, int]
+"""Size in bytes and time of the last change in ns: what is looked at before a file is hashed again."""
+
+
+@dataclass(frozen=True)
+class FileDigest:
+    """What a file holds.
+
+    Args:
+        size: Bytes.
+        sha256: Digest of them, hexadecimal.
+    """
+
+    size: int
+    sha256: str
+
+
+class FileWatch:
+    """Remembers the digest of every file that was read. Any number of threads may use it.
+
+    A file of the same size and time counts as the same; one with another time is hashed again, and is the same if its
+    bytes are. Hashing reads a file once more, from the system's cache: a few percent of the time that decoding takes.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[Path, tuple[Stamp, FileDigest]] = {}
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def unchanged(self, *paths: Path | None) -> Iterator[None]:
+        """Read files inside the block that are those that were read before.
+
+        Args:
+            paths: The files; None stands for none.
+
+        Raises:
+            DatasetError: one has changed since it was first read, or while the block ran.
+        """
+        given = [path for path in paths if path is not None]
+        stamps = [self._check(path) for path in given]
+        yield
+        for path, stamp in zip(given, stamps, strict=True):
+            if stamp is not None and _stamp(path) != stamp:
+                self._check(path)
+
+    def digest(self, path: Path) -> FileDigest | None:
+        """Return the digest of a file as it was first read, or is now; None if there is no such file."""
+        self._check(path)
+        with self._lock:
+            known = self._known.get(path)
+        return known[1] if known else None
+
+    def _check(self, path: Path) -> Stamp | None:
+        stamp = _stamp(path)
+        with self._lock:
+            known = self._known.get(path)
+        if stamp is None or (known is not None and known[0] == stamp):
+            return stamp
+        with path.open("rb") as file:
+            digest = FileDigest(stamp[0], hashlib.file_digest(file, "sha256").hexdigest())
+        if known is not None and known[1] != digest:
+            raise DatasetError(f"{path}: has changed since it was first read; put the file back as it was")
+        with self._lock:
+            self._known[path] = stamp, digest
+        return stamp
+
+
+def _stamp(path: Path) -> Stamp | None:
+    """Return size and time of a regular file; None for anything else, which whoever decodes it complains of."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return None
+    return (status.st_size, status.st_mtime_ns) if stat.S_ISREG(status.st_mode) else None

@@ -1,0 +1,147 @@
+"""One writer per folder: a lock that the operating system gives up when its process ends, however it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.files import check_folder, named_failure
+
+LOCK = ".lock"
+"""Name of the lock in its folder. It is removed at the end; one that a killed process left locks nothing."""
+
+_FAR = 1 << 30
+"""Byte that is locked on Windows, where nobody can read a locked one: far behind what the file says."""
+
+_held: set[int] = set()
+
+
+@contextmanager
+def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Keep other processes from writing to a folder while the block runs. It is made where it is missing.
+
+    The lock is `flock` on Linux and macOS, a locked byte on Windows. Both end with the process, even by kill -9;
+    processes it starts or forks do not keep it. Threads of one process exclude one another likewise.
+
+    Args:
+        name: What the user calls the folder, for messages.
+        folder: The folder. If the block leaves it empty and it was made here, it is removed again.
+        what: What this process does, for the message that the next one prints.
+        say: Receives a sentence if the file system has no locks: the block then runs without.
+
+    Raises:
+        ArgumentError: another process holds the lock; the message says which. Or the folder cannot be written to.
+    """
+    check_folder(name, folder)
+    made = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / LOCK
+    try:
+        handle = _acquired(name, path)
+        if handle is None:
+            say(f"{folder}: its file system has no locks; do not let two commands write to it at once")
+            yield
+            return
+        try:
+            facts = {"pid": os.getpid(), "host": socket.gethostname(), "since": _now(), "what": what}
+            with named_failure(path):
+                os.ftruncate(handle, 0)
+                os.write(handle, json.dumps(facts).encode())
+            yield
+        finally:
+            _release(handle, path)
+    finally:
+        for place in made:
+            with contextlib.suppress(OSError):  # it holds what the block wrote
+                place.rmdir()
+
+
+def _acquired(name: str, path: Path) -> int | None:
+    """Return an open, locked file; None if the file system has no locks."""
+    while True:
+        handle = os.open(
+            path, os.O_RDWR | os.O_CREAT, 0o666
+        )  # Python keeps it from programs that are started
+        try:
+            _lock(handle)
+        except (BlockingIOError, PermissionError):
+            holder = _holder(handle)
+            os.close(handle)
+            raise ArgumentError(
+                f"{name}: {path.parent} is in use by {holder}; wait until that ends, or name another folder"
+            ) from None
+        except OSError:
+            os.close(handle)
+            path.unlink(missing_ok=True)
+            return None
+        if _is_at(path, handle):
+            _held.add(handle)
+            return handle
+        os.close(
+            handle
+        )  # its last holder removed it between our two calls: another file is there now, or none
+
+
+def _release(handle: int, path: Path) -> None:
+    _held.discard(handle)
+    if sys.platform != "win32":
+        path.unlink(missing_ok=True)  # before it is let go: afterwards it may be another process's
+    os.close(handle)
+    if sys.platform == "win32":
+        with contextlib.suppress(OSError):  # another process has opened it meanwhile
+            path.unlink()
+
+
+def _lock(handle: int) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        os.lseek(handle, _FAR, os.SEEK_SET)
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        os.lseek(handle, 0, os.SEEK_SET)
+    else:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _is_at(path: Path, handle: int) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(handle))
+    except FileNotFoundError:
+        return False
+
+
+def _holder(handle: int) -> str:
+    """Say who wrote the lock, in words that cannot do anything to a terminal."""
+    try:
+        facts = json.loads(os.read(handle, 1000))
+        words = [re.sub(r"[^ -~]", "?", str(facts[key]))[:80] for key in ("what", "pid", "host", "since")]
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process"
+    return "`{}`, process {} on {}, since {}".format(*words)
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S %z")
+
+
+def _drop_in_child() -> None:
+    """Close a forked child's copies: with one of them open, the lock would outlive its process."""
+    for handle in _held:
+        with contextlib.suppress(OSError):
+            os.close(handle)
+    _held.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_drop_in_child)

@@ -1,0 +1,81 @@
+"""What a run of training is asked to do. It imports nothing heavy: the command line checks its options first."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.validation import whole_number
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """One run of training.
+
+    Args:
+        data: The capture.
+        out: The run's folder.
+        config: The recipe.
+        data_settings: How the capture is read.
+        points: A PLY to start from; the capture's own points where None.
+        scene: A trained scene to start from in place of points: a scene file, or the folder of a run.
+        backend: Rendering backend, by its own name.
+        eval_every: Iterations between judgements by the test views; 0 judges at the end only.
+        save_every: Iterations between checkpoints; 0 writes one at the end only, or when the run is stopped.
+        time_limit: Seconds of training after which the run ends; None for none.
+        resume: Continue from the last checkpoint of the folder.
+
+    Raises:
+        ArgumentError: a number is out of range.
+    """
+
+    data: Path
+    out: Path
+    config: TrainConfig
+    data_settings: DataSettings
+    points: Path | None = None
+    scene: Path | None = None
+    backend: str = "cpu"
+    eval_every: int = 1_000
+    save_every: int = 500
+    time_limit: float | None = None
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("eval_every", "save_every"):
+            whole_number(name, getattr(self, name), 0)
+        if self.time_limit is not None and self.time_limit <= 0:
+            raise ArgumentError("time_limit: has to be above 0 seconds")
+
+    @property
+    def folder(self) -> RunFolder:
+        """The run's folder."""
+        return RunFolder(self.out)
+
+    @property
+    def render_settings(self) -> RenderSettings:
+        """How the scene is rendered once it is trained."""
+        config = self.config
+        return RenderSettings(
+            background=config.background,
+            sh_degree=config.sh_degree,
+            antialiased=config.antialiased,
+            jacobian_limit=config.jacobian_limit,
+            depth=False,
+        )
+
+    @property
+    def renderer(self) -> Callable[..., Any]:
+        """Renders the scene with these settings; takes Gaussians and a camera."""
+        from gsplat_edu.render.api import render  # it imports torch
+
+        return functools.partial(render, settings=self.render_settings, backend=self.backend)

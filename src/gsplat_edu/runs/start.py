@@ -1,0 +1,84 @@
+"""A trained scene as the start of another training."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io import ply
+from gsplat_edu.io.formats import SOG_META, format_of, read_scene
+from gsplat_edu.runs.folder import RunFolder, render_settings
+from gsplat_edu.runs.source import relative_to, run_of
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.initialize import from_gaussians
+from gsplat_edu.validation import ArrayLike
+
+
+def scene_file(path: Path) -> Path:
+    """Return the scene file that a path names: a file as it is, the latest scene of a run.
+
+    Raises:
+        ArgumentError: there is nothing that could be a scene.
+        CheckpointError: the run is damaged, or has no scene yet.
+    """
+    if not path.exists():
+        raise ArgumentError(f"--from: {path} is not there; give a scene file or the folder of a run")
+    if not path.is_dir() or (path / SOG_META).is_file():
+        file = path / SOG_META if path.is_dir() else path
+        format_of(file)
+        return file
+    folder = RunFolder(path)
+    if not folder.exists():
+        raise ArgumentError(
+            f"--from: {path} is neither a scene file nor the folder of a run; give one of these"
+        )
+    return folder.latest_scene()[0]
+
+
+def scene_start(path: Path, config: TrainConfig, origin: ArrayLike) -> tuple[Gaussians, list[str]]:
+    """Read a scene to start training from.
+
+    Args:
+        path: Scene file of any readable format, in the capture's own coordinates; or the folder of a run.
+        config: SH degree and cap of the run that starts.
+        origin: (3,) what is subtracted from the capture's coordinates for training.
+
+    Returns:
+        Gaussians of the run's SH degree, float32, relative to the origin; and sentences that say what was done.
+
+    Raises:
+        ArgumentError: there is no scene, or it has no Gaussians that can be used, or more than the cap.
+        SceneFormatError: the file is damaged.
+        CheckpointError: the run is damaged, or has no scene yet.
+        OSError: the file cannot be read.
+    """
+    file = scene_file(path)
+    # A PLY is read with what is broken in it, which is left out below. A run's says nothing of antialiasing.
+    scene = ply.read(file, finite=False) if format_of(file).suffix == ".ply" else read_scene(file)
+    run = run_of(file)
+    antialiased = scene.antialiased if run is None else render_settings(run.read_config()).antialiased
+    gaussians = relative_to(scene.gaussians, origin)
+    try:
+        start, notes = from_gaussians(gaussians, config)
+    except ArgumentError as error:
+        raise ArgumentError(f"--from: {file}: {error}") from None
+    notes = [f"{file}: {note}" for note in notes]
+    if antialiased is not None and antialiased != config.antialiased:
+        was, now = ("with", "without") if antialiased else ("without", "with")
+        advice = "leave out --antialiased" if config.antialiased else "add --antialiased"
+        notes.append(
+            f"{file}: was trained {was} antialiasing, this run trains {now}: small splats change their brightness;"
+            f" {advice} to keep it"
+        )
+    return start, [f"{file}: {len(start)} Gaussians to start from", *notes]
+
+
+def scene_digest(gaussians: Gaussians) -> str:
+    """Return a digest of all raw parameters."""
+    digest = hashlib.sha256()
+    for name, tensor in gaussians.tensors().items():
+        digest.update(name.encode())
+        digest.update(tensor.contiguous().numpy(force=True).tobytes())
+    return digest.hexdigest()

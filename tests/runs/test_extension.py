@@ -1,0 +1,364 @@
+"""Longer than it was begun, from another scene, from photos that changed: what a run makes of it."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gsplat_edu.cli.main import build_parser, main
+from gsplat_edu.cli.options.train import options_from
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.io.formats import write_scene
+from gsplat_edu.io.ply import load_ply, save_ply
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.locks import locked
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.train.config import TrainConfig, recipe
+
+BASE = ["--eval-every", "0", "--save-every", "5", "--densify-start", "1", "--densify-every", "4"]
+BASE += ["--grad-threshold", "5e-5"]
+VIEWS = 6
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_torch_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "egg"
+    write_colmap(folder, *procedural_capture(24, VIEWS, splats=60))
+    (folder / "masks").mkdir()
+    for photo in (folder / "images").iterdir():
+        with Image.open(photo) as file:
+            Image.new("L", file.size, 255).save(folder / "masks" / photo.name)
+    return folder
+
+
+def train(capture, out, *options):
+    return main(["train", str(capture), "--out", str(out), *BASE, *options])
+
+
+def options(capture, out, *words):
+    words = ["train", str(capture), "--out", str(out), *BASE, *words]
+    return options_from(build_parser(words).parse_args(words))
+
+
+def ply(out, iterations):
+    return RunFolder(out).scene(iterations).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def finished(capture, tmp_path_factory):
+    """20 iterations by the schedule of 20, milestones made by the recipe."""
+    out = tmp_path_factory.mktemp("runs") / "egg"
+    assert train(capture, out, "--iterations", "20") == 0
+    return out
+
+
+@pytest.fixture
+def run(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+@pytest.fixture(scope="module")
+def whole(capture, tmp_path_factory):
+    """30 iterations in one go, by the milestones of 20."""
+    short, words = recipe(20), []
+    for name in ("means_rate_iterations", "sh_every", "densify_stop", "reset_every"):
+        words += [f"--{name.replace('_', '-')}", str(getattr(short, name))]
+    out = tmp_path_factory.mktemp("whole") / "egg"
+    assert train(capture, out, "--iterations", "30", *words) == 0
+    return out
+
+
+def test_a_finished_run_is_extended_by_its_own_milestones(capture, finished, whole, run, capsys):
+    assert train(capture, run, "--iterations", "30", "--resume") == 0
+    said = capsys.readouterr().out.replace("\n", " ")
+    assert "extended from 20 to 30 iterations" in said and "resuming after 20 iterations" in said
+    assert ply(run, 30) == ply(whole, 30) != ply(finished, 20)
+    config = RunFolder(run).read_config()
+    assert config["history"] == [{"iteration": 20, "iterations_before": 20, "iterations": 30}]
+    assert config["train"]["densify_stop"] == recipe(20).densify_stop
+    metrics = RunFolder(run).read_metrics()
+    assert metrics["iterations"] == 30
+    assert [line["iteration"] for line in RunFolder(run).log() if "loss" in line] == [10, 20, 30]
+    assert train(capture, run, "--resume") == 0
+    assert "is finished, 30 iterations; nothing to do" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_an_interrupted_extension_gives_the_same_bytes(capture, whole, run):
+    capture_run = CaptureRun(_taken_up(capture, run, "--iterations", "30", "--resume"))
+    trainer = capture_run.start()
+    assert capture_run.train(lambda: trainer.iteration >= 23)
+    assert RunFolder(run).read_metrics()["iterations"] == 20, "it was not finished"
+    assert train(capture, run, "--resume") == 0, "the new length stands in config.json"
+    assert ply(run, 30) == ply(whole, 30)
+
+
+def test_an_unfinished_run_is_extended_and_no_run_is_shortened(capture, whole, tmp_path, capsys):
+    out = tmp_path / "run"
+    first = CaptureRun(options(capture, out, "--iterations", "20"))
+    trainer = first.start()
+    first.train(lambda: trainer.iteration >= 7)
+    assert train(capture, out, "--iterations", "19", "--resume") == 2
+    error = capsys.readouterr().err
+    assert "begun with iterations = 20, not 19: a run can be extended, not shortened" in error
+    assert error.count("\n") == 1
+    assert train(capture, out, "--iterations", "30", "--resume") == 0
+    assert ply(out, 30) == ply(whole, 30)
+    (entry,) = RunFolder(out).read_config()["history"]
+    assert entry == {"iteration": 7, "iterations_before": 20, "iterations": 30}
+
+
+def _taken_up(capture, out, *words):
+    from gsplat_edu.doctor.plan import taken_up
+
+    given = [
+        name for name in ("iterations", "densify_start") if f"--{name.replace('_', '-')}" in (*BASE, *words)
+    ]
+    return taken_up(options(capture, out, *words), given)
+
+
+def test_a_run_starts_from_a_run(capture, finished, tmp_path, capsys):
+    out = tmp_path / "from"
+    assert train(capture, out, "--iterations", "4", "--from", str(finished)) == 0
+    count = RunFolder(finished).read_metrics()["num_gaussians"]
+    said = capsys.readouterr().out.replace("\n", " ")
+    assert f"{count} Gaussians to start from" in said
+    config = RunFolder(out).read_config()
+    assert config["data"]["scene"] == str(RunFolder(finished).scene(20))
+    assert (config["train"]["sh_every"], config["train"]["means_rate"]) == (0, 1.6e-5)
+    first = CaptureRun(options(capture, tmp_path / "x", "--iterations", "4", "--from", str(finished)))
+    trainer = first.start()
+    loaded = load_ply(RunFolder(finished).scene(20))
+    for name, tensor in loaded.tensors().items():
+        assert torch.equal(trainer.gaussians.tensors()[name].detach(), tensor), name
+    # it is a better start than the points: that is what it is for
+    scores = [RunFolder(folder).read_metrics()["train"]["psnr"] for folder in (finished, out)]
+    assert scores[1] > scores[0]
+
+
+def test_a_run_from_a_scene_is_resumed_with_it_or_without_its_name(capture, finished, tmp_path, capsys):
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes(ply(finished, 20))
+    out = tmp_path / "run"
+    first = CaptureRun(options(capture, out, "--iterations", "8", "--from", str(scene)))
+    trainer = first.start()
+    first.train(lambda: trainer.iteration >= 5)
+    shutil.copytree(out, tmp_path / "other")
+    assert train(capture, out, "--iterations", "8", "--resume") == 0
+    gaussians = load_ply(scene)
+    save_ply(scene, gaussians.map(lambda tensor: tensor[:-1]))
+    other = tmp_path / "other"
+    assert train(capture, other, "--iterations", "8", "--resume", "--from", str(scene)) == 2
+    error = capsys.readouterr().err
+    assert "was begun from another scene" in error and error.count("\n") == 1
+    scene.unlink()
+    assert train(capture, other, "--resume") == 0, "the checkpoint holds all that the scene gave"
+    assert ply(other, 8) == ply(out, 8)
+    capsys.readouterr()
+    assert train(capture, finished, "--iterations", "20", "--resume", "--from", str(out)) == 2
+    assert "was begun from points" in capsys.readouterr().err
+
+
+def test_scenes_of_other_degrees_origins_and_broken_splats(capture, finished, tmp_path, capsys):
+    """Degree 1 in a run of degree 2, a NaN, a zero quaternion, and a capture far from zero."""
+    views, points, colors = procedural_capture(24, VIEWS, splats=60)
+    shift = np.array([1e5, -2e5, 3e4])
+    far = []
+    for view in views:
+        c = view.camera
+        camera = type(c)(c.R, c.eye + shift, c.fx, c.fy, c.cx, c.cy, c.H, c.W)
+        far.append(type(view)(camera, view.image, name=view.name))
+    write_colmap(tmp_path / "far", far, points + shift, colors)
+    near = load_ply(RunFolder(finished).scene(20))
+    broken = near.map(lambda tensor: tensor.clone())
+    parts = broken.tensors() | {"sh_rest": broken.sh_rest[:, :3].clone()}
+    broken = type(near)(**parts)
+    broken.quats[3] = 0.0
+    path = tmp_path / "far.ply"
+    save_ply(path, broken, shift)
+    raw = bytearray(path.read_bytes())
+    row = (len(raw) - raw.index(b"end_header\n") - 11) // len(near)
+    at = len(raw) - row * len(near) + 5 * row
+    raw[at : at + 4] = np.float32(np.nan).tobytes()
+    path.write_bytes(raw)
+    run = CaptureRun(
+        options(
+            tmp_path / "far", tmp_path / "run", "--iterations", "2", "--sh-degree", "2", "--from", str(path)
+        ),
+        say := _Said(),
+    )
+    trainer = run.start()
+    assert len(trainer.gaussians) == len(near) - 2 and "2 of" in say.text and "left out" in say.text
+    assert "up to degree 1 are stored; the others start at zero" in say.text
+    assert trainer.gaussians.sh_rest.shape[1] == 8
+    kept = [i for i in range(len(near)) if i not in (3, 5)]
+    # float32 near 2e5 keeps 2**-7 of a coordinate, half of that lost in writing
+    np.testing.assert_allclose(
+        trainer.gaussians.means.detach() + torch.tensor(run.dataset.origin - shift).float(),
+        near.means[kept],
+        atol=2**-7,
+    )
+    assert torch.equal(trainer.gaussians.sh_rest[:, :3].detach(), near.sh_rest[kept, :3])
+    assert not trainer.gaussians.sh_rest[:, 3:].any()
+
+
+class _Said:
+    text = ""
+
+    def __call__(self, sentence):
+        self.text += sentence + "\n"
+
+
+def test_antialiasing_that_does_not_match_is_told(capture, finished, tmp_path):
+    gaussians = load_ply(RunFolder(finished).scene(20))
+    for antialiased, words, says in (
+        (True, [], "was trained with antialiasing, this run trains without"),
+        (False, ["--antialiased"], "was trained without antialiasing, this run trains with"),
+        (True, ["--antialiased"], None),
+    ):
+        path = tmp_path / "scene.glb"
+        write_scene(path, Scene(gaussians, antialiased))
+        run = CaptureRun(
+            options(capture, tmp_path / "run", "--iterations", "2", "--from", str(path), *words),
+            say := _Said(),
+        )
+        run._start_cloud()
+        assert (says in say.text) if says else ("was trained" not in say.text)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--max-gaussians", "10"], "more than --max-gaussians 10"),
+        (["--points", "x.ply"], "not allowed with argument"),
+        (["--max-memory", "4GiB"], "cannot be planned"),
+        (["--start-opacity", "0.2"], "--start-opacity: only a start from points uses it"),
+    ],
+)
+@pytest.mark.usefixtures("as_shipped")
+def test_what_does_not_go_with_a_scene_is_one_line(capture, finished, tmp_path, capsys, words, says):
+    try:
+        code = train(capture, tmp_path / "run", "--iterations", "4", "--from", str(finished), *words)
+    except SystemExit as stop:
+        code = stop.code
+    error = capsys.readouterr().err
+    assert code == 2 and says in error and error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def changed(path):
+    with Image.open(path) as file:
+        pixels = np.array(file)
+    Image.fromarray(255 - pixels).save(path)
+
+
+def copied(capture, tmp_path):
+    shutil.copytree(capture, tmp_path / "moved", copy_function=shutil.copyfile)  # other times
+    return tmp_path / "moved"
+
+
+@pytest.mark.parametrize("part", ["images", "masks"])
+def test_a_photo_that_changed_before_a_resume_is_named(capture, tmp_path, capsys, part):
+    """One in the middle, which the fingerprint of older runs does not cover; touching it is no change."""
+    moved, out = copied(capture, tmp_path), tmp_path / "run"
+    assert train(moved, out, "--iterations", "2", "--time-limit", "0.001s") == 0
+    photo = moved / part / "view_003.png"
+    os.utime(photo, ns=(1, 1))
+    assert train(capture, out, "--iterations", "2", "--resume", "--time-limit", "0.001s") == 0
+    before = photo.read_bytes()
+    changed(photo)
+    capsys.readouterr()
+    assert train(moved, out, "--iterations", "4", "--resume") == 2
+    error = capsys.readouterr().err
+    assert "other photos: 1 of 6 have changed since the run began, first view_003.png" in error
+    assert error.count("\n") == 1
+    photo.write_bytes(before)
+    assert train(moved, out, "--iterations", "4", "--resume") == 0
+
+
+def test_an_older_run_resumes_by_the_older_check(capture, whole, tmp_path, capsys):
+    out = tmp_path / "run"
+    first = CaptureRun(options(capture, out, "--iterations", "6"))
+    trainer = first.start()
+    first.train(lambda: trainer.iteration >= 3)
+    RunFolder(out).photos.unlink()
+    config = RunFolder(out).read_config()
+    del config["data"]["scene"]
+    RunFolder(out).write_config(config)
+    moved = copied(capture, tmp_path)
+    changed(moved / "images" / "view_001.png")  # the first view of training
+    assert train(moved, out, "--resume") == 2
+    assert "other photos or start points" in capsys.readouterr().err
+    assert train(capture, out, "--resume") == 0
+
+
+def test_a_photo_that_changes_in_mid_run_ends_it_with_its_state_saved(capture, tmp_path):
+    moved, out = copied(capture, tmp_path), tmp_path / "run"
+    words = ["--iterations", "12", "--image-memory", "0"]
+    assert train(moved, tmp_path / "undisturbed", *words) == 0
+    run = CaptureRun(options(moved, out, *words))
+    photos = sorted((moved / "images").iterdir())
+    before = [photo.read_bytes() for photo in photos]
+
+    def stop():
+        if trainer.iteration == 7 and photos[0].read_bytes() == before[0]:
+            for photo in photos:
+                changed(photo)
+        for photo in photos:
+            os.utime(photo)  # which is no change
+        return False
+
+    trainer = run.start()
+    with pytest.raises(
+        DatasetError, match=r"view_00\d\.png: has changed since it was first read; .* saved after"
+    ) as e:
+        run.train(stop)
+    assert 7 <= trainer.iteration <= 8 and f"saved after {trainer.iteration} iterations" in str(e.value)
+    assert RunFolder(out).checkpoints.joinpath(f"iteration_{trainer.iteration}.safetensors").exists()
+    for photo, content in zip(photos, before, strict=True):
+        photo.write_bytes(content)
+    assert train(moved, out, *words, "--resume") == 0
+    assert ply(out, 12) == ply(tmp_path / "undisturbed", 12)
+
+
+def test_a_folder_in_use_is_refused_by_train_and_eval(capture, run, tmp_path, capsys):
+    with locked("--out", run, "gsplat-edu train", pytest.fail):
+        for words in (["train", str(capture), "--out", str(run), "--resume"], ["eval", str(run)]):
+            assert main(words) == 2
+            error = capsys.readouterr().err
+            assert (
+                f"is in use by `gsplat-edu train`, process {os.getpid()} on " in error
+                and error.count("\n") == 1
+            )
+        assert main(["eval", str(run), "--out", str(tmp_path / "apart")]) == 0, "it writes elsewhere"
+    assert main(["eval", str(run)]) == 0
+    assert json.loads((run / "metrics.json").read_text())["iterations"] == 20
+
+
+def test_the_progress_names_the_photo_of_its_psnr(capture, tmp_path, capsys):
+    assert train(capture, tmp_path / "run", "--iterations", "2") == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("iteration ")]
+    assert len(lines) == 2 and all("dB of view_00" in line for line in lines)
+
+
+def test_the_defaults_of_a_start_from_a_scene_are_in_the_help(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "--from SCENE|RUN" in said and "--means-rate is 1.6e-05 unless given" in said
+    assert TrainConfig().means_rate == 1.6e-4

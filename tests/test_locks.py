@@ -1,0 +1,112 @@
+"""One writer per folder: the second is told who is there, and nothing outlives its process."""
+
+import errno
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.locks import LOCK, locked
+
+HOLDS = """
+import sys, os
+from pathlib import Path
+from gsplat_edu.locks import locked
+with locked("--out", Path(sys.argv[1]), "gsplat-edu train", print):
+    child = os.fork() if sys.argv[2] == "fork" else 1
+    if child == 0:
+        os.setsid()
+    print("held", child, flush=True)
+    sys.stdin.read()
+"""
+
+
+def holder(folder, fork="none"):
+    words = [sys.executable, "-c", HOLDS, str(folder), fork]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    lines = [process.stdout.readline() for _ in range(2 if fork == "fork" else 1)]
+    assert all(line.startswith("held") for line in lines)
+    return process, max(int(line.split()[1]) for line in lines)
+
+
+def killed(process):
+    process.kill()
+    process.wait()
+    process.stdin.close()
+    process.stdout.close()
+
+
+def taken(folder):
+    with locked("--out", folder, "gsplat-edu train", pytest.fail):
+        return True
+
+
+@pytest.mark.own_process
+def test_the_second_is_told_who_holds_it_and_kill_9_frees_it(tmp_path):
+    process, _ = holder(tmp_path / "run")
+    says = rf"^--out: .*run is in use by `gsplat-edu train`, process {process.pid} on .+, since 2\d{{3}}-.*; wait"
+    with pytest.raises(ArgumentError, match=says):
+        taken(tmp_path / "run")
+    killed(process)
+    assert (tmp_path / "run" / LOCK).exists(), "nobody could remove it"
+    assert taken(tmp_path / "run")
+    assert not (tmp_path / "run" / LOCK).exists()
+
+
+@pytest.mark.own_process
+def test_a_forked_child_does_not_keep_it(tmp_path):
+    process, child = holder(tmp_path / "run", "fork")
+    try:
+        with pytest.raises(ArgumentError, match=f"process {process.pid} "):
+            taken(tmp_path / "run")
+        killed(process)
+        os.kill(child, 0)  # it lives
+        assert taken(tmp_path / "run")
+    finally:
+        os.kill(child, signal.SIGKILL)
+
+
+def test_the_same_process_does_not_get_it_twice(tmp_path):
+    with locked("OUT", tmp_path, "gsplat-edu sfm", pytest.fail):
+        with pytest.raises(ArgumentError, match=f"^OUT: .*process {os.getpid()} "):
+            taken_as_out(tmp_path)
+        assert (tmp_path / LOCK).exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def taken_as_out(folder):
+    with locked("OUT", folder, "gsplat-edu sfm", pytest.fail):
+        return True
+
+
+def test_a_folder_that_was_made_and_left_empty_is_removed(tmp_path):
+    assert taken(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+    with locked("--out", tmp_path / "a" / "b", "gsplat-edu train", pytest.fail):
+        (tmp_path / "a" / "file").write_text("kept")
+    assert [path.name for path in tmp_path.rglob("*")] == ["a", "file"]
+
+
+def test_what_a_damaged_lock_says_is_not_printed(tmp_path):
+    with locked("--out", tmp_path, "gsplat-edu train", pytest.fail):
+        for text in ('{"pid": "\x1b[31m", "host": "\n", "what": 1, "since": []}', "{", "7", "\xff" * 50):
+            (tmp_path / LOCK).write_text(text)
+            with pytest.raises(ArgumentError, match="is in use by") as caught:
+                taken(tmp_path)
+            assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_costs_one_sentence(tmp_path, monkeypatch, number):
+    def refuse(handle, how):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    said = []
+    with locked("--out", tmp_path, "gsplat-edu train", said.append):
+        assert not (tmp_path / LOCK).exists()
+    assert len(said) == 1 and "has no locks" in said[0]
