@@ -18,6 +18,7 @@ from gsplat_edu.cli.exporting import check_and_say
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
+from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.viewer import export
@@ -162,7 +163,7 @@ def _similarity(text: str) -> Similarity:
                 if turn is not None:
                     return Similarity(turn.as_matrix(), 1.0, np.zeros(3))
             case "matrix":
-                numbers = Path(value).read_text("utf-8", errors="replace").replace(",", " ").split()
+                numbers = read_text(Path(value), errors="replace").replace(",", " ").split()
                 if len(numbers) in (12, 16):
                     return Similarity.of_matrix(np.array(numbers, dtype=np.float64).reshape(-1, 4))
     except ArgumentError as error:

@@ -20,6 +20,7 @@ from PIL import Image
 from gsplat_edu.evaluate.figures import run_curves_figure, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
 from gsplat_edu.files import written_aside
+from gsplat_edu.text import write_text
 
 PICTURES = 8
 """Test views that a report shows."""
@@ -144,7 +145,7 @@ def write_report(path: Path, report: Report) -> None:
         f"<h1>{title}</h1>\n{''.join(sections)}</body>\n</html>\n"
     )
     with written_aside(path) as aside:
-        aside.write_text(page, encoding="utf-8")
+        write_text(aside, page)
 
 
 def _headline(metrics: Mapping[str, Any]) -> str:
