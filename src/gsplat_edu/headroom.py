@@ -92,7 +92,7 @@ def _cgroups() -> list[int]:
     """Return what each cgroup above this process leaves; pages of its file cache count as free."""
     found = []
     for line in _lines(PROC / "self" / "cgroup"):
-        _, controllers, place = (line.rstrip("\n").split(":", 2) + ["", "/"])[:3]
+        _, controllers, place = [*line.split(":", 2), "", "/"][:3]
         if controllers == "":
             top, most, used, cache = CGROUPS, "memory.max", "memory.current", ("inactive_file", "active_file")
         elif "memory" in controllers.split(","):

@@ -18,8 +18,8 @@ from PIL import Image
 from gsplat_edu.headroom import require_memory
 from gsplat_edu.reading import open_file
 
-FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM")
-"""Formats that are opened, by Pillow's names. MPO is what some cameras and phones write as .jpg."""
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
+"""Formats that are opened, by Pillow's names. JPEG opens MPO too, which some cameras and phones write as .jpg."""
 
 SPELLED = "JPEG, PNG, WebP, TIFF, BMP or PPM"
 """The same for people."""

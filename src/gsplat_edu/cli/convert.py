@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.cli.exporting import check_and_say
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
@@ -83,9 +83,9 @@ def run(arguments: argparse.Namespace) -> None:
         raise ArgumentError(
             "IN: are several; add --merge to join them into one scene, or convert one at a time"
         )
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

@@ -8,10 +8,10 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsplat_edu.cli.arguments import add_backend
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.render.api import render
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Score every view, print a line per split, and say what was written."""
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     backend = resolve_backend(arguments.backend)
     folder = RunFolder(arguments.run_folder)
     config = folder.read_config()

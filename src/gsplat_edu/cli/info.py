@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Console
 
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.errors import ArgumentError, CheckpointError
@@ -29,6 +29,9 @@ BINS = 40
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 """Heights of a bin: the first is for an empty one only."""
+
+PLAIN_BLOCKS = " .:-=+*#@"
+"""The same for terminals that have ASCII only."""
 
 HIGHLIGHTS = {
     "data": ("path", "resolution", "test_every", "points"),
@@ -59,7 +62,10 @@ def run(arguments: argparse.Namespace) -> None:
         facts = _run_facts(RunFolder(path))
     else:
         facts = _dataset_facts(path)
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
+    if not console.shows(BLOCKS):
+        plain = str.maketrans(BLOCKS, PLAIN_BLOCKS)
+        facts = [(name, value.translate(plain)) for name, value in facts]
     console.print(*(f"{name:<10} {value}".rstrip() for name, value in facts), sep="\n", soft_wrap=True)
 
 

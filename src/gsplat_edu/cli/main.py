@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
+from gsplat_edu.cli.printing import complain, spell_what_cannot_be_encoded
 
 COMMANDS = {
     "demo": "learn a sphere from 24 renders of it and judge the result with a held-out camera",
@@ -34,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0; 2 for bad input; 130 when interrupted.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
+    spell_what_cannot_be_encoded()
     try:
         parser = build_parser(words)
         parsed = parser.parse_args(words)
@@ -42,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return EXIT_BAD_INPUT
         return run_command(f"gsplat-edu {parsed.command}", lambda: parsed.run(parsed), parsed.debug)
     except KeyboardInterrupt:  # while a command was still being imported
-        print("gsplat-edu: interrupted", file=sys.stderr)
+        complain("gsplat-edu: interrupted")
         return EXIT_INTERRUPTED
 
 

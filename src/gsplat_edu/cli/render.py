@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from rich.console import Console
 from rich.progress import track
 
 from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.images import write_frames
@@ -115,7 +115,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     else:
         raise ArgumentError(f"{arguments.source}: is not there; give the folder of a run, or a scene file")
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     started = time.perf_counter()
     frames = track(
         _frames(replace(shot, gaussians=shot.gaussians.to(device_of(backend))), backend),

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.sfm.mapping import CAMERA_MODELS, MAPPERS
 from gsplat_edu.sfm.reconstruct import MATCHERS, SfmOptions, reconstruct
 
@@ -67,7 +68,7 @@ def options_from(arguments: argparse.Namespace) -> SfmOptions:
 def run(arguments: argparse.Namespace) -> None:
     """Find the poses, showing how it goes."""
     options = options_from(arguments)
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
 
     def say(sentence: str) -> None:
         console.print(sentence, soft_wrap=True)

@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.sfm import stage_bars
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.cli.train_options import add_arguments as add_arguments
 from gsplat_edu.cli.train_options import given_from, limits_from, options_from
 from gsplat_edu.data.colmap import find_model
@@ -45,7 +46,7 @@ PSNR_EVERY = 20
 
 def run(arguments: argparse.Namespace) -> None:
     """Train, showing how it goes; write the scene, the metrics and the report."""
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
 
     def say(sentence: str) -> None:
         console.print(sentence, soft_wrap=True)
@@ -218,7 +219,7 @@ def _psnr(trainer: Trainer) -> float:
 
 def _bar(console: Console, state: str) -> Progress:
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
         TextColumn(state),

@@ -9,9 +9,8 @@ import threading
 import webbrowser
 from pathlib import Path
 
-from rich.console import Console
-
 from gsplat_edu.cli.arguments import whole_number_text
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import page
 from gsplat_edu.viewer.serve import LOOPBACK, PageServer, exposure
@@ -42,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C, which is how it ends."""
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     with PageServer(
         b"", arguments.host, arguments.port
     ) as server:  # a port that is taken is no reason to wait

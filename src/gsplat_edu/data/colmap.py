@@ -23,12 +23,15 @@ from gsplat_edu.data.capture import (
     Capture,
     Cloud,
     Frame,
+    Listings,
     checked_frame,
     entries,
     find_photo,
     is_file,
     is_folder,
+    is_outside,
     missing_note,
+    outside_note,
     unit_colors,
 )
 from gsplat_edu.data.lens import Lens, lens_of
@@ -245,12 +248,14 @@ def _files(
         DatasetError: two images lead to one file.
     """
     photo_folders, mask_folders = _photo_folders(folder, model)
+    mask_folders = [place for place in mask_folders if is_folder(place)]
+    listings = Listings()
     bare = Counter(Path(name).name for name in names)
     photos, masks, unclear = dict[str, Path](), dict[str, Path](), list[str]()
     for name in names:
         last = Path(name).name
         alone = [last] if bare[last] == 1 else []
-        places = list(_candidates(photo_folders, name, alone))
+        places = [p for p in _candidates(photo_folders, name, alone) if listings.may_hold(str(p))]
         # Photos of full size first, wherever they are; then those of images_2, images_4 and images_8.
         photo = next((p for find in (_present, find_photo) for p in map(find, places) if p), None)
         mask = next((p for p in _masks(mask_folders, [name, *alone]) if is_file(p)), None)
@@ -263,6 +268,9 @@ def _files(
     _check_single(model, names, photos)
     _check_single(model, names, masks)
     notes = list[str]()
+    outside = [photos[name] for name in names if name in photos and is_outside(folder, name)]
+    if outside:
+        notes.append(outside_note(outside, folder))
     if unclear:
         notes.append(
             f"{len(unclear)} of {len(names)} photos have a mask only by a bare name that several share: not used, "
