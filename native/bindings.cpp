@@ -120,8 +120,6 @@ std::vector<std::string> isas() {
     return {names, names + count};
 }
 
-}  // namespace
-
 // A Python function, kept as long as the process: native frames may outlive the interpreter's modules.
 PyObject *free_memory_function = nullptr;
 
@@ -137,6 +135,8 @@ int64_t free_memory() {
     }
     return bytes;
 }
+
+}  // namespace
 
 NB_MODULE(_native, m) {
     nb::set_leak_warnings(false);  // what Python still holds when it ends is freed with the process

@@ -134,7 +134,7 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
             facts.append(
                 (
                     split,
-                    f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}, {scores['num_images']} images",
+                    ", ".join(_scores(scores)),
                 )
             )
     if not metrics:
@@ -152,6 +152,14 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
     except CheckpointError as error:
         return [*facts, ("scene", str(error))]
     return [*facts, ("", f"after {iteration:,} iterations:"), *_scene_facts(scene)]
+
+
+def _scores(scores: Mapping[str, Any]) -> list[str]:
+    """Say what metrics.json has of a split; another program's may lack some."""
+    ssim, images = scores.get("ssim"), scores.get("num_images")
+    said = [f"PSNR {scores['psnr']:.2f} dB"]
+    said += [] if ssim is None else [f"SSIM {ssim:.4f}"]
+    return said + ([] if images is None else [f"{images} images"])
 
 
 def _dataset_facts(path: Path) -> list[Fact]:

@@ -138,7 +138,7 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> 
     scene, _ = folder.latest_scene()
     if arguments.dataset not in (None, RUNS_CAMERAS):
         return _dataset_shot(arguments, load_ply(scene), settings, data_settings(config), orbit)
-    origin = config.get("origin", ORIGIN)
+    origin = config.get("origin") or ORIGIN
     gaussians = load_ply(scene, origin)
     cameras = folder.read_cameras(origin)
     named = [(name, camera) for name, _, camera in cameras]
