@@ -7,9 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.progress import Task, TaskID
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.evaluate.report import Report, write_report
@@ -121,3 +122,9 @@ def test_many_images_of_one_name_get_file_names_in_linear_work():
     """Each looks for its number from where the last one found its own; a billion comparisons would not end here."""
     names = image_file_names(["a.png"] * 50_000 + ["A.jpg", "b", "a_7.png"])
     assert names[:3] == ["a.png", "a_2.png", "a_3.png"] and len({name.lower() for name in names}) == 50_003
+
+
+def test_a_bar_prints_names_as_they_are():
+    """rich takes "[/x]" in a description for markup that ends what never began, and passes ESC on."""
+    task = Task(TaskID(0), "checking [/x]\x1b[2J.ply", 1, 0, _get_time=lambda: 0.0)
+    assert Field("{task.description}").render(task).plain == r"checking [/x]\x1b[2J.ply"

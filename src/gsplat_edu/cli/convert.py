@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
 from gsplat_edu.cli.exporting import check_and_say
-from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     console = Terminal()
     columns = (
-        TextColumn("{task.description}", markup=False),
+        Field("{task.description}"),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

@@ -11,7 +11,6 @@ from rich.progress import Progress, TaskID
 
 from gsplat_edu.evaluate.metrics import ImageScore
 from gsplat_edu.runs.source import Source
-from gsplat_edu.text import printable
 from gsplat_edu.viewer import export
 
 
@@ -19,7 +18,7 @@ def check_and_say(
     path: Path, source: Source, backend: str, bar: Progress, say: Callable[[str], None]
 ) -> export.Exported:
     """Check a file against what was written to it, and say what came out in a line."""
-    task = bar.add_task(printable(f"checking {path}"), total=len(source.probes(export.VIEWS, export.SIDE)))
+    task = bar.add_task(f"checking {path}", total=len(source.probes(export.VIEWS, export.SIDE)))
     found = export.check(path, source, backend, functools.partial(_advance, bar, task))
     bar.remove_task(task)
     say(found.line())

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
+from rich.progress import Task, TextColumn
+from rich.text import Text
 
 from gsplat_edu.text import printable
 
@@ -26,3 +28,18 @@ class Terminal(Console):
         except (UnicodeError, LookupError):
             return False
         return True
+
+
+class Field(TextColumn):
+    """A column of a progress bar whose text may quote names.
+
+    Args:
+        text: As for rich's `TextColumn`: "{task.description}", for example.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text, markup=False)
+
+    def render(self, task: Task) -> Text:
+        """Return the text of a task, escaped."""
+        return Text(printable(self.text_format.format(task=task)))

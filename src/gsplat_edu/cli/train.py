@@ -13,12 +13,12 @@ from dataclasses import replace
 from types import ModuleType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.sfm import stage_bars
-from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.cli.train_options import add_arguments as add_arguments
 from gsplat_edu.cli.train_options import given_from, limits_from, options_from
 from gsplat_edu.data.colmap import find_model
@@ -219,10 +219,10 @@ def _psnr(trainer: Trainer) -> float:
 
 def _bar(console: Console, state: str) -> Progress:
     columns = (
-        TextColumn("{task.description}", markup=False),
+        Field("{task.description}"),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
-        TextColumn(state),
+        Field(state),
     )
     quiet = not console.is_terminal
     return Progress(*columns, TimeRemainingColumn(), console=console, transient=not state, disable=quiet)

@@ -6,6 +6,7 @@ import os
 import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
@@ -271,7 +272,7 @@ def photo_file(
         W, H = size_of(path)
         lens = _fitted(frame, path, (W, H))
     try:
-        pinhole = straightened(lens).resized(W, H)
+        pinhole = _resized(straightened(lens), W, H)
     except DatasetError as error:
         raise DatasetError(f"{frame.name}: {error}") from None
     camera = Camera(frame.R, frame.eye, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, H, W)
@@ -288,6 +289,12 @@ def _fitted(frame: Frame, path: Path, size: tuple[int, int]) -> Lens:
             f"{path}: the photo of {frame.name} is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect "
             "ratio; was the photo cropped or turned after the poses were found?"
         )
+    return _resized(lens, W, H)
+
+
+@lru_cache(maxsize=4096)
+def _resized(lens: Lens, W: int, H: int) -> Lens:
+    """Resize a lens; the frames of a capture share a few."""
     return lens.resized(W, H)
 
 

@@ -49,6 +49,11 @@ FOCAL_KEYS = {axis: (f"fl_{axis}", f"camera_angle_{axis}") for axis in "xy"}
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
+INTRINSICS = frozenset(
+    ("w", "h", "cx", "cy", "camera_model", "is_fisheye", *COEFFICIENTS, *FOCAL_KEYS["x"], *FOCAL_KEYS["y"])
+)
+"""Keys that decide a lens."""
+
 
 class Found(NamedTuple):
     """What a file lists."""
@@ -136,7 +141,8 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
     """
     frames, missing, outside = list[Frame](), list[str](), list[Path]()
     parts, listings = _parts(path, contents), Listings()
-    shared = {key: value for key, value in contents.items() if key != "frames"}
+    shared = {key: value for key, value in contents.items() if key in INTRINSICS}
+    common: Lens | None = None  # that of all frames without intrinsics of their own
     for number, frame in enumerate(contents["frames"]):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise DatasetError(f"{path}, frame {number}: has no file_path; every frame names its photo")
@@ -146,7 +152,12 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
             missing.append(legible(name))
             continue
         where = f"{path}, frame {legible(name)}"
-        lens = _lens(where, _merged(shared, frame), image)
+        if common is not None and frame.keys().isdisjoint(INTRINSICS):
+            lens = common
+        else:
+            lens = _lens(where, _merged(shared, frame), image)
+            if frame.keys().isdisjoint(INTRINSICS) and {"w", "h"} <= shared.keys():
+                common = lens
         R, eye = _pose(where, frame)
         mask, its_part = _mask(where, path.parent, frame), part or parts.get(name, parts[""])
         outside += [image] if is_outside(path.parent, name) else []
@@ -159,8 +170,10 @@ def _photo(path: Path, listings: Listings) -> Path | None:
     """Find the photo of a file_path, which may lack its ending."""
     if not listings.may_hold(str(path)):
         return None
+    if (photo := find_photo(path)) is not None:
+        return photo
     spelled = (s for ending in PHOTO_ENDINGS for s in (ending, ending.upper(), ending.title()))
-    return next((p for end in ("", *spelled) if (p := find_photo(Path(f"{path}{end}")))), None)
+    return next((p for end in spelled if (p := find_photo(Path(f"{path}{end}")))), None)
 
 
 def _tidy(file_path: str) -> str:
