@@ -121,7 +121,7 @@ def _address_space() -> list[int]:
     if soft == resource.RLIM_INFINITY or soft >= UNLIMITED:
         return []
     pages = "".join(_lines(PROC / "self" / "statm")).split()[:1]
-    return [soft - n for n in _numbers(*pages, os.sysconf("SC_PAGE_SIZE"))] if pages else []
+    return [soft - n for n in _numbers(pages[0], os.sysconf("SC_PAGE_SIZE"))] if pages else []
 
 
 def _lines(path: Path) -> list[str]:

@@ -84,6 +84,11 @@ def parse_json(text: str | bytes, parse_constant: Callable[[str], Any] | None = 
         return json.loads(text, parse_constant=parse_constant)
     except RecursionError:
         raise ValueError("nested too deep") from None
+    except json.JSONDecodeError:
+        raise
+    except ValueError as error:
+        # Python's own words for it advise to change a limit of the interpreter
+        raise ValueError("a number has thousands of digits") if "digits" in str(error) else error from None
 
 
 def _check_regular(path: Path, mode: int) -> None:

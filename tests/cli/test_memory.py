@@ -71,6 +71,7 @@ def screens(path: Path, count: int) -> Path:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not tell what it has")
+@pytest.mark.own_process
 def test_a_process_that_may_take_little_more(tmp_path):
     """A 24,000 x 18,000 PNG, an image 200,000 px wide and screen-filling splats, where 640 MiB are left.
 

@@ -59,6 +59,7 @@ def odd_capture(tmp_path_factory):
     return folder
 
 
+@pytest.mark.own_process
 def test_a_training_among_odd_names_in_a_locale_of_ascii(odd_capture, tmp_path):
     """All commands, as a program of its own: the locale belongs to the process."""
     run = os.fsdecode(bytes(tmp_path) + b"/run\xfe \x1b[1m")

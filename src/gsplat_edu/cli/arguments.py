@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 import traceback
 from collections.abc import Callable
@@ -119,4 +120,8 @@ def _line(program: str, error: Exception) -> str | None:
         return str(error)
     if (said := shortage(error)) is not None:
         return f"ran out of memory ({said}); {LESS_MEMORY.get(program.split()[-1], 'close other programs')}"
-    return str(error) if isinstance(error, OSError) else None
+    if not isinstance(error, OSError):
+        return None
+    if not isinstance(error.filename, str | bytes) or error.filename2 is not None or not error.strerror:
+        return str(error)
+    return f"{os.fsdecode(error.filename)}: {error.strerror}"
