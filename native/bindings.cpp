@@ -279,6 +279,22 @@ std::vector<std::string> isas() {
     return {names, names + count};
 }
 
+// A Python function, kept as long as the process: native frames may outlive the interpreter's modules.
+PyObject *free_memory_function = nullptr;
+
+int64_t free_memory() {
+    if (!Py_IsInitialized()) return -1;
+    nb::gil_scoped_acquire hold;
+    PyObject *found = PyObject_CallNoArgs(free_memory_function);
+    const int64_t bytes = found && found != Py_None ? int64_t(PyLong_AsLongLong(found)) : -1;
+    Py_XDECREF(found);
+    if (PyErr_Occurred()) {  // not knowing is no reason to end a training
+        PyErr_Clear();
+        return -1;
+    }
+    return bytes;
+}
+
 }  // namespace
 
 NB_MODULE(_native, m) {
@@ -295,6 +311,10 @@ NB_MODULE(_native, m) {
     m.def("adam_f64", &adam<double>);
     m.def("loss_f32", &loss_of<float>);
     m.def("loss_f64", &loss_of<double>);
+    m.def("ask_before_large_blocks", [](const nb::object &function) {
+        free_memory_function = function.inc_ref().ptr();
+        ask_before_large_blocks(&free_memory);
+    });
     m.def("isas", &isas);
     m.def("isa", [] { return std::string(isa().name); });
     m.def("choose_isa", [](const std::string &name) { choose_isa(name.c_str()); });

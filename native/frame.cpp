@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <mutex>
@@ -19,6 +20,27 @@ namespace gsplat {
 namespace {
 
 constexpr size_t MAX_SPARES = 32;
+constexpr size_t LARGE_BLOCK = size_t(256) << 20;
+
+FreeMemory free_memory = nullptr;
+
+class OutOfMemory : public std::bad_alloc {
+  public:
+    OutOfMemory(size_t bytes, int64_t free) {
+        const double gib = 1.0 / double(1 << 30);
+        std::snprintf(text_, sizeof text_, "the renderer needs a block of %.2f GiB, but %.2f GiB are free", double(bytes) * gib, double(free) * gib);
+    }
+    const char *what() const noexcept override { return text_; }
+
+  private:
+    char text_[128];
+};
+
+void check_room(size_t bytes) {
+    if (bytes < LARGE_BLOCK || !free_memory) return;
+    const int64_t free = free_memory();
+    if (free >= 0 && bytes > size_t(free)) throw OutOfMemory(bytes, free);
+}
 
 struct Spare {
     void *data;
@@ -52,12 +74,15 @@ class Timer {
 
 }  // namespace
 
+void ask_before_large_blocks(FreeMemory function) { free_memory = function; }
+
 #ifdef GSPLAT_SANITIZE
 // Exact sizes and real frees, so that the sanitizer sees every overrun; filled with what no kernel may rely on.
 Buffer::~Buffer() { std::free(data_); }
 
 void *Buffer::reserve(size_t bytes) {
-    std::free(data_);
+    std::free(std::exchange(data_, nullptr));
+    check_room(bytes);
     data_ = std::malloc(bytes);
     if (!data_) throw std::bad_alloc();
     std::memset(data_, 0xFF, bytes);
@@ -78,7 +103,7 @@ Buffer::~Buffer() {
 
 void *Buffer::reserve(size_t bytes) {
     if (data_ && capacity_ >= bytes) return data_;
-    std::lock_guard<std::mutex> lock(*spares_lock);
+    std::unique_lock<std::mutex> lock(*spares_lock);
     if (data_) spares().push_back({std::exchange(data_, nullptr), capacity_});
     auto best = spares().end();
     for (auto it = spares().begin(); it != spares().end(); ++it)
@@ -96,7 +121,9 @@ void *Buffer::reserve(size_t bytes) {
         std::free(grow->data);
         spares().erase(grow);
     }
+    lock.unlock();  // asking may wait for Python, which may wait for this lock
     const size_t rounded = (bytes + bytes / 4 + 4095) / 4096 * 4096;
+    check_room(rounded);
     data_ = std::aligned_alloc(4096, rounded);
     if (!data_) throw std::bad_alloc();
     capacity_ = rounded;

@@ -17,6 +17,10 @@ int list_isas(const char **names, int capacity);
 template <class T>
 const Kernels<T> &kernels();
 
+// What is asked before a large block is allocated: the bytes that are free, negative where nobody knows. None at first.
+using FreeMemory = int64_t (*)();
+void ask_before_large_blocks(FreeMemory free_memory);
+
 // Memory that is kept when its owner goes and handed to the next one that asks, so that frames of changing size do
 // not grow the process.
 class Buffer {
@@ -25,7 +29,8 @@ class Buffer {
     ~Buffer();
     Buffer(const Buffer &) = delete;
     Buffer &operator=(const Buffer &) = delete;
-    // At least `bytes`; what was in it is lost. Throws std::bad_alloc.
+    // At least `bytes`; what was in it is lost. Throws std::bad_alloc, for a large block also where the system would
+    // grant memory that it does not have.
     void *reserve(size_t bytes);
     template <class T>
     T *as() const { return static_cast<T *>(data_); }

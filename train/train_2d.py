@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gsplat_edu.cli.arguments import OneLineParser, run_command, whole_number_text
+from gsplat_edu.cli.printing import say
 from gsplat_edu.data.images import decode
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.evaluate.figures import save_figure
@@ -124,7 +125,7 @@ def train(options: Fit2DOptions) -> None:
     for path in (options.out, options.curves):
         check_writable("--out", path)
     height, width = target.shape[:2]
-    print(f"{options.image.name}: {width}x{height} px, {options.splats} splats", flush=True)
+    say(f"{options.image.name}: {width}x{height} px, {options.splats} splats")
     start = random_splats_2d(options.splats, height, width, np.random.default_rng(options.seed))
     began = time.perf_counter()
     fit = fit_2d(target, start, Fit2DSettings(options.iters), [log])
@@ -136,7 +137,7 @@ def train(options: Fit2DOptions) -> None:
     per_iteration = f"{1e3 * seconds / options.iters:.1f} ms/iter"
     print(f"{options.iters} iters in {seconds:.1f} s -> {per_iteration}")
     print(f"PSNR: start {fit.psnrs[0]:.2f} -> end {fit.psnrs[-1]:.2f} dB")
-    print(f"wrote {options.out}, {options.curves}")
+    say(f"wrote {options.out}, {options.curves}")
 
 
 def main(given: list[str] | None = None) -> int:

@@ -6,7 +6,8 @@
     ├── BackendUnavailableError              this machine cannot run the backend that was asked for
     ├── DatasetError                         a capture cannot be read, or not as it stands
     ├── SceneFormatError                     a scene file is not what it says it is
-    └── CheckpointError                      a run cannot be continued, or its state not be written
+    ├── CheckpointError                      a run cannot be continued, or its state not be written
+    └── NotEnoughMemoryError                 work needs more memory than is free
 
 Every message is one line that says what is wrong, where, and what to do next. The command line prints that
 line and exits with 2.
@@ -41,3 +42,7 @@ class SceneFormatError(SplatError):
 
 class CheckpointError(SplatError):
     """A run cannot be saved or continued; the message names the file and what stands unharmed."""
+
+
+class NotEnoughMemoryError(SplatError):
+    """Work needs more memory than is free; the message says what, how much, and what to do."""

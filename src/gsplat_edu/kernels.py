@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils.dlpack import to_dlpack
 
 from gsplat_edu.errors import BackendUnavailableError
+from gsplat_edu.headroom import available_memory
 
 _native: ModuleType | None
 REASON: str | None
@@ -27,6 +28,7 @@ except ImportError as error:
     REASON = f"the native module does not load ({error}); {mend}, or use the backend torch"
 else:
     REASON = None
+    _native.ask_before_large_blocks(available_memory)
 
 SUFFIXES = {torch.float32: "32", torch.float64: "64"}
 """How native names end by scalar type: float for speed, double for proof."""

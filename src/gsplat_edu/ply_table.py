@@ -13,6 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.headroom import require_memory
+from gsplat_edu.reading import TOO_LARGE
 
 FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 """Formats and their byte order as NumPy writes it."""
@@ -42,6 +44,12 @@ LINE_LIMIT = 4096
 
 HEADER_LIMIT = 10_000
 """Lines of a header: a file that goes on longer is not a PLY, whatever its first line says."""
+
+MOST_ROWS = 10**12
+"""Rows of an element that are believed: more are a damaged header's, or one made to break readers."""
+
+COPIES = 3
+"""Copies of its rows that reading a scene takes at its peak: the table, its columns and the tensors."""
 
 LFS_POINTER = b"version https://git-lfs"
 
@@ -123,7 +131,7 @@ def read_elements(path: Path, file: BinaryIO) -> Header:
         raise SceneFormatError(f"{path}: no end_header in {HEADER_LIMIT} lines; the file is damaged")
     if header.format is None:
         raise SceneFormatError(f"{path}: its header names no format; the file is damaged, get it again")
-    elements = tuple(Element(n, c, tuple(p)) for n, c, p in header.elements)
+    elements = tuple(Element(n, c, tuple(p.items())) for n, (c, p) in header.elements.items())
     return Header(header.format, elements, tuple(header.comments))
 
 
@@ -132,7 +140,7 @@ class _HeaderLines:
 
     def __init__(self) -> None:
         self.format: str | None = None
-        self.elements: list[tuple[str, int, list[tuple[str, str | None]]]] = []
+        self.elements: dict[str, tuple[int, dict[str, str | None]]] = {}
         self.comments: list[tuple[str, ...]] = []
 
     def add(self, words: list[str]) -> str | None:
@@ -143,8 +151,10 @@ class _HeaderLines:
                 self.comments.append(tuple(said))
             case ["format", name, _] if name in FORMATS and self.format is None:
                 self.format = name
-            case ["element", name, count] if count.isdecimal() and name not in [e[0] for e in self.elements]:
-                self.elements.append((name, int(count), []))
+            case ["element", name, count] if count.isdecimal() and name not in self.elements:
+                if int(count) > MOST_ROWS:
+                    return f"element {name[:40]} of {count[:30]} rows is more than any file holds"
+                self.elements[name] = (int(count), {})
             case ["property", "list", size, number, name] if size in NUMBERS and number in NUMBERS:
                 return self._property(name, None)
             case ["property", number, name] if number in NUMBERS:
@@ -156,10 +166,10 @@ class _HeaderLines:
     def _property(self, name: str, kind: str | None) -> str | None:
         if not self.elements:
             return f"property {name} belongs to no element"
-        properties = self.elements[-1][2]
-        if name in [other for other, _ in properties]:
+        _, properties = next(reversed(self.elements.values()))
+        if name in properties:
             return f"property {name} stands twice"
-        properties.append((name, kind))
+        properties[name] = kind
         return None
 
 
@@ -184,12 +194,17 @@ def read_rows(path: Path, file: BinaryIO, header: Header, wanted: Element) -> np
     before = header.elements[: header.elements.index(wanted)]
     dtype = wanted.dtype(path, order)
     if header.format == "ascii":
-        return _ascii_rows(path, file, sum(element.count for element in before), wanted)
+        # rows of an element without properties are blank lines, which are passed over
+        skipped = sum(element.count for element in before if element.properties)
+        return _ascii_rows(path, file, skipped, wanted)
     left = os.fstat(file.fileno()).st_size - file.tell()
     skipped = sum(element.count * element.dtype(path, order).itemsize for element in before)
     there = max(0, left - skipped) // dtype.itemsize if dtype.itemsize else 0
     if there < wanted.count:
         raise _truncated(path, wanted, there)
+    if not wanted.count:  # what stands before it may be longer than a file can be
+        return np.empty(0, dtype)
+    require_memory(str(path), COPIES * wanted.count * dtype.itemsize, TOO_LARGE)
     file.seek(skipped, os.SEEK_CUR)
     return np.fromfile(file, dtype=dtype, count=wanted.count)
 
@@ -202,6 +217,9 @@ def _ascii_rows(path: Path, file: BinaryIO, skipped: int, wanted: Element) -> np
         min(skipped + wanted.count, sys.maxsize),
     )
     rows = np.empty((0, len(names)))
+    # a number takes two bytes at least in the file, and eight in the table
+    lines_left = os.fstat(file.fileno()).st_size - file.tell()
+    require_memory(str(path), min(4 * lines_left, 8 * wanted.count * len(names)), TOO_LARGE)
     if wanted.count:
         try:
             with warnings.catch_warnings():

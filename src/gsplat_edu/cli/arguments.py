@@ -15,12 +15,26 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from gsplat_edu.cli.printing import complain, spell_what_cannot_be_encoded
 from gsplat_edu.errors import SplatError
 from gsplat_edu.files import described
+from gsplat_edu.headroom import shortage
 from gsplat_edu.render.settings import BACKENDS
+from gsplat_edu.text import printable
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+
+LESS_MEMORY = {
+    "train": "close other programs, or train with a smaller --resolution, --max-gaussians or --image-memory; what was "
+    "saved is unharmed",
+    "render": "close other programs, or give a smaller --size",
+    "sfm": "close other programs, or give a smaller --max-image-size or --max-features",
+    "train_2d.py": "close other programs, or give a smaller --size or --splats",
+    "train_3d.py": "close other programs, or give a smaller --size or --cap",
+    "demo": "close other programs, or give a smaller --size or --cap",
+}
+"""What to do where a command ran out of memory; the others have no option that takes less."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -51,7 +65,8 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the line and exit with 2."""
         end = "" if message.endswith("?") else ";"
-        self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message}{end} see {self.prog} --help\n")
+        self.exit(EXIT_BAD_INPUT, printable(f"{self.prog}: {message}{end} see {self.prog} --help") + "
+")
 
 
 def add_backend(parser: argparse._ActionsContainer) -> None:
@@ -117,19 +132,21 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
         debug: Print the traceback too.
 
     Returns:
-        Exit code: 0; 2 for bad input or a file that cannot be written; 130 when interrupted.
+        Exit code: 0; 2 for bad input, a file that cannot be written, or too little memory; 130 when interrupted.
     """
+    spell_what_cannot_be_encoded()
     try:
         with _terminable():
             command()
     except KeyboardInterrupt as interruption:
-        print(f"{program}: {str(interruption) or 'interrupted'}", file=sys.stderr)
+        complain(f"{program}: {str(interruption) or 'interrupted'}")
         return EXIT_INTERRUPTED
-    except (SplatError, OSError) as error:
+    except Exception as error:
+        if (line := _line(program, error)) is None:
+            raise
         if debug:
             traceback.print_exc()
-        said = described(error) if isinstance(error, OSError) else str(error)
-        print(f"{program}: {said}", file=sys.stderr)
+        complain(f"{program}: {line}")
         return EXIT_BAD_INPUT
     return 0
 
@@ -149,3 +166,12 @@ def _terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _line(program: str, error: Exception) -> str | None:
+    """Say what went wrong in one line; None for what is a fault of the program."""
+    if isinstance(error, SplatError):
+        return str(error)
+    if (said := shortage(error)) is not None:
+        return f"ran out of memory ({said}); {LESS_MEMORY.get(program.split()[-1], 'close other programs')}"
+    return described(error) if isinstance(error, OSError) else None

@@ -9,15 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.arguments import numbers_text
 from gsplat_edu.cli.exporting import check_and_say
 from gsplat_edu.cli.options.convert import MOVES
+from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
+from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.viewer import export
@@ -35,9 +36,9 @@ def run(arguments: argparse.Namespace) -> None:
         raise ArgumentError(
             "IN: are several; add --merge to join them into one scene, or convert one at a time"
         )
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     columns = (
-        TextColumn("{task.description}"),
+        Field("{task.description}"),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -115,7 +116,7 @@ def _similarity(text: str) -> Similarity:
                 if turn is not None:
                     return Similarity(turn.as_matrix(), 1.0, np.zeros(3))
             case "matrix":
-                numbers = Path(value).read_text("utf-8", errors="replace").replace(",", " ").split()
+                numbers = read_text(Path(value), errors="replace").replace(",", " ").split()
                 if len(numbers) in (12, 16):
                     return Similarity.of_matrix(np.array(numbers, dtype=np.float64).reshape(-1, 4))
     except ArgumentError as error:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsplat_edu.cli.sphere import options_from, run_sphere
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
@@ -17,7 +17,7 @@ LOSS_EVERY = 20
 
 def run(arguments: argparse.Namespace) -> None:
     """Train, showing a bar with the loss and the number of Gaussians."""
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     options, notice = options_from(arguments)
     if notice:
         console.print(notice, soft_wrap=True)

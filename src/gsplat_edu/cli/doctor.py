@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.before import examine
@@ -40,7 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
     path: Path = arguments.path
     if not path.exists():
         raise ArgumentError(f"{path}: is not there; give a dataset folder or a run folder")
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     if RunFolder(path).exists():
         diagnosis, lines = _after(arguments, console)
     else:

@@ -8,9 +8,9 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.io.ply import load_ply
@@ -25,7 +25,7 @@ from gsplat_edu.runs.identity import difference
 
 def run(arguments: argparse.Namespace) -> None:
     """Score every view, print a line per split, and say what was written."""
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
 
     def say(sentence: str) -> None:
         console.print(sentence, soft_wrap=True)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Console
 
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.errors import ArgumentError, CheckpointError
@@ -27,6 +27,9 @@ BINS = 40
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 """Heights of a bin: the first is for an empty one only."""
+
+PLAIN_BLOCKS = " .:-=+*#@"
+"""The same for terminals that have ASCII only."""
 
 HIGHLIGHTS = {
     "data": ("path", "resolution", "test_every", "points"),
@@ -52,7 +55,10 @@ def run(arguments: argparse.Namespace) -> None:
         facts = _run_facts(RunFolder(path))
     else:
         facts = _dataset_facts(path)
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
+    if not console.shows(BLOCKS):
+        plain = str.maketrans(BLOCKS, PLAIN_BLOCKS)
+        facts = [(name, value.translate(plain)) for name, value in facts]
     console.print(*(f"{name:<10} {value}".rstrip() for name, value in facts), sep="\n", soft_wrap=True)
 
 
@@ -121,7 +127,7 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
             facts.append(
                 (
                     split,
-                    f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}, {scores['num_images']} images",
+                    ", ".join(_scores(scores)),
                 )
             )
     if not metrics:
@@ -139,6 +145,14 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
     except CheckpointError as error:
         return [*facts, ("scene", str(error))]
     return [*facts, ("", f"after {iteration:,} iterations:"), *_scene_facts(scene)]
+
+
+def _scores(scores: Mapping[str, Any]) -> list[str]:
+    """Say what metrics.json has of a split; another program's may lack some."""
+    ssim, images = scores.get("ssim"), scores.get("num_images")
+    said = [f"PSNR {scores['psnr']:.2f} dB"]
+    said += [] if ssim is None else [f"SSIM {ssim:.4f}"]
+    return said + ([] if images is None else [f"{images} images"])
 
 
 def _dataset_facts(path: Path) -> list[Fact]:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
+from gsplat_edu.cli.printing import complain, spell_what_cannot_be_encoded
 from gsplat_edu.render.settings import check_backend
 
 COMMANDS = {
@@ -36,6 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0; 2 for bad input; 130 when interrupted.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
+    spell_what_cannot_be_encoded()
     try:
         parser = build_parser(words)
         parsed = parser.parse_args(words)
@@ -44,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return EXIT_BAD_INPUT
         return run_command(f"gsplat-edu {parsed.command}", lambda: parsed.run(parsed), parsed.debug)
     except KeyboardInterrupt:  # while the options were still being imported
-        print("gsplat-edu: interrupted", file=sys.stderr)
+        complain("gsplat-edu: interrupted")
         return EXIT_INTERRUPTED
 
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from rich.console import Console
 from rich.progress import track
 
 from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.cli.options.render import RUNS_CAMERAS, SCENE_SIZE
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.following import path_along
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     else:
         raise ArgumentError(f"{arguments.source}: is not there; give the folder of a run, or a scene file")
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     if shot.says:
         console.print(shot.says, soft_wrap=True)
     started = time.perf_counter()
@@ -101,7 +101,7 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> 
     scene, _ = folder.latest_scene()
     if arguments.dataset not in (None, RUNS_CAMERAS):
         return _dataset_shot(arguments, load_ply(scene), settings, data_settings(config), orbit)
-    origin = config.get("origin", ORIGIN)
+    origin = config.get("origin") or ORIGIN
     gaussians = load_ply(scene, origin)
     cameras = folder.read_cameras(origin)
     named = [(name, camera) for name, _, camera in cameras]

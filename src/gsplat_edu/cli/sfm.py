@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from gsplat_edu.cli.options.sfm import options_from
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.locks import locked
 from gsplat_edu.sfm.reconstruct import reconstruct
 
@@ -19,7 +20,7 @@ from gsplat_edu.sfm.reconstruct import reconstruct
 def run(arguments: argparse.Namespace) -> None:
     """Find the poses, showing how it goes."""
     options = options_from(arguments)
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
 
     def say(sentence: str) -> None:
         console.print(sentence, soft_wrap=True)

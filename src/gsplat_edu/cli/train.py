@@ -13,12 +13,13 @@ from dataclasses import replace
 from types import ModuleType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.cli.sfm import stage_bars
+from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.doctor.pace import Pace
@@ -46,7 +47,7 @@ PSNR_EVERY = 20
 
 def run(arguments: argparse.Namespace) -> None:
     """Train, showing how it goes; write the scene, the metrics and the report."""
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
 
     def say(sentence: str) -> None:
         console.print(sentence, soft_wrap=True)
@@ -233,10 +234,10 @@ def _psnr(trainer: Trainer) -> float:
 
 def _bar(console: Console, state: str) -> Progress:
     columns = (
-        TextColumn("{task.description}"),
+        Field("{task.description}"),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
-        TextColumn(state),
+        Field(state),
     )
     quiet = not console.is_terminal
     return Progress(*columns, TimeRemainingColumn(), console=console, transient=not state, disable=quiet)

@@ -9,8 +9,7 @@ import threading
 import webbrowser
 from pathlib import Path
 
-from rich.console import Console
-
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import export, page
@@ -19,7 +18,7 @@ from gsplat_edu.viewer.serve import PageServer, exposure
 
 def run(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C, which is how it ends."""
-    console = Console(highlight=False, markup=False)
+    console = Terminal()
     _check_is_no_page(arguments.source)
     # first of all: a port that is taken is no reason to wait for the scene
     with PageServer(b"", arguments.host, arguments.port, policy=page.policy()) as server:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gsplat_edu.data.capture import Capture, Frame, is_file, missing_note
+from gsplat_edu.data.capture import Capture, Frame, is_file, missing_note, outside_note
 from gsplat_edu.data.points import BLENDER_CUBE
 from gsplat_edu.data.transforms import nothing_found, read_frames, read_json
 
@@ -23,7 +23,7 @@ def read_blender(folder: Path) -> Capture:
     Raises:
         DatasetError: as for `read_transforms`.
     """
-    frames, missing = list[Frame](), list[str]()
+    frames, missing, outside = list[Frame](), list[str](), list[Path]()
     held_out = next((p for part in ("test", "val") if is_file(p := folder / f"transforms_{part}.json")), None)
     for part, path in (("train", folder / TRAIN_FILE), ("test", held_out)):
         if path is None:
@@ -34,9 +34,11 @@ def read_blender(folder: Path) -> Capture:
             raise nothing_found(path, found.missing)
         frames += found.frames
         missing += found.missing
+        outside += found.outside
     val = folder / "transforms_val.json"
     notes = list[str]()
     if held_out is not None and held_out != val and is_file(val):
         notes.append(f"{val.name}: its photos are left out; {held_out.name} is there to test with")
     notes += [missing_note(missing, len(frames) + len(missing))] if missing else []
+    notes += [outside_note(outside, folder)] if outside else []
     return Capture("Blender", tuple(frames), None, tuple(notes), cube=BLENDER_CUBE)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import unicodedata
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import lru_cache
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 from jaxtyping import Float64
@@ -106,6 +109,71 @@ def is_folder(path: Path) -> bool:
         return False
 
 
+class Listings:
+    """The names in the folders of photos, each folder listed once.
+
+    A capture may name hundreds of thousands of photos that are not there, each of which could have twenty-two endings
+    in four folders. Asking the system about every spelling takes minutes.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, frozenset[str] | None] = {}
+
+    def may_hold(self, path: str) -> bool:
+        """Say whether a photo of that name can be there; the system then has to say that it is.
+
+        Args:
+            path: Path of the photo, with or without its ending. Case does not matter, nor how accents are composed, as
+                on file systems that ignore both.
+        """
+        parent, name = os.path.split(path)
+        if parent not in self._known:
+            self._known[parent] = _folded_names(Path(parent))
+        names = self._known[parent]
+        return names is None or _folded(name) in names
+
+
+def _folded(name: str) -> str:
+    return name.lower() if name.isascii() else unicodedata.normalize("NFC", name).casefold()
+
+
+def _folded_names(folder: Path) -> frozenset[str] | None:
+    """List a folder and those with smaller copies of its photos; None where one cannot be listed."""
+    names = set[str]()
+    for place in (folder, *(copy for name in PHOTO_FOLDERS[1:] if (copy := _copy_place(folder, name)))):
+        try:
+            for name in os.listdir(place):  # noqa: PTH208 - names are enough
+                stem, dot, ending = name.rpartition(".")
+                names.add(_folded(name))
+                if f"{dot}{ending}".lower() in PHOTO_ENDINGS:
+                    names.add(_folded(stem))
+        except (FileNotFoundError, NotADirectoryError, ValueError):
+            continue
+        except OSError:
+            return None
+    return frozenset(names)
+
+
+def is_outside(folder: Path, name: str) -> bool:
+    """Say whether a path that a capture names leads out of its folder; links are not followed.
+
+    Args:
+        folder: The capture.
+        name: The path, relative to the folder or absolute, with slashes.
+    """
+    if ".." not in name and not PurePosixPath(name).is_absolute() and not PureWindowsPath(name).drive:
+        return False
+    place, top = os.path.abspath(folder / name), os.path.abspath(folder)  # noqa: PTH100 - it folds ".." lexically
+    return not Path(place).is_relative_to(top)
+
+
+def outside_note(outside: Sequence[Path], folder: Path) -> str:
+    """Say which files are read from elsewhere because the capture says so."""
+    more = f" and {len(outside) - 1} more files" if len(outside) > 1 else ""
+    verb = "lie" if more else "lies"
+    return f"{outside[0]}{more} {verb} outside of {folder}; the capture names {'them' if more else 'it'}"
+
+
 def entries(folder: Path) -> list[Path]:
     """List a folder.
 
@@ -167,7 +235,10 @@ def checked_frame(where: str, frame: Frame) -> Frame:
 
 
 def photo_file(
-    frame: Frame, resolution: float | None, background: tuple[float, float, float] | None
+    frame: Frame,
+    resolution: float | None,
+    background: tuple[float, float, float] | None,
+    size_of: Callable[[Path], tuple[int, int]] = image_size,
 ) -> tuple[PhotoFile, Camera, bool]:
     """Work out which file a view is read from, how, and the camera that goes with the result.
 
@@ -175,6 +246,7 @@ def photo_file(
         frame: The frame.
         resolution: Below `FACTOR_BELOW` what to divide the size by, else the longest side, px; None: as it is.
         background: As for `PhotoFile`.
+        size_of: Reads the size of an image file; one that remembers saves time where frames share files.
 
     Returns:
         The photo; its camera, a pinhole of the final size; whether the file has another size than the frame
@@ -185,10 +257,10 @@ def photo_file(
             cannot be undone.
     """
     path = frame.image
-    size = image_size(path)
+    size = size_of(path)
     rescaled = size != (frame.lens.W, frame.lens.H)
     lens = _fitted(frame, path, size)
-    if frame.mask is not None and (mask_size := image_size(frame.mask)) != size:
+    if frame.mask is not None and (mask_size := size_of(frame.mask)) != size:
         raise DatasetError(
             f"{frame.mask}: the mask is {_spelled(mask_size)} but its photo {_spelled(size)}; make them one size"
         )
@@ -197,10 +269,10 @@ def photo_file(
     smaller = _smaller_copy(path, resolution) if frame.mask is None else None
     if smaller is not None:
         path = smaller
-        W, H = image_size(path)
+        W, H = size_of(path)
         lens = _fitted(frame, path, (W, H))
     try:
-        pinhole = straightened(lens).resized(W, H)
+        pinhole = _resized(straightened(lens), W, H)
     except DatasetError as error:
         raise DatasetError(f"{frame.name}: {error}") from None
     camera = Camera(frame.R, frame.eye, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, H, W)
@@ -217,6 +289,12 @@ def _fitted(frame: Frame, path: Path, size: tuple[int, int]) -> Lens:
             f"{path}: the photo of {frame.name} is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect "
             "ratio; was the photo cropped or turned after the poses were found?"
         )
+    return _resized(lens, W, H)
+
+
+@lru_cache(maxsize=4096)
+def _resized(lens: Lens, W: int, H: int) -> Lens:
+    """Resize a lens; the frames of a capture share a few."""
     return lens.resized(W, H)
 
 
@@ -234,10 +312,15 @@ def _smaller_copy(path: Path, resolution: float | None) -> Path | None:
 
 def _copy(path: Path, name: str) -> Path | None:
     """Find the same photo in another of the folders."""
-    for folder in path.parents:
+    place = _copy_place(path.parent, name)
+    return copy if place is not None and is_file(copy := place / path.name) else None
+
+
+def _copy_place(parent: Path, name: str) -> Path | None:
+    """Return the folder that corresponds to a folder of photos among their smaller copies."""
+    for folder in (parent, *parent.parents):
         if folder.name in PHOTO_FOLDERS:
-            copy = folder.with_name(name) / path.relative_to(folder)
-            return copy if is_file(copy) else None
+            return folder.with_name(name) / parent.relative_to(folder)
     return None
 
 

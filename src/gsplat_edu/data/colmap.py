@@ -23,17 +23,22 @@ from gsplat_edu.data.capture import (
     Capture,
     Cloud,
     Frame,
+    Listings,
     checked_frame,
     entries,
     find_photo,
     is_file,
     is_folder,
+    is_outside,
     missing_note,
+    outside_note,
     unit_colors,
 )
 from gsplat_edu.data.lens import Lens, lens_of
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.gaussian_math import quat_to_R
+from gsplat_edu.reading import read_bytes, read_text
+from gsplat_edu.text import legible
 
 MODELS: tuple[tuple[str, str], ...] = (
     ("SIMPLE_PINHOLE", "f cx cy"),
@@ -115,7 +120,7 @@ def read_colmap(folder: Path, model: Path) -> Capture:
         raise DatasetError(f"{listed}: lists no images; run COLMAP's mapper, or name another model")
     photos, masks, notes = _files(folder, model, [pose.name for pose in poses])
     there = [pose for pose in poses if pose.name in photos]
-    missing = [_printable(pose.name) for pose in poses if pose.name not in photos]
+    missing = [legible(pose.name) for pose in poses if pose.name not in photos]
     if not there:
         raise DatasetError(
             f"{folder}: none of the {len(poses)} photos that {listed.name} lists has a file, first {missing[0]}; put "
@@ -124,7 +129,7 @@ def read_colmap(folder: Path, model: Path) -> Capture:
     lenses = read_cameras(model / f"cameras{suffix}", {pose.camera for pose in there})
     frames = []
     for pose in there:
-        name = _printable(pose.name)
+        name = legible(pose.name)
         where = f"{listed}, image {name}"
         if pose.camera not in lenses:
             raise DatasetError(
@@ -243,12 +248,14 @@ def _files(
         DatasetError: two images lead to one file.
     """
     photo_folders, mask_folders = _photo_folders(folder, model)
+    mask_folders = [place for place in mask_folders if is_folder(place)]
+    listings = Listings()
     bare = Counter(Path(name).name for name in names)
     photos, masks, unclear = dict[str, Path](), dict[str, Path](), list[str]()
     for name in names:
         last = Path(name).name
         alone = [last] if bare[last] == 1 else []
-        places = list(_candidates(photo_folders, name, alone))
+        places = [p for p in _candidates(photo_folders, name, alone) if listings.may_hold(str(p))]
         # Photos of full size first, wherever they are; then those of images_2, images_4 and images_8.
         photo = next((p for find in (_present, find_photo) for p in map(find, places) if p), None)
         mask = next((p for p in _masks(mask_folders, [name, *alone]) if is_file(p)), None)
@@ -257,10 +264,13 @@ def _files(
         if mask is not None:
             masks[name] = mask
         elif not alone and any(is_file(p) for p in _masks(mask_folders, [last])):
-            unclear.append(_printable(name))
+            unclear.append(legible(name))
     _check_single(model, names, photos)
     _check_single(model, names, masks)
     notes = list[str]()
+    outside = [photos[name] for name in names if name in photos and is_outside(folder, name)]
+    if outside:
+        notes.append(outside_note(outside, folder))
     if unclear:
         notes.append(
             f"{len(unclear)} of {len(names)} photos have a mask only by a bare name that several share: not used, "
@@ -282,10 +292,10 @@ def _check_single(model: Path, names: Sequence[str], files: Mapping[str, Path]) 
         if files[name] not in owners:
             owners[files[name]] = name
         elif (other := owners[files[name]]) == name:
-            raise DatasetError(f"{model}: lists the image {_printable(name)} twice; export the model again")
+            raise DatasetError(f"{model}: lists the image {legible(name)} twice; export the model again")
         else:
             raise DatasetError(
-                f"{files[name]}: is the file of two images, {_printable(other)} and {_printable(name)}; put each "
+                f"{files[name]}: is the file of two images, {legible(other)} and {legible(name)}; put each "
                 "where its whole name says"
             )
 
@@ -306,11 +316,6 @@ def _masks(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Path]:
 def _name(raw: bytes) -> str:
     """Return the name of a file as the system's functions take it, with slashes."""
     return os.fsdecode(raw).replace("\\", "/")
-
-
-def _printable(name: str) -> str:
-    """Replace what could not be decoded."""
-    return os.fsencode(name).decode("utf-8", "replace")
 
 
 def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
@@ -345,7 +350,7 @@ class _Binary:
     def __init__(self, path: Path, smallest: int) -> None:
         self.path, self.at, self.where = path, 0, "its header"
         try:
-            self.data = path.read_bytes()
+            self.data = read_bytes(path)
         except OSError as error:
             raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
         (self.count,) = self.take(struct.Struct("<Q"))
@@ -424,7 +429,7 @@ def _points_bin(path: Path) -> list[tuple[float, ...]]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8", errors="surrogateescape").split("\n")
+        return read_text(path, errors="surrogateescape").split("\n")
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from gsplat_edu.data.capture import (
     photo_file,
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
-from gsplat_edu.data.images import ImageStore, PhotoFile
+from gsplat_edu.data.images import ImageStore, PhotoFile, image_size
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
@@ -123,7 +124,8 @@ def load_dataset(
     notes = list(capture.notes)
     frames = sorted(capture.frames, key=lambda frame: frame.name)
     frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
-    made = [photo_file(frame, settings.resolution, settings.background) for frame in frames]
+    size_of = functools.cache(image_size)
+    made = [photo_file(frame, settings.resolution, settings.background, size_of) for frame in frames]
     store = ImageStore(settings.image_memory, [source for source, _, _ in made])
     views = [
         View.stored(camera, partial(store.read, source), frame.name)

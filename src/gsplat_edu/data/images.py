@@ -3,37 +3,20 @@
 from __future__ import annotations
 
 import os
-import struct
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
-from PIL import Image
 
 from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.data.watch import FileWatch
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.errors import DatasetError, NotEnoughMemoryError, SplatError
+from gsplat_edu.image_files import SPELLED, UNDECODABLE, opened_image, require_room
 from gsplat_edu.views import Photo
-
-# What Pillow's decoders raise on files that are cut short, corrupt, absurdly large or no images.
-_UNDECODABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    KeyError,
-    IndexError,
-    OverflowError,
-    struct.error,
-)
-
-MAX_PIXELS = 2**30
-"""Pixels of a photo that are believed; a header that says more is a corrupt file's or not a photo's."""
 
 ALL_OF_IT = 0.9999
 """Share of a pixel's sources that have to count for it to count: all, up to float32 rounding."""
@@ -63,42 +46,6 @@ class PhotoFile:
     background: tuple[float, float, float] | None
 
 
-class _PillowsLimit:
-    """Lifts Pillow's limit of 89 megapixels, made for programs that strangers send files to, while photos are read.
-
-    The limit is the process's, and looked at while a header is read and by some decoders again. It is back as soon as
-    no thread reads.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._readers = 0
-        self._limit: int | None = None
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if self._readers == 0:
-                self._limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-            self._readers += 1
-
-    def __exit__(self, *error: object) -> None:
-        with self._lock:
-            self._readers -= 1
-            if self._readers == 0:
-                Image.MAX_IMAGE_PIXELS = self._limit
-
-
-_no_limit = _PillowsLimit()
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    with _no_limit, Image.open(path) as file:
-        if file.width * file.height > MAX_PIXELS:
-            raise ValueError(f"{file.width}x{file.height} px are more than a photo has")
-        yield file
-
-
 def image_size(path: Path) -> tuple[int, int]:
     """Read width and height from a file's header, px. EXIF orientation is ignored, as COLMAP ignores it.
 
@@ -106,23 +53,25 @@ def image_size(path: Path) -> tuple[int, int]:
         DatasetError: the file is no image.
     """
     try:
-        with _opened(path) as file:
+        with opened_image(path) as file:
             return file.size
-    except _UNDECODABLE as error:
+    except UNDECODABLE as error:
         raise _undecodable(path, error) from None
 
 
 def decode(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
-    """Decode an image file of any kind Pillow knows to 8 bits.
+    """Decode an image file of one of `gsplat_edu.image_files.FORMATS` to 8 bits.
 
     Returns:
         RGB, and the alpha: None where the photo is opaque.
 
     Raises:
         DatasetError: the file is cut short, corrupt or no image.
+        NotEnoughMemoryError: its pixels need more memory than is free.
     """
     try:
-        with _opened(path) as file:
+        with opened_image(path) as file:
+            require_room(path, file)
             if file.mode.startswith("I"):  # 16-bit gray
                 gray = np.clip(np.asarray(file, dtype=np.int64), 0, 65535)
                 return np.repeat(((gray + 128) // 257).astype(np.uint8)[..., None], 3, axis=2), None
@@ -131,7 +80,7 @@ def decode(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H
             if not file.has_transparency_data:
                 return np.array(file.convert("RGB")), None
             pixels = np.array(file.convert("RGBA"))
-    except _UNDECODABLE as error:
+    except UNDECODABLE as error:
         raise _undecodable(path, error) from None
     rgb, alpha = np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
     return rgb, None if alpha.min() == 255 else alpha
@@ -142,13 +91,15 @@ def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
 
     Raises:
         DatasetError: the file is cut short, corrupt or no image.
+        NotEnoughMemoryError: its pixels need more memory than is free.
     """
     try:
-        with _opened(path) as file:
+        with opened_image(path) as file:
+            require_room(path, file)
             plain = file if file.mode[0] in "IF" else file.convert("L")
             mask: Bool[np.ndarray, "H W"] = np.asarray(plain) != 0
             return mask
-    except _UNDECODABLE as error:
+    except UNDECODABLE as error:
         raise _undecodable(path, error) from None
 
 
@@ -272,10 +223,12 @@ def _smaller_mask(mask: Bool[np.ndarray, "H W"], W: int, H: int) -> Bool[np.ndar
     return counts
 
 
-def _undecodable(path: Path, error: BaseException) -> DatasetError:
+def _undecodable(path: Path, error: BaseException) -> SplatError:
     reason = getattr(error, "strerror", None) or str(error).split("\n")[0] or type(error).__name__
+    if "out of memory" in reason:  # Pillow's decoders say so in an OSError
+        return NotEnoughMemoryError(f"{path}: memory ran out while it was decoded; close other programs")
     if "cannot identify" in reason:
-        reason = "it is no image that Pillow knows"
+        reason = f"it is not a {SPELLED} image"
     return DatasetError(
         f"{path}: cannot be decoded ({reason}); replace the file, or take it out of the capture"
     )

@@ -12,6 +12,7 @@ from gsplat_edu.constants import C0
 from gsplat_edu.data.capture import MAX_COORDINATE, Cloud, unit_colors
 from gsplat_edu.errors import DatasetError, SceneFormatError
 from gsplat_edu.ply_table import read_elements, read_rows
+from gsplat_edu.reading import open_file
 
 RANDOM_POINTS = 100_000
 """Points of a random start cloud, the number Inria's code draws for Blender scenes."""
@@ -39,7 +40,7 @@ def read_points_ply(path: Path) -> Cloud:
         DatasetError: the file is not that, or is cut short.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             header = read_elements(path, file)
             vertex = next((e for e in header.elements if {"x", "y", "z"} <= set(e.names)), None)
             if vertex is None:

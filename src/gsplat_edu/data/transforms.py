@@ -22,16 +22,21 @@ from gsplat_edu.data.capture import (
     Capture,
     Cloud,
     Frame,
+    Listings,
     checked_frame,
     find_photo,
     is_file,
+    is_outside,
     missing_note,
+    outside_note,
 )
 from gsplat_edu.data.colmap import find_model, points_file, read_points
 from gsplat_edu.data.images import image_size
 from gsplat_edu.data.lens import Lens, lens_of
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.errors import DatasetError
+from gsplat_edu.reading import parse_json, read_text
+from gsplat_edu.text import as_file_name, legible
 
 FISHEYE_MODEL = "OPENCV_FISHEYE"
 
@@ -44,12 +49,20 @@ FOCAL_KEYS = {axis: (f"fl_{axis}", f"camera_angle_{axis}") for axis in "xy"}
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
+INTRINSICS = frozenset(
+    ("w", "h", "cx", "cy", "camera_model", "is_fisheye", *COEFFICIENTS, *FOCAL_KEYS["x"], *FOCAL_KEYS["y"])
+)
+"""Keys that decide a lens."""
+
 
 class Found(NamedTuple):
-    """The frames of a file that have a photo, and the names of those that have none."""
+    """What a file lists."""
 
     frames: list[Frame]
     missing: list[str]
+    """Names of photos that have no file."""
+    outside: list[Path]
+    """Photos and masks that are not in the folder of the file."""
 
 
 def read_transforms(path: Path) -> Capture:
@@ -63,11 +76,16 @@ def read_transforms(path: Path) -> Capture:
             has a photo.
     """
     contents = read_json(path)
-    frames, missing = read_frames(path, contents)
+    frames, missing, outside = read_frames(path, contents)
     if not frames:
         raise nothing_found(path, missing)
     notes = [missing_note(missing, len(frames) + len(missing))] if missing else []
     cloud, no_cloud = _cloud(path, contents)
+    if "ply_file_path" in contents and is_outside(
+        path.parent, points := _tidy(str(contents["ply_file_path"]))
+    ):
+        outside.append(path.parent / points)
+    notes += [outside_note(outside, path.parent)] if outside else []
     return Capture("transforms.json", tuple(frames), cloud, tuple(notes), no_cloud or Capture.no_cloud)
 
 
@@ -81,15 +99,17 @@ def read_json(path: Path) -> dict[str, Any]:
         DatasetError: it does not; a syntax error is named by line and column.
     """
     try:
-        contents = json.loads(path.read_text(encoding="utf-8-sig"))
+        contents = parse_json(read_text(path, "utf-8-sig"))
     except json.JSONDecodeError as error:
         raise DatasetError(
             f"{path}, line {error.lineno} column {error.colno}: is not JSON ({error.msg}); repair the file"
         ) from None
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
-    except (UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise DatasetError(f"{path}: is not JSON ({type(error).__name__}); repair the file") from None
+    except UnicodeDecodeError:
+        raise DatasetError(f"{path}: is not JSON (no UTF-8 text); repair the file") from None
+    except ValueError as error:
+        raise DatasetError(f"{path}: is not JSON ({error}); repair the file") from None
     if not isinstance(contents, dict) or not isinstance(contents.get("frames"), list):
         raise DatasetError(f"{path}: has no list of frames; it has to be a transforms.json")
     contents["frames"] = [_stated(f) if isinstance(f, dict) else f for f in contents["frames"]]
@@ -119,30 +139,41 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
     Raises:
         DatasetError: names the frame, and the key it lacks or that cannot be used.
     """
-    frames, missing = list[Frame](), list[str]()
-    parts = _parts(path, contents)
+    frames, missing, outside = list[Frame](), list[str](), list[Path]()
+    parts, listings = _parts(path, contents), Listings()
+    shared = {key: value for key, value in contents.items() if key in INTRINSICS}
+    common: Lens | None = None  # that of all frames without intrinsics of their own
     for number, frame in enumerate(contents["frames"]):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise DatasetError(f"{path}, frame {number}: has no file_path; every frame names its photo")
         name = _tidy(frame["file_path"])
-        image = _photo(path.parent / name)
+        image = _photo(path.parent / as_file_name(name), listings)
         if image is None:
-            missing.append(name)
+            missing.append(legible(name))
             continue
-        where = f"{path}, frame {name}"
-        lens = _lens(where, _merged(contents, frame), image)
+        where = f"{path}, frame {legible(name)}"
+        if common is not None and frame.keys().isdisjoint(INTRINSICS):
+            lens = common
+        else:
+            lens = _lens(where, _merged(shared, frame), image)
+            if frame.keys().isdisjoint(INTRINSICS) and {"w", "h"} <= shared.keys():
+                common = lens
         R, eye = _pose(where, frame)
-        found = Frame(
-            name, image, lens, R, eye, _mask(where, path.parent, frame), part or parts.get(name, parts[""])
-        )
-        frames.append(checked_frame(where, found))
-    return Found(frames, missing)
+        mask, its_part = _mask(where, path.parent, frame), part or parts.get(name, parts[""])
+        outside += [image] if is_outside(path.parent, name) else []
+        outside += [mask] if mask and is_outside(path.parent, _tidy(str(frame["mask_path"]))) else []
+        frames.append(checked_frame(where, Frame(legible(name), image, lens, R, eye, mask, its_part)))
+    return Found(frames, missing, outside)
 
 
-def _photo(path: Path) -> Path | None:
+def _photo(path: Path, listings: Listings) -> Path | None:
     """Find the photo of a file_path, which may lack its ending."""
+    if not listings.may_hold(str(path)):
+        return None
+    if (photo := find_photo(path)) is not None:
+        return photo
     spelled = (s for ending in PHOTO_ENDINGS for s in (ending, ending.upper(), ending.title()))
-    return next((p for end in ("", *spelled) if (p := find_photo(Path(f"{path}{end}")))), None)
+    return next((p for end in spelled if (p := find_photo(Path(f"{path}{end}")))), None)
 
 
 def _tidy(file_path: str) -> str:
@@ -254,7 +285,7 @@ def _matrix(where: str, values: Mapping[str, Any], key: str) -> Float64[np.ndarr
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)):
         raise DatasetError(f"{where}: {key} is not 3x4 or 4x4 numbers; repair it")
-    if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=1e-6):
+    if matrix.shape == (4, 4) and not np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() <= 1e-6:
         raise DatasetError(f"{where}: {key} has the last row {matrix[3].tolist()}, but it has to be 0 0 0 1")
     return matrix
 
@@ -262,7 +293,7 @@ def _matrix(where: str, values: Mapping[str, Any], key: str) -> Float64[np.ndarr
 def _mask(where: str, folder: Path, frame: Mapping[str, Any]) -> Path | None:
     if "mask_path" not in frame:
         return None
-    mask = folder / _tidy(str(frame["mask_path"]))
+    mask = folder / as_file_name(_tidy(str(frame["mask_path"])))
     if not is_file(mask):
         raise DatasetError(f"{where}: its mask {mask} is not there; put it there or remove mask_path")
     return mask
@@ -278,7 +309,7 @@ def _cloud(path: Path, contents: Mapping[str, Any]) -> tuple[Cloud | None, str]:
         The points; or none, and why COLMAP's are not used where that is the reason.
     """
     if "ply_file_path" in contents:
-        return read_points_ply(path.parent / _tidy(str(contents["ply_file_path"]))), ""
+        return read_points_ply(path.parent / as_file_name(_tidy(str(contents["ply_file_path"])))), ""
     model = find_model(path.parent)
     if model is None or points_file(model) is None:
         return None, ""

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
-from PIL import Image
 
 from gsplat_edu.data.images import decode, decode_mask, image_size
 from gsplat_edu.data.lens import Lens, undistortion
+from gsplat_edu.image_files import UNDECODABLE, opened_image
 from gsplat_edu.views import Photo
 
 WORK_SIDE = 1024
@@ -36,8 +35,6 @@ ANGLES = np.arange(8) * math.pi / 8
 
 FLAT = 1e-2
 """Energy that is added to both scales, grey levels² per px²: below it there is nothing but rounding."""
-
-_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, IndexError, KeyError, OverflowError, struct.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +105,11 @@ def _decoded(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     W, H = image_size(path)
     if path.suffix.lower() in (".jpg", ".jpeg") and W * H <= JPEG_ONLY:
         try:
-            with Image.open(path) as file:
+            with opened_image(path) as file:
                 if file.format == "JPEG":
                     file.draft("RGB", (WORK_SIDE, WORK_SIDE))
                     return np.array(file.convert("RGB"))
-        except _DAMAGED:
+        except UNDECODABLE:
             pass  # `decode` tells what is wrong with it
     image, alpha = decode(path)
     return image if alpha is None else np.asarray(Photo(image, alpha).over((0.0, 0.0, 0.0)))

@@ -25,6 +25,7 @@ from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.evaluate.figures import run_curves_figure, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
 from gsplat_edu.files import written_aside
+from gsplat_edu.text import write_text
 
 PICTURES = 8
 """Test views that a report shows."""
@@ -199,7 +200,7 @@ def write_report(path: Path, report: Report) -> None:
         f"<h1>{title}</h1>\n{''.join(sections)}<script>{SCRIPT}</script>\n</body>\n</html>\n"
     )
     with written_aside(path) as aside:
-        aside.write_text(page, encoding="utf-8")
+        write_text(aside, page)
 
 
 def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> str:

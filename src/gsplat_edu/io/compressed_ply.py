@@ -36,6 +36,7 @@ from gsplat_edu.io.ply_comments import comments, read_comments
 from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.ply_table import Element, Header, read_elements, read_rows
+from gsplat_edu.reading import open_file
 
 CHUNK = 256
 """Splats of a chunk; the last one may have fewer."""
@@ -76,7 +77,7 @@ def read(path: Path) -> Scene:
         SceneFormatError: not a compressed PLY, or damaged: truncated, or with bounds that are NaN or infinite.
         OSError: it cannot be read.
     """
-    with path.open("rb") as file:
+    with open_file(path) as file:
         header = read_elements(path, file)
         chunk, vertex, sh = _elements(path, header)
         body = file.tell()

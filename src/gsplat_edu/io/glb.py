@@ -37,6 +37,7 @@ from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
 from gsplat_edu.io.quantize import unit_quats
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.ply_table import LFS_POINTER
+from gsplat_edu.reading import parse_json, read_bytes
 
 EXTENSION = "KHR_gaussian_splatting"
 
@@ -167,7 +168,7 @@ def _description(scene: Scene, attributes: dict[str, Float32[np.ndarray, "N C"]]
 
 def read(path: Path) -> Scene:
     """Read a binary glTF; see `gsplat_edu.io.formats.read_scene`."""
-    data = path.read_bytes()
+    data = read_bytes(path)
     document, body = _chunks(path, data)
     try:
         return _scene(path, document, body)
@@ -195,8 +196,8 @@ def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview]:
     if kind != b"JSON" or size > min(len(data) - start, MOST_JSON):
         _refuse(path, "does not begin with its JSON")
     try:
-        document = json.loads(data[start : start + size])
-    except (ValueError, RecursionError):
+        document = parse_json(data[start : start + size])
+    except ValueError:
         _refuse(path, "has JSON that cannot be read")
     if not isinstance(document, dict):
         _refuse(path, "has JSON that is no object")

@@ -32,6 +32,7 @@ from gsplat_edu.io import compressed_ply
 from gsplat_edu.io.ply_comments import comments, read_comments
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.ply_table import Element, read_elements, read_rows
+from gsplat_edu.reading import open_file
 from gsplat_edu.validation import ArrayLike, float64_array
 
 MEANS = ("x", "y", "z")
@@ -56,7 +57,7 @@ def read(path: Path, finite: bool = True) -> Scene:
         path: The file.
         finite: Refuse one with NaN or infinite numbers.
     """
-    with path.open("rb") as file:
+    with open_file(path) as file:
         header = read_elements(path, file)
     if any("packed_position" in element.names for element in header.elements):
         return compressed_ply.read(path)
@@ -136,7 +137,7 @@ def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
 
 def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
     shift = float64_array("origin", origin, (3,))
-    with path.open("rb") as file:
+    with open_file(path) as file:
         header = read_elements(path, file)
         vertex = _splat_vertex(path, header.elements)
         rest = sum(name.startswith("f_rest_") for name in vertex.names)

@@ -21,8 +21,10 @@ from PIL import Image
 
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import named_failure, written_aside
+from gsplat_edu.image_files import opened_image
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.ply_table import LFS_POINTER
+from gsplat_edu.reading import read_bytes
 
 META_NAME = "meta.json"
 
@@ -60,10 +62,7 @@ _UNDECODABLE = (
     EOFError,
     RuntimeError,
     OverflowError,
-    MemoryError,
     struct.error,
-    Image.DecompressionBombError,
-    Image.DecompressionBombWarning,
 )
 
 
@@ -80,7 +79,7 @@ class Bundle:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        data = path.read_bytes()
+        data = read_bytes(path)
         _check_pointer(path, data)
         self._size = len(data)
         if not data.startswith(b"PK"):
@@ -136,7 +135,7 @@ class Folder:
             OSError: it cannot be read, or there is no meta.json.
         """
         file = self._file(name)
-        data = file.read_bytes()
+        data = read_bytes(file)
         _check_pointer(file, data)
         return data
 
@@ -264,7 +263,7 @@ def decode(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
         SceneFormatError: it is damaged.
     """
     try:
-        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+        with opened_image(data, formats=["WEBP"]) as image:
             pixels: UInt8[np.ndarray, "H W 4"] = np.asarray(image.convert("RGBA"))
     except _UNDECODABLE:
         raise SceneFormatError(f"{path}: {name} is a damaged WebP image; get the file again") from None

@@ -17,6 +17,7 @@ from jaxtyping import Float32, Float64
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.io.sog_palette import CODEBOOK, MOST_ENTRIES
 from gsplat_edu.io.sog_values import LARGEST_LOG, Range
+from gsplat_edu.reading import parse_json
 
 VERSION = 2
 
@@ -160,9 +161,9 @@ def from_json(path: Path, data: bytes) -> Meta:
         SceneFormatError: it is no meta.json of version 2, or says what cannot be.
     """
     try:
-        document = json.loads(data, parse_constant=_no_number)
-    except (ValueError, RecursionError) as error:
-        reason = "nested too deep" if isinstance(error, RecursionError) else str(error).splitlines()[0][:80]
+        document = parse_json(data, _no_number)
+    except ValueError as error:
+        reason = str(error).splitlines()[0][:80]
         raise SceneFormatError(f"{path}: its metadata is no JSON ({reason}); get the file again") from None
     if not isinstance(document, dict):
         _refuse(path, "no object")

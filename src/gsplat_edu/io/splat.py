@@ -24,6 +24,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.ply_table import LFS_POINTER
+from gsplat_edu.reading import read_bytes
 
 SPLAT = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -46,7 +47,7 @@ def read(path: Path) -> Scene:
             negative.
         OSError: it cannot be read.
     """
-    stored = path.read_bytes()
+    stored = read_bytes(path)
     if stored.startswith(LFS_POINTER):
         raise SceneFormatError(
             f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"

@@ -41,6 +41,7 @@ from gsplat_edu.io import spz_values as values
 from gsplat_edu.io.axes import half_turned
 from gsplat_edu.io.quantize import SMALL, byte_to_logit, check_expansion, logit_to_byte
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.reading import read_bytes
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
@@ -111,7 +112,7 @@ def read(path: Path) -> Scene:
         SceneFormatError: the file is no SPZ, damaged, or of a kind that is not read; the message says which.
         OSError: it cannot be read.
     """
-    data = path.read_bytes()
+    data = read_bytes(path)
     if data.startswith(LFS_POINTER):
         raise SceneFormatError(f"{path}: is a Git LFS pointer, not the file; fetch it with: git lfs pull")
     if data.startswith(GZIP):

@@ -13,10 +13,15 @@ from torch import Tensor
 from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
+from gsplat_edu.headroom import require_memory
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.render.output import RenderOutput, RenderStack
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_dense
+
+BYTES_PER_PIXEL = 40
+"""Memory that an image takes while it is made and used: 20 as float32 with transmittance and depth, and as much again
+for its copies as bytes or its gradient."""
 
 
 @overload
@@ -66,6 +71,7 @@ def render(
     Raises:
         BackendUnavailableError: the backend does not run here.
         ShapeError: the background is not of shape (3,), or cameras have different sizes.
+        NotEnoughMemoryError: an image alone takes more memory than is free.
         ArgumentError: on the backend torch, a parameter is NaN or infinite, or a quaternion has zero length.
             The kernels leave such a Gaussian out instead, with gradient zero, and no other notices.
 
@@ -111,6 +117,12 @@ def _sent(color: tuple[float, float, float], dtype: torch.dtype, device: torch.d
 def _render_one(
     name: str, gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Float[Tensor, "3"]
 ) -> RenderOutput:
+    if gaussians.means.device.type == "cpu":
+        require_memory(
+            f"an image of {camera.W}x{camera.H} px",
+            BYTES_PER_PIXEL * int(camera.W) * int(camera.H),
+            "close other programs, or render fewer pixels (--size)",
+        )
     if name == "cpu":
         from gsplat_edu.render.cpu import render_cpu  # the native module is there: backends.py has seen to it
 

@@ -30,7 +30,10 @@ import numpy as np
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.files import written_aside
+from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.fields import CONFIG, LOG, METRICS, checked
+from gsplat_edu.text import as_file_name
 from gsplat_edu.validation import ArrayLike, float64_array
 from gsplat_edu.views import View
 
@@ -105,7 +108,7 @@ class RunFolder:
             raise CheckpointError(
                 f"{self.path}: is no run: it has no config.json; give the folder of a training"
             )
-        return _read_object(self.config)
+        return checked(_read_object(self.config), CONFIG, str(self.config))
 
     def write_config(self, config: dict[str, Any]) -> None:
         """Write what decides the run.
@@ -122,7 +125,9 @@ class RunFolder:
         Raises:
             CheckpointError: the file is damaged.
         """
-        return _read_object(self.metrics) if self.metrics.is_file() else {}
+        if not self.metrics.is_file():
+            return {}
+        return checked(_read_object(self.metrics), METRICS, str(self.metrics))
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Write the judgement; errors as for `write_config`."""
@@ -150,9 +155,9 @@ class RunFolder:
         """
         if not self.log_file.is_file():
             return []
-        *lines, _torn = self.log_file.read_text("utf-8", errors="replace").split("\n")
+        *lines, _torn = read_text(self.log_file, errors="replace").split("\n")
         return [
-            _parse_object(line, f"{self.log_file}: line {number}")
+            checked(_parse_object(line, where := f"{self.log_file}: line {number}"), LOG, where)
             for number, line in enumerate(lines, start=1)
             if line.strip()
         ]
@@ -256,14 +261,16 @@ def image_file_names(names: Sequence[str], suffix: str = ".png") -> list[str]:
     """
     result: list[str] = []
     taken: set[str] = set()
+    copies: dict[str, int] = {}  # a thousand images of one name are not counted up from 2 each
     for index, name in enumerate(names):
         base = re.sub(r"\.[A-Za-z]{3,4}$", "", name)
         stem = re.sub(r"[^\w.-]", "_", base).lstrip(".")[:200] or f"view_{index:04d}"
-        chosen, copy = stem, 2
+        chosen, copy = stem, copies.get(stem.lower(), 2)
         while chosen.lower() in taken:  # file systems that know no case
             chosen, copy = f"{stem}_{copy}", copy + 1
         taken.add(chosen.lower())
-        result.append(chosen + suffix)
+        copies[stem.lower()] = copy
+        result.append(as_file_name(chosen + suffix))
     return result
 
 
@@ -288,9 +295,10 @@ def _refuse_constant(name: str) -> NoReturn:
 
 def _parse(text: str, where: str) -> Any:  # noqa: ANN401
     try:
-        return json.loads(text, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{where}: is not JSON ({error}); mend or remove it") from None
+        return parse_json(text, _refuse_constant)
+    except ValueError as error:
+        reason = str(error)[:80]
+        raise CheckpointError(f"{where}: is not JSON ({reason}); mend or remove it") from None
 
 
 def _parse_object(text: str, where: str) -> dict[str, Any]:
@@ -301,11 +309,11 @@ def _parse_object(text: str, where: str) -> dict[str, Any]:
 
 
 def _read_json(path: Path) -> Any:  # noqa: ANN401
-    return _parse(path.read_text("utf-8", errors="replace"), str(path))
+    return _parse(read_text(path, errors="replace"), str(path))
 
 
 def _read_object(path: Path) -> dict[str, Any]:
-    return _parse_object(path.read_text("utf-8", errors="replace"), str(path))
+    return _parse_object(read_text(path, errors="replace"), str(path))
 
 
 def _camera_entry(index: int, view: View, split: str, shift: np.ndarray) -> dict[str, Any]:
@@ -344,6 +352,6 @@ def _camera(where: str, entry: object, shift: np.ndarray) -> tuple[str, str, Cam
         )
     except KeyError as error:
         raise CheckpointError(f"{where}: lacks {error}; write the file again or remove it") from None
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise CheckpointError(f"{where}: {error}; write the file again or remove it") from None
     return str(entry.get("img_name", "")), str(entry.get("split", "train")), camera

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.files import named_failure, written_aside
+from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.train.events import Event, StepEvent
 
 STEPS_PER_LINE = 10
@@ -78,9 +79,9 @@ class LogWriter:
         if not self.path.exists():
             return
         kept = []
-        for line in self.path.read_text(encoding="utf-8").splitlines(keepends=True):
+        for line in read_text(self.path, errors="replace").splitlines(keepends=True):
             try:
-                if line.endswith("\n") and json.loads(line)["iteration"] <= iteration:
+                if line.endswith("\n") and parse_json(line)["iteration"] <= iteration:
                     kept.append(line)
             except (ValueError, KeyError, TypeError):
                 continue  # torn by a kill

@@ -127,7 +127,7 @@ def relative_to(gaussians: Gaussians, origin: ArrayLike) -> Gaussians:
 def _of_run(folder: RunFolder, path: Path) -> Source:
     config = folder.read_config()
     settings = replace(render_settings(config), depth=False)
-    x, y, z = float64_array("config.json: origin", config.get("origin", ORIGIN), (3,)).tolist()
+    x, y, z = float64_array("config.json: origin", config.get("origin") or ORIGIN, (3,)).tolist()
     gaussians = load_ply(path, (x, y, z))
     cameras: tuple[NamedCamera, ...] = ()
     held_out: frozenset[str] = frozenset()

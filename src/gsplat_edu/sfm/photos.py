@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import struct
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,10 +19,8 @@ from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, is_file
 from gsplat_edu.data.images import AT_ONCE, decode
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
+from gsplat_edu.image_files import SPELLED, UNDECODABLE, is_image, opened_image
 from gsplat_edu.views import Photo
-
-FORMATS = frozenset(("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "JPEG2000", "PPM"))
-"""Kinds of files that are photos, by Pillow's names; an animation or a drawing is none."""
 
 PASSED_OVER = frozenset(("masks", *PHOTO_FOLDERS[1:]))
 """Folders beside photos whose images are no photos, or the same ones smaller."""
@@ -42,8 +39,6 @@ COPY_QUALITY = 97
 
 GRAY = (0.5, 0.5, 0.5)
 """What is put behind transparent photos before features are looked for."""
-
-_UNREADABLE = (OSError, ValueError, SyntaxError, KeyError, TypeError, EOFError, struct.error)
 
 
 @dataclass(frozen=True)
@@ -116,13 +111,7 @@ def is_photo(path: Path) -> bool:
     """Say whether a file is named like a photo, or is one."""
     if path.suffix.lower() in (*PHOTO_ENDINGS, ".heif"):
         return True
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path) as file:
-                return file.format in FORMATS
-    except (*_UNREADABLE, Image.DecompressionBombError):
-        return False
+    return is_image(path)
 
 
 def fingerprint(files: Sequence[Path], source: Path) -> str:
@@ -205,22 +194,15 @@ def _facts(path: Path, name: str, copy: str) -> PhotoFacts:
             warnings.simplefilter(
                 "ignore"
             )  # of sizes and of odd EXIF, neither of which is the user's to mend
-            with Image.open(path) as file:
+            with opened_image(path) as file:
                 (W, H), exif = file.size, file.getexif()
-                kind = file.format
                 details = exif.get_ifd(ExifTags.IFD.Exif)
                 place = _place(exif.get_ifd(ExifTags.IFD.GPSInfo))
-    except _UNREADABLE as error:
+    except UNDECODABLE as error:
         if path.suffix.lower() in (".heic", ".heif"):
             raise ValueError("HEIC is not decoded here: export it as JPEG") from None
-        reason = (
-            "no image that Pillow knows" if "cannot identify" in str(error) else str(error).split("\n")[0]
-        )
+        reason = f"is not a {SPELLED} image" if "cannot identify" in str(error) else str(error).split("\n")[0]
         raise ValueError(reason) from None
-    except Image.DecompressionBombError:
-        raise ValueError("too large") from None
-    if kind not in FORMATS:
-        raise ValueError(f"{kind} is no kind of photo")
     focal = _focal(details, W, H)
     said = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)]
     said += [details.get(tag) for tag in (ExifTags.Base.LensModel, ExifTags.Base.FocalLength)]

@@ -22,6 +22,7 @@ from gsplat_edu.data.lens import Lens, straightened
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussian_math import quat_to_R
+from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.sfm.align import upright
 from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.photos import PhotoFacts
@@ -132,7 +133,7 @@ def published(folder: Path) -> tuple[str, ...]:
     if not path.is_file():
         return _published_before(folder / "stages.json")
     try:
-        named = json.loads(path.read_text(encoding="utf-8"))["parts"]
+        named = parse_json(read_text(path))["parts"]
         return tuple(part for part in PARTS if part in named)
     except (ValueError, KeyError, TypeError):
         raise DatasetError(f"{path}: is damaged; name another folder, or remove the capture") from None
@@ -141,7 +142,7 @@ def published(folder: Path) -> tuple[str, ...]:
 def _published_before(stages: Path) -> tuple[str, ...]:
     """Return the parts of captures that were finished before there was a file that names them."""
     try:
-        finished = json.loads(stages.read_text(encoding="utf-8"))["stages"]["capture"]["facts"] is not None
+        finished = parse_json(read_text(stages))["stages"]["capture"]["facts"] is not None
     except (OSError, ValueError, KeyError, TypeError):
         return ()
     return ("images", "sparse") if finished else ()

@@ -9,6 +9,7 @@ from typing import Any
 
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
+from gsplat_edu.reading import parse_json, read_text
 
 
 class Stages:
@@ -30,7 +31,7 @@ class Stages:
         self._stages: dict[str, dict[str, Any]] = {}
         if path.is_file():
             try:
-                self._stages = json.loads(path.read_text(encoding="utf-8"))["stages"]
+                self._stages = parse_json(read_text(path))["stages"]
                 if not all({"options", "facts"} <= stage.keys() for stage in self._stages.values()):
                     raise ValueError
             except (ValueError, KeyError, TypeError, AttributeError):

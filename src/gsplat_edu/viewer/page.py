@@ -26,6 +26,7 @@ from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.reading import parse_json, read_bytes
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.viewer import page_data
@@ -130,7 +131,7 @@ def read(path: Path) -> Scene:
         SceneFormatError: it is no page of ours, or damaged.
         OSError: it cannot be read.
     """
-    data = path.read_bytes()
+    data = read_bytes(path)
     if data.startswith(b"version https://git-lfs"):
         raise SceneFormatError(f"{path}: is a Git LFS pointer, not a page; fetch it with: git lfs pull")
     facts = _read_facts(path, data)
@@ -251,8 +252,8 @@ def _read_facts(path: Path, data: bytes) -> dict[str, Any]:
     if begin < len(FACTS_OPEN) or end < 0:
         raise SceneFormatError(f"{path}: is no page of this package, or cut off; export the page again")
     try:
-        facts = json.loads(data[begin:end])
-    except (ValueError, RecursionError):
+        facts = parse_json(data[begin:end])
+    except ValueError:
         facts = None
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         raise SceneFormatError(f"{path}: its facts are damaged; export the page again")

@@ -1,0 +1,100 @@
+"""What the fields of a run's files may hold. The files are edited by hand and come from elsewhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from gsplat_edu.errors import CheckpointError
+
+LARGEST_WHOLE = 2**63
+"""Whole numbers that are believed lie below this, in size."""
+
+Check = Callable[[object], bool]
+
+
+def _whole(value: object) -> bool:
+    return type(value) is int and abs(value) < LARGEST_WHOLE
+
+
+def _number(value: object) -> bool:
+    return _whole(value) or (type(value) is float and math.isfinite(value))
+
+
+def _text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _section(value: object) -> bool:
+    return isinstance(value, dict)
+
+
+def _place(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(map(_number, value))
+
+
+KINDS: Mapping[Check, str] = {
+    _whole: "a whole number",
+    _number: "a number",
+    _text: "text",
+    _section: "an object",
+    _place: "three numbers",
+}
+"""How each check is called in messages."""
+
+CONFIG: Mapping[str, Check] = {
+    "version": _text,
+    "backend": _text,
+    "fingerprint": _text,
+    "origin": _place,
+    "data": _section,
+    "train": _section,
+    "render": _section,
+    "train.iterations": _whole,
+    "data.path": _text,
+}
+
+LOG: Mapping[str, Check] = {
+    "iteration": _whole,
+    "num_gaussians": _whole,
+    **dict.fromkeys(("loss", "psnr", "ssim", "ms", "seconds"), _number),
+}
+
+METRICS: Mapping[str, Check] = {
+    "iterations": _whole,
+    "num_gaussians": _whole,
+    "seconds": _number,
+    **{
+        field: check
+        for split in ("test", "train")
+        for field, check in {
+            split: _section,
+            f"{split}.num_images": _whole,
+            **dict.fromkeys((f"{split}.{score}" for score in ("psnr", "psnr_8bit", "ssim", "l1")), _number),
+        }.items()
+    },
+}
+
+
+def checked(contents: dict[str, Any], fields: Mapping[str, Check], where: str) -> dict[str, Any]:
+    """Return a file's contents once the fields that this program reads have the types that it writes.
+
+    Args:
+        contents: The file's object.
+        fields: `CONFIG`, `LOG` or `METRICS`; a dot leads into a section. A field that is missing or null is no mistake.
+        where: The file, and the line where it has lines.
+
+    Raises:
+        CheckpointError: a field has another type; the message names it.
+    """
+    for name, check in fields.items():
+        section, _, field = name.rpartition(".")
+        values = contents.get(section) if section else contents
+        value = values.get(field) if isinstance(values, dict) else None
+        if value is not None and not check(value):
+            said = str(value)[:40] if not isinstance(value, int) or _whole(value) else "a huge number"
+            raise CheckpointError(
+                f"{where}: {name} is {said}, but has to be {KINDS[check]}; mend or remove the file"
+            )
+    return contents
