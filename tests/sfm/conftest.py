@@ -25,8 +25,8 @@ def phone(tmp_path_factory):
     truth = {}
     landscape, portrait = box_orbit(14), box_orbit(14, size=(240, 320))
     for i in range(14):
-        # a name with a space, in a folder, and an ending in capitals
-        name = f"walk {i % 3}/IMG_{i:02d}.{'JPG' if i % 5 else 'png'}"
+        # a name with a space, and an ending in capitals
+        name = f"walk {i % 3} IMG_{i:02d}.{'JPG' if i % 5 else 'png'}"
         truth[name] = portrait[i] if i % 2 else landscape[i]
         pixels = photograph_box(truth[name])
         exif = Image.Exif()
