@@ -11,6 +11,10 @@ from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 
 
+LIMIT = 1200
+"""Features of a photo: some of the box's have more."""
+
+
 @pytest.fixture(scope="session")
 def colmap():
     """Skip where pycolmap is not installed. It is not imported here: its libraries do not get along with Pillow's."""
@@ -43,6 +47,6 @@ def done(colmap, phone, tmp_path_factory):
     """The capture of the phone's photos, and what was said and told on the way."""
     out = tmp_path_factory.mktemp("done") / "capture"
     said, told = [], []
-    options = SfmOptions(phone.folder, out)
+    options = SfmOptions(phone.folder, out, max_features=LIMIT)
     assert reconstruct(options, said.append, lambda *progress: told.append(progress)) == out
     return SimpleNamespace(out=out, said=said, told=told, options=options, truth=phone.truth)

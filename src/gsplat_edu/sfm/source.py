@@ -22,6 +22,7 @@ NAMED = 12
 """Photos that a sentence names; more are counted."""
 
 WANTED = "name a folder of photos, or a video"
+OR_CAPTURE = "name a capture, a folder of photos, or a video"
 
 
 def needs_poses(path: str | Path) -> bool:
@@ -31,17 +32,19 @@ def needs_poses(path: str | Path) -> bool:
         path: What the user named.
 
     Raises:
-        DatasetError: it is a run's folder, or a file of another kind, or its photos lie in several folders.
+        DatasetError: it is a run's folder, an empty one, or a file of another kind, or its photos lie in several folders.
     """
     path = Path(path)
     if is_file(path):
         if path.suffix.lower() == ".json":
             return False
-        _check_file(path)
+        _check_file(path, OR_CAPTURE)
         return True
     if not is_folder(path) or _is_capture(path):
         return False
     _check_run(path)
+    if not any(place.name[0] != "." for place in entries(path)):
+        raise DatasetError(f"{path}: holds no photos, it is empty; {OR_CAPTURE}")
     return bool(photo_files(path))
 
 
@@ -66,7 +69,7 @@ def check_source(source: Path, out: Path) -> list[Path]:
     if _holds_others(out):
         raise ArgumentError(f"OUT: {out} holds photos or poses already; name another folder")
     if is_file(source):
-        _check_file(source)
+        _check_file(source, WANTED)
         return []
     if not is_folder(source):
         raise DatasetError(f"{source}: is not there; {WANTED}")
@@ -103,13 +106,11 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + more
 
 
-def _check_file(path: Path) -> None:
+def _check_file(path: Path, wanted: str) -> None:
     """Refuse a file that is no video."""
-    if is_video(path):
-        return
-    if is_photo(path):
-        raise DatasetError(f"{path}: is a single photo; {WANTED}")
-    raise DatasetError(f"{path}: is neither a photo nor a video; {WANTED}")
+    if not is_video(path):
+        what = "a single photo" if is_photo(path) else "neither a photo nor a video"
+        raise DatasetError(f"{path}: is {what}; {wanted}")
 
 
 def _check_run(folder: Path) -> None:
