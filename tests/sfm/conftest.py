@@ -9,10 +9,7 @@ from PIL import Image
 
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
-
-
-LIMIT = 1200
-"""Features of a photo: some of the box's have more."""
+from sfm.textured_box import LIMIT
 
 
 @pytest.fixture(scope="session")

@@ -21,8 +21,7 @@ from gsplat_edu.sfm.mapping import attempts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.result import publish, published
 from gsplat_edu.sfm.source import needs_poses
-from sfm.conftest import LIMIT
-from sfm.textured_box import TURNED, cameras_of, check
+from sfm.textured_box import LIMIT, TURNED, cameras_of, check
 
 pytestmark = pytest.mark.usefixtures("colmap")
 
@@ -103,7 +102,7 @@ class StoppedError(Exception):
 
 
 def test_an_interrupted_run_goes_on(done, phone, tmp_path):
-    options = SfmOptions(phone.folder, tmp_path / "capture")
+    options = SfmOptions(phone.folder, tmp_path / "capture", max_features=LIMIT)
     for finished, stage in enumerate(("photos", "features", "matches", "mapping", "undistorting")):
         said = []
 
@@ -280,7 +279,7 @@ def test_who_needs_poses(done, phone, tmp_path):
 
 
 def test_the_limit_of_features_is_one(done):
-    """COLMAP's own limit keeps whole levels of scale, and counts places: 1,000 left 1,800 here."""
+    """COLMAP's own limit keeps whole levels of scale, and counts places, of which some give two features."""
     with closing(sqlite3.connect(done.out / "sfm" / "database.db")) as reader:
         (most,) = reader.execute("SELECT MAX(rows) FROM keypoints").fetchone()
     assert most == LIMIT

@@ -35,14 +35,6 @@ CENTRED = 0.1
 ITERATIONS = 30
 """Of the adjustments that judge; they begin at the solution of a simpler lens."""
 
-ALIKE = 1.05
-"""A small group of photos keeps the focal length of another one's camera while its own would lower the error of its
-photos by less than this factor."""
-
-MIDDLE = ("SIMPLE_PINHOLE", "PINHOLE")
-"""Models without distortion."""
-
-
 class Rung(NamedTuple):
     """What is refined of a camera."""
 
