@@ -1,6 +1,7 @@
 """Faults of the cameras and the cloud, each at three severities."""
 
 import math
+import struct
 
 import cv2
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from doctor.rooms import replaced, room, turned, with_camera
 from gsplat_edu.doctor.finding import Severity
+from gsplat_edu.doctor.support import observed_points
 
 
 @pytest.fixture
@@ -147,3 +149,72 @@ def test_what_the_reader_notes_is_told(diagnosed, orbit):
 
     facts = diagnosed(views, points, spoil).facts
     assert any("sparse holds 2 models: 0 is read" in value for _, value in facts)
+
+
+def with_tracks(folder, counts):
+    """Write so many found points into each image of a model, in the order of the names."""
+    path = folder / "sparse" / "0" / "images.bin"
+    data = path.read_bytes()
+    (number,), at, written = struct.unpack_from("<Q", data), 8, [data[:8]]
+    for count in counts:
+        end = data.index(b"\0", at + 64) + 1
+        (points,) = struct.unpack_from("<Q", data, end)
+        seen = np.zeros(count + 5, [("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+        seen["point"][:5] = -1  # features that are no point
+        written += [data[at:end], struct.pack("<Q", len(seen)), seen.tobytes()]
+        at = end + 8 + 24 * points
+    assert number == len(counts) and at == len(data)
+    path.write_bytes(b"".join(written))
+
+
+COUNTS = [200] * 24
+
+
+@pytest.mark.parametrize(("count", "is_named"), [(60, False), (11, True), (0, True)])
+def test_a_pose_that_few_points_fix_is_named(named, orbit, count, is_named):
+    views, points = orbit
+    counts = [*COUNTS[:7], count, *COUNTS[8:]]
+    found = named(views, points, lambda folder: with_tracks(folder, counts)).get("doubtful poses", ())
+    assert found == ((f"{views[7].name} ({count} points)",) if is_named else ())
+
+
+def test_few_points_in_all_photos_are_no_fault_of_one(named, orbit):
+    views, points = orbit
+    found = named(views, points, lambda folder: with_tracks(folder, [25, 40] * 12))
+    assert "doubtful poses" not in found
+
+
+@pytest.mark.parametrize(("times", "is_named"), [(2, False), (20, True)])
+def test_a_camera_that_stands_far_away_is_named(named, orbit, times, is_named):
+    """With the counts of found points, where they are low; without them, by its distance alone."""
+    views, points = orbit
+    spoiled = replaced(views, {7: with_camera(views[7], eye=times * views[7].camera.eye)})
+    low = [*COUNTS[:7], 60, *COUNTS[8:]]
+    for counts in (low, None):
+        spoil = None if counts is None else lambda folder: with_tracks(folder, low)
+        (told,) = named(spoiled, points, spoil).get("doubtful poses", ("",))
+        assert ("times as far as the others" in told) == is_named
+        assert told.startswith(views[7].name) == is_named
+    assert "doubtful poses" not in named(spoiled, points, lambda folder: with_tracks(folder, COUNTS)), (
+        "many points fix it: it may stand there"
+    )
+
+
+def test_a_camera_that_looks_past_with_few_points_is_named(named, orbit):
+    views, points = orbit
+    points = points[np.abs(points).max(axis=1) < 4.5]
+    spoiled = replaced(views, {5: turned(views[5], 35)})
+    low = [*COUNTS[:5], 60, *COUNTS[6:]]
+    found = named(spoiled, points, lambda folder: with_tracks(folder, low))
+    assert found["doubtful poses"] == (f"{views[5].name} (60 points, looks past what the others look at)",)
+    assert "doubtful poses" not in named(spoiled, points, lambda folder: with_tracks(folder, COUNTS))
+
+
+def test_found_points_are_read_from_text_as_well(tmp_path):
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text("1 PINHOLE 10 10 9 9 5 5\n")
+    rows = "1 1 0 0 0 0 0 0 1 a b.png\n1 2 7 3 4 -1 5 6 8\n2 1 0 0 0 0 0 0 1 c.png\n\n"
+    (model / "images.txt").write_text(f"# Image list\n{rows}")
+    assert observed_points(tmp_path) == {"a b.png": 2, "c.png": 0}
+    assert observed_points(tmp_path / "nowhere") == {}

@@ -118,7 +118,7 @@ def test_photos_there_twice(named, how):
     views, points = room("orbit", 160)
     change, is_named = TWINS[how]
     copy = with_photo(views[9], change(views[8].image))
-    told = (f"{views[8].name} = {views[9].name}",) if is_named else ()
+    told = (f"{views[8].name} and {views[9].name}",) if is_named else ()
     assert named(replaced(views, {9: copy}), points).get("same photo", ()) == told
     at_one_place = with_camera(copy, R=views[8].camera.R, eye=views[8].camera.eye)
     found = named(replaced(views, {9: at_one_place}), points)
@@ -129,5 +129,5 @@ def test_photos_there_twice(named, how):
 def test_two_photos_with_one_pose(named, distance, is_named):
     views, points = room("orbit", 160)
     copy = with_camera(views[9], R=views[8].camera.R, eye=views[8].camera.eye + distance)
-    told = (f"{views[8].name} = {views[9].name}",) if is_named else ()
+    told = (f"{views[8].name} and {views[9].name}",) if is_named else ()
     assert named(replaced(views, {9: copy}), points).get("same pose", ()) == told

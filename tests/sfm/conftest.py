@@ -9,6 +9,7 @@ from PIL import Image
 
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from sfm.textured_box import LIMIT
 
 
 @pytest.fixture(scope="session")
@@ -25,8 +26,8 @@ def phone(tmp_path_factory):
     truth = {}
     landscape, portrait = box_orbit(14), box_orbit(14, size=(240, 320))
     for i in range(14):
-        # a name with a space, in a folder, and an ending in capitals
-        name = f"walk {i % 3}/IMG_{i:02d}.{'JPG' if i % 5 else 'png'}"
+        # a name with a space, and an ending in capitals
+        name = f"walk {i % 3} IMG_{i:02d}.{'JPG' if i % 5 else 'png'}"
         truth[name] = portrait[i] if i % 2 else landscape[i]
         pixels = photograph_box(truth[name])
         exif = Image.Exif()
@@ -43,6 +44,6 @@ def done(colmap, phone, tmp_path_factory):
     """The capture of the phone's photos, and what was said and told on the way."""
     out = tmp_path_factory.mktemp("done") / "capture"
     said, told = [], []
-    options = SfmOptions(phone.folder, out)
+    options = SfmOptions(phone.folder, out, max_features=LIMIT)
     assert reconstruct(options, said.append, lambda *progress: told.append(progress)) == out
     return SimpleNamespace(out=out, said=said, told=told, options=options, truth=phone.truth)

@@ -5,17 +5,18 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm import mapping
-from gsplat_edu.sfm.mapping import MANY_PHOTOS, Attempt, attempts
+from gsplat_edu.sfm.mapping import MANY_PHOTOS, Attempt, attempts, best_model
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.result import QUARTER, output_names, turned
 
 
-def test_another_mapper_a_simpler_lens_and_a_camera_per_photo_are_tried_in_turn():
+def test_another_mapper_lens_thresholds_and_a_camera_per_photo_are_tried_in_turn():
     assert attempts("auto", "auto", 50, 1, one_lens=False) == [
+        Attempt("incremental", "auto"),
+        Attempt("global", "auto"),
         Attempt("incremental", "OPENCV"),
-        Attempt("global", "OPENCV"),
-        Attempt("incremental", "SIMPLE_RADIAL", loose=True),
-        Attempt("incremental", "SIMPLE_RADIAL", per_photo=True, loose=True),
+        Attempt("incremental", "auto", loose=True),
+        Attempt("incremental", "auto", per_photo=True, loose=True),
     ]
 
 
@@ -23,10 +24,9 @@ def test_frames_of_a_video_are_of_one_camera():
     assert not any(way.per_photo for way in attempts("auto", "auto", 50, 1, one_lens=True))
 
 
-def test_few_photos_of_a_camera_fix_a_simple_lens_only():
-    assert attempts("auto", "auto", 9, 1, one_lens=True)[0].model == "SIMPLE_RADIAL"
-    assert attempts("auto", "auto", 25, 3, one_lens=True)[0].model == "SIMPLE_RADIAL"
-    assert attempts("auto", "auto", 10, 1, one_lens=True)[0].model == "OPENCV"
+def test_few_photos_of_a_camera_are_never_mapped_with_a_free_lens():
+    for photos, cameras in ((9, 1), (25, 3)):
+        assert {way.model for way in attempts("auto", "auto", photos, cameras, one_lens=True)} == {"auto"}
 
 
 def test_what_the_user_asks_for_stays():
@@ -42,7 +42,7 @@ def test_many_photos_are_mapped_globally_first():
 def test_a_way_says_what_it_is():
     assert str(Attempt("global", "OPENCV")) == "global mapper, OPENCV"
     last = attempts("auto", "auto", 50, 1, one_lens=False)[-1]
-    assert str(last) == "incremental mapper, SIMPLE_RADIAL, a camera per photo, lower thresholds"
+    assert str(last) == "incremental mapper, a camera per photo, lower thresholds"
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
@@ -68,7 +68,14 @@ def test_a_file_is_not_named_like_a_folder():
     assert output_names(photos) == ["a_2.png", "A.png/1.png", "b.png", "c/b.png/1.jpg"]
 
 
-WAYS = attempts("auto", "auto", 10, 1, one_lens=True)
+WAYS = attempts("auto", "auto", 9, 1, one_lens=True)
+
+
+def model(numbers, agreement=1.0, steady=100, error=0.5):
+    """What the job "mapping" returns of a model with some photos."""
+    names = [f"{i}.jpg" for i in numbers]
+    facts = {"folder": "0", "doubtful": [], "points": 200, "lens": "SIMPLE_RADIAL"}
+    return facts | {"names": names, "agreement": agreement, "steady": steady, "error": error}
 
 
 @pytest.fixture
@@ -83,8 +90,7 @@ def mapped(monkeypatch, tmp_path):
             tried.append(arguments["attempt"])
             if count is None:
                 raise DatasetError(f"COLMAP's mapping failed, number {len(tried)}")
-            names = [f"{i}.jpg" for i in range(count)]
-            return {"models": [{"folder": "0", "names": names, "points": 9, "error": 0.5}]}
+            return {"models": [model(range(count))]}
 
         monkeypatch.setattr(mapping, "call", job)
         monkeypatch.setattr(mapping, "_usable", lambda out, model: model)
@@ -102,16 +108,16 @@ def mapped(monkeypatch, tmp_path):
 def test_the_first_way_that_places_most_photos_is_the_last(mapped):
     best, tried, said = mapped(4, 9, 10)
     assert tried == 2 and len(best["names"]) == 9
-    assert best["folder"] == "models/2/0" and best["way"] == str(WAYS[1])
-    assert said == [f"{WAYS[0]}: 4 of 10 photos have a pose"]
+    assert best["folder"] == "models/2/0" and best["way"] == f"{WAYS[1]}, SIMPLE_RADIAL"
+    assert said == [f"{WAYS[0]}: 4 of 10 photos have a pose that counts"]
     assert mapped(8, 9, 10)[1] == 1, "80 % are enough"
 
 
 def test_the_largest_model_is_kept_where_none_has_most_photos(mapped):
-    best, tried, said = mapped(4, 7, 5)
-    assert tried == 3 and len(best["names"]) == 7 and best["way"] == str(WAYS[1])
+    best, tried, said = mapped(4, 7, 5)  # no two ways agree
+    assert tried == 3 and len(best["names"]) == 7 and best["way"] == f"{WAYS[1]}, SIMPLE_RADIAL"
     assert said == [
-        f"{way}: {count} of 10 photos have a pose" for way, count in zip(WAYS, (4, 7, 5), strict=True)
+        f"{way}: {count} of 10 photos have a pose that counts" for way, count in zip(WAYS, (4, 7, 5), strict=True)
     ]
 
 
@@ -147,3 +153,26 @@ def test_names_keep_folders_and_say_what_the_files_are():
         "no_ending.png",
         "x_y.jpeg",
     ]
+
+
+def test_the_model_with_the_most_poses_is_not_the_best_where_matches_contradict_it():
+    sound, wrong = model(range(26), agreement=0.95), model(range(40), agreement=0.4, steady=300, error=0.1)
+    assert best_model([wrong, sound]) is sound
+    assert best_model([model(range(20)), sound]) is sound
+
+
+def test_of_models_of_equal_worth_the_one_with_points_in_three_photos_and_a_small_error_is_taken():
+    thin, dense = model(range(30), steady=50, error=0.1), model(range(30), steady=100, error=0.5)
+    assert best_model([thin, dense]) is dense
+    assert best_model([dense, model(range(30), steady=99, error=0.4)])["error"] == 0.4
+
+
+def test_two_ways_that_agree_about_most_photos_are_the_last(mapped):
+    best, tried, said = mapped(6, 6, 7)
+    assert tried == 2 and len(best["names"]) == 6, "the other four share too little with them"
+
+
+def test_without_poses_the_reason_is_named(mapped):
+    best, _, _ = mapped(0, 0, 0)
+    assert "10 of 10 photos match one another, but no poses follow" in str(best)
+    assert "too little in common" not in str(best)

@@ -26,23 +26,37 @@ def facts(tmp_path, exif, **options):
 def test_photos_are_known_by_what_is_in_them(tmp_path):
     wanted = [
         photo(tmp_path / "IMG_1.JPG", format="JPEG"),
-        photo(tmp_path / "day 2" / "no_ending", format="PNG"),
-        photo(tmp_path / "day 2" / "b.webp"),
-        photo(tmp_path / "images" / "c.tif"),
+        photo(tmp_path / "no_ending", format="PNG"),
+        photo(tmp_path / "b.webp"),
+        photo(tmp_path / "c.tif"),
         photo(tmp_path / "named.png", format="JPEG"),
     ]
     (tmp_path / "torn.jpeg").write_bytes(b"")
     wanted.append(tmp_path / "torn.jpeg")  # it is to be named later
+    photo(tmp_path / "textures" / "atlas.png")  # of a model that was made of these photos
     photo(tmp_path / "masks" / "IMG_1.png")
-    photo(tmp_path / "images_4" / "c.png")
-    photo(tmp_path / ".hidden" / "d.png")
-    photo(tmp_path / "__MACOSX" / "e.png")
+    photo(tmp_path / "b.mask.png")
     photo(tmp_path / "._IMG_1.JPG", format="JPEG")
-    photo(tmp_path / "out" / "images" / "f.png")
     photo(tmp_path / "drawing.gif")
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "walk.mp4").write_bytes(b"\0" * 100)
-    assert photo_files(tmp_path, (tmp_path / "out").resolve()) == sorted(wanted)
+    assert photo_files(tmp_path) == sorted(wanted)
+
+
+def test_photos_lie_in_one_folder(tmp_path):
+    wanted = [photo(tmp_path / "session" / "jpeg" / name) for name in ("a.jpg", "b.jpg")]
+    for other in ("images_4/a.png", ".hidden/d.png", "__MACOSX/e.png", "out/images/f.png", "masks/a.png"):
+        photo(tmp_path / other)
+    photo(tmp_path / "session" / "atlas" / "texture.png")
+    assert photo_files(tmp_path, (tmp_path / "out").resolve()) == wanted, "one picture alone is no capture"
+    others = [photo(tmp_path / "day 2" / name) for name in ("a.jpg", "b.jpg", "c.jpg")]
+    said = r"lie in 2 folders: day 2 \(3\), session/jpeg \(2\); name one of them"
+    with pytest.raises(DatasetError, match=said):
+        photo_files(tmp_path, (tmp_path / "out").resolve())
+    assert photo_files(tmp_path / "day 2") == others
+    images = [photo(tmp_path / "images" / name) for name in ("a.jpg", "b.jpg")]
+    assert photo_files(tmp_path, (tmp_path / "out").resolve()) == images
+    assert photo_files(tmp_path / "masks", None) == [tmp_path / "masks" / "a.png"]
 
 
 def test_copies_are_rgb_and_small_and_have_plain_names(tmp_path):
@@ -163,14 +177,12 @@ def test_the_fingerprint_knows_names_sizes_and_contents(tmp_path):
 
 def test_captures_and_runs_that_were_made_here_are_no_photos(tmp_path):
     wanted = photo(tmp_path / "a.png")
-    for made in ("capture/images/b.png", "run/test/c.png"):
+    for made in ("capture/images/b.png", "run/test/c.png", "run/test/d.png"):
         photo(tmp_path / made)
     for note in ("capture/sfm/stages.json", "run/config.json", "run/cameras.json"):
         (tmp_path / note).parent.mkdir(exist_ok=True)
         (tmp_path / note).write_text("{}")
-    other = photo(tmp_path / "day 2" / "d.png")
-    (tmp_path / "day 2" / "config.json").write_text("{}")  # some camera's
-    assert photo_files(tmp_path) == [wanted, other]
+    assert photo_files(tmp_path) == [wanted]
     assert photo_files(tmp_path / "capture") == [tmp_path / "capture" / "images" / "b.png"], (
         "what is named counts"
     )

@@ -15,6 +15,10 @@ MOVED = 2 * 4 / 352 / 3.6
 """Largest distance of a centre from its truth, as a share of the cameras' extent of 3.6."""
 
 
+LIMIT = 1200
+"""Features of a photo: some photos of the box have more."""
+
+
 def cameras_of(capture):
     """The cameras of a capture on disk, by the names of their photos."""
     dataset = load_dataset(capture, DataSettings(test_every=0))

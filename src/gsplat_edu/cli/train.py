@@ -29,7 +29,8 @@ from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.training import CaptureRun, RunOptions
-from gsplat_edu.sfm.reconstruct import SfmOptions, needs_poses, reconstruct
+from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from gsplat_edu.sfm.source import needs_poses
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target

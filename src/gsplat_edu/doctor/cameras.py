@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
@@ -52,6 +52,23 @@ SEES_LITTLE = 0.05
 ALONE = 0.05
 """A camera none of whose neighbours sees more than this share of what it sees is alone. The least of 158 cameras of
 three captures was 0.7."""
+
+SUPPORT = 30
+"""Points found in a photo that fix its pose: COLMAP's own bound for placing a photo."""
+
+SUPPORT_SHARE = 0.25
+"""A camera with fewer points than that is named if it also has fewer than this share of the median camera's: in captures
+with little texture few points are all there are."""
+
+HALF_SUPPORT = 0.5
+"""A camera that stands oddly is named if it has fewer than this share of the median camera's points."""
+
+FAR_AWAY = 8.0
+"""A camera stands far away whose distance from the middle of all cameras is so many times what three quarters of them
+keep. At the ends of a walk it is 1.4 times, on an orbit 1."""
+
+PAST = math.radians(25.0)
+"""Least angle at which a camera looks past what the others look at, where it is supported badly too."""
 
 HOLE = math.radians(60.0)
 """Least gap of an orbit that is told: sides seen at more than 30 degrees to their normal are drawn out by half."""
@@ -158,20 +175,57 @@ def check_parallax(survey: Survey) -> list[Finding]:
 
 
 def check_away(survey: Survey) -> list[Finding]:
-    """Find cameras that look away from what the others look at, or at nothing that another sees."""
-    away = looking_away(survey.geometry)
-    if not away:
-        return []
-    names = tuple(survey.names[i] for i in sorted(away))
-    return [
-        Finding(
-            "look away",
-            Severity.WARNING,
-            f"{len(names)} of {len(survey.shots)} cameras, towards what hardly another one sees",
-            "look at the photos of the cameras that look away: a wrong pose spoils the scene, take it out",
-            names,
-        )
-    ]
+    """Find cameras whose pose is probably wrong: by where they look, where they stand, and what fixes them."""
+    away, doubtful = looking_away(survey.geometry), _doubtful(survey)
+    found = []
+    if named := away - doubtful.keys():
+        names = tuple(survey.names[i] for i in sorted(named))
+        what = f"{len(names)} of {len(survey.shots)} cameras, towards what hardly another one sees"
+        advice = "look at the photos of the cameras that look away: a wrong pose spoils the scene, take it out"
+        found.append(Finding("look away", Severity.WARNING, what, advice, names))
+    if doubtful:
+        names = tuple(f"{survey.names[i]} ({why})" for i, why in sorted(doubtful.items()))
+        what = f"{len(names)} of {len(survey.shots)} cameras have poses that little supports"
+        advice = "take out the cameras with doubtful poses: a wrong pose spoils the scene for all others"
+        found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names))
+    return found
+
+
+def _doubtful(survey: Survey) -> dict[int, str]:
+    """Return the cameras whose pose little supports, and why.
+
+    Where the capture says in which photos its points were found, these counts decide, alone where they are small, or
+    with an odd place or direction. Where it does not, only a camera very far from all others is named.
+    """
+    distances, angles = _from_the_middle(survey.geometry), _past(survey.geometry)
+    far = distances > FAR_AWAY
+    if not any(survey.observed.values()):
+        return {int(i): f"{distances[i]:.0f} times as far as the others" for i in np.flatnonzero(far)}
+    counts = np.array([survey.observed.get(name, 0) for name in survey.names])
+    median = float(np.median(counts))
+    few = (counts < SUPPORT) & (counts < SUPPORT_SHARE * median)
+    poor = counts < HALF_SUPPORT * median
+    found = {}
+    for i in np.flatnonzero(few | (poor & (far | angles))).tolist():
+        reasons = [f"{counts[i]} points"]
+        reasons += [f"{distances[i]:.0f} times as far as the others"] * bool(far[i])
+        reasons += ["looks past what the others look at"] * bool(angles[i])
+        found[i] = ", ".join(reasons)
+    return found
+
+
+def _from_the_middle(geometry: Geometry) -> Float64[np.ndarray, " C"]:
+    """Return how far each camera stands from the middle of all, in distances that three quarters of them keep."""
+    distances = np.linalg.norm(geometry.eyes - np.median(geometry.eyes, axis=0), axis=1)
+    return np.asarray(distances / max(float(np.quantile(distances, 0.75)), 1e-300))
+
+
+def _past(geometry: Geometry) -> Bool[np.ndarray, " C"]:
+    """Say which cameras look past what the others look at, where there is such a thing."""
+    if geometry.arrangement != INWARD or geometry.centre is None:
+        return np.zeros(len(geometry.cameras), dtype=np.bool_)
+    angles = geometry.angles_to(geometry.centre)
+    return np.asarray(angles > max(PAST, AWAY_FACTOR * float(np.quantile(angles, 0.75))))
 
 
 def looking_away(geometry: Geometry) -> set[int]:

@@ -138,17 +138,17 @@ def check_twins(survey: Survey) -> list[Finding]:
     names = survey.names
     found = []
     if moved := [(i, j) for i, j in twins if _motion(survey, i, j) > TWIN_MOTION]:
-        told = tuple(f"{names[i]} = {names[j]}" for i, j in moved)
-        what = f"{counted(len(moved), 'pair')} of equal photos with poses that differ"
+        told = tuple(f"{names[i]} and {names[j]}" for i, j in moved)
+        what = f"{counted(len(moved), 'pair')} of photos that show the same to a few per cent, but with poses that differ"
         advice = "take out one photo of each pair that shows the same: one of the two poses is wrong"
         found.append(Finding("same photo", Severity.WARNING, what, advice, told))
     if copies := [pair for pair in twins if pair not in moved]:
-        told = tuple(f"{names[i]} = {names[j]}" for i, j in copies)
-        what = f"{counted(len(copies), 'pair')} of equal photos from one place"
-        advice = "take out one photo of each equal pair: if one of them is for testing, it tests nothing"
+        told = tuple(f"{names[i]} and {names[j]}" for i, j in copies)
+        what = f"{counted(len(copies), 'pair')} of photos that show the same to a few per cent, from one place"
+        advice = "take out one photo of each such pair: if one of them is for testing, it tests nothing"
         found.append(Finding("duplicates", Severity.WARNING, what, advice, told))
     if apart := sorted(poses - set(twins)):
-        told = tuple(f"{names[i]} = {names[j]}" for i, j in apart)
+        told = tuple(f"{names[i]} and {names[j]}" for i, j in apart)
         what = f"{counted(len(apart), 'pair')} of photos that show different things"
         advice = "look at the photos that share a pose: something moved between them, or a pose is wrong"
         found.append(Finding("same pose", Severity.WARNING, what, advice, told))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.photos import Look, look_at_photo
+from gsplat_edu.doctor.support import observed_points
 from gsplat_edu.errors import DatasetError
 
 WORKERS = 2
@@ -58,6 +59,7 @@ class Survey:
         unposed: Names of files in the folders of the photos that have no pose.
         points: (N, 3) the capture's own points, world units; none where it has none.
         notes: What the reader of the layout had to say.
+        observed: How many points were found in each photo, by the names of the shots; empty where nothing says so.
     """
 
     path: Path
@@ -67,6 +69,7 @@ class Survey:
     unposed: tuple[str, ...]
     points: Float64[np.ndarray, "N 3"]
     notes: tuple[str, ...]
+    observed: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -112,6 +115,7 @@ def prepare(path: Path, progress: Progress | None = None) -> Survey:
         _unposed(capture),
         _points(capture),
         capture.notes,
+        observed_points(path) if capture.layout == "COLMAP" else {},
     )
 
 

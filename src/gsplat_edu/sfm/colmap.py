@@ -14,6 +14,8 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gsplat_edu.errors import ArgumentError, DatasetError
 
 POLL = 0.25
@@ -47,7 +49,7 @@ def call(
     """Let COLMAP do a job, in a process that ends with this call whatever happens.
 
     Args:
-        job: One of `gsplat_edu.sfm.engine.JOBS`.
+        job: One of `gsplat_edu.sfm.engine.jobs.JOBS`.
         log: Where COLMAP's own words go, behind what stands there.
         progress: Told how much is done, from the calling thread. What it raises ends the job.
         arguments: Of the job.
@@ -59,7 +61,7 @@ def call(
         DatasetError: the job failed; names the log.
     """
     # -P: the files beside the program are no modules to be imported by their bare names
-    command = [sys.executable, "-P", str(Path(__file__).with_name("engine.py"))]
+    command = [sys.executable, "-P", str(Path(__file__).parent / "engine" / "__main__.py")]
     with log.open("ab") as words:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
     answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
@@ -119,10 +121,46 @@ def forget_matches(database: Path) -> None:
             for table in ("matches", "two_view_geometries"):
                 writer.execute(f"DELETE FROM {table}")
     except sqlite3.Error as error:
-        raise DatasetError(
-            f"{database}: cannot be changed ({error}); remove {database.parent / 'stages.json'} and "
-            f"{database}, or name another folder"
-        ) from None
+        raise _unchangeable(database, error) from None
+
+
+def limit_features(database: Path, most: int) -> None:
+    """Keep the features of the largest scales of each photo: COLMAP's own limit keeps whole levels of scale.
+
+    It passes over the finest levels only while the rest is still more than the limit, and counts places, some of which
+    become two features with two orientations: a limit of 2,000 gave 3,500.
+
+    Args:
+        database: COLMAP's, before anything is matched.
+        most: Features of a photo.
+
+    Raises:
+        DatasetError: it cannot be changed.
+    """
+    tables = (("keypoints", np.float32), ("descriptors", np.uint8))
+    try:
+        with closing(sqlite3.connect(database)) as writer, writer:
+            many = writer.execute("SELECT image_id FROM keypoints WHERE rows > ?", (most,)).fetchall()
+            for (image,) in many:
+                kept = slice(None)
+                for table, kind in tables:
+                    query = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
+                    rows, columns, data = writer.execute(query, (image,)).fetchone()
+                    values = np.frombuffer(data, kind).reshape(rows, columns)
+                    if table == "keypoints":
+                        a, b, c, d = values[:, 2:6].T.astype(np.float64)  # shape: scale times rotation
+                        kept = np.sort(np.argsort(-np.abs(a * d - b * c), kind="stable")[:most])
+                    change = f"UPDATE {table} SET rows = ?, data = ? WHERE image_id = ?"
+                    writer.execute(change, (most, values[kept].tobytes(), image))
+    except sqlite3.Error as error:
+        raise _unchangeable(database, error) from None
+
+
+def _unchangeable(database: Path, error: sqlite3.Error) -> DatasetError:
+    return DatasetError(
+        f"{database}: cannot be changed ({error}); remove {database.parent / 'stages.json'} and "
+        f"{database}, or name another folder"
+    )
 
 
 def _listen(process: subprocess.Popen[bytes], answers: queue.SimpleQueue[dict[str, Any]]) -> None:

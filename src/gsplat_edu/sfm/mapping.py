@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,23 @@ from gsplat_edu.data.colmap import read_cameras, read_images
 from gsplat_edu.data.lens import straightened
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call
+from gsplat_edu.sfm.source import FEWEST
 
 ENOUGH = 0.8
-"""Share of the photos that hang together by matches that have to have a pose for the first way to be the last."""
-
-FEW_PHOTOS = 10
-"""Photos of one camera from which its model is OPENCV: fewer do not fix eight numbers."""
+"""Stop once this share of the photos that are connected by matches has a pose that counts."""
 
 MANY_PHOTOS = 400
 """Photos beyond which the global mapper comes first: the incremental one's time grows with their square."""
 
-FEWEST = 3
-"""Photos of a model that is worth having. Two photos alone get no pose: no mapper makes a model of so few here."""
+ENOUGH_FOR_OPENCV = 10
+"""Photos of each camera from which a way is tried that maps with OPENCV's lens from the beginning: the simple lens of the
+other ways cannot follow a strong wide angle."""
+
+SAME = 0.5
+"""Share of the connected photos from which two ways that agree are believed."""
+
+NEARLY = 0.97
+"""Models whose worth is at least this share of the best one's are compared by their points as well."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ class Attempt:
 
     def __str__(self) -> str:
         """Say what it does."""
-        words = [f"{self.mapper} mapper", self.model]
+        words = [f"{self.mapper} mapper"] + [self.model] * (self.model != "auto")
         words += ["a camera per photo"] * self.per_photo + ["lower thresholds"] * self.loose
         return ", ".join(words)
 
@@ -59,17 +65,15 @@ def attempts(mapper: str, model: str, photos: int, cameras: int, one_lens: bool)
         cameras: By how many cameras, as far as EXIF and sizes tell.
         one_lens: They are known to be of one camera, as the frames of a video are.
     """
-    first_model = (
-        model if model != "auto" else "OPENCV" if photos >= FEW_PHOTOS * cameras else "SIMPLE_RADIAL"
-    )
-    simple = model if model != "auto" else "SIMPLE_RADIAL"
     order = ["incremental", "global"] if photos <= MANY_PHOTOS else ["global", "incremental"]
     order = order if mapper == "auto" else [mapper]
-    ways = [Attempt(name, first_model) for name in order]
+    ways = [Attempt(name, model) for name in order]
     steady = "incremental" if mapper == "auto" else mapper
-    ways.append(Attempt(steady, simple, loose=True))
+    if model == "auto" and photos >= ENOUGH_FOR_OPENCV * cameras:
+        ways.append(Attempt(steady, "OPENCV"))
+    ways.append(Attempt(steady, model, loose=True))
     if not one_lens and cameras < photos:
-        ways.append(Attempt(steady, simple, per_photo=True, loose=True))
+        ways.append(Attempt(steady, model, per_photo=True, loose=True))
     return ways
 
 
@@ -82,7 +86,7 @@ def map_photos(
     say: Callable[[str], None],
     progress: Callable[[str, int, int], None],
 ) -> dict[str, Any]:
-    """Try ways until one gives most of the photos a pose; keep the model with the most.
+    """Try ways until one gives most of the photos a pose that counts; keep the best model.
 
     Args:
         folder: Holds database.db and photos/; models/ is made anew.
@@ -94,41 +98,78 @@ def map_photos(
         progress: Told how many photos have a pose.
 
     Returns:
-        The model: its "folder" below `folder`, the "names" of the photos with a pose, "points", "error" in px, and the
-        "way" that gave it.
+        The model: its "folder" below `folder`, the "names" of the photos whose pose counts, "doubtful", those with a pose
+        that does not, "points", "error" in px, and the "way" that gave it; the rest is as the job "mapping" returns it.
 
     Raises:
         DatasetError: no way gives enough photos a pose to be a model, or the last one failed and none gave any.
     """
     models = folder / "models"
     shutil.rmtree(models, ignore_errors=True)
-    best: dict[str, Any] = {"names": []}
+    found = list[dict[str, Any]]()
     for number, way in enumerate(ways, 1):
         out = models / str(number)
         out.mkdir(parents=True)
         try:
-            largest = _largest(
-                folder, out, way, threads, lambda done: progress("mapping", min(done, total), total)
-            )
+            made = _mapped(folder, out, way, threads, lambda done: progress("mapping", min(done, total), total))
         except DatasetError as error:
-            if number == len(ways) and not best["names"]:
+            if number == len(ways) and not found:
                 raise
             say(f"{way}: {error}")
             continue
-        if len(largest["names"]) > len(best["names"]):
-            best = largest | {"folder": f"models/{number}/{largest['folder']}", "way": str(way)}
-        if len(best["names"]) >= ENOUGH * connected:
+        found += [
+            model | {"folder": f"models/{number}/{model['folder']}", "way": f"{way}, {model['lens']}"}
+            for model in made
+            if model["names"]
+        ]
+        counting = max((len(model["names"]) for model in made), default=0)
+        if counting >= ENOUGH * connected or _agreed(found, connected):
             break
-        say(f"{way}: {len(largest['names'])} of {total} photos have a pose")
+        say(f"{way}: {counting} of {total} photos have a pose that counts")
+    best = best_model(found) if found else {"names": []}
     if len(best["names"]) < min(FEWEST, total):
-        raise DatasetError(no_overlap(f"of {total} photos, {len(best['names'])} could be given a pose"))
+        raise DatasetError(_without_poses(total, connected))
     return best
 
 
-def _largest(
+def _agreed(found: Sequence[dict[str, Any]], connected: int) -> bool:
+    """Say whether two ways gave the same photos a pose that counts, most of the connected ones: then the others share
+    too little with them, and no further way is tried.
+    """
+    sets = [set(model["names"]) for model in found if len(model["names"]) > SAME * connected]
+    return any(len(one & other) >= NEARLY * len(one | other) for one, other in combinations(sets, 2))
+
+
+def best_model(models: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Choose a model.
+
+    The worth of a model is the number of photos whose pose counts, times the share of all their matches that agree with
+    their poses. Of models of nearly equal worth, those with the most points that three photos see are taken, and of
+    these the one with the smallest reprojection error.
+
+    Args:
+        models: At least one, as the job "mapping" returns them.
+    """
+    worth = [len(model["names"]) * model["agreement"] for model in models]
+    good = [model for model, w in zip(models, worth, strict=True) if w >= NEARLY * max(worth)]
+    most = max(model["steady"] for model in good)
+    return min((model for model in good if model["steady"] >= NEARLY * most), key=lambda model: model["error"])
+
+
+def _without_poses(total: int, connected: int) -> str:
+    """Say why there is no model."""
+    if connected < FEWEST:
+        return no_overlap(f"of {total} photos, no {FEWEST} match one another")
+    return (
+        f"{connected} of {total} photos match one another, but no poses follow from their matches; photos from one spot "
+        "show no depth: walk around the subject in small steps, and photograph something that is not flat"
+    )
+
+
+def _mapped(
     folder: Path, out: Path, way: Attempt, threads: int, progress: Callable[[int], None]
-) -> dict[str, Any]:
-    """Map in one way, and return the model with the most photos; without "names" where there is none."""
+) -> list[dict[str, Any]]:
+    """Map in one way, and return the models."""
     found = call(
         "mapping",
         folder / "log.txt",
@@ -140,8 +181,7 @@ def _largest(
         threads=threads,
         seed=COLMAP_SEED,
     )["models"]
-    usable = [_usable(out, model) for model in found]
-    return max(usable, key=lambda model: (len(model["names"]), -model["error"]), default={"names": []})
+    return [_usable(out, model) for model in found]
 
 
 def no_overlap(what: str) -> str:

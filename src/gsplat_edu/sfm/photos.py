@@ -6,9 +6,9 @@ import hashlib
 import math
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -20,6 +20,7 @@ from gsplat_edu.data.images import AT_ONCE, decode
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.image_files import SPELLED, UNDECODABLE, is_image, opened_image
+from gsplat_edu.sfm.masks import MASK_ENDING, check_masks, counting, find_masks, write_mask
 from gsplat_edu.views import Photo
 
 PASSED_OVER = frozenset(("masks", *PHOTO_FOLDERS[1:]))
@@ -54,6 +55,7 @@ class PhotoFacts:
         focal: Focal length by EXIF, px; None where it does not say.
         camera: Equal for photos that one camera took with one lens and zoom.
         place: Latitude and longitude in degrees and height in m by EXIF; None where it does not say.
+        mask: File of its mask; empty where it has none.
     """
 
     name: str
@@ -64,6 +66,7 @@ class PhotoFacts:
     focal: float | None = None
     camera: str = ""
     place: tuple[float, float, float] | None = None
+    mask: str = ""
 
     def copy_size(self, longest: int) -> tuple[int, int]:
         """Return width and height of the working copy, px.
@@ -76,9 +79,11 @@ class PhotoFacts:
 
 
 def photo_files(source: Path, besides: Path | None = None) -> list[Path]:
-    """List the photos in a folder and below, by what is in the files.
+    """List the photos of one folder, by what is in the files.
 
-    Hidden files and folders are passed over, and so are captures and runs that were made here.
+    It is the folder that was named where that holds at least two photos, else images/ in it, else the only folder below
+    it that holds some. Hidden files and folders are passed over, and so are masks, smaller copies of the photos, and
+    captures and runs that were made here.
 
     Args:
         source: The folder.
@@ -86,25 +91,69 @@ def photo_files(source: Path, besides: Path | None = None) -> list[Path]:
 
     Returns:
         Sorted by path. A file that is named like a photo is among them even if it is none.
+
+    Raises:
+        DatasetError: several folders hold photos, and none of them is named images.
     """
-    found = []
-    for place, folders, files in os.walk(source):
+    here = _photos_in(source)
+    if len(here) > 1:
+        return here
+    below = {Path(place): found for place in _folders_below(source, besides) if (found := _photos_in(place))}
+    if source / "images" in below:
+        return below[source / "images"]
+    several = {folder: found for folder, found in below.items() if len(found) > 1}
+    if several or (below and not here):
+        return _only(source, several or below)
+    return here
+
+
+def _only(source: Path, folders: dict[Path, list[Path]]) -> list[Path]:
+    """Return the photos of the only folder.
+
+    Raises:
+        DatasetError: there are several.
+    """
+    if len(folders) == 1:
+        return next(iter(folders.values()))
+    shown = [f"{folder.relative_to(source).as_posix()} ({len(found)})" for folder, found in folders.items()]
+    more = f" and {len(shown) - 3} more" if len(shown) > 3 else ""
+    raise DatasetError(
+        f"{source}: its photos lie in {len(shown)} folders: {', '.join(shown[:3])}{more}; name one of them, or put the "
+        "photos of one place into one folder"
+    )
+
+
+def _folders_below(source: Path, besides: Path | None) -> Iterator[Path]:
+    """Yield the folders below one, sorted, but for those that hold no photos of their own."""
+    for place, folders, _ in os.walk(source):
         here = Path(place)
         folders[:] = [
             name
-            for name in folders
+            for name in sorted(folders)
             if name[0] not in "._" and name not in PASSED_OVER
             if (here / name).resolve() != besides and not _made_here(here / name)
         ]
-        visible = [here / name for name in files if name[0] != "."]
-        found += [path for path in visible if is_file(path) and is_photo(path)]  # no pipe, no link to nowhere
-    return sorted(found)
+        yield from (here / name for name in folders)
+
+
+def _photos_in(folder: Path) -> list[Path]:
+    """List the photos in a folder, not those below it; a folder that cannot be read has none."""
+    try:
+        paths = sorted(folder.iterdir())
+    except OSError:
+        return []
+    visible = [path for path in paths if path.name[0] != "." and not path.name.lower().endswith(MASK_ENDING)]
+    return [path for path in visible if is_file(path) and is_photo(path)]  # no pipe, no link to nowhere
+
+
+def is_run(folder: Path) -> bool:
+    """Say whether a folder is that of a run."""
+    return all(is_file(folder / name) for name in ("config.json", "cameras.json"))
 
 
 def _made_here(folder: Path) -> bool:
     """Say whether a folder is a capture that structure from motion wrote, or a run."""
-    capture, run = (folder / "sfm" / "stages.json",), (folder / "config.json", folder / "cameras.json")
-    return all(map(is_file, capture)) or all(map(is_file, run))
+    return is_file(folder / "sfm" / "stages.json") or is_run(folder)
 
 
 def is_photo(path: Path) -> bool:
@@ -130,7 +179,7 @@ def fingerprint(files: Sequence[Path], source: Path) -> str:
                 ends += file.read(PEEK)
         except OSError as error:
             raise DatasetError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
-        name = path.relative_to(source).as_posix()
+        name = Path(os.path.relpath(path, source)).as_posix()
         digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape") + ends)
     return digest.hexdigest()
 
@@ -145,7 +194,7 @@ def copy_photos(
     """Write a working copy of every photo that can be decoded. Copies that are there already are kept.
 
     Copies have names without spaces, which COLMAP's lists of pairs need, and are RGB in 8 bits: pycolmap reads fewer
-    kinds of files than Pillow.
+    kinds of files than Pillow. A photo with a mask or with transparent parts gets a mask beside them, masks/COPY.png.
 
     Args:
         files: The photos.
@@ -157,15 +206,21 @@ def copy_photos(
     Returns:
         facts: Of the photos that can be decoded, in the order of the files.
         unreadable: Of the others: name and reason.
+
+    Raises:
+        DatasetError: a mask is not as large as its photo.
     """
     folder.mkdir(parents=True, exist_ok=True)
     facts, unreadable = list[PhotoFacts](), list[str]()
     headers = list[tuple[Path, PhotoFacts]]()
+    masks = find_masks(files)
     for number, path in enumerate(files):
         try:
-            headers.append((path, _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")))
+            found = _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")
+            headers.append((path, replace(found, mask=str(masks[path]) if path in masks else "")))
         except ValueError as error:
             unreadable.append(f"{path.relative_to(source).as_posix()} ({error})")
+    check_masks(masks, {path: (photo.W, photo.H) for path, photo in headers})
     largest = max((photo.W * photo.H for _, photo in headers), default=1)
     pool = ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, AT_ONCE // largest)))
     futures = [pool.submit(_copy, path, photo, folder, longest) for path, photo in headers]
@@ -180,6 +235,10 @@ def copy_photos(
             progress(done, len(headers))
     finally:
         pool.shutdown(cancel_futures=True)
+    masked = mask_folder(folder)
+    for photo in facts if masked.is_dir() else ():  # COLMAP passes over photos without a mask where others have one
+        if not (target := masked / f"{photo.copy}.png").is_file():
+            write_mask(np.ones((1, 1), np.bool_), target, photo.copy_size(longest))
     return facts, unreadable
 
 
@@ -256,7 +315,7 @@ def _place(gps: dict[int, object]) -> tuple[float, float, float] | None:
 
 
 def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int) -> None:
-    """Write the working copy, unless it is there.
+    """Write the working copy, and its mask before it, unless it is there.
 
     Raises:
         DatasetError: the photo cannot be decoded.
@@ -264,9 +323,18 @@ def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int) -> None:
     target = folder / photo.copy
     if target.is_file():
         return
-    image = np.asarray(Photo(*decode(path)).over(GRAY))
+    pixels, alpha = decode(path)
     size = photo.copy_size(longest)
+    counts = counting(Path(photo.mask) if photo.mask else None, alpha)
+    if counts is not None:
+        write_mask(counts, mask_folder(folder) / f"{photo.copy}.png", size)
+    image = np.asarray(Photo(pixels, alpha).over(GRAY))
     if image.shape[1::-1] != size:
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     with written_aside(target) as aside:
         Image.fromarray(image).save(aside, format="JPEG", quality=COPY_QUALITY)
+
+
+def mask_folder(folder: Path) -> Path:
+    """Return where the masks of working copies lie, given where these do."""
+    return folder.with_name("masks")

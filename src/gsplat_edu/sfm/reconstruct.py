@@ -1,4 +1,4 @@
-"""Photos or a video become a capture, stage by stage; an interrupted run goes on behind the last finished one.
+"""Photos or a video become a capture, stage by stage; an interrupted run resumes after the last finished one.
 
 Chapter: 13_photos_to_scene.
 """
@@ -8,22 +8,22 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.data.blender import TRAIN_FILE
-from gsplat_edu.data.capture import entries, is_file, is_folder
-from gsplat_edu.data.colmap import find_model
-from gsplat_edu.errors import ArgumentError, DatasetError
-from gsplat_edu.files import check_folder, remove_leftovers
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
-from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, require_colmap
+from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap
 from gsplat_edu.sfm.mapping import attempts, map_photos, no_overlap
+from gsplat_edu.sfm.masks import find_masks
 from gsplat_edu.sfm.options import SfmOptions as SfmOptions
-from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, is_photo, photo_files
-from gsplat_edu.sfm.result import PARTS, build_capture, note_published, publish, published
+from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, mask_folder, photo_files
+from gsplat_edu.sfm.result import build_capture, note_published, publish, published
+from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
 
@@ -42,25 +42,14 @@ CLOSE_BY = 15
 INLIERS = 15
 """Matches of one geometry from which two photos hang together: COLMAP's own bound."""
 
-NAMED = 12
-"""Photos that a sentence names; more are counted."""
 
+FEATURES, MAPPING = 2, 2
+"""Numbers of the methods: what earlier ones left in a work folder is not mixed with what these find. 1 kept more features
+of a photo than `max_features`, 1 of the mappings counted every pose."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
 """Told which stage, how much of it is done, and of how much."""
-
-
-def needs_poses(path: str | Path) -> bool:
-    """Say whether a path is a video, or a folder of photos without poses in any layout that is read.
-
-    Args:
-        path: What the user named.
-    """
-    path = Path(path)
-    if is_file(path):
-        return is_video(path)
-    return is_folder(path) and not _is_capture(path) and bool(photo_files(path))
 
 
 def reconstruct(
@@ -83,12 +72,24 @@ def reconstruct(
 
     Raises:
         ArgumentError: pycolmap is not installed, or the folder of the result cannot be used.
-        DatasetError: there are no photos, or they show too little in common.
+        DatasetError: there are no photos, or they show too little in common. Folders that were made for the work are
+            removed where no stage was finished.
         OSError: a file cannot be written.
     """
     require_colmap()
-    files = _check(options)
-    return _Run(options, say, progress).run(files)
+    files = check_source(options.source, options.out)
+    folder = options.out / "sfm"
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    run = _Run(options, say, progress)
+    try:
+        return run.run(files)
+    except DatasetError:
+        if made and not run.stages.any_finished:  # nothing to resume: leave no folder behind
+            shutil.rmtree(folder)
+            for place in made[1:]:
+                with suppress(OSError):
+                    place.rmdir()
+        raise
 
 
 class _Run:
@@ -113,17 +114,26 @@ class _Run:
             self._stage("frames", wanted, self._take_frames, [self.folder / "frames"])
             source = self.folder / "frames"
             files = photo_files(source)
-        self.source = source
-        wanted = {"photos": fingerprint(files, source), "max_image_size": options.max_image_size}
+        self.source = source = files[0].parent
+        masks = find_masks(files)
+        wanted = {
+            "photos": fingerprint(files, source),
+            "max_image_size": options.max_image_size,
+            "masks": fingerprint(sorted(masks.values()), source) if masks else "",
+        }
         copies = self.folder / "photos"
-        facts = self._stage("photos", wanted, lambda: self._copy(files), [copies])
+        facts = self._stage("photos", wanted, lambda: self._copy(files), [copies, mask_folder(copies)])
         self.photos = [PhotoFacts(**photo | {"place": _tuple(photo["place"])}) for photo in facts["photos"]]
         self.groups = _groups(self.photos, options.max_image_size)
         database = [self.folder / f"database.db{ending}" for ending in ("", "-wal", "-shm")]
-        wanted = {"max_features": options.max_features, "pycolmap": version("pycolmap")}
+        wanted = {
+            "max_features": options.max_features,
+            "pycolmap": version("pycolmap"),
+            "method": FEATURES,
+        }
         self._stage("features", wanted, self._features, database)
         facts = self._stage("matches", {"matcher": options.matcher}, self._match, [], self._forget_matches)
-        wanted = {"mapper": options.mapper, "camera_model": options.camera_model}
+        wanted = {"mapper": options.mapper, "camera_model": options.camera_model, "method": MAPPING}
         connected = facts["connected"]
         self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
         if not all((options.out / part).is_dir() for part in ("images", "sparse/0")):
@@ -190,27 +200,33 @@ class _Run:
             lambda *count: self._progress("photos", *count),
         )
         if unreadable:
-            self._say(f"left out, cannot be decoded: {_listed(unreadable)}")
-        if len(photos) < 2:
-            raise DatasetError(_too_few(self.source, len(photos), unreadable))
+            self._say(f"left out, cannot be decoded: {listed(unreadable)}")
+        if len(photos) < FEWEST:
+            raise DatasetError(too_few(self.source, len(photos), unreadable))
         lenses = len({photo.camera for photo in photos})
         known = sum(photo.focal is not None for photo in photos)
         kinds = "one camera" if lenses == 1 else f"{lenses} kinds of camera or zoom"
         summary = f"{len(photos)} by {kinds}; {known} say their focal length"
+        if masked := sum(bool(photo.mask) for photo in photos):
+            summary += f"; {masked} have a mask"
         return {"summary": summary, "photos": [asdict(photo) for photo in photos], "unreadable": unreadable}
 
     def _features(self) -> dict[str, Any]:
-        total = len(self.photos)
+        total, most = len(self.photos), self.options.max_features
+        masks = mask_folder(self.folder / "photos")
         found = self._call(
             "features",
             lambda done: self._progress("features", min(done, total), total),
             photos=str(self.folder / "photos"),
+            masks=str(masks) if masks.is_dir() else "",
             groups=self.groups,
-            max_features=self.options.max_features,
+            max_features=most,
         )["features"]
+        limit_features(self.folder / "database.db", most)
+        found = {name: min(count, most) for name, count in found.items()}
         names = [photo.name for photo in self.photos if not found.get(photo.copy)]
         if names:
-            self._say(f"without features, blank or out of focus: {_listed(names)}")
+            self._say(f"without features, blank or out of focus: {listed(names)}")
         return {"summary": f"{sum(found.values()):,} in {total - len(names)} photos"}
 
     def _match(self) -> dict[str, Any]:
@@ -269,13 +285,21 @@ class _Run:
         options, total = self.options, len(self.photos)
         ways = attempts(options.mapper, options.camera_model, total, len(self.groups), self.video)
         model = map_photos(self.folder, ways, total, connected, self.threads, self._say, self._progress)
-        return model | {"summary": f"{len(model['names'])} of {total} photos have a pose ({model['way']})"}
+        count = len(model["names"])
+        summary = f"{count} of {total} photos have a pose ({model['way']})"
+        if count < total:
+            summary += f"; the other {total - count} share too little with them"
+        return model | {"summary": summary}
 
     def _finish(self) -> dict[str, Any]:
         facts = build_capture(self.model, self.photos, self.source, self.folder, self._progress)
         publish(self.folder, self.options.out)
         if facts["left_out"]:
-            self._say(f"left out, no pose was found: {_listed(facts['left_out'])}")
+            self._say(f"left out, no pose was found: {listed(facts['left_out'])}")
+        if facts["doubtful"]:
+            self._say(
+                f"left out, too few points in common with the others to trust the pose: {listed(facts['doubtful'])}"
+            )
         figures = f"{facts['points']:,} points, mean reprojection error {facts['error']:.2f} px"
         return facts | {"summary": f"{len(self.model['names'])} photos undistorted, {figures}"}
 
@@ -290,65 +314,6 @@ class _Run:
             seed=COLMAP_SEED,
             **arguments,
         )
-
-
-def _check(options: SfmOptions) -> list[Path]:
-    """Find out before any work whether there is something to do it with, and somewhere to put it.
-
-    Returns:
-        The photos; none where the source is a video.
-    """
-    source, out = options.source, options.out
-    check_folder("OUT", out)
-    here, there = source.resolve(), out.resolve()
-    if here == there or any(here.is_relative_to(there / part) for part in (*PARTS, "sfm")):
-        raise ArgumentError(f"OUT: {out} is where the photos themselves are; name another folder")
-    if _holds_others(out):
-        raise ArgumentError(f"OUT: {out} holds photos or poses already; name another folder")
-    if is_file(source):
-        if not is_video(source):
-            kind = "one photo" if is_photo(source) else "neither a folder nor a video"
-            raise DatasetError(f"{source}: is {kind}; name a folder of photos, or a video")
-        return []
-    if not is_folder(source):
-        raise DatasetError(f"{source}: is not there; name a folder of photos, or a video")
-    files = photo_files(source, there)
-    if len(files) < 2:
-        raise DatasetError(_too_few(source, len(files), []))
-    return files
-
-
-def _holds_others(out: Path) -> bool:
-    """Say whether the folder of the result holds what no run put there and a run would put away.
-
-    Masks beside a run's capture are no such thing: they stay.
-    """
-    work = out / "sfm"
-    if not (work / "stages.json").is_file():
-        begun = is_folder(work) and any(path.name[0] != "." for path in entries(work))
-        return begun or _is_capture(out) or any((out / part).exists() for part in PARTS)
-    others = {"images", "sparse"}.difference(published(work))
-    return any((out / part).exists() for part in others)
-
-
-def _too_few(source: Path, count: int, unreadable: Sequence[str]) -> str:
-    """Say why there is nothing to do."""
-    if count == 1:
-        return f"{source}: holds one photo; poses need several, from different places"
-    if unreadable:
-        return f"{source}: holds no photo that can be decoded: {_listed(unreadable)}; export them as JPEG"
-    video = next((path.name for path in sorted(source.iterdir()) if is_video(path)), None)
-    advice = (
-        f"it holds a video, name that: {source / video}" if video else "name a folder of photos, or a video"
-    )
-    return f"{source}: holds no photo; {advice}"
-
-
-def _is_capture(path: Path) -> bool:
-    """Say whether a folder has poses in a layout that is read."""
-    return (
-        any(is_file(path / name) for name in (TRAIN_FILE, "transforms.json")) or find_model(path) is not None
-    )
 
 
 def _groups(photos: Sequence[PhotoFacts], longest: int) -> list[dict[str, Any]]:
@@ -366,11 +331,6 @@ def _groups(photos: Sequence[PhotoFacts], longest: int) -> list[dict[str, Any]]:
             }
         groups[photo.camera]["names"].append(photo.copy)
     return list(groups.values())
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
 
 
 def _tuple(value: list[float] | None) -> tuple[float, ...] | None:

@@ -60,7 +60,7 @@ class Undistorted:
     pinhole: Lens
 
     def entry(self) -> dict[str, Any]:
-        """Return what `gsplat_edu.sfm.engine.finish` wants to know."""
+        """Return what `gsplat_edu.sfm.engine.jobs.finish` wants to know."""
         p = self.pinhole  # formats put the first pixel's centre at (0.5, 0.5)
         sizes = {"name": self.name, "W": p.W, "H": p.H, "turns": self.photo.turns}
         return sizes | {"fx": p.fx, "fy": p.fy, "cx": p.cx + 0.5, "cy": p.cy + 0.5}
@@ -83,7 +83,8 @@ def build_capture(
         progress: Told how many photos are undistorted.
 
     Returns:
-        "points", "error" in px of the undistorted photos, and "left_out", the names of photos without a pose.
+        "points", "error" in px of the undistorted photos, "left_out", the names of photos without a pose, and
+        "doubtful", those whose pose did not count.
 
     Raises:
         DatasetError: a photo cannot be decoded any more, or COLMAP failed.
@@ -117,7 +118,12 @@ def build_capture(
         scale=move.s,
         photos={entry.photo.copy: entry.entry() for entry in entries},
     )
-    return facts | {"left_out": [photo.name for photo in photos if photo.copy not in placed]}
+    doubtful = set(model["doubtful"]) - placed
+    out = [photo for photo in photos if photo.copy not in placed]
+    return facts | {
+        "left_out": [photo.name for photo in out if photo.copy not in doubtful],
+        "doubtful": [photo.name for photo in out if photo.copy in doubtful],
+    }
 
 
 def published(folder: Path) -> tuple[str, ...]:
@@ -248,7 +254,8 @@ def _write_photos(
 
 def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
     lens = entry.lens
-    photo = develop(PhotoFile(source / entry.photo.name, None, lens, lens.W, lens.H, None))
+    counts = Path(entry.photo.mask) if entry.photo.mask else None
+    photo = develop(PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None))
     pixels = np.asarray(photo.image)
     if photo.alpha is not None:
         pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)

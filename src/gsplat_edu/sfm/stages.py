@@ -15,8 +15,8 @@ from gsplat_edu.reading import parse_json, read_text
 class Stages:
     """The stages of a run, in a file that is whole at any time.
 
-    A stage has options: whatever its outcome depends on, beside the stages before it. When they are others than
-    before, it and all behind it are forgotten.
+    A stage has options: whatever its outcome depends on, beside the stages before it. When they differ from
+    those before, it and all that follow are forgotten.
 
     Args:
         path: stages.json; it need not be there.
@@ -38,6 +38,11 @@ class Stages:
                 raise DatasetError(
                     f"{path}: is damaged; remove {path.parent}, and the same command begins anew"
                 ) from None
+
+    @property
+    def any_finished(self) -> bool:
+        """Whether there is something to resume."""
+        return any(stage["facts"] is not None for stage in self._stages.values())
 
     def finished(self, name: str, options: dict[str, Any]) -> dict[str, Any] | None:
         """Return what a finished stage left to say; None where it is not finished, or was with other options.

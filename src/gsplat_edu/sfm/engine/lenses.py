@@ -1,0 +1,197 @@
+"""How much of a camera the photos tell: which intrinsics are refined, judged on photos that had no part in it.
+
+Every camera begins with one focal length, one coefficient of distortion and the principal point in the middle. More
+freedom always fits the photos it was fitted to better; few photos, or poor geometry, then give intrinsics that no camera
+has. So a camera's photos are divided in two. Intrinsics found on one half are held while the poses and points of the
+other half are refined: only intrinsics that explain those photos better, both ways round, are worth having.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+
+from .judge import residuals, take_out
+
+WITNESSES = 20
+"""Photos of a camera from which more than the first lens model is considered: ten in either half."""
+
+HALF = 30
+"""Most photos of a half: more cost time and tell nothing new."""
+
+SEEN = 30
+"""Points that a photo of a half has to see, median, for the half to be a judge."""
+
+GAIN = 0.02
+"""Least share by which a freer lens has to lower the error in the other half's photos."""
+
+CENTRED = 0.1
+"""Farthest that a principal point may be from the middle, as a share of the size."""
+
+ITERATIONS = 30
+"""Of the adjustments that judge; they begin at the solution of a simpler lens."""
+
+class Rung(NamedTuple):
+    """What is refined of a camera."""
+
+    model: str
+    centre: bool
+
+    def __str__(self) -> str:
+        """Name it."""
+        return f"{self.model}, free centre" if self.centre else self.model
+
+
+LADDER = (
+    Rung("SIMPLE_RADIAL", centre=False),
+    Rung("RADIAL", centre=False),
+    Rung("OPENCV", centre=False),
+    Rung("OPENCV", centre=True),
+)
+"""Lens models in the order of their freedom: 2, 3, 6 and 8 numbers."""
+
+
+def refined(
+    model: pycolmap.Reconstruction, climb: bool, threads: int
+) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
+    """Adjust everything once more, with as much freedom for each camera as its photos support.
+
+    Args:
+        model: A model whose cameras all have the lens model it was mapped with.
+        climb: Whether freer lens models than that are considered; the principal point always is.
+        threads: Threads.
+
+    Returns:
+        The adjusted model, and by the numbers of the cameras, what was refined of each.
+    """
+    photos = Counter(model.image(image).camera_id for image in model.reg_image_ids())
+    chosen = {camera: _climbed(model, camera, climb, threads) for camera in sorted(photos)}
+    result = copy.deepcopy(model)
+    for camera, rung in chosen.items():
+        _change(result.camera(camera), rung.model)
+    _adjust(result, threads)
+    if any(rung.centre for rung in chosen.values()):
+        fixed = {camera for camera, rung in chosen.items() if not rung.centre}
+        free = copy.deepcopy(result)
+        _adjust(free, threads, centre=True, fixed=fixed)
+        if all(_believable(free.camera(camera)) for camera in chosen):
+            result = free
+        else:
+            chosen = {camera: rung._replace(centre=False) for camera, rung in chosen.items()}
+    if not all(_believable(result.camera(camera)) for camera in chosen):
+        return model, {camera: model.camera(camera).model_name for camera in chosen}
+    result.update_point_3d_errors()
+    return result, {camera: str(rung) for camera, rung in chosen.items()}
+
+
+def _climbed(model: pycolmap.Reconstruction, camera: int, climb: bool, threads: int) -> Rung:
+    """Return the last rung that explains photos better that had no part in it."""
+    given = Rung(model.camera(camera).model_name, centre=False)
+    rungs = [rung for rung in LADDER if rung.model != given.model] if climb else [given._replace(centre=True)]
+    images = sorted(
+        (i for i in model.reg_image_ids() if model.image(i).camera_id == camera),
+        key=lambda i: model.image(i).name,
+    )
+    if len(images) < WITNESSES:
+        return given
+    middle = len(images) // 2
+    blocks = images[max(0, middle - HALF) : middle], images[middle : middle + HALF]
+    halves = [_part(model, set(block)) for block in blocks]
+    if any(_median_seen(half) < SEEN for half in halves):
+        return given
+    best, errors = given, _errors(halves, given, threads)
+    for rung in rungs:
+        found = _errors(halves, rung, threads)
+        gained = all(new < old for new, old in zip(found, errors, strict=True))
+        if gained and sum(found) < (1.0 - GAIN) * sum(errors):
+            best, errors = rung, found
+    return best
+
+
+def _errors(halves: list[pycolmap.Reconstruction], rung: Rung, threads: int) -> list[float]:
+    """Return, for either half, the error of its photos with the intrinsics that the other half found."""
+    found = []
+    for one, other in ((0, 1), (1, 0)):
+        teacher, judge = copy.deepcopy(halves[one]), copy.deepcopy(halves[other])
+        (camera,) = {teacher.image(image).camera_id for image in teacher.reg_image_ids()}
+        _change(teacher.camera(camera), rung.model)
+        _adjust(teacher, threads, iterations=ITERATIONS)
+        if rung.centre:
+            _adjust(teacher, threads, iterations=ITERATIONS, centre=True)
+        if not _believable(teacher.camera(camera)):
+            return [np.inf, np.inf]
+        _change(judge.camera(camera), rung.model)
+        judge.camera(camera).params = teacher.camera(camera).params
+        _adjust(judge, threads, iterations=ITERATIONS, fixed={camera})
+        found.append(_error(judge))
+    return found
+
+
+def _error(model: pycolmap.Reconstruction) -> float:
+    """Return the mean reprojection error, px; large ones count as their root, so that no wrong match decides."""
+    errors = np.concatenate([residuals(model, image)[2] for image in sorted(model.reg_image_ids())])
+    return float(np.mean(2.0 * (np.sqrt(1.0 + np.minimum(errors, 1e6)) - 1.0)))
+
+
+def _part(model: pycolmap.Reconstruction, images: set[int]) -> pycolmap.Reconstruction:
+    """Return the model of some of its photos."""
+    part = copy.deepcopy(model)
+    take_out(part, set(part.reg_image_ids()) - images)
+    return part
+
+
+def _median_seen(model: pycolmap.Reconstruction) -> float:
+    return float(np.median([model.image(image).num_points3D for image in model.reg_image_ids()]))
+
+
+def _change(camera: pycolmap.Camera, name: str) -> None:
+    """Give a camera another lens model that bends light as it did before; models only gain numbers here."""
+    if camera.model_name == name:
+        return
+    focal, (x, y) = camera.focal_length_x, (camera.principal_point_x, camera.principal_point_y)
+    bends = [camera.params[i] for i in camera.extra_params_idxs()]
+    after = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, name, focal, camera.width, camera.height
+    )
+    params = np.array(after.params)
+    for index, value in zip(after.principal_point_idxs(), (x, y), strict=True):
+        params[index] = value
+    for index, value in zip(after.extra_params_idxs(), bends, strict=False):
+        params[index] = value
+    camera.model = after.model
+    camera.params = params
+
+
+def _adjust(
+    model: pycolmap.Reconstruction,
+    threads: int,
+    *,
+    iterations: int = 100,
+    centre: bool = False,
+    fixed: set[int] | None = None,
+) -> None:
+    """Adjust poses, points and intrinsics; those of some cameras may be held."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point, options.print_summary = centre, False
+    options.ceres.use_gpu = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.solver_options.function_tolerance = 1e-6
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in sorted(model.reg_image_ids()):
+        config.add_image(image)
+    for camera in sorted(fixed or ()):
+        config.set_constant_cam_intrinsics(camera)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def _believable(camera: pycolmap.Camera) -> bool:
+    """Say whether intrinsics may be a camera's."""
+    x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
+    return max(abs(x - 0.5), abs(y - 0.5)) <= CENTRED and not camera.has_bogus_params(0.1, 10.0, 1.0)

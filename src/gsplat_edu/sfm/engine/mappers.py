@@ -1,0 +1,130 @@
+"""From matches to models: COLMAP's two mappers, and what is done about poses that do not count."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pycolmap
+
+from .judge import agreement, take_out, unsupported
+
+Tell = Callable[[int], None]
+"""Told how much is done."""
+
+ROUNDS = 5
+"""Most rounds of taking photos out: what is left may lose what supported it."""
+
+
+class Options(NamedTuple):
+    """What mappers have in common."""
+
+    loose: bool
+    threads: int
+    seed: int
+
+
+def incremental(
+    tell: Tell, database: str, photos: str, out: str, common: Options, begin: str = ""
+) -> dict[int, pycolmap.Reconstruction]:
+    """Place one photo after the other (Schönberger and Frahm 2016).
+
+    Args:
+        tell: Told how many photos have a pose.
+        database: With features and matches.
+        photos: Folder of the photos, for the colours of the points.
+        out: Folder for what COLMAP writes.
+        common: Thresholds, threads and seed.
+        begin: Folder of a model to begin with.
+
+    Returns:
+        The models by their numbers.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = common.threads, common.seed
+    options.min_model_size = 3  # photos are few here, and the best model is taken anyway
+    options.multiple_models = not begin
+    if common.loose:  # half the matches, and a quarter of the angle, that COLMAP asks for
+        options.min_num_matches = 10
+        options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = 50, 15
+        options.mapper.init_min_tri_angle, options.mapper.abs_pose_min_inlier_ratio = 4.0, 0.15
+    placed = 0
+
+    def begun() -> None:
+        nonlocal placed
+        placed = 2
+        tell(placed)
+
+    def one_more() -> None:
+        nonlocal placed
+        placed += 1
+        tell(placed)
+
+    return pycolmap.incremental_mapping(
+        database,
+        photos,
+        out,
+        options,
+        begin,
+        initial_image_pair_callback=begun,
+        next_image_callback=one_more,
+    )
+
+
+def all_at_once(database: str, photos: str, out: str, common: Options) -> dict[int, pycolmap.Reconstruction]:
+    """Place all photos together (Pan et al. 2024, GLOMAP); arguments as for `incremental`."""
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    calibration.random_seed = common.seed
+    pycolmap.calibrate_view_graph(database, calibration)
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = common.threads
+    options.random_seed = options.mapper.random_seed = common.seed
+    options.min_num_matches = 10 if common.loose else options.min_num_matches
+    return pycolmap.global_mapping(database, photos, out, options)
+
+
+def mended(
+    model: pycolmap.Reconstruction, database: str, photos: str, folder: Path, options: Options
+) -> pycolmap.Reconstruction:
+    """Take out photos whose poses do not count, and let the mapper place them in what is left.
+
+    While focal lengths are still guesses, the incremental mapper may place two photos well beside each other but
+    wrongly beside the rest, and never looks at them again. The global mapper gives every photo a pose, however few
+    points it has.
+
+    Args:
+        model: May be changed.
+        database: With features and matches.
+        photos: Folder of the photos.
+        folder: For the work.
+        options: Thresholds, threads and seed.
+
+    Returns:
+        A model all of whose poses count; the one that was given, or what became of it.
+    """
+    if not without_doubtful(model, database) or model.num_reg_images() < 2:
+        return model
+    begin = folder / "begin"
+    begin.mkdir()
+    model.write_binary(begin)
+    found = incremental(lambda done: None, database, photos, str(folder), options, str(begin))
+    again = max(found.values(), key=lambda other: other.num_reg_images(), default=model)
+    without_doubtful(again, database)
+    return again if again.num_reg_images() >= model.num_reg_images() else pycolmap.Reconstruction(begin)
+
+
+def without_doubtful(model: pycolmap.Reconstruction, database: str) -> int:
+    """Take out the photos whose poses do not count; say how many.
+
+    Args:
+        model: Changed.
+        database: With the matches.
+    """
+    before = model.num_reg_images()
+    for _ in range(ROUNDS):
+        doubtful = agreement(model, database).contradictory | set(unsupported(model))
+        if not doubtful:
+            break
+        take_out(model, doubtful)
+    return before - model.num_reg_images()

@@ -1,0 +1,148 @@
+"""What the user named: photos, a video, or something that poses cannot be found for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsplat_edu.data.blender import TRAIN_FILE
+from gsplat_edu.data.capture import entries, is_file, is_folder
+from gsplat_edu.data.colmap import find_model
+from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.files import check_folder
+from gsplat_edu.sfm.photos import is_photo, is_run, photo_files
+from gsplat_edu.sfm.result import PARTS, published
+from gsplat_edu.sfm.video import is_video
+
+FEWEST = 3
+"""Photos of a model that is worth having: two photos alone leave nothing to check their poses with."""
+
+NAMED = 12
+"""Photos that a sentence names; more are counted."""
+
+WANTED = "name a folder of photos, or a video"
+OR_CAPTURE = "name a capture, a folder of photos, or a video"
+
+
+def needs_poses(path: str | Path) -> bool:
+    """Say whether a path is a video, or a folder of photos without poses in any layout that is read.
+
+    Args:
+        path: What the user named.
+
+    Raises:
+        DatasetError: it is a run's folder, an empty one, or a file of another kind, or its photos lie in several folders.
+    """
+    path = Path(path)
+    if is_file(path):
+        if path.suffix.lower() == ".json":
+            return False
+        _check_file(path, OR_CAPTURE)
+        return True
+    if not is_folder(path) or _is_capture(path):
+        return False
+    _check_run(path)
+    if not any(place.name[0] != "." for place in entries(path)):
+        raise DatasetError(f"{path}: holds no photos, it is empty; {OR_CAPTURE}")
+    return bool(photo_files(path))
+
+
+def check_source(source: Path, out: Path) -> list[Path]:
+    """Find out before any work whether there is something to do it with, and somewhere to put it.
+
+    Args:
+        source: Folder of the photos, or a video.
+        out: Folder of the result.
+
+    Returns:
+        The photos; none where the source is a video.
+
+    Raises:
+        ArgumentError: the result cannot go there.
+        DatasetError: the source is of no use.
+    """
+    check_folder("OUT", out)
+    here, there = source.resolve(), out.resolve()
+    if here == there or any(here.is_relative_to(there / part) for part in (*PARTS, "sfm")):
+        raise ArgumentError(f"OUT: {out} is where the photos themselves are; name another folder")
+    if _holds_others(out):
+        raise ArgumentError(f"OUT: {out} holds photos or poses already; name another folder")
+    if is_file(source):
+        _check_file(source, WANTED)
+        return []
+    if not is_folder(source):
+        raise DatasetError(f"{source}: is not there; {WANTED}")
+    _check_run(source)
+    files = photo_files(source, there)
+    if len(files) < FEWEST:
+        raise DatasetError(too_few(source, len(files), []))
+    return files
+
+
+def too_few(source: Path, count: int, unreadable: Sequence[str]) -> str:
+    """Say why there is nothing to do.
+
+    Args:
+        source: What the user named.
+        count: Photos that can be decoded.
+        unreadable: The others.
+    """
+    if count:
+        held = "one photo" if count == 1 else f"{count} photos"
+        besides = f" that can be decoded (not {listed(unreadable)})" if unreadable else ""
+        return f"{source}: holds {held}{besides}; poses need at least {FEWEST}, from different places"
+    if unreadable:
+        return f"{source}: holds no photo that can be decoded: {listed(unreadable)}; export them as JPEG"
+    video = next((path.name for path in sorted(source.iterdir()) if is_video(path)), None)
+    return f"{source}: holds no photos; " + (
+        f"it holds a video, name that: {source / video}" if video else WANTED
+    )
+
+
+def listed(names: Sequence[str]) -> str:
+    """Name the first photos of a list, and count the others."""
+    more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _check_file(path: Path, wanted: str) -> None:
+    """Refuse a file that is no video."""
+    if not is_video(path):
+        what = "a single photo" if is_photo(path) else "neither a photo nor a video"
+        raise DatasetError(f"{path}: is {what}; {wanted}")
+
+
+def _check_run(folder: Path) -> None:
+    """Refuse the folder of a run: what it holds are renders."""
+    if not is_run(folder):
+        return
+    try:
+        said = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        capture = said["data"]["path"] if isinstance(said["data"]["path"], str) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        capture = None
+    instead = f", {capture}" if capture else ""
+    raise DatasetError(
+        f"{folder}: is a run, and its pictures are renders, not photos; name the capture it was trained on{instead}"
+    )
+
+
+def _holds_others(out: Path) -> bool:
+    """Say whether the folder of the result holds what no run put there and a run would put away.
+
+    Masks beside a run's capture are no such thing: they stay.
+    """
+    work = out / "sfm"
+    if not (work / "stages.json").is_file():
+        begun = is_folder(work) and any(path.name[0] != "." for path in entries(work))
+        return begun or _is_capture(out) or any((out / part).exists() for part in PARTS)
+    others = {"images", "sparse"}.difference(published(work))
+    return any((out / part).exists() for part in others)
+
+
+def _is_capture(path: Path) -> bool:
+    """Say whether a folder has poses in a layout that is read."""
+    return (
+        any(is_file(path / name) for name in (TRAIN_FILE, "transforms.json")) or find_model(path) is not None
+    )

@@ -1,0 +1,23 @@
+"""Run a script beside the engine, in a process of its own: pycolmap is not loaded into that of the tests."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import gsplat_edu.sfm
+
+START = f"""
+import sys
+sys.path.insert(0, {str(Path(gsplat_edu.sfm.__file__).parent)!r})
+import numpy as np
+import pycolmap
+"""
+
+
+def printed(script):
+    """Return the lines that a script prints."""
+    ran = subprocess.run(
+        [sys.executable, "-P", "-c", START + script], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout.splitlines()

@@ -1,0 +1,112 @@
+"""Which poses count: models are spoiled in one way each, and what is found is what was spoiled."""
+
+import json
+
+import pytest
+
+from sfm.engine_check import printed
+
+pytestmark = pytest.mark.usefixtures("colmap")
+
+
+@pytest.fixture(scope="module")
+def work(done):
+    """The folders of a finished run, as the beginning of a script."""
+    stages = json.loads((done.out / "sfm" / "stages.json").read_text())["stages"]
+    chosen = done.out / "sfm" / stages["mapping"]["facts"]["folder"]
+    return f"""
+from pathlib import Path
+from engine import judge, mappers
+
+database = {str(chosen.parent / "database.db")!r}
+photos = {str(done.out / "sfm" / "photos")!r}
+model = pycolmap.Reconstruction({str(chosen)!r})
+
+
+def moved(number, far, turn):
+    image = model.image(number)
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), far)
+    model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose * image.cam_from_world())
+
+
+def keep(number, wanted):
+    image = model.image(number)
+    for index, point in enumerate(image.points2D):
+        if point.has_point3D() and index not in wanted:
+            model.delete_observation(number, index)
+
+
+def seen(number):
+    points = model.image(number).points2D
+    return [i for i, p in enumerate(points) if p.has_point3D()], np.array([p.xy for p in points])
+"""
+
+
+def test_every_pose_of_a_sound_model_counts(work):
+    assert printed(work + "print(judge.unsupported(model), judge.agreement(model, database).contradictory)") == [
+        "{} set()"
+    ]
+
+
+def test_a_pose_needs_thirty_points_spread_over_the_photo(work):
+    script = """
+few, one_spot = seen(5), seen(9)
+keep(5, few[0][::len(few[0]) // 12])
+indices, places = one_spot
+middle = np.median(places[indices], axis=0)
+nearest = sorted(indices, key=lambda i: np.linalg.norm(places[i] - middle))
+keep(9, [i for i in nearest if np.linalg.norm(places[i] - middle) < 0.01 * 320])
+found = judge.unsupported(model)
+print(sorted(found), all(count < 30 for count in found.values()))
+"""
+    assert printed(work + script) == ["[5, 9] True"]
+
+
+def test_points_on_a_line_fix_no_pose(work):
+    script = """
+from engine.judge import _supported
+line = np.column_stack([np.linspace(0, 300, 60), np.linspace(0, 200, 60)])
+spread = np.random.default_rng(0).uniform(0, 240, (60, 2))
+count = np.full(60, 2)
+print(_supported(count, line, 320), _supported(count, spread, 320))
+print(_supported(np.where(np.arange(60) < 10, 2, 1), spread, 320))  # two photos see ten of them, one the others
+"""
+    assert printed(work + script) == ["False True", "False"]
+
+
+def test_of_two_parts_that_share_too_little_the_larger_is_kept(work):
+    """Each part supports itself; what one says about the other's place is a handful of points."""
+    script = """
+part = {1, 2, 3, 4, 5}
+names = {i: model.image(i).name for i in model.reg_image_ids()}
+crossing = 0
+for number in sorted(part):
+    for index in seen(number)[0]:
+        if not model.image(number).point2D(index).has_point3D():
+            continue
+        track = model.point3D(model.image(number).point2D(index).point3D_id).track
+        if {element.image_id for element in track.elements} - part:
+            crossing += 1
+            if crossing > 10:
+                model.delete_observation(number, index)
+print(set(judge.unsupported(model)) >= part or sorted(judge.unsupported(model)))
+"""
+    assert printed(work + script) == ["True"]
+
+
+def test_cameras_far_away_with_few_points_are_taken_out_and_placed_again(work, tmp_path):
+    """As a mapper that gives every photo a pose leaves them: one far away with few points, one in a wrong place."""
+    script = f"""
+truth = {{i: model.image(i).projection_center() for i in (5, 9)}}
+keep(9, seen(9)[0][:8])
+moved(9, [0.0, 0.0, 60.0], [0.0, 0.5, 0.0])
+moved(5, [1.0, 0.0, 0.0], [0.1, 0.0, 0.0])
+print(sorted(judge.agreement(model, database).contradictory | set(judge.unsupported(model))))
+mended = mappers.mended(model, database, photos, Path({str(tmp_path)!r}), mappers.Options(False, 1, 0))
+print(judge.unsupported(mended), judge.agreement(mended, database).contradictory, mended.num_reg_images())
+print(max(abs(mended.image(i).projection_center() - truth[i]).max() for i in truth))
+"""
+    broken, after, off = printed(work + script)
+    assert set(json.loads(broken)) >= {5, 9}
+    assert after == "{} set() 14"
+    assert float(off) < 0.2, "a fifth of what the nearer one was moved by"

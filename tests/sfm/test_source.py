@@ -1,0 +1,76 @@
+"""What is refused before any work, in one line, and what a failure leaves behind."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu.cli.main import main
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.sfm.source import check_source, needs_poses
+
+RNG = np.random.default_rng(0)
+
+
+def photos(folder, count):
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        Image.fromarray(RNG.integers(0, 255, (30, 40, 3)).astype(np.uint8)).save(folder / f"{i}.png")
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path):
+    """The folder of a run, as far as it is told by."""
+    folder = photos(tmp_path / "run" / "renders", 4).parent
+    (folder / "config.json").write_text(json.dumps({"data": {"path": "captures/desk"}}))
+    (folder / "cameras.json").write_text("[]")
+    return folder
+
+
+@pytest.mark.parametrize("command", ["sfm", "train"])
+def test_a_run_is_no_folder_of_photos(run, tmp_path, capsys, command):
+    out = ["--out"] if command == "train" else []
+    assert main([command, str(run), *out, str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is a run, and its pictures are renders, not photos" in line
+    assert line.endswith("name the capture it was trained on, captures/desk")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_whose_configuration_is_damaged_is_still_one(run):
+    (run / "config.json").write_text("{")
+    with pytest.raises(DatasetError, match="name the capture it was trained on$"):
+        needs_poses(run)
+
+
+@pytest.mark.parametrize("command", ["sfm", "train"])
+def test_a_file_of_another_kind_and_an_empty_folder_are_told_of_photos_and_videos(tmp_path, capsys, command):
+    out = ["--out"] if command == "train" else []
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "empty").mkdir()
+    for name, what in (("notes.txt", "is neither a photo nor a video"), ("empty", "holds no photo")):
+        assert main([command, str(tmp_path / name), *out, str(tmp_path / "out")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{name}: {what}" in line and "a folder of photos" in line and "video" in line
+        assert not (tmp_path / "out").exists()
+
+
+def test_two_photos_are_too_few_and_not_too_different(tmp_path):
+    source = photos(tmp_path / "photos", 2)
+    with pytest.raises(DatasetError, match="holds 2 photos; poses need at least 3, from different places"):
+        check_source(source, tmp_path / "out")
+    Image.open(source / "0.png").save(source / "one.jpg")
+    assert len(check_source(source, tmp_path / "out")) == 3
+
+
+@pytest.mark.usefixtures("colmap")
+def test_a_failure_before_any_result_leaves_no_folder(tmp_path):
+    (tmp_path / "broken.mp4").write_bytes(b"not a video")
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for out in (tmp_path / "deep" / "out", mine):
+        assert main(["sfm", str(tmp_path / "broken.mp4"), str(out)]) == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "mine"]
+    assert not any(mine.iterdir()), "a folder that was there stays, and nothing in it"
