@@ -65,8 +65,7 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the line and exit with 2."""
         end = "" if message.endswith("?") else ";"
-        self.exit(EXIT_BAD_INPUT, printable(f"{self.prog}: {message}{end} see {self.prog} --help") + "
-")
+        self.exit(EXIT_BAD_INPUT, printable(f"{self.prog}: {message}{end} see {self.prog} --help") + "\n")
 
 
 def add_backend(parser: argparse._ActionsContainer) -> None:
