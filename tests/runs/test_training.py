@@ -184,6 +184,8 @@ sys.exit(main(sys.argv[3:]))
 DEATHS = (
     ("cameras.json", "before"),
     ("cameras.json", "after"),
+    ("photos.json", "before"),
+    ("photos.json", "after"),
     ("config.json", "before"),
     ("config.json", "after"),
     ("iteration_10.safetensors", "before"),
@@ -199,7 +201,7 @@ DEATHS = (
 @pytest.mark.slow
 @pytest.mark.own_process
 def test_killed_around_the_renaming_of_every_file(capture, finished, tmp_path):
-    """One run, killed eleven times: with each file still under its temporary name, or just renamed."""
+    """One run, killed thirteen times: with each file still under its temporary name, or just renamed."""
     out = tmp_path / "run"
     words = ["train", str(capture), "--out", str(out), *SHORT]
     for name, moment in DEATHS:
@@ -321,7 +323,7 @@ def test_a_run_is_not_overwritten(capture, finished, capsys):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (["--iterations", "50"], "iterations"),
+        (["--iterations", "30"], "iterations"),
         (["--seed", "3"], "seed"),
         (["--test-every", "4"], "test_every"),
     ],

@@ -124,7 +124,7 @@ def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None
     if options.folder.exists():
         if not options.resume:
             raise CheckpointError(
-                f"--out: {options.folder.path} holds a run already; add --resume to go on with it, "
+                f"--out: {options.folder.path} holds a run already; add --resume to continue it, "
                 "or name another folder"
             )
         if find_model(found) is not None:

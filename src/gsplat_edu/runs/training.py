@@ -99,7 +99,7 @@ class CaptureRun:
         if folder.exists():
             if not options.resume:
                 raise CheckpointError(
-                    f"--out: {folder.path} holds a run already; add --resume to go on with it, or name another folder"
+                    f"--out: {folder.path} holds a run already; add --resume to continue it, or name another folder"
                 )
             self._check_start()
             check_options(folder, document(options))
