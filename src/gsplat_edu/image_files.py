@@ -88,7 +88,7 @@ def opened_image(source: Path | bytes, formats: Sequence[str] = FORMATS) -> Iter
     with (
         _no_limit,
         BytesIO(source) if isinstance(source, bytes) else open_file(source) as file,
-        Image.open(file, formats=formats) as image,
+        Image.open(file, formats=tuple(formats)) as image,
     ):
         if image.width * image.height > MAX_PIXELS:
             raise ValueError(f"{image.width}x{image.height} px are more than a photo has")

@@ -79,7 +79,7 @@ def test_cut_short_files_are_named(tmp_path, name):
             decode(path)
         assert "\n" not in str(caught.value)
     path.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
-    with pytest.raises(DatasetError, match="no image"):
+    with pytest.raises(DatasetError, match="not a JPEG, PNG"):
         image_size(path)
     path.unlink()
     with pytest.raises(DatasetError, match="No such file"):
@@ -217,7 +217,7 @@ def test_large_photos_are_photos(tmp_path, name, limit, monkeypatch):
 
 
 def test_an_absurd_size_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("gsplat_edu.data.images.MAX_PIXELS", 100)
+    monkeypatch.setattr("gsplat_edu.image_files.MAX_PIXELS", 100)
     with pytest.raises(DatasetError, match=r"a\.png: .*16x12 px are more than a photo has"):
         image_size(saved(tmp_path, Image.fromarray(NOISE)))
 

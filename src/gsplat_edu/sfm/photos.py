@@ -260,7 +260,7 @@ def _facts(path: Path, name: str, copy: str) -> PhotoFacts:
     except UNDECODABLE as error:
         if path.suffix.lower() in (".heic", ".heif"):
             raise ValueError("HEIC is not decoded here: export it as JPEG") from None
-        reason = f"is not a {SPELLED} image" if "cannot identify" in str(error) else str(error).split("\n")[0]
+        reason = f"not a {SPELLED} image" if "cannot identify" in str(error) else str(error).split("\n")[0]
         raise ValueError(reason) from None
     focal = _focal(details, W, H)
     said = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)]
