@@ -26,7 +26,9 @@ def written_aside(path: Path) -> Iterator[Path]:
         OSError: the folder cannot be made or written to. What stood under `path` before is untouched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    prefix = f".{path.stem}.{os.getpid()}-"  # the writer's process: remove_leftovers asks whether it still runs
+    prefix = (
+        f".{path.stem}.{os.getpid()}-"  # the writer's process: remove_leftovers asks whether it still runs
+    )
     handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
     os.close(handle)
     aside = Path(name)

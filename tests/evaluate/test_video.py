@@ -77,7 +77,12 @@ def test_the_whole_picture_is_in_it(tmp_path, height, width):
     for frame in frames:
         read, shown = video.read()
         assert read
-        assert np.abs(shown[: height - 2, : width - 2, ::-1].astype(int) - frame[: height - 2, : width - 2]).max(initial=0) < 20
+        assert (
+            np.abs(shown[: height - 2, : width - 2, ::-1].astype(int) - frame[: height - 2, : width - 2]).max(
+                initial=0
+            )
+            < 20
+        )
         # in white, lossy, in chroma of half the resolution and 16..235: nearer to white than to the grey beside it
         assert shown[height - 1 :].min() > 200 and shown[:, width - 1 :].min() > 200
     assert not video.read()[0]
@@ -85,7 +90,9 @@ def test_the_whole_picture_is_in_it(tmp_path, height, width):
 
 def test_equal_frames_give_equal_bytes_and_the_index_is_in_front(tmp_path):
     rng = np.random.default_rng(0)
-    noise = [cv2.GaussianBlur(rng.integers(0, 256, (96, 128, 3)).astype(np.uint8), (0, 0), 3) for _ in range(12)]
+    noise = [
+        cv2.GaussianBlur(rng.integers(0, 256, (96, 128, 3)).astype(np.uint8), (0, 0), 3) for _ in range(12)
+    ]
     first, second = (write_frames(tmp_path / name, noise)[0].read_bytes() for name in ("a.mp4", "b.mp4"))
     assert first == second
     kinds = boxes(first)
@@ -120,7 +127,9 @@ def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width):
         played = tab.evaluate(PLAY, ["video/mp4", data, len(frames)])
         browser.close()
     assert played["size"] == [width + width % 2, height + height % 2]
-    assert played["duration"] == pytest.approx(0.4, abs=0.01) and played["time"] == pytest.approx(0.4, abs=0.01)
+    assert played["duration"] == pytest.approx(0.4, abs=0.01) and played["time"] == pytest.approx(
+        0.4, abs=0.01
+    )
     for i, shown in enumerate(played["shown"]):
         # one step of YUV in limited range is up to 2.3 of RGB, and quantization a few; a wrong matrix is 30 off
         assert np.abs(np.array(shown) - np.roll(COLOURS, i, axis=0)).max() <= 8
