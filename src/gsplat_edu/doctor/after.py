@@ -94,7 +94,7 @@ class Trained:
             return scores[-1][1] - max(earlier[-2:]) >= RISING
         losses = _pairs(self.log, "loss", self.reached)
         last, before = (
-            [value for iteration, value in losses if low < iteration / self.reached <= high]
+            [value for iteration, value in losses if low * self.reached < iteration <= high * self.reached]
             for low, high in ((0.9, 1.0), (0.65, 0.75))
         )
         return float(np.mean(last)) < FALLING * float(np.mean(before)) if last and before else None
