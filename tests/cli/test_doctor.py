@@ -48,7 +48,9 @@ def test_a_clean_capture_fits_on_a_screen_and_ends_with_advice(doctor, capture):
     lines = said.splitlines()
     assert code == 0 and len(lines) <= 24 and "warning" not in said
     assert "COLMAP: 24 photos of 64x48; 200 points" in said
-    assert lines[-4] == "what to do:" and lines[-3] == f"  1. train: gsplat-edu train {folder} --out out/capture"
+    assert (
+        lines[-4] == "what to do:" and lines[-3] == f"  1. train: gsplat-edu train {folder} --out out/capture"
+    )
 
 
 def test_faults_are_named_and_the_exit_code_stays_0(doctor, capture, tmp_path):

@@ -116,7 +116,10 @@ def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, ca
         (["BARE", "--fps", "-1"], "--fps: is -1"),
         (["BARE", "--backend", "abacus"], "backend 'abacus'"),
         (["BARE", "--dataset", "."], "is no capture"),
-        (["BARE", "--out", "x.gif"], "x.gif: GIF is not written here; give a video (.mp4) or a folder of PNGs"),
+        (
+            ["BARE", "--out", "x.gif"],
+            "x.gif: GIF is not written here; give a video (.mp4) or a folder of PNGs",
+        ),
     ],
 )
 def test_mistakes_are_one_line(made, cli, capsys, tmp_path, arguments, says):

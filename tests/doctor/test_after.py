@@ -209,14 +209,20 @@ def evaluations(reached, gain, count=8):
     """A log whose test PSNR rises to that of the scene, 34 dB; its last quarter gains so many decibels."""
     iterations = [reached * i // count for i in range(1, count)]
     return [{"iteration": i, "loss": 0.1, "psnr": None} for i in iterations] + [
-        {"iteration": i, "psnr": 34.0 - gain - 3.0 * (0.75 - i / reached) * (i < 0.75 * reached)} for i in iterations
+        {"iteration": i, "psnr": 34.0 - gain - 3.0 * (0.75 - i / reached) * (i < 0.75 * reached)}
+        for i in iterations
     ]
 
 
 @pytest.mark.parametrize(
     ("reached", "gain", "severity", "says"),
     [
-        (1500, 1.0, Severity.WARNING, "1,500 iterations; the recipe has 30,000, and the test views' PSNR was still rising"),
+        (
+            1500,
+            1.0,
+            Severity.WARNING,
+            "1,500 iterations; the recipe has 30,000, and the test views' PSNR was still rising",
+        ),
         (1500, None, Severity.WARNING, "1,500 iterations; the recipe has 30,000"),
         (1500, -1.0, Severity.NOTE, "but the test views' PSNR no longer rises"),
         (30_000, 1.0, None, ""),
@@ -257,4 +263,6 @@ def test_what_the_photos_show_before_training_is_not_gone_after_it(scene):
     diagnosis = examine_run(trained(gaussians, views, beforehand=[before]))
     (found,) = (finding for finding in diagnosis.findings if finding.name == "exposure")
     assert found.images == before.images and found.severity is Severity.WARNING
-    assert found.sentence.startswith("1 of 12 photos; the scene fits them") and "exposure" not in diagnosis.fine
+    assert (
+        found.sentence.startswith("1 of 12 photos; the scene fits them") and "exposure" not in diagnosis.fine
+    )

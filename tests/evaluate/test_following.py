@@ -68,8 +68,11 @@ def test_cameras_all_round_get_a_full_circle(frame, count):
     path = path_along(cameras, 40)
     assert "full circle" in path.says and len(path.cameras) == 40
     azimuths, elevations, distances = seen_from(path, frame)
-    np.testing.assert_allclose(np.sort(np.diff(np.unwrap(np.radians(azimuths)))), math.radians(9) * np.sign(
-        np.unwrap(np.radians(azimuths))[-1] - np.radians(azimuths[0])), atol=1e-6)
+    np.testing.assert_allclose(
+        np.sort(np.diff(np.unwrap(np.radians(azimuths)))),
+        math.radians(9) * np.sign(np.unwrap(np.radians(azimuths))[-1] - np.radians(azimuths[0])),
+        atol=1e-6,
+    )
     np.testing.assert_allclose(elevations, 20, atol=1e-5)
     np.testing.assert_allclose(distances, 2.5, rtol=1e-6)
     np.testing.assert_allclose(path.cameras[0].eye, cameras[0].eye, atol=1e-5)
@@ -86,8 +89,11 @@ def test_an_arc_is_never_left(frame, extent, count):
     path = path_along(cameras, 60)
     assert "full circle" not in path.says
     if extent > 20:
-        assert f"cover {extent} degrees" in path.says or f"cover {extent - 1} degrees" in path.says or (
-            f"cover {extent + 1} degrees" in path.says)
+        assert (
+            f"cover {extent} degrees" in path.says
+            or f"cover {extent - 1} degrees" in path.says
+            or (f"cover {extent + 1} degrees" in path.says)
+        )
     seen, elevations, distances = seen_from(path, frame)
     # the centre is that of jittered axes: 1 degree each, less in the mean
     assert np.abs(seen).max() <= extent / 2 + 1 and np.ptp(seen) > 0.85 * extent
@@ -110,9 +116,7 @@ def test_the_path_follows_distance_and_height():
     """Near and low on one side, far and high on the other, as one walks around a statue on a slope."""
     azimuths = np.arange(36) * 10.0
     swing = np.cos(np.radians(azimuths))
-    cameras = [
-        around([a], [15 + 10 * s], radius=3 + s)[0] for a, s in zip(azimuths, swing, strict=True)
-    ]
+    cameras = [around([a], [15 + 10 * s], radius=3 + s)[0] for a, s in zip(azimuths, swing, strict=True)]
     found, elevations, distances = seen_from(path_along(cameras, 72))
     # a Gaussian of 15 degrees takes exp(-0.26²/2) = 3.4 % off a swing of one period; ln r is not quite a cosine
     np.testing.assert_allclose(elevations, 15 + 10 * np.cos(np.radians(found)), atol=0.5)
@@ -122,7 +126,9 @@ def test_the_path_follows_distance_and_height():
 def test_outliers_do_not_move_the_path():
     good = around(np.linspace(0, 80, 24), [20] * 24, jitter=1)
     far = [placed(SUBJECT + 20 * (camera.eye - SUBJECT), SUBJECT) for camera in around([200, 300], [5, 5])]
-    past = [placed(camera.eye, camera.eye - (SUBJECT - camera.eye)) for camera in around([150, 250, 330], [0] * 3)]
+    past = [
+        placed(camera.eye, camera.eye - (SUBJECT - camera.eye)) for camera in around([150, 250, 330], [0] * 3)
+    ]
     cameras = [*far, *good, *past]
     assert np.linalg.norm(point_looked_at(cameras) - SUBJECT) < 0.05
     azimuths, elevations, distances = seen_from(path_along(cameras, 40))
@@ -148,7 +154,7 @@ def grid(frame, turns=(0.0,), jitter=0.0, pitch=0.0):
 @pytest.mark.parametrize("turns", [(0.0,), (0.0, math.pi)])
 @pytest.mark.parametrize("jitter", [0.0, 0.03])
 def test_cameras_that_look_one_way_get_a_loop_between_them(frame, turns, jitter):
-    """A wall, or fields from the air, strips flown to and fro. Views turn by 12 degrees at most; the jitter is 2 to 3."""
+    """A wall, or fields from the air, strips flown to and fro. Views turn by 12 degrees; the jitter is 2 to 3."""
     cameras = grid(frame, turns, jitter)
     for depth in (1.0, 4.0, 100.0):
         path = path_along(cameras, 40, depth)
@@ -191,7 +197,8 @@ def test_a_walk_is_followed():
     places += [(0.5 * i, 0.0, 10.0) for i in range(20)]
     ways = [0.0] * 15 + list(np.radians(np.linspace(0, 90, 10))) + [math.pi / 2] * 15
     cameras = [
-        placed(np.array(p), np.array(p) + (math.sin(w), 0.0, math.cos(w))) for p, w in zip(places, ways, strict=True)
+        placed(np.array(p), np.add(p, (math.sin(w), 0.0, math.cos(w))))
+        for p, w in zip(places, ways, strict=True)
     ]
     path = path_along(cameras, 80, 2.0)
     eyes, real = (np.stack([camera.eye for camera in group]) for group in (path.cameras, cameras))

@@ -75,7 +75,9 @@ def test_a_file_is_no_folder(tmp_path):
 @pytest.mark.parametrize("suffix", [*sorted(NOT_WRITTEN), ".GIF"])
 def test_other_formats_are_refused_by_name(tmp_path, suffix):
     """`--out x.gif` was taken for a folder."""
-    with pytest.raises(ArgumentError, match=rf"x\{suffix}: {suffix[1:].upper()} is not written here; give a video"):
+    with pytest.raises(
+        ArgumentError, match=rf"x\{suffix}: {suffix[1:].upper()} is not written here; give a video"
+    ):
         write_frames(tmp_path / f"x{suffix}", [colour(4, 4, (0, 0, 0))])
     assert list(tmp_path.iterdir()) == []
 
@@ -83,14 +85,21 @@ def test_other_formats_are_refused_by_name(tmp_path, suffix):
 def test_a_folder_may_have_a_dot_in_its_name(tmp_path):
     (tmp_path / "made.gif").mkdir()
     for name in ("frames.v2", "made.gif"):
-        assert write_frames(tmp_path / name, [colour(4, 4, (0, 0, 0))]) == [tmp_path / name / "frame_0000.png"]
+        assert write_frames(tmp_path / name, [colour(4, 4, (0, 0, 0))]) == [
+            tmp_path / name / "frame_0000.png"
+        ]
 
 
 def test_leftovers_of_killed_writers_go_and_other_files_stay(tmp_path):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     stale = [f".v.{gone.pid}-abcd1234.mp4", f".frame_0001.{gone.pid}-a_b_c_d1.png", f".x.{gone.pid}-00000000"]
-    kept = [f".v.{os.getppid()}-abcd1234.mp4", f"v.{gone.pid}-abcd1234.mp4", ".v.original.mp4", ".v.12-ab.mp4"]
+    kept = [
+        f".v.{os.getppid()}-abcd1234.mp4",
+        f"v.{gone.pid}-abcd1234.mp4",
+        ".v.original.mp4",
+        ".v.12-ab.mp4",
+    ]
     for name in (*stale, *kept):
         (tmp_path / name).write_text("")
     (tmp_path / "below").mkdir()

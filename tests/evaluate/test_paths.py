@@ -7,6 +7,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
 from gsplat_edu.gaussians import Gaussians
 
+
 def image_of(camera, point):
     u, v, z = camera.project(camera.world_to_cam(point))
     return float(u), float(v), float(z)

@@ -119,7 +119,9 @@ def test_pictures_are_render_photo_and_difference(tmp_path):
     assert base64.b64decode(sources[1].removeprefix("data:image/jpeg;base64,")) == render
 
 
-@pytest.mark.parametrize(("step", "times"), [(0, 16), (3, 16), (15, 16), (16, 8), (60, 4), (127, 2), (128, 1), (200, 1)])
+@pytest.mark.parametrize(
+    ("step", "times"), [(0, 16), (3, 16), (15, 16), (16, 8), (60, 4), (127, 2), (128, 1), (200, 1)]
+)
 def test_differences_are_bright_enough_to_see_and_say_by_how_much(step, times):
     """The difference of a good render, a few steps of 255, was black."""
     title, data = Picture.of(
@@ -132,7 +134,7 @@ def test_differences_are_bright_enough_to_see_and_say_by_how_much(step, times):
 def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
     """The evaluation at the end is in the metrics, not in the log."""
     drawn = []
-    monkeypatch.setattr(report_module, "run_curves_figure", lambda log: drawn.append(log))
+    monkeypatch.setattr(report_module, "run_curves_figure", drawn.append)
     log = [{"iteration": i, "loss": 0.1} for i in (1, 2, 3)] + [{"iteration": 2, "psnr": 20.0}]
     metrics = {"test": {"psnr": 25.0, "num_images": 1}, "iterations": 3}
     for lines in (log, [*log, {"iteration": 3, "psnr": 24.0}]):
@@ -144,7 +146,15 @@ def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("test", "train", "says"),
     [
-        (31.0, 32.0, ["held out are matched at 31.0 dB", "look very close to them", "1.0 dB below the training photos;"]),
+        (
+            31.0,
+            32.0,
+            [
+                "held out are matched at 31.0 dB",
+                "look very close to them",
+                "1.0 dB below the training photos;",
+            ],
+        ),
         (26.0, 25.5, ["26.0 dB", "look close to them", "0.5 dB above the training photos"]),
         (21.0, 29.5, ["soft or partly wrong", "8.5 dB below", "so the scene has overfitted to those"]),
         (15.0, None, ["15.0 dB", "look wrong in places"]),
@@ -154,13 +164,17 @@ def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
 )
 def test_the_verdict_is_a_sentence_from_the_numbers(tmp_path, test, train, says):
     metrics = {"iterations": 1500}
-    metrics |= {k: {"psnr": v, "num_images": 2} for k, v in (("test", test), ("train", train)) if v is not None}
+    metrics |= {
+        k: {"psnr": v, "num_images": 2} for k, v in (("test", test), ("train", train)) if v is not None
+    }
     scores = [score("<i>low</i>", 12.5), score("high", 40.0)] if test is not None else []
     sentence = verdict(metrics, scores)
     assert all(words in sentence for words in says), sentence
     assert sentence.count(". ") == 0 and sentence.endswith(".") and sentence[0].isupper()
     if scores:
-        assert "the worst is <i>low</i> at 12.5 dB" in sentence and sentence.startswith("After 1,500 iterations ")
+        assert "the worst is <i>low</i> at 12.5 dB" in sentence and sentence.startswith(
+            "After 1,500 iterations "
+        )
     write_report(tmp_path / "r.html", Report("t", metrics, scores=scores))
     assert sentence in Page(tmp_path / "r.html").text and "<i>" not in (tmp_path / "r.html").read_text()
 
@@ -197,7 +211,10 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("chromium is not installed")
-    scores = [score("a_rather_long_folder_name/with_a_photo_0001.jpg", 20.0), score('" onload="alert(1)', 30.0)]
+    scores = [
+        score("a_rather_long_folder_name/with_a_photo_0001.jpg", 20.0),
+        score('" onload="alert(1)', 30.0),
+    ]
     pictures = [picture(each.name, 150) for each in scores]
     config = {"data": {"path": "/a/very/long/path" * 9}}
     metrics = {"test": summarize(scores), "train": summarize(scores), "num_gaussians": 1234567}
@@ -213,7 +230,9 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
         tab.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
         # a number has one line: its cell is as high as one
-        heights = tab.evaluate("[...document.querySelectorAll('td.n')].map((e) => e.getClientRects()[0].height)")
+        heights = tab.evaluate(
+            "[...document.querySelectorAll('td.n')].map((e) => e.getClientRects()[0].height)"
+        )
         lines = tab.evaluate(
             "[...document.querySelectorAll('td.n')].map((e) => {const r = document.createRange();"
             " r.selectNodeContents(e); return r.getClientRects().length; })"

@@ -120,7 +120,11 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--strategy": train.get("strategy"),
         "--max-gaussians": train.get("max_gaussians"),
     }
-    given = ((flag, f"{value:g}" if isinstance(value, float) else str(value)) for flag, value in named.items() if value)
+    given = (
+        (flag, f"{value:g}" if isinstance(value, float) else str(value))
+        for flag, value in named.items()
+        if value
+    )
     flags = ("--antialiased",) if train.get("antialiased") else ()
     return (*(word for pair in given for word in pair), *flags)
 

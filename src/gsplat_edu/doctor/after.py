@@ -27,7 +27,7 @@ UNEXPLAINED_SPREAD = 3.0
 """It has to be so many standard deviations below as well, by the median absolute deviation."""
 
 RISING = 0.1
-"""Decibels that the test views' PSNR has to gain over the last quarter of a training for more of it to be worth the time."""
+"""Decibels that the test views' PSNR has to gain over the last quarter of a training for longer ones to be advised."""
 
 FALLING = 0.97
 """A loss still falls if its mean over the last tenth of a training is below this times that of the tenth that ends a
@@ -94,7 +94,7 @@ class Trained:
             return scores[-1][1] - max(earlier[-2:]) >= RISING
         losses = _pairs(self.log, "loss", self.reached)
         last, before = (
-            [value for iteration, value in losses if low < iteration / self.reached <= high]
+            [value for iteration, value in losses if low * self.reached < iteration <= high * self.reached]
             for low, high in ((0.9, 1.0), (0.65, 0.75))
         )
         return float(np.mean(last)) < FALLING * float(np.mean(before)) if last and before else None
@@ -150,8 +150,9 @@ def _train_longer(run: Trained) -> str:
     if run.capture is None:
         return f"train for {RECIPE_ITERATIONS:,} iterations, as the recipe does"
     name = f"{run.path.resolve().name}_{RECIPE_ITERATIONS}"
-    words = ("train", run.capture, "--iterations", str(RECIPE_ITERATIONS), *run.options, "--out", new_run(name))
-    return f"train for longer: {command(*words)}"
+    length = ("--iterations", str(RECIPE_ITERATIONS))
+    words = command("train", run.capture, *length, *run.options, "--out", new_run(name))
+    return f"train for longer: {words}"
 
 
 def view_lines(run: Trained) -> list[str]:
@@ -190,7 +191,9 @@ def _length(run: Trained) -> list[Finding]:
         advice = f"more iterations alone will not help much, better photos may{_what_photos_lack(run)}"
         return [Finding("short training", Severity.NOTE, f"{what}, but {held}", advice)]
     if run.rising:
-        what += ", and " + ("the test views' PSNR was still rising" if run.test else "the loss was still falling")
+        what += ", and " + (
+            "the test views' PSNR was still rising" if run.test else "the loss was still falling"
+        )
     return [Finding("short training", Severity.WARNING, what, _train_longer(run))]
 
 

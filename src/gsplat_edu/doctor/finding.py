@@ -83,7 +83,9 @@ class Diagnosis:
 def command(*words: str | Path) -> str:
     """Write a command of ours so that it can be pasted into a shell, whatever the names of files hold."""
     # a file whose name begins with a dash would be taken for an option
-    spelled = [f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word) for word in words]
+    spelled = [
+        f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word) for word in words
+    ]
     return shlex.join(["gsplat-edu", *spelled])
 
 

@@ -21,8 +21,8 @@ Vector = Float64[np.ndarray, "3"]
 Values = Float64[np.ndarray, " n"]
 
 SAMPLED, DRAWS = 5, 40
-"""Cameras of a random sample, and samples, from which the centre is found: with one camera in five wrong, a sample is free
-of them with probability 0.8^5 = 0.33, and 40 samples all have one with probability 1e-7."""
+"""Cameras of a random sample, and samples, from which the centre is found: with one camera in five wrong, a sample is
+free of them with probability 0.8^5 = 0.33, and 40 samples all have one with probability 1e-7."""
 
 MOST = 0.7
 """Fraction of the cameras that has to see the centre, in front of it."""
@@ -35,8 +35,8 @@ FAR = math.log(3.0)
 outliers."""
 
 GAP, SPARSE_GAP, SPARSE = math.radians(40.0), math.radians(75.0), 2.0
-"""Azimuths without a camera that a path crosses: 40 degrees, and up to 75 where twice the median gap is as much: rings of
-five or more evenly spaced photos are closed."""
+"""Azimuths without a camera that a path crosses: 40 degrees, and up to 75 where twice the median gap is as much. Rings
+of five or more evenly spaced photos are closed."""
 
 STEEP = math.radians(65.0)
 """Median elevation above which azimuths say nothing: the cameras look down on something."""
@@ -132,7 +132,10 @@ def point_looked_at(cameras: Sequence[Camera]) -> Vector | None:
     """
     eyes, axes = (np.stack(rows) for rows in zip(*((c.eye, c.R[2]) for c in cameras), strict=True))
     rng, count = np.random.default_rng(0), len(cameras)
-    samples = [np.arange(count), *(rng.choice(count, min(SAMPLED, count), replace=False) for _ in range(DRAWS))]
+    samples = [
+        np.arange(count),
+        *(rng.choice(count, min(SAMPLED, count), replace=False) for _ in range(DRAWS)),
+    ]
     found = [point_nearest_axes([cameras[int(i)] for i in rows], PARALLEL) for rows in samples]
     points = [point for point in found if point is not None]
     if not points:
@@ -187,7 +190,9 @@ def _around(cameras: Sequence[Camera], centre: Vector, up: Vector, turns: Values
         middle, _, spread = _local_means(data, az, None, width)
         el = middle + RISE * spread * np.cos(turns)
         logs = _local_means(data, az, el, width)[1]
-        says = f"the cameras cover {math.degrees(covered):.0f} degrees: the path swings over those, no farther"
+        says = (
+            f"the cameras cover {math.degrees(covered):.0f} degrees: the path swings over those, no farther"
+        )
     ring = np.cos(az)[:, None] * start + np.sin(az)[:, None] * side
     eyes = centre + np.exp(logs)[:, None] * (np.cos(el)[:, None] * ring + np.sin(el)[:, None] * up)
     return CameraPath([_like(cameras[0], look_at(eye, centre, up), eye) for eye in eyes], says)
@@ -208,7 +213,8 @@ def _covered(azimuths: Values) -> tuple[float, float, Int64[np.ndarray, " m"], f
         return 0.0, 2.0 * np.pi, order, float(gaps.max())
     # the stretches between breaks; the one with the most cameras, as most photos are of that side
     pieces = [
-        np.arange(first + 1, last + 1) for first, last in zip(breaks, [*breaks[1:], breaks[0] + len(gaps)], strict=True)
+        np.arange(first + 1, last + 1)
+        for first, last in zip(breaks, [*breaks[1:], breaks[0] + len(gaps)], strict=True)
     ]
     piece = max(pieces, key=len)
     inner = gaps[piece[:-1] % len(gaps)]
@@ -217,7 +223,10 @@ def _covered(azimuths: Values) -> tuple[float, float, Int64[np.ndarray, " m"], f
 
 
 def _local_means(
-    data: tuple[Values, Values, Values], az: Float64[np.ndarray, " F"], el: Float64[np.ndarray, " F"] | None, width: float
+    data: tuple[Values, Values, Values],
+    az: Float64[np.ndarray, " F"],
+    el: Float64[np.ndarray, " F"] | None,
+    width: float,
 ) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, " F"], Float64[np.ndarray, " F"]]:
     """Average cameras around directions by a Gaussian kernel.
 
@@ -262,7 +271,11 @@ def _loop_between(
         reach = float(np.quantile(np.abs(column), 0.85))
         halves.append(max(min(SPREAD * float(column.std()), reach), LEAST_LOOP * depth))
     focus = middle + max(depth, halves[0] / MOST_TURN) * forward if target is None else target
-    path = middle + np.outer(np.sin(turns) * halves[0], main[:, 0]) + np.outer(np.cos(turns) * halves[1], main[:, 1])
+    path = (
+        middle
+        + np.outer(np.sin(turns) * halves[0], main[:, 0])
+        + np.outer(np.cos(turns) * halves[1], main[:, 1])
+    )
     up = -np.sum([camera.R[1] for camera in cameras], axis=0)
     if np.linalg.norm(np.cross(up, forward)) < 0.2 * len(cameras):  # strips flown to and fro
         up = -first.R[1]
@@ -274,14 +287,18 @@ def _flight(cameras: Sequence[Camera], turns: Values, depth: float) -> CameraPat
     """Follow a chain of cameras, each near the one before in place and direction; position and axes are averaged."""
     chosen = [cameras[i] for i in range(0, len(cameras), -(-len(cameras) // CHAIN))]
     eyes, axes = (np.stack(rows) for rows in zip(*((c.eye, c.R[2]) for c in chosen), strict=True))
-    apart = np.linalg.norm(eyes[:, None] - eyes, axis=2) / depth + np.arccos(np.clip(axes @ axes.T, -1.0, 1.0))
+    apart = np.linalg.norm(eyes[:, None] - eyes, axis=2) / depth + np.arccos(
+        np.clip(axes @ axes.T, -1.0, 1.0)
+    )
     chain = _chain(apart)
     steps = apart[chain[:-1], chain[1:]]
     back = float(apart[chain[-1], chain[0]])
     closed = len(chain) > 2 and back <= max(JUMP / 2, 2.0 * float(steps.max()))
     places = np.r_[0.0, np.cumsum(steps)]
     length = float(places[-1]) + (back if closed else 0.0)
-    width = max(length / 40, float(np.median(steps)) if len(steps) else 0.0, 0.6 * float(steps.max(initial=0.0)), 1e-9)
+    width = max(
+        length / 40, float(np.median(steps)) if len(steps) else 0.0, 0.6 * float(steps.max(initial=0.0)), 1e-9
+    )
     at = length * turns / (2.0 * np.pi) if closed else length * (1.0 - np.cos(turns)) / 2
     away = np.abs(at[:, None] - places)
     away = np.minimum(away, length - away) if closed else away
@@ -290,7 +307,9 @@ def _flight(cameras: Sequence[Camera], turns: Values, depth: float) -> CameraPat
     downs = np.stack([chosen[i].R[1] for i in chain])
     path = [
         _like(chosen[chain[0]], look_at(eye, eye + forward, -down), eye)
-        for eye, forward, down in zip(weights @ eyes[chain], depth * _units(weights @ axes[chain]), weights @ downs, strict=True)
+        for eye, forward, down in zip(
+            weights @ eyes[chain], depth * _units(weights @ axes[chain]), weights @ downs, strict=True
+        )
     ]
     how = "round and round" if closed else "to their end and back"
     return CameraPath(path, f"the cameras look at no common point: the path follows them, {how}")
@@ -310,7 +329,9 @@ def _chain(apart: Float64[np.ndarray, "n n"]) -> Int64[np.ndarray, " m"]:
         left[nearest[-1]] = False
     orders = (listed, np.array(nearest))
     pieces = [
-        piece for order in orders for piece in np.split(order, np.flatnonzero(apart[order[:-1], order[1:]] > JUMP) + 1)
+        piece
+        for order in orders
+        for piece in np.split(order, np.flatnonzero(apart[order[:-1], order[1:]] > JUMP) + 1)
     ]
     longest = max(len(piece) for piece in pieces)
     return min(

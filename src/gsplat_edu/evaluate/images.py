@@ -23,7 +23,30 @@ SEPARATOR_GREY = 128
 VIDEO_SUFFIX = ".mp4"
 
 NOT_WRITTEN = frozenset(
-    ".3gp .apng .avi .avif .bmp .flv .gif .jpeg .jpg .m4v .mkv .mov .mpeg .mpg .ogv .png .tif .tiff .webm .webp .wmv".split()
+    "." + name
+    for name in (
+        "3gp",
+        "apng",
+        "avi",
+        "avif",
+        "bmp",
+        "flv",
+        "gif",
+        "jpeg",
+        "jpg",
+        "m4v",
+        "mkv",
+        "mov",
+        "mpeg",
+        "mpg",
+        "ogv",
+        "png",
+        "tif",
+        "tiff",
+        "webm",
+        "webp",
+        "wmv",
+    )
 )
 """Suffixes of pictures and videos that are not written: nobody means a folder by them."""
 

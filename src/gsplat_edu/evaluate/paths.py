@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from gsplat_edu.camera import WORLD_UP, Camera, scaled_intrinsics
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
+from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
 Vector = Float64[np.ndarray, "3"]
 

@@ -85,7 +85,7 @@ for (const slider of document.querySelectorAll(".pair input")) {
   move();
 }
 """
-"""Moves the line between photo and render; a page without it shows half of each. It needs no other source than itself."""
+"""Moves the line between photo and render; without it a page shows half of each."""
 
 
 def machine_facts() -> dict[str, str]:
@@ -249,8 +249,9 @@ def _with_last(log: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any]) -> 
 def _page_link(report: Path, exports: object) -> str:
     """Link to the page that shows the scene, or name the command that makes one."""
     folder = report.parent.absolute()
-    written = [entry.get("path") for entry in exports if isinstance(entry, Mapping)] if isinstance(exports, list) else []
-    pages = [Path(path) for path in (*written, folder / "page.html") if str(path).endswith(".html")]
+    entries = exports if isinstance(exports, list) else []
+    named = [str(entry.get("path")) for entry in entries if isinstance(entry, Mapping)]
+    pages = [Path(name) for name in named if name.endswith(".html")] + [folder / "page.html"]
     for page in pages:
         if page.is_file() and page.absolute() != report.absolute():
             place = quote(Path(os.path.relpath(page.absolute(), folder)).as_posix())
@@ -265,7 +266,10 @@ def _machines(report: Report) -> list[str]:
     trained = {key: _plain(value) for key, value in trained.items()} if isinstance(trained, Mapping) else {}
     if not trained or trained == dict(report.machine):
         return [_section("Machine", _facts(report.machine))]
-    return [_section("Machine of the training", _facts(trained)), _section("Machine of this report", _facts(report.machine))]
+    return [
+        _section("Machine of the training", _facts(trained)),
+        _section("Machine of this report", _facts(report.machine)),
+    ]
 
 
 def _headline(metrics: Mapping[str, Any]) -> str:
@@ -351,7 +355,8 @@ def _figure(picture: Picture, score: ImageScore | None) -> str:
     pair = (
         f'<div class="pair">{_image(photo, above)}{_image(render, below)}'
         f'<span class="left">{photo}</span><span class="right">{render}</span>'
-        f'<input type="range" min="0" max="100" value="50" aria-label="{name}: {photo} left of here, {render} right"></div>'
+        f'<input type="range" min="0" max="100" value="50"'
+        f' aria-label="{name}: {photo} on the left, {render} on the right"></div>'
     )
     beside = f'<div class="difference">{_image(difference, apart)}</div>'
     numbers = f": PSNR {_score('psnr', score.psnr)} dB, SSIM {_score('ssim', score.ssim)}" if score else ""

@@ -19,8 +19,8 @@ from gsplat_edu.validation import ArrayLike
 FOURCC = "vp09"
 
 BT709, BT601 = 1, 6
-"""Codes of ISO/IEC 23091-2 for colour primaries, transfer function and matrix: sRGB's primaries are those of BT.709, and
-swscale, through which OpenCV converts to YUV, has the matrix of BT.601."""
+"""Codes of ISO/IEC 23091-2 for colour primaries, transfer function and matrix: sRGB has the primaries of BT.709, and
+swscale, through which OpenCV converts to YUV, the matrix of BT.601."""
 
 CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
 """Boxes on the way to the tables of an MP4 file's index."""
@@ -82,8 +82,8 @@ def _writer(path: Path, shown: Path, size: tuple[int, int], fps: float) -> cv2.V
 def streamable(data: bytes) -> bytes:
     """Put an MP4 file's index in front of its frames, and name the colours of its VP9 track.
 
-    With the index behind the frames a player has to fetch the whole file first. Without the colours' names browsers assume
-    BT.709's matrix, which turns (30, 220, 30) into (15, 190, 23).
+    With the index behind the frames a player has to fetch the whole file first. Without the colours' names browsers
+    assume the matrix of BT.709, which turns (30, 220, 30) into (15, 190, 23).
 
     Args:
         data: The file.
@@ -96,7 +96,9 @@ def streamable(data: bytes) -> bytes:
     """
     boxes = {kind: (start, end) for kind, start, _, end in _boxes(data, 0, len(data))}
     if not {b"ftyp", b"moov", b"mdat"} <= set(boxes):
-        raise ArgumentError("video: is not an MP4 file with an index; OpenCV's encoder failed, write a folder")
+        raise ArgumentError(
+            "video: is not an MP4 file with an index; OpenCV's encoder failed, write a folder"
+        )
     (_, front), (start, end) = boxes[b"ftyp"], boxes[b"moov"]
     index = bytearray(data[start:end])
     _name_colours(index)
@@ -142,7 +144,7 @@ def _shift_offsets(index: bytearray, shift: int) -> None:
 
 
 def _name_colours(index: bytearray) -> None:
-    """Set the bytes of vpcC for primaries, transfer function and matrix; 4 of version and flags, 3 of format precede."""
+    """Set the bytes of vpcC for primaries, transfer function and matrix, behind 4 of version and 3 of format."""
     for kind, content, _ in list(_tables(index, 0, len(index))):
         if kind == b"vpcC":
             index[content + 7 : content + 10] = bytes((BT709, BT709, BT601))

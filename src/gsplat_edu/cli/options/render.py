@@ -29,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--orbit",
         action="store_true",
-        help="render a path that shows the scene from where it was photographed: a full circle if the cameras stand all"
-        " round, else only as far as they go (default)",
+        help="render a path that stays where the photos were taken: a full circle if the cameras stand all round,"
+        " else only as far as they go (default)",
     )
 
     def number(flag: str, default: int | None, text: str) -> None:
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         metavar="DIR|X.mp4",
-        help="folder of PNGs, or a video that browsers play, VP9 in MP4 (default: renders/ in the run, out/ for a scene file)",
+        help="folder of PNGs, or a video, VP9 in MP4 (default: renders/ in the run, out/ for a scene file)",
     )
     parser.add_argument(
         "--white-background", action="store_true", help="render over white (default: the run's background)"
