@@ -27,7 +27,7 @@ def test_memory_is_flat_after_the_warm_up(tmp_path, case):
     over its background, which is below 4 images (bytes: RGBA a third of a float image, twice while it is copied).
     """
     run = [sys.executable, soak.__file__, case, str(tmp_path / "capture")]
-    done = subprocess.run(run, check=False, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(run, check=False, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stderr[-2000:]
     resident = json.loads(done.stdout)
     assert len(resident) == soak.ITERATIONS
