@@ -23,7 +23,7 @@ from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import View
 
-ITERATIONS = 320
+ITERATIONS = 240
 SIZES = {"one": [(320, 240)], "mixed": [(320, 240), (240, 320), (304, 304), (360, 200)]}
 """(W, H) of the photos, by turns."""
 
@@ -67,9 +67,9 @@ def main(case, folder):
         max_gaussians=600,
         densify_start=20,
         densify_every=40,
-        densify_stop=280,
-        mcmc_stop=280,
-        reset_every=150,
+        densify_stop=200,
+        mcmc_stop=200,
+        reset_every=100,
     )
     start = from_points(dataset.points, dataset.colors, config)
     resident, page = [], os.sysconf("SC_PAGE_SIZE")

@@ -64,21 +64,19 @@ class TrainResult:
 
 
 class _Losses:
-    """Losses of a run as numbers. A GPU's are collected where they are, and read many at a time: reading waits."""
+    """The losses of a run as numbers.
+
+    They are collected where the Gaussians are and read many at a time: reading waits for a GPU, and a tensor kept for
+    every step would pin the heap's pages.
+    """
 
     ROOM = 1024
 
-    def __init__(self) -> None:
+    def __init__(self, like: Tensor) -> None:
         self._read: list[float] = []
-        self._waiting: Tensor | None = None
-        self._count = 0
+        self._waiting, self._count = like.new_empty(self.ROOM), 0
 
     def add(self, loss: Tensor) -> None:
-        if loss.device.type == "cpu":
-            self._read.append(loss.item())
-            return
-        if self._waiting is None:
-            self._waiting = loss.new_empty(self.ROOM)
         self._waiting[self._count] = loss
         self._count += 1
         if self._count == self.ROOM:
@@ -86,9 +84,8 @@ class _Losses:
 
     def read(self) -> list[float]:
         """Return all losses so far."""
-        if self._waiting is not None:
-            self._read += self._waiting[: self._count].tolist()
-            self._count = 0
+        self._read += self._waiting[: self._count].tolist()
+        self._count = 0
         return self._read
 
 
@@ -153,7 +150,7 @@ class Trainer:
         Args:
             stop: Asked after every iteration; the run ends when it says so, and can be taken up again.
         """
-        losses, counts = _Losses(), []
+        losses, counts = _Losses(self.gaussians.means.detach()), []
         start = time.perf_counter()
         with reused_buffers():
             while self.iteration < self.config.iterations:
