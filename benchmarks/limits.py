@@ -2,10 +2,11 @@
 
     python benchmarks/limits.py [CAPTURE] [--memory SIZE ...] [--time TIME ...] [--smoke] [--out FILE.json]
 
-Runs `gsplat-edu train CAPTURE` (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else a procedural capture) in a process
-of its own, once for each limit (default: 1GiB, 2GiB, 2m, 4m), and looks at it from outside: its peak RSS by wait4, its wall time,
-what it said it would take. Runs with a limit of memory get options that split every Gaussian as often as it goes, so
-that the cap which was chosen is reached and the memory used. Linux, where ru_maxrss is in KiB.
+Runs `gsplat-edu train CAPTURE` (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else a procedural
+capture) in a process of its own, once for each limit (default: 1GiB, 2GiB, 2m, 4m), and measures it from outside: its
+peak RSS by wait4, its wall time, the forecast it printed. Runs with a limit of memory get options that split every
+Gaussian as often as possible, so that they reach the cap that was chosen and use the memory. Linux, where ru_maxrss is
+in KiB.
 """
 
 from __future__ import annotations
@@ -99,13 +100,14 @@ def main() -> None:
     made.add_argument("--out", type=Path, help="JSON file to write")
     made.add_argument("--smoke", action="store_true", help="one tiny training per kind of limit")
     arguments = made.parse_args()
-    default = (["1GiB"], ["5s"]) if arguments.smoke else (["1GiB", "2GiB"], ["2m", "4m"])
+    default = (["1GiB"], ["1h"]) if arguments.smoke else (["1GiB", "2GiB"], ["2m", "4m"])
     memory, times = (
         usual if given is None else given
         for given, usual in zip((arguments.memory, arguments.time), default, strict=True)
     )
-    limits = [["--max-memory", size, *FILLING.split()] for size in memory]
-    limits += [["--time-limit", duration] for duration in times]
+    short = ["--iterations", "20"] if arguments.smoke else []
+    limits = [["--max-memory", size, *FILLING.split(), *short] for size in memory]
+    limits += [["--time-limit", duration, *short] for duration in times]
     rows = []
     with capture(arguments.capture, arguments.smoke) as folder:
         for limit in limits:

@@ -1,10 +1,11 @@
 """What does a whole training of a capture come to, and where does its time go as the scene grows?
 
-    python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--smoke] [--out FILE.json] [options of gsplat-edu train]
+    python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--smoke] [--out FILE.json] [options of train]
 
-Trains as `gsplat-edu train CAPTURE --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or
-../shared/data, or else a procedural capture), and takes an iteration apart at the start, after 1,000 and 3,000 iterations and at the end: medians
-over 20 views. The wall time is that of the training with its checkpoints and evaluations, without these measurements.
+Trains as `gsplat-edu train CAPTURE --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data,
+or else a procedural capture), and takes an iteration apart at the start, after 1,000 and 3,000 iterations and at the
+end: medians over 20 views. The wall time is that of the training with its checkpoints and evaluations, without these
+measurements.
 """
 
 from __future__ import annotations

@@ -37,8 +37,8 @@ SUFFIXES = {torch.float32: "32", torch.float64: "64"}
 def array(tensor: Tensor) -> object:
     """Hand a tensor to the native module, which checks it.
 
-    The module is built against no torch. From torch 2.10 on, tensors describe themselves through DLPack's C
-    interface, at no cost; before that, as DLPack capsules (`Tensor.__dlpack__` takes ten times as long).
+    The module is built against no torch. Tensors describe themselves to it through DLPack's C interface, at next to no
+    cost; those of older versions of torch, which lack it, become DLPack capsules.
     """
     return tensor if _DESCRIBE_THEMSELVES else to_dlpack(tensor)
 

@@ -1,4 +1,4 @@
-"""Damaged config.json: `train --resume` ends with 0 or with one line and 2, and what reads runs refuses it in one line."""
+"""Damaged config.json: `train --resume` exits with 0, or with 2 after one line; other readers refuse it in one line."""
 
 import contextlib
 import io

@@ -169,11 +169,9 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         *kept, image, transmittance, depth = ctx.saved_tensors
         call: _Call = ctx.call
-        incoming = [None if g is None else g.contiguous() for g in grads]
-        if incoming[0] is None:
-            incoming[0] = torch.zeros_like(image)
-        if not call.settings.depth:
-            incoming[2] = None
+        grad_image, grad_transmittance, grad_depth = (None if g is None else g.contiguous() for g in grads)
+        if grad_image is None:
+            grad_image = torch.zeros_like(image)
         outgoing = [empty(p.shape, p) for p in kept]
         norms = empty((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
@@ -181,7 +179,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.frame.backward(
             scene=_scene(kept, call.direct),
             images=_images(image, transmittance, depth if call.settings.depth else None),
-            incoming=_images(*incoming),
+            incoming=_images(grad_image, grad_transmittance, grad_depth if call.settings.depth else None),
             gradients=native().Gradients(
                 **_arrays(outgoing, call.direct), means2d_norm=array(norms), background=array(background)
             ),
