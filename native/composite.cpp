@@ -1,6 +1,6 @@
 // composite: one tile's splats, near to far, into its pixels.
 //
-//     alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
+//     p = log2_o - s² - t²;   alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 //
 // The tile ends before the first splat that finds every pixel below 1e-4.
 #include "isa.h"
@@ -20,15 +20,15 @@ template <class T, bool DEPTH>
 GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileState<T> &tile) {
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
-    const T most = vmin(s.log2_o, T(LOG2_ALPHA_MAX));
+    RowTerms<T> terms;
+    row_terms(s, box, terms);
     V brightest = V{};
     for (int column = 0; column < TILE; column += LANES) {
-        const V dx = iota<T>() + splat(T(column + box.x0) - s.u);
-        const V along = splat(s.log2_o) + splat(s.a) * dx * dx, cross = splat(s.b) * dx;
-        V dy = splat(T(first + box.y0) - s.v);
-        for (int row = first; row <= last; ++row, dy += splat(T(1))) {
-            const V p = along + dy * (cross + splat(s.c) * dy);
-            const V alpha = exp2_between(p, T(LOG2_ALPHA_MIN), most);
+        const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
+        const V across = splat(s.s0) + splat(s.sx) * dx;
+        for (int row = first; row <= last; ++row) {
+            const V q = across + splat(terms.shift[row]);
+            const V alpha = exp2_between(splat(terms.base[row]) - q * q, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
             V t = load<V>(&tile.transmittance[row][column]);
             const V w = t * alpha;
             store(&tile.red[row][column], load<V>(&tile.red[row][column]) + w * splat(s.color[0]));

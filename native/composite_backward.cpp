@@ -5,7 +5,8 @@
 //     cg = g . c;   w = T alpha;   R -= w cg;   dL/dalpha = T cg - R / (1 - alpha);   T -= w
 //     h = alpha dL/dalpha, 0 where alpha was clamped
 //
-// Every pair writes its sums over the tile's pixels, w g and the moments of h, to a slot of its own.
+// Every pair writes its sums over the tile's pixels, w g and the moments of h about the splat's reference point, to a slot
+// of its own.
 #include "isa.h"
 #include "tile.h"
 
@@ -23,18 +24,19 @@ template <class T, bool WITH_DEPTH>
 GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileGradient<T> &tile, T *slot) {
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
-    const T most = vmin(s.log2_o, T(LOG2_ALPHA_MAX));
+    RowTerms<T> terms;
+    row_terms(s, box, terms);
     // w g (3) and the moments of h, 1, x, xx, y, xy, in the order of a slot; then yy and w z.
     V sums[8] = {}, hyy = V{}, wz = V{};
     for (int column = 0; column < TILE; column += LANES) {
-        const V dx = iota<T>() + splat(T(column + box.x0) - s.u);
-        const V along = splat(s.log2_o) + splat(s.a) * dx * dx, cross = splat(s.b) * dx;
+        const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
+        const V across = splat(s.s0) + splat(s.sx) * dx;
         V wr = V{}, wg = V{}, wb = V{};
         V sum0 = V{}, sum1 = V{}, sum2 = V{};  // h, h dy, h dy²; the factors dx are put in once per splat
-        V dy = splat(T(first + box.y0) - s.v);
+        V dy = splat(T(first + box.y0) - s.y);
         for (int row = first; row <= last; ++row, dy += splat(T(1))) {
-            const V p = along + dy * (cross + splat(s.c) * dy);
-            const V alpha = exp2_between(p, T(LOG2_ALPHA_MIN), most);
+            const V q = across + splat(terms.shift[row]), p = splat(terms.base[row]) - q * q;
+            const V alpha = exp2_between(p, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
             const V r = load<V>(&tile.red[row][column]), g = load<V>(&tile.green[row][column]);
             const V b = load<V>(&tile.blue[row][column]);
             V cg = r * splat(s.color[0]) + g * splat(s.color[1]) + b * splat(s.color[2]);

@@ -1,6 +1,6 @@
 // intersect: which tiles an ellipse alpha >= 1/255 meets, exactly, and the tile lists in depth order.
 //
-// The ellipse is A dx² + 2 B dx dy + C dy² <= L. Its x interval over a band of rows is found where the band meets it:
+// The ellipse is (sx dx + sy dy)² + (ty dy)² <= L. Its x interval over a band of rows is found where the band meets it:
 // at the rightmost point of the ellipse if that lies in the band, else at the end of the band that is nearest to it.
 #include "gaussian_math.h"
 #include "isa.h"
@@ -15,31 +15,31 @@ template <class T>
 struct Ellipse {
     T u, v, ex, ey;
     T inverse_ey;
-    T slant;          // B / C: the rightmost point is at dy = -slant ex
+    T slant;          // sx sy / (sy² + ty²): the rightmost point is at dy = -slant ex
     T half, tangent;  // at height dy the ellipse spans dx = tangent dy +- half sqrt(1 - (dy / ey)²)
 };
 
 template <class T>
 GSPLAT_INLINE Ellipse<T> ellipse(const Splat<T> &s) {
-    // a = -A log2(e) / 2, b = -B log2(e), c = -C log2(e) / 2, so b / a = 2 B / A and 4 a c - b² = (log2 e)² det.
     Ellipse<T> e;
     e.u = s.u, e.v = s.v, e.ex = s.extent[0], e.ey = s.extent[1];
     e.inverse_ey = 1 / e.ey;
-    e.slant = s.b / (2 * s.c);
-    e.tangent = -s.b / (2 * s.a);
-    // L log2(e) / 2 = log2(255 o) is the drop of the exponent from the centre to the rim.
+    e.slant = s.sx * s.sy / (s.sy * s.sy + s.ty * s.ty);
+    e.tangent = -s.sy / s.sx;
+    // L = log2(255 o) is the drop of the exponent from the centre to the rim.
     const T drop = s.log2_o - T(LOG2_ALPHA_MIN);
-    e.half = sqrt_(vmax(drop / -s.a, T(0)));
+    e.half = sqrt_(vmax(drop, T(0))) / s.sx;
     return e;
 }
 
 // Calls visit(tile_y, first tile_x, last tile_x) for every row of tiles that the ellipse meets.
 template <class T, class F>
 GSPLAT_INLINE void rows_of_tiles(const Ellipse<T> &e, const Camera &cam, F visit) {
-    const T slack = T(RIM_SLACK);
-    const int32_t first = int32_t(vmax(ceil_(e.v - e.ey - slack), T(0)));
-    const int32_t last = int32_t(vmin(floor_(e.v + e.ey + slack), T(cam.H - 1)));
+    const T above = rim_slack(abs_(e.v) + e.ey);
+    const int32_t first = int32_t(vmin(vmax(ceil_(e.v - e.ey - above), T(0)), T(cam.H)));
+    const int32_t last = int32_t(vmax(vmin(floor_(e.v + e.ey + above), T(cam.H - 1)), T(-1)));
     if (first > last) return;
+    const T slack = rim_slack(abs_(e.u) + abs_(e.tangent) * vmin(e.ey, abs_(e.v) + T(cam.H)) + e.half);
     for (int32_t ty = first / TILE; ty <= last / TILE; ++ty) {
         T low = T(ty * TILE) - e.v, high = T(ty * TILE + TILE - 1) - e.v;
         low = vmax(low, -e.ey), high = vmin(high, e.ey);

@@ -18,6 +18,20 @@ GSPLAT_INLINE TileBox tile_box(const Grid &grid, const gsplat::Camera &cam, int3
     return box;
 }
 
+// What a splat's exponent takes from each row of a tile: p = base - (shift + s0 + sx dx)².
+template <class T>
+struct RowTerms {
+    alignas(64) T base[TILE], shift[TILE];
+};
+
+template <class T>
+GSPLAT_INLINE void row_terms(const Splat<T> &s, const TileBox &box, RowTerms<T> &terms) {
+    for (int row = 0; row < TILE; ++row) {
+        const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;
+        terms.base[row] = s.log2_o - t * t, terms.shift[row] = s.sy * dy;
+    }
+}
+
 // The rows of a tile that each of its next few splats can touch; first > last where it touches none.
 constexpr uint32_t BATCH = 16;
 
@@ -40,21 +54,23 @@ GSPLAT_INLINE void fetch_next(const Splat<T> *splats, const Pair *pairs, uint32_
 // Plain loops over BATCH lanes, which the compiler turns into vectors.
 template <class T>
 GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, Rows &rows) {
-    T u[BATCH], v[BATCH], a[BATCH], b[BATCH], c[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
+    T u[BATCH], v[BATCH], sx[BATCH], sy[BATCH], ty[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
     for (uint32_t i = 0; i < BATCH; ++i) {
         const Splat<T> &s = splats[pairs[i < count ? i : 0].gaussian];
-        u[i] = s.u, v[i] = s.v, a[i] = s.a, b[i] = s.b, c[i] = s.c, ex[i] = s.extent[0], ey[i] = s.extent[1];
+        u[i] = s.u - T(box.x0), v[i] = s.v - T(box.y0);
+        sx[i] = s.sx, sy[i] = s.sy, ty[i] = s.ty, ex[i] = s.extent[0], ey[i] = s.extent[1];
         drop[i] = s.log2_o - T(LOG2_ALPHA_MIN);
     }
-    const T x0 = T(box.x0), y0 = T(box.y0), lowest = T(box.height - 1), slack = T(RIM_SLACK);
+    const T lowest = T(box.height - 1);
     for (uint32_t i = 0; i < BATCH; ++i) {
-        const T low = x0 - u[i], high = low + T(TILE - 1);
-        const T tangent = -b[i] / (2 * c[i]), half = sqrt_(vmax(drop[i] / -c[i], T(0)));
-        const T foot = -b[i] / (2 * a[i]) * ey[i];
+        const T low = -u[i], high = low + T(TILE - 1), yy = sy[i] * sy[i] + ty[i] * ty[i];
+        const T tangent = -sx[i] * sy[i] / yy, half = sqrt_(vmax(drop[i] / yy, T(0)));
+        const T slack = rim_slack(abs_(v[i]) + abs_(tangent) * vmax(abs_(low), abs_(high)) + half);
+        const T foot = -sy[i] / sx[i] * ey[i];
         const T xb = vmin(vmax(foot, low), high), xt = vmin(vmax(-foot, low), high);
         const T qb = vmax(1 - (xb / ex[i]) * (xb / ex[i]), T(0)), qt = vmax(1 - (xt / ex[i]) * (xt / ex[i]), T(0));
-        const T bottom = v[i] - y0 + tangent * xb + half * sqrt_(qb) + slack;
-        const T top = v[i] - y0 + tangent * xt - half * sqrt_(qt) - slack;
+        const T bottom = v[i] + tangent * xb + half * sqrt_(qb) + slack;
+        const T top = v[i] + tangent * xt - half * sqrt_(qt) - slack;
         rows.first[i] = int32_t(ceil_(vmin(vmax(top, T(0)), T(TILE))));
         rows.last[i] = int32_t(floor_(vmin(vmax(bottom, T(-1)), lowest)));
     }

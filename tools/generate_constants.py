@@ -19,6 +19,7 @@ NAMES = (
     "ALPHA_MAX",
     "T_STOP",
     "DET_FLOOR",
+    "SPLAT_LIMIT",
     "COLOR_LIMIT",
     "RIM_SLACK",
     "C0",

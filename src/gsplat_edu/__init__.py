@@ -4,8 +4,8 @@ The names here are the NumPy half of the system, the chapter's own. Training liv
 differentiable rendering in `gsplat_edu.render.api`; those import torch, these do not.
 """
 
-from gsplat_edu.camera import Camera, look_at, orbit_camera
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, C0, DILATION, T_STOP, TILE, Z_NEAR
+from gsplat_edu.camera import Camera, CameraLike, look_at, orbit_camera
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, C0, C1, C2, C3, DILATION, T_STOP, TILE, Z_NEAR
 from gsplat_edu.errors import ArgumentError, BackendUnavailableError, ShapeError, SplatError
 from gsplat_edu.gaussian_math import build_cov3d, build_cov3d_batch, project_cov3d, quat_to_R, quat_to_R_batch
 from gsplat_edu.render.numpy_reference import render_gaussians
@@ -18,6 +18,9 @@ __all__ = [
     "ALPHA_MAX",
     "ALPHA_MIN",
     "C0",
+    "C1",
+    "C2",
+    "C3",
     "DILATION",
     "TILE",
     "T_STOP",
@@ -25,6 +28,7 @@ __all__ = [
     "ArgumentError",
     "BackendUnavailableError",
     "Camera",
+    "CameraLike",
     "ShapeError",
     "SplatError",
     "build_cov3d",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, SupportsFloat, SupportsIndex, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -195,6 +196,73 @@ class Camera:
         depth = np.where(z > 0, z, np.nan)
         u, v = self.fx * x / depth + self.cx, self.fy * y / depth + self.cy
         return np.asarray(u), np.asarray(v), np.array(z)  # one point: arrays of no axes, not bare numbers
+
+
+@runtime_checkable
+class CameraLike(Protocol):
+    """Any pinhole camera: what the renderers need to know of one, by the names of `Camera`.
+
+    Arrays may be lists, and numbers NumPy scalars; `as_camera` reads and checks them. Other members, such as
+    the methods of a chapter's own camera, may be there and are not called.
+    """
+
+    @property
+    def R(self) -> ArrayLike:
+        """(3, 3) world-to-camera rotation, rows (right, down, forward)."""
+
+    @property
+    def eye(self) -> ArrayLike:
+        """(3,) camera centre, world units."""
+
+    @property
+    def fx(self) -> SupportsFloat:
+        """Focal length along x, px."""
+
+    @property
+    def fy(self) -> SupportsFloat:
+        """Focal length along y, px."""
+
+    @property
+    def cx(self) -> SupportsFloat:
+        """Column of the principal point, px."""
+
+    @property
+    def cy(self) -> SupportsFloat:
+        """Row of the principal point, px."""
+
+    @property
+    def H(self) -> SupportsIndex:
+        """Image height, px."""
+
+    @property
+    def W(self) -> SupportsIndex:
+        """Image width, px."""
+
+
+def as_camera(name: str, camera: CameraLike) -> Camera:
+    """Return a camera that is one of ours: the same object where it is, else one of the same eight numbers and arrays.
+
+    Args:
+        name: What the caller calls the argument.
+        camera: A `Camera`, or anything with its members R, eye, fx, fy, cx, cy, H and W.
+
+    Raises:
+        ShapeError: its R is not (3, 3) or its eye not (3,).
+        ArgumentError: a member is missing, or has a value that no pinhole camera has.
+    """
+    if isinstance(camera, Camera):
+        return camera
+    members = ("R", "eye", "fx", "fy", "cx", "cy", "H", "W")
+    missing = [member for member in members if not hasattr(camera, member)]
+    if missing:
+        raise ArgumentError(
+            f"{name}: is no camera, a {type(camera).__name__} has no {', '.join(missing)}; "
+            "a camera has R, eye, fx, fy, cx, cy, H and W"
+        )
+    try:
+        return Camera(*(getattr(camera, member) for member in members))
+    except ArgumentError as error:
+        raise type(error)(f"{name}.{error}") from None
 
 
 def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius: float = 3.0) -> Camera:

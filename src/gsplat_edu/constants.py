@@ -42,6 +42,10 @@ COLOR_LIMIT: Final = 1e6
 """The kernels take a colour beyond this for one that is not finite and leave its Gaussian out. No photo comes near, and
 the gradients of the Gaussians around it would lose all their digits to it. Source: ours."""
 
+SPLAT_LIMIT: Final = 1e15
+"""px: the native kernels leave out a Gaussian whose standard deviation on the screen is beyond this. float32 holds
+the squares of its inverse, a factor of the exponent. Source: ours."""
+
 DET_FLOOR: Final = 1e-12
 """px⁴: floor under the determinant of a screen-space covariance before its dilation, where antialiasing takes
 the root of its ratio to the one after. A Gaussian that is a line on the screen has determinant 0, where the
@@ -71,17 +75,26 @@ C0: Final = 0.28209479177387814
 C1: Final = math.sqrt(3.0 / (4.0 * math.pi))
 """Degree 1: factor of x, y and z."""
 
-C2: Final = (math.sqrt(15.0 / math.pi) / 2.0, math.sqrt(5.0 / math.pi) / 4.0, math.sqrt(15.0 / math.pi) / 4.0)
-"""Degree 2: factors of the mixed products (xy, yz, xz), of 2z² - x² - y², and of x² - y²."""
+C2: Final = (
+    math.sqrt(15.0 / math.pi) / 2.0,
+    -math.sqrt(15.0 / math.pi) / 2.0,
+    math.sqrt(5.0 / math.pi) / 4.0,
+    -math.sqrt(15.0 / math.pi) / 2.0,
+    math.sqrt(15.0 / math.pi) / 4.0,
+)
+"""Degree 2, one factor for each harmonic from m = -2 to 2, signs included: of xy, yz, 2z² - x² - y², xz, x² - y²."""
 
 C3: Final = (
-    math.sqrt(35.0 / (2.0 * math.pi)) / 4.0,
+    -math.sqrt(35.0 / (2.0 * math.pi)) / 4.0,
     math.sqrt(105.0 / math.pi) / 2.0,
-    math.sqrt(21.0 / (2.0 * math.pi)) / 4.0,
+    -math.sqrt(21.0 / (2.0 * math.pi)) / 4.0,
     math.sqrt(7.0 / math.pi) / 4.0,
+    -math.sqrt(21.0 / (2.0 * math.pi)) / 4.0,
     math.sqrt(105.0 / math.pi) / 4.0,
+    -math.sqrt(35.0 / (2.0 * math.pi)) / 4.0,
 )
-"""Degree 3: factors by the order |m| of the harmonic: |m| = 3, xyz, |m| = 1, m = 0, z(x² - y²)."""
+"""Degree 3, one factor for each harmonic from m = -3 to 3, signs included: of y(3x² - y²), xyz, y(4z² - x² - y²),
+z(2z² - 3x² - 3y²), x(4z² - x² - y²), z(x² - y²), x(x² - 3y²)."""
 
 SH_OFFSET: Final = 0.5
 """Added to every evaluated colour, so that all-zero coefficients are mid-grey.

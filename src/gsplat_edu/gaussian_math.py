@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import CameraLike, as_camera
 from gsplat_edu.constants import DET_FLOOR, DILATION
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array
@@ -102,7 +102,7 @@ def build_cov3d_batch(scales: ArrayLike, Rs: ArrayLike) -> Float64[np.ndarray, "
 
 
 def project_cov3d(
-    cov3d: ArrayLike, mean_cam: ArrayLike, cam: Camera, *, jacobian_limit: float | None = None
+    cov3d: ArrayLike, mean_cam: ArrayLike, cam: CameraLike, *, jacobian_limit: float | None = None
 ) -> Float64[np.ndarray, "*batch 2 2"]:
     """Project 3D covariances to the image, to first order around their means.
 
@@ -113,7 +113,7 @@ def project_cov3d(
     Args:
         cov3d: (..., 3, 3) covariances in world axes, world units squared.
         mean_cam: (..., 3) means in camera coordinates, world units; the same leading axes.
-        cam: The camera.
+        cam: The camera: a `Camera`, or anything with its members (`CameraLike`).
         jacobian_limit: x/z and y/z inside J are clamped to this many half fields of view, see
             `Camera.jacobian_bounds`; None clamps nothing.
 
@@ -122,10 +122,12 @@ def project_cov3d(
 
     Raises:
         ShapeError: a shape differs.
-        ArgumentError: a mean is not in front of the camera (z <= 0), or anything is NaN or infinite.
+        ArgumentError: a mean is not in front of the camera (z <= 0), anything is NaN or infinite, or `cam` is
+            no camera.
 
     Source: Zwicker et al. 2002, "EWA Splatting", eq. 31; Kerbl et al. 2023, eq. 5.
     """
+    cam = as_camera("cam", cam)
     cov3d = float64_array("cov3d", cov3d, ("...", 3, 3))
     mean_cam = float64_array("mean_cam", mean_cam, ("...", 3))
     check_shape("mean_cam", mean_cam.shape, (*cov3d.shape[:-2], 3), {})
@@ -161,7 +163,10 @@ def opacity_compensation(cov2d: ArrayLike) -> Float64[np.ndarray, "*batch"]:
     Source: Yu et al. 2024, "Mip-Splatting", eq. 9 with the dilation of Kerbl et al.; the floor is ours.
     """
     cov2d = float64_array("cov2d", cov2d, ("...", 2, 2))
-    det, dilated = np.linalg.det(cov2d), np.linalg.det(cov2d + DILATION * np.eye(2))
+    a, b, c = cov2d[..., 0, 0], cov2d[..., 0, 1], cov2d[..., 1, 1]
+    det = np.maximum(a * c - b * b, 0.0)
+    # det(Sigma2d + d I) = det Sigma2d + d (a + c) + d²: no term is negative, so that nothing cancels a second time.
+    dilated = det + DILATION * (a + c) + DILATION * DILATION
     return np.asarray(np.sqrt(np.maximum(det, DET_FLOOR) / dilated))
 
 

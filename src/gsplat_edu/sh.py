@@ -95,20 +95,20 @@ def basis_terms(degree: int, x: Any, y: Any, z: Any) -> list[Any]:  # noqa: ANN4
         xx, yy, zz = x * x, y * y, z * z
         terms += [
             C2[0] * x * y,
-            -C2[0] * y * z,
-            C2[1] * (2.0 * zz - xx - yy),
-            -C2[0] * x * z,
-            C2[2] * (xx - yy),
+            C2[1] * y * z,
+            C2[2] * (2.0 * zz - xx - yy),
+            C2[3] * x * z,
+            C2[4] * (xx - yy),
         ]
     if degree >= 3:
         terms += [
-            -C3[0] * y * (3.0 * xx - yy),
+            C3[0] * y * (3.0 * xx - yy),
             C3[1] * x * y * z,
-            -C3[2] * y * (4.0 * zz - xx - yy),
+            C3[2] * y * (4.0 * zz - xx - yy),
             C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-            -C3[2] * x * (4.0 * zz - xx - yy),
-            C3[4] * z * (xx - yy),
-            -C3[0] * x * (xx - 3.0 * yy),
+            C3[4] * x * (4.0 * zz - xx - yy),
+            C3[5] * z * (xx - yy),
+            C3[6] * x * (xx - 3.0 * yy),
         ]
     return terms
 

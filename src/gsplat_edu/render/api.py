@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
 from gsplat_edu.render.backends import resolve_backend
@@ -22,7 +22,7 @@ from gsplat_edu.render.torch_reference import render_dense
 @overload
 def render(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: CameraLike,
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
@@ -33,7 +33,7 @@ def render(
 @overload
 def render(
     gaussians: Gaussians,
-    camera: Sequence[Camera],
+    camera: Sequence[CameraLike],
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
@@ -43,7 +43,7 @@ def render(
 
 def render(
     gaussians: Gaussians,
-    camera: Camera | Sequence[Camera],
+    camera: CameraLike | Sequence[CameraLike],
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
@@ -53,7 +53,8 @@ def render(
 
     Args:
         gaussians: N Gaussians, raw parameters, float32 or float64 (cuda: float32).
-        camera: The camera, or a sequence of cameras of one image size.
+        camera: The camera, a `Camera` or anything with its members (`gsplat_edu.CameraLike`); or a sequence of cameras
+            of one image size.
         settings: Background, SH degree, antialiasing, depth; the defaults where None.
         background: (3,) background as a tensor, to differentiate in; that of the settings where None.
         backend: "auto" for the fastest there is where the Gaussians are, or a backend by name (see
@@ -77,13 +78,14 @@ def render(
     else:
         check_tensor("background", background, (3,), {})
         background = background.to(gaussians.means)
-    if isinstance(camera, Camera):
-        return _render_one(name, gaussians, camera, settings, background)
-    if len({(c.H, c.W) for c in camera}) != 1:
+    if not isinstance(camera, Sequence):
+        return _render_one(name, gaussians, as_camera("camera", camera), settings, background)
+    cameras = [as_camera(f"camera[{k}]", one) for k, one in enumerate(camera)]
+    if len({(c.H, c.W) for c in cameras}) != 1:
         raise ArgumentError(
             "camera: is a sequence that is empty or of different image sizes; render those one by one"
         )
-    views = tuple(_render_one(name, gaussians, c, settings, background) for c in camera)
+    views = tuple(_render_one(name, gaussians, c, settings, background) for c in cameras)
     depths = [view.depth for view in views if view.depth is not None]
     return RenderStack(
         torch.stack([view.image for view in views]),

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, LAMBDA_FLOOR, T_STOP, TILE, Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussian_math import project_cov3d
@@ -21,6 +21,10 @@ from gsplat_edu.validation import ArrayLike, first_index, float64_array, in_rang
 Extent = Literal["box3sigma", "exact"]
 Stop = Literal["box", "tile", "none"]
 Box = tuple[slice, slice]
+
+RESOLVED = 16 * np.finfo(np.float64).eps
+"""Smallest ratio of the variances across and along an ellipse whose inverse is still a number to rely on. A float64
+covariance holds its smaller variance to about eps times the larger one; at sixteen times that, digits are left."""
 
 COV_TOLERANCE = 1e-6
 """How far a covariance may be from symmetric and positive, as a fraction of its trace: room for float32."""
@@ -35,7 +39,7 @@ class Projection(NamedTuple):
 
 
 def render_gaussians(
-    cam: Camera,
+    cam: CameraLike,
     means: ArrayLike,
     cov3ds: ArrayLike,
     colors: ArrayLike,
@@ -53,17 +57,17 @@ def render_gaussians(
     image = sum_i T_i alpha_i c_i + T_final bg,  T_i = product over j nearer than i of (1 - alpha_j)
 
     Args:
-        cam: The camera; pixels are sampled at integer coordinates.
+        cam: The camera, any with the members of a `Camera`; pixels are sampled at integer coordinates.
         means: (N, 3) centres, world units.
         cov3ds: (N, 3, 3) covariances, world units squared, symmetric and positive semi-definite.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
         bg: (3,) background colour.
         z_near: Means at this camera depth or nearer are culled, world units, >= 0.
-        extent: Which pixels a splat may reach. "box3sigma": the box of the chapter, radius
-            ceil(3 sqrt(lambda_max)), which cuts faint tails. "exact": every pixel with alpha >= 1/255.
-        stop: When nothing more is drawn. "box": a splat is skipped when its whole box is below 1e-4
-            transmittance. "tile": a 16x16 tile ends when all its pixels are. "none": never.
+        extent: Which pixels a splat may reach. "box3sigma": the chapter's box of radius ceil(3 sqrt(lambda_max)), which
+            cuts faint tails. "exact": every pixel with alpha >= 1/255.
+        stop: When nothing more is drawn. "box": a splat is skipped when its whole box is below 1e-4 transmittance.
+            "tile": a 16x16 tile ends when all its pixels are. "none": never.
         jacobian_limit: As for `project_cov3d`: the course clamps nothing, captures are trained with 1.3.
 
     Returns:
@@ -71,24 +75,24 @@ def render_gaussians(
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: NaN or infinite numbers, an opacity outside 0 to 1, a covariance that is not one.
+        ArgumentError: NaN or infinite numbers, an opacity outside 0 to 1, a covariance that is not one, no camera; or a
+            Gaussian, by number, whose ellipse is too large or too thin for float64.
 
     Source: Kerbl et al. 2023, eq. 2-5; Zwicker et al. 2001 for the projection.
     """
+    cam = as_camera("cam", cam)
     means, cov3ds, colors, opacities = _checked(means, cov3ds, colors, opacities)
     bg, z_near = float64_array("bg", bg, (3,)), in_range("z_near", z_near, 0.0)
-    one_of("extent", extent, ("box3sigma", "exact"))
-    one_of("stop", stop, ("box", "tile", "none"))
+    _check_modes(extent, stop)
     image = np.zeros((cam.H, cam.W, 3))
     # Whole tiles are kept; pixels outside the image have no transmittance and keep no tile alive.
     padded = np.pad(np.ones((cam.H, cam.W)), ((0, -cam.H % TILE), (0, -cam.W % TILE)))
     transmittance = padded[: cam.H, : cam.W]
     for i, mean2d, cov2d in zip(*project(cam, means, cov3ds, z_near, jacobian_limit), strict=True):
-        box = _box(mean2d, cov2d, opacities[i], cam, extent)
-        T = transmittance[box]
+        T = transmittance[box := _box(mean2d, cov2d, opacities[i], cam, extent)]
         if T.size == 0 or (stop == "box" and T.max() < T_STOP):
             continue
-        alpha = _alpha(mean2d, cov2d, opacities[i], box)
+        alpha = _alpha(mean2d, _resolved(i, cov2d), opacities[i], box)
         if stop == "tile":
             alpha = np.where(_in_live_tile(padded, box), alpha, 0.0)
         image[box] += (T * alpha)[..., None] * colors[i]
@@ -111,10 +115,13 @@ def _checked(
     opacities = float64_array("opacities", opacities, ("N",), sizes)
     if np.any(outside := (opacities < 0) | (opacities > 1)):
         raise ArgumentError(f"opacities{first_index(outside)}: is outside 0 to 1")
-    trace = np.abs(np.trace(cov3ds, axis1=1, axis2=2))
+    with np.errstate(over="ignore"):
+        trace = np.abs(np.trace(cov3ds, axis1=1, axis2=2))
     skew = np.abs(cov3ds - np.swapaxes(cov3ds, 1, 2)).max(axis=(1, 2), initial=0.0)
-    smallest = np.linalg.eigvalsh(cov3ds)[:, 0]
-    if np.any(improper := (skew > COV_TOLERANCE * trace) | (smallest < -COV_TOLERANCE * trace)):
+    # Of the covariance over its trace, which neither overflows nor fails to converge.
+    unit = np.where(trace > 0, trace, 1.0)
+    smallest = np.linalg.eigvalsh(cov3ds / unit[:, None, None])[:, 0]
+    if np.any(improper := (skew > COV_TOLERANCE * trace) | (smallest < -COV_TOLERANCE)):
         raise ArgumentError(f"cov3ds{first_index(improper)}: is not symmetric and positive semi-definite")
     return means, cov3ds, colors, opacities
 
@@ -130,13 +137,22 @@ def project(
 
     Sigma2d = J W Sigma W' J' + 0.3 I
     """
-    means_cam = cam.world_to_cam(means)
-    index = np.flatnonzero(means_cam[:, 2] > z_near)
-    index = index[np.argsort(means_cam[index, 2], kind="stable")]
-    u, v, _ = cam.project(means_cam[index])
-    cov2d = project_cov3d(
-        cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit
-    ) + DILATION * np.eye(2)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is named below
+        means_cam = cam.world_to_cam(means)
+        fits = np.isfinite(means_cam).all(axis=1)
+        if not fits.all():
+            raise ArgumentError(f"means{first_index(~fits)}: is too far from the camera for float64")
+        index = np.flatnonzero(means_cam[:, 2] > z_near)
+        index = index[np.argsort(means_cam[index, 2], kind="stable")]
+        u, v, _ = cam.project(means_cam[index])
+        cov2d = project_cov3d(
+            cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit
+        ) + DILATION * np.eye(2)
+        # As _box and _alpha use it: the determinant, and the squares of distances.
+        fits = np.isfinite(u * u + v * v + np.trace(cov2d, axis1=1, axis2=2) ** 2)
+    if not fits.all():
+        i = index[np.argmin(fits)]
+        raise ArgumentError(f"means[{i}], cov3ds[{i}]: are too large on the screen for float64")
     return Projection(index, np.stack([u, v], axis=-1), cov2d)
 
 
@@ -157,6 +173,21 @@ def _box(
     low = np.clip(np.floor(mean2d) - np.ceil(reach), 0, (cam.W, cam.H)).astype(int)
     high = np.clip(np.ceil(mean2d) + np.ceil(reach) + 1, 0, (cam.W, cam.H)).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _check_modes(extent: Extent, stop: Stop) -> None:
+    one_of("extent", extent, ("box3sigma", "exact"))
+    one_of("stop", stop, ("box", "tile", "none"))
+
+
+def _resolved(i: np.int64, cov2d: Float64[np.ndarray, "2 2"]) -> Float64[np.ndarray, "2 2"]:
+    """Return the covariance of Gaussian i; refuse an ellipse whose inverse would be rounding."""
+    if np.linalg.det(cov2d) <= RESOLVED * np.trace(cov2d) ** 2:
+        raise ArgumentError(
+            f"cov3ds[{i}]: is {np.sqrt(np.trace(cov2d)):.2g} px long on the screen and too thin for its inverse "
+            "to be more than rounding in float64; leave this Gaussian out or make it smaller"
+        )
+    return cov2d
 
 
 def _alpha(

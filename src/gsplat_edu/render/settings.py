@@ -36,9 +36,15 @@ class RenderSettings:
     dense_chunk: int = 16
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
-        float64_array("background", self.background, (3,))
-        whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE)
-        if self.jacobian_limit is not None:
-            in_range("jacobian_limit", self.jacobian_limit, 1.0)
-        whole_number("dense_chunk", self.dense_chunk, 1)
+        """Check the ranges, and turn NumPy scalars and arrays into plain Python values, which the kernels take."""
+        limit = self.jacobian_limit
+        plain = {
+            "background": tuple(float64_array("background", self.background, (3,)).tolist()),
+            "sh_degree": whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE),
+            "antialiased": bool(self.antialiased),
+            "depth": bool(self.depth),
+            "jacobian_limit": None if limit is None else in_range("jacobian_limit", limit, 1.0),
+            "dense_chunk": whole_number("dense_chunk", self.dense_chunk, 1),
+        }
+        for name, value in plain.items():
+            object.__setattr__(self, name, value)

@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, DILATION, SH_OFFSET, Z_NEAR
 from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.gaussians import Gaussians, check_tensor, cov3d_t
+from gsplat_edu.gaussians import Gaussians, check_tensor, quat_to_R_t
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.sh import basis_terms, num_coefficients
@@ -37,7 +37,7 @@ class _Screen(NamedTuple):
     """The visible splats in the image, near to far."""
 
     means2d: Float[Tensor, "M 2"]
-    conics: Float[Tensor, "M 3"]  # inverse of the dilated 2D covariance: xx, xy, yy, px^-2
+    ellipses: Float[Tensor, "M 3"]  # A, m, C: d' Sigma2d^-1 d = A (dx - m dy)² + C dy², Sigma2d dilated
     visible: Int64[Tensor, " M"]
     depths: Float[Tensor, " M"]
     variances: Float[Tensor, "M 2"]  # xx and yy of the dilated 2D covariance, px^2
@@ -81,7 +81,7 @@ def render_t(
     cov3ds: Float[Tensor, "N 3 3"],
     colors: Float[Tensor, "N 3"],
     opacities: Float[Tensor, " N"],
-    cam: Camera,
+    cam: CameraLike,
     alpha_min: float = ALPHA_MIN,
     chunk: int = 512,
     track_means2d: bool = False,
@@ -96,7 +96,7 @@ def render_t(
         cov3ds: (N, 3, 3) covariances, world units squared; that they are is not checked here.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
-        cam: The camera; means at depth 0.05 or nearer are culled.
+        cam: The camera, a `Camera` or anything with its members; means at depth 0.05 or nearer are culled.
         alpha_min: Alpha below this is zero. 0 makes the image smooth, for finite differences.
         chunk: Splats evaluated at once, near to far. It bounds the size of a temporary and decides speed.
         track_means2d: Keep the gradient of means2d, for density control.
@@ -107,12 +107,13 @@ def render_t(
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: an entry is NaN or infinite, an opacity is outside 0 to 1, alpha_min is negative, or
-            chunk is not a whole number of at least 1.
+        ArgumentError: an entry is NaN or infinite, an opacity is outside 0 to 1, alpha_min is negative,
+            chunk is not a whole number of at least 1, or `cam` is no camera.
 
     Differentiable in: means, cov3ds, colors, opacities. Not in: the camera.
     Source: Kerbl et al. 2023, eq. 2-5.
     """
+    cam = as_camera("cam", cam)
     _check(means, cov3ds, colors, opacities)
     alpha_min, chunk = in_range("alpha_min", alpha_min, 0.0), whole_number("chunk", chunk, 1)
 
@@ -144,8 +145,10 @@ def render_dense(
     gaussians.check_finite()
     degree = min(settings.sh_degree, gaussians.sh_degree)
     colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
-    cov3ds = cov3d_t(gaussians.log_scales, gaussians.quats)
-    screen = _project(gaussians.means, cov3ds, camera, settings.jacobian_limit)
+    R, scales = quat_to_R_t(gaussians.quats), torch.exp(gaussians.log_scales)
+    screen = _project(
+        gaussians.means, R * scales[:, None, :], camera, settings.jacobian_limit, factors=(R, scales)
+    )
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     opacities = gaussians.opacities[screen.visible]
@@ -189,13 +192,13 @@ def _composite(
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
     """Mix C channels on zero, near to far; returns them and the final transmittance."""
     # Empty sums tie the image to the inputs, so that backward gives zeros when nothing is visible.
-    tie = sum(tensor[:0].sum() for tensor in (screen.means2d, screen.conics, colors, opacities))
+    tie = sum(tensor[:0].sum() for tensor in (screen.means2d, screen.ellipses, colors, opacities))
     dtype, device = colors.dtype, colors.device
     image = torch.zeros(cam.H, cam.W, colors.shape[1], dtype=dtype, device=device) + tie
     T = torch.ones(cam.H, cam.W, dtype=dtype, device=device)
     for start in range(0, len(screen.visible), chunk):
         part = slice(start, start + chunk)
-        alpha = _alpha(screen.means2d[part], screen.conics[part], opacities[part], cam, alpha_min)
+        alpha = _alpha(screen.means2d[part], screen.ellipses[part], opacities[part], cam, alpha_min)
         T_after = T * torch.cumprod(1.0 - alpha, dim=0)
         T_before = torch.cat([T[None], T_after[:-1]], dim=0)
         image = image + torch.einsum("nyx,nc->yxc", T_before * alpha, colors[part])
@@ -228,10 +231,13 @@ def _check(
 
 def _project(
     means: Float[Tensor, "N 3"],
-    cov3ds: Float[Tensor, "N 3 3"],
+    shapes: Float[Tensor, "N 3 3"],
     cam: Camera,
     jacobian_limit: float | None = None,
+    *,
+    factors: tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]] | None = None,
 ) -> _Screen:
+    """Project; `shapes` are covariances, or M = R S where the factors are given: thin ones keep their digits."""
     R = torch.tensor(cam.R, dtype=means.dtype, device=means.device)
     means_cam = (means - torch.tensor(cam.eye, dtype=means.dtype, device=means.device)) @ R.T
     visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]
@@ -243,26 +249,36 @@ def _project(
     x_z, y_z = (x / z).clamp(x_low, x_high), (y / z).clamp(y_low, y_high)
     rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
     JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
-    cov2d = JW @ cov3ds[visible] @ JW.mT
-    a, b, c = cov2d[:, 0, 0] + DILATION, cov2d[:, 0, 1], cov2d[:, 1, 1] + DILATION
-    det = a * c - b * b
-    conics = torch.stack([c, -b, a], dim=-1) / det[:, None]
-    det_before = cov2d[:, 0, 0] * cov2d[:, 1, 1] - b * b
+    if factors is not None:
+        rows_of_M = JW @ shapes[visible]
+        cov2d = rows_of_M @ rows_of_M.mT
+        # |n|² = a c - b² without the cancellation, n the cross product of the rows of J W R S, by way of that of J W.
+        axes, (s0, s1, s2) = factors[0][visible], factors[1][visible].unbind(-1)
+        normal = torch.linalg.cross(JW[:, 0], JW[:, 1])[:, None, :] @ axes
+        normal = normal[:, 0] * torch.stack([s1 * s2, s2 * s0, s0 * s1], dim=-1)
+        det_before = (normal * normal).sum(dim=-1)
+    else:
+        cov2d = JW @ shapes[visible] @ JW.mT
+        det_before = cov2d[:, 0, 0] * cov2d[:, 1, 1] - cov2d[:, 0, 1] ** 2
+    a0, b, c0 = cov2d[:, 0, 0], cov2d[:, 0, 1], cov2d[:, 1, 1]
+    a, c = a0 + DILATION, c0 + DILATION
+    det = det_before + DILATION * (a0 + c0) + DILATION * DILATION
+    ellipses = torch.stack([c / det, b / c, 1 / c], dim=-1)
     compensation = torch.sqrt(det_before.clamp(min=DET_FLOOR) / det)
-    return _Screen(means2d, conics, visible, z, torch.stack([a, c], dim=-1), compensation)
+    return _Screen(means2d, ellipses, visible, z, torch.stack([a, c], dim=-1), compensation)
 
 
 def _alpha(
     means2d: Float[Tensor, "k 2"],
-    conics: Float[Tensor, "k 3"],
+    ellipses: Float[Tensor, "k 3"],
     opacities: Float[Tensor, " k"],
     cam: Camera,
     alpha_min: float,
 ) -> Float[Tensor, "k H W"]:
     u, v = (axis[:, None, None] for axis in means2d.unbind(-1))
-    A, B, C = (axis[:, None, None] for axis in conics.unbind(-1))
+    A, m, C = (axis[:, None, None] for axis in ellipses.unbind(-1))
     dx = torch.arange(cam.W, dtype=means2d.dtype, device=means2d.device) - u
     dy = torch.arange(cam.H, dtype=means2d.dtype, device=means2d.device)[:, None] - v
-    power = -0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy
+    power = -0.5 * A * (dx - m * dy) ** 2 - 0.5 * C * dy * dy
     alpha = (opacities[:, None, None] * torch.exp(power)).clamp(max=ALPHA_MAX)
     return alpha * (alpha >= alpha_min)

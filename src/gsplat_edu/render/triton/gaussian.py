@@ -14,14 +14,14 @@ from gsplat_edu import constants
 
 C0 = tl.constexpr(constants.C0)
 C1 = tl.constexpr(constants.C1)
-C2_0, C2_1, C2_2 = (tl.constexpr(value) for value in constants.C2)
-C3_0, C3_1, C3_2, C3_3, C3_4 = (tl.constexpr(value) for value in constants.C3)
+C2_0, C2_1, C2_2, C2_3, C2_4 = (tl.constexpr(value) for value in constants.C2)
+C3_0, C3_1, C3_2, C3_3, C3_4, C3_5, C3_6 = (tl.constexpr(value) for value in constants.C3)
 DILATION = tl.constexpr(constants.DILATION)
 DET_FLOOR = tl.constexpr(constants.DET_FLOOR)
 
 # Places in a camera's row of numbers, see `camera_row`.
-EYE_AT, FOCAL_AT, MIDDLE_AT, SIZE_AT, BOUNDS_AT, NEAR_AT = (
-    tl.constexpr(place) for place in (9, 12, 14, 16, 18, 22)
+EYE_AT, FOCAL_AT, MIDDLE_AT, SIZE_AT, BOUNDS_AT, NEAR_AT, EYE_REST_AT = (
+    tl.constexpr(place) for place in (9, 12, 14, 16, 18, 22, 23)
 )
 
 
@@ -95,11 +95,11 @@ def rotation(w, x, y, z):
 @triton.jit
 @no_type_check
 def into_camera(means, camera, i, mask):
-    """Return mean - eye in world axes, and in camera axes."""
+    """Return mean - eye in world axes, and in camera axes; the eye comes as float32 and the rest of it."""
     m0, m1, m2 = load3(means, i, mask)
-    o0 = m0 - tl.load(camera + EYE_AT)
-    o1 = m1 - tl.load(camera + EYE_AT + 1)
-    o2 = m2 - tl.load(camera + EYE_AT + 2)
+    o0 = m0 - tl.load(camera + EYE_AT) - tl.load(camera + EYE_REST_AT)
+    o1 = m1 - tl.load(camera + EYE_AT + 1) - tl.load(camera + EYE_REST_AT + 1)
+    o2 = m2 - tl.load(camera + EYE_AT + 2) - tl.load(camera + EYE_REST_AT + 2)
     x = dot3(tl.load(camera), tl.load(camera + 1), tl.load(camera + 2), o0, o1, o2)
     y = dot3(tl.load(camera + 3), tl.load(camera + 4), tl.load(camera + 5), o0, o1, o2)
     z = dot3(tl.load(camera + 6), tl.load(camera + 7), tl.load(camera + 8), o0, o1, o2)
@@ -156,27 +156,27 @@ def harmonic(j: tl.constexpr, x, y, z):
     elif j == 4:
         b = x * y * C2_0
     elif j == 5:
-        b = y * z * (-C2_0)
+        b = y * z * C2_1
     elif j == 6:
-        b = (2 * zz - xx - yy) * C2_1
+        b = (2 * zz - xx - yy) * C2_2
     elif j == 7:
-        b = x * z * (-C2_0)
+        b = x * z * C2_3
     elif j == 8:
-        b = (xx - yy) * C2_2
+        b = (xx - yy) * C2_4
     elif j == 9:
-        b = y * (3 * xx - yy) * (-C3_0)
+        b = y * (3 * xx - yy) * C3_0
     elif j == 10:
         b = x * y * z * C3_1
     elif j == 11:
-        b = y * (4 * zz - xx - yy) * (-C3_2)
+        b = y * (4 * zz - xx - yy) * C3_2
     elif j == 12:
         b = z * (2 * zz - 3 * xx - 3 * yy) * C3_3
     elif j == 13:
-        b = x * (4 * zz - xx - yy) * (-C3_2)
+        b = x * (4 * zz - xx - yy) * C3_4
     elif j == 14:
-        b = z * (xx - yy) * C3_4
+        b = z * (xx - yy) * C3_5
     else:
-        b = x * (xx - 3 * yy) * (-C3_0)
+        b = x * (xx - 3 * yy) * C3_6
     return b
 
 
@@ -194,25 +194,25 @@ def harmonic_slope(j: tl.constexpr, x, y, z):
     elif j == 4:
         d = (y * C2_0, x * C2_0, zero)
     elif j == 5:
-        d = (zero, z * (-C2_0), y * (-C2_0))
+        d = (zero, z * C2_1, y * C2_1)
     elif j == 6:
-        d = (x * (-2 * C2_1), y * (-2 * C2_1), z * (4 * C2_1))
+        d = (x * (-2 * C2_2), y * (-2 * C2_2), z * (4 * C2_2))
     elif j == 7:
-        d = (z * (-C2_0), zero, x * (-C2_0))
+        d = (z * C2_3, zero, x * C2_3)
     elif j == 8:
-        d = (x * (2 * C2_2), y * (-2 * C2_2), zero)
+        d = (x * (2 * C2_4), y * (-2 * C2_4), zero)
     elif j == 9:
-        d = (x * y * (-6 * C3_0), (xx - yy) * (-3 * C3_0), zero)
+        d = (x * y * (6 * C3_0), (xx - yy) * (3 * C3_0), zero)
     elif j == 10:
         d = (y * z * C3_1, x * z * C3_1, x * y * C3_1)
     elif j == 11:
-        d = (x * y * (2 * C3_2), (4 * zz - xx - 3 * yy) * (-C3_2), y * z * (-8 * C3_2))
+        d = (x * y * (-2 * C3_2), (4 * zz - xx - 3 * yy) * C3_2, y * z * (8 * C3_2))
     elif j == 12:
         d = (x * z * (-6 * C3_3), y * z * (-6 * C3_3), (2 * zz - xx - yy) * (3 * C3_3))
     elif j == 13:
-        d = ((4 * zz - 3 * xx - yy) * (-C3_2), x * y * (2 * C3_2), x * z * (-8 * C3_2))
+        d = ((4 * zz - 3 * xx - yy) * C3_4, x * y * (-2 * C3_4), x * z * (8 * C3_4))
     elif j == 14:
-        d = (x * z * (2 * C3_4), y * z * (-2 * C3_4), (xx - yy) * C3_4)
+        d = (x * z * (2 * C3_5), y * z * (-2 * C3_5), (xx - yy) * C3_5)
     else:
-        d = ((xx - yy) * (-3 * C3_0), x * y * (6 * C3_0), zero)
+        d = ((xx - yy) * (3 * C3_6), x * y * (-6 * C3_6), zero)
     return d

@@ -55,12 +55,12 @@ vec3 color(vec3 d) {
     sum += C1 * (-y * coefficient(1) + z * coefficient(2) - x * coefficient(3));
     if (degree < 2) return sum;
     float xx = x * x, yy = y * y, zz = z * z;
-    sum += C2[0] * (x * y * coefficient(4) - y * z * coefficient(5) - x * z * coefficient(7));
-    sum += C2[1] * (2.0 * zz - xx - yy) * coefficient(6) + C2[2] * (xx - yy) * coefficient(8);
+    sum += C2[0] * x * y * coefficient(4) + C2[1] * y * z * coefficient(5) + C2[3] * x * z * coefficient(7);
+    sum += C2[2] * (2.0 * zz - xx - yy) * coefficient(6) + C2[4] * (xx - yy) * coefficient(8);
     if (degree < 3) return sum;
-    sum -= C3[0] * (y * (3.0 * xx - yy) * coefficient(9) + x * (xx - 3.0 * yy) * coefficient(15));
-    sum += C3[1] * x * y * z * coefficient(10) + C3[4] * z * (xx - yy) * coefficient(14);
-    sum -= C3[2] * (4.0 * zz - xx - yy) * (y * coefficient(11) + x * coefficient(13));
+    sum += C3[0] * y * (3.0 * xx - yy) * coefficient(9) + C3[6] * x * (xx - 3.0 * yy) * coefficient(15);
+    sum += C3[1] * x * y * z * coefficient(10) + C3[5] * z * (xx - yy) * coefficient(14);
+    sum += (4.0 * zz - xx - yy) * (C3[2] * y * coefficient(11) + C3[4] * x * coefficient(13));
     return sum + C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(12);
 }
 
