@@ -2,7 +2,7 @@
 
     python benchmarks/precision.py [--scenes 2000] [--seed 24] [--smoke]
 
-Each scene is drawn at random over many decades: focal length, distance, place in the world, scales along the three axes,
+Each scene is drawn at random over many decades: focal length, distance, place in the world, scales along the axes,
 distance of the means from the image. The native kernels render it in float32 and in float64 from the same float32
 parameters. Every scene whose images differ by more than rounding is searched for a discontinuity that a rounding can
 step over; the table counts scenes by what was found. docs/PRECISION.md explains the classes and the bound.
@@ -53,6 +53,23 @@ def extreme_scene(seed: int, index: int) -> tuple[Camera, Gaussians]:
     return camera, Gaussians(**{k: torch.tensor(v, dtype=torch.float32) for k, v in arrays.items()})
 
 
+def needle(size: int) -> tuple[Camera, Gaussians]:
+    """Make one Gaussian: standard deviation 1000 px along the diagonal, none across, its mean outside."""
+    camera = Camera(np.eye(3), (0, 0, 0), 1000.0, 1000.0, size / 2, size / 2, size, size)
+    place = (-100 - size / 2) / 1000.0
+    arrays = {
+        "means": [[place, place, 1.0]],
+        "quats": [[np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8)]],
+        "log_scales": np.log([[1.0, 1e-5, 1e-5]]),
+        "sh0": np.ones((1, 1, 3)),
+        "sh_rest": np.zeros((1, 3, 3)),
+        "logit_opacities": [2.0],
+    }
+    return camera, Gaussians(
+        **{k: torch.tensor(np.asarray(v), dtype=torch.float32) for k, v in arrays.items()}
+    )
+
+
 def _direction(rng: np.random.Generator) -> np.ndarray:
     vector = rng.normal(size=3)
     return np.asarray(vector / np.linalg.norm(vector))
@@ -66,7 +83,9 @@ class Layers:
     depths: np.ndarray  # M
     alphas: np.ndarray  # M H W, before the floor and the clamp
     colors: np.ndarray  # M 3
-    noise: np.ndarray  # M, an estimate of how far float64 may be off in the exponent where covariances are multiplied out
+    noise: (
+        np.ndarray
+    )  # M, an estimate of how far float64 may be off in the exponent where covariances are multiplied out
 
     def drawn(self) -> np.ndarray:
         """Return alpha as it is composited, (M, H, W)."""
@@ -85,7 +104,9 @@ def layers(camera: Camera, gaussians: Gaussians) -> Layers:
     JW = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2) @ camera.R
     R, scales = quat_to_R_batch(arrays["quats"][order]), np.exp(arrays["log_scales"][order])
     r0, r1 = np.moveaxis(JW @ (R * scales[:, None, :]), 1, 0)
-    normal = (np.cross(JW[:, 0], JW[:, 1])[:, None, :] @ R)[:, 0] * np.roll(scales, 1, 1) * np.roll(scales, 2, 1)
+    normal = (
+        (np.cross(JW[:, 0], JW[:, 1])[:, None, :] @ R)[:, 0] * np.roll(scales, 1, 1) * np.roll(scales, 2, 1)
+    )
     a0, b, c0, det0 = ((p * q).sum(axis=1) for p, q in ((r0, r0), (r0, r1), (r1, r1), (normal, normal)))
     a, c, det = a0 + DILATION, c0 + DILATION, det0 + DILATION * (a0 + c0) + DILATION**2
     dx = np.arange(camera.W) - (camera.fx * x / z + camera.cx)[:, None, None]
@@ -127,7 +148,9 @@ def judge(camera: Camera, gaussians: Gaussians) -> Verdict:
     """Compare float32 with float64 and look for ties."""
     with torch.no_grad():
         single, double = (
-            render(gaussians.map(lambda t, d=dtype: t.to(d)), camera, settings=SETTINGS, backend="cpu").image.double()
+            render(
+                gaussians.map(lambda t, d=dtype: t.to(d)), camera, settings=SETTINGS, backend="cpu"
+            ).image.double()
             for dtype in (torch.float32, torch.float64)
         )
     error = float((single - double).abs().max())
@@ -187,14 +210,16 @@ def oracle_error(camera: Camera, gaussians: Gaussians) -> tuple[float, float] | 
     except SplatError as error:
         return str(error)
     with torch.no_grad():
-        image = render(gaussians.map(torch.Tensor.double), camera, settings=SETTINGS, backend="cpu").image.numpy()
+        image = render(
+            gaussians.map(torch.Tensor.double), camera, settings=SETTINGS, backend="cpu"
+        ).image.numpy()
     drawn = layers(camera, gaussians)
     bright = max(1.0, np.abs(colors).max())
     return float(np.abs(image - truth).max()), float(2 * bright * (1e-12 + drawn.noise.sum()))
 
 
 def gradient_error(camera: Camera, gaussians: Gaussians) -> tuple[float, str]:
-    """Return the largest relative difference of float64 gradients, kernels against autograd, and the parameter's name."""
+    """Return the largest relative difference of float64 gradients, kernels against autograd, and whose it is."""
     found = []
     for backend in ("cpu", "torch"):
         moved = gaussians.map(torch.Tensor.double).trainable()
@@ -204,7 +229,8 @@ def gradient_error(camera: Camera, gaussians: Gaussians) -> tuple[float, str]:
         found.append({name: tensor.grad for name, tensor in moved.tensors().items()})
     ours, theirs = found
     errors = {
-        name: float((ours[name] - grad).abs().max() / grad.abs().max().clamp(min=1e-300)) for name, grad in theirs.items()
+        name: float((ours[name] - grad).abs().max() / grad.abs().max().clamp(min=1e-300))
+        for name, grad in theirs.items()
     }
     return max((error, name) for name, error in errors.items())
 
@@ -235,13 +261,21 @@ def oracle_table(seed: int, count: int) -> None:
         if isinstance(result, str):
             classes["the oracle refuses, naming the Gaussian"] += 1
         else:
-            classes["to 1e-9" if result[0] < 1e-9 else "as covariances allow" if result[0] < result[1] else "unexplained"] += 1
+            classes[
+                "to 1e-9"
+                if result[0] < 1e-9
+                else "as covariances allow"
+                if result[0] < result[1]
+                else "unexplained"
+            ] += 1
     print(f"float64 kernels against the NumPy oracle: {dict(classes)}")
 
 
 def gradients_table(seed: int, count: int) -> None:
     """Print how float64 gradients agree with autograd through the dense renderer."""
-    errors = [gradient_error(*scene)[0] for k in range(count) if not is_stopped(*(scene := extreme_scene(seed, k)))]
+    errors = [
+        gradient_error(*scene)[0] for k in range(count) if not is_stopped(*(scene := extreme_scene(seed, k)))
+    ]
     print(
         f"float64 gradients against autograd, {len(errors)} of {count} scenes in which no tile stops: "
         f"over 1e-6 of the largest: {sum(error > 1e-6 for error in errors)}, worst {max(errors, default=0.0):.2g}"

@@ -1,6 +1,7 @@
 """Degenerate input to every public function: the documented result, or an error that names the argument."""
 
 import inspect
+import re
 
 import numpy as np
 import pytest
@@ -198,6 +199,50 @@ def test_far_outside_the_image_is_not_drawn_and_does_not_overflow():
     for x in (1e3, 1e30, -1e30):
         _, T = render_gaussians(**splat(means=[[x, 0, 1.0]], cov3ds=[np.zeros((3, 3))]))
         assert (T == 1).all()
+
+
+FIRST = {"means": [[0, 0, 1.0]] * 2, "colors": np.ones((2, 3)), "opacities": [0.5, 0.5]}
+
+
+@pytest.mark.parametrize("length", [1e12, 1e20, 1e60, 1e200, 1e300])
+def test_an_ellipse_that_float64_cannot_hold_is_named(length):
+    """NumPy's own LinAlgError said neither which Gaussian it was nor what was wrong with it."""
+    along = np.array([0.6, 0.8, 0.0])
+    needle = length * np.outer(along, along)
+    with pytest.raises(ArgumentError, match=r"cov3ds\[1\]: "):
+        render_gaussians(**splat(**FIRST, cov3ds=[I3, needle]))
+
+
+def test_a_place_that_float64_cannot_hold_is_named():
+    with pytest.raises(ArgumentError, match=r"means\[1\], cov3ds\[1\]: "):
+        render_gaussians(**splat(**FIRST | {"means": [[0, 0, 1.0], [1e200, 0, 1.0]]}, cov3ds=[I3, I3]))
+    far = Camera(I3, (0, 0, -1.7e308), 10.0, 10.0, 4.0, 4.0, 8, 9)
+    with pytest.raises(ArgumentError, match=r"means\[1\]: is too far"):
+        render_gaussians(
+            **splat(**FIRST | {"means": [[0, 0, 1.0], [0, 0, 1.7e308]]}, cov3ds=[I3, I3], cam=far)
+        )
+
+
+def test_extreme_scenes_raise_no_error_of_numpys():
+    """300 scenes of scales over 40 decades: an image, or an ArgumentError that has the Gaussian's number."""
+    refused = 0
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        scales, quats = 10 ** rng.uniform(-20, 20, (4, 3)), rng.normal(size=(4, 4))
+        scene = {
+            "means": rng.normal(size=(4, 3)) * 10 ** rng.uniform(-3, 3, (4, 1)),
+            "cov3ds": build_cov3d_batch(scales, quat_to_R_batch(quats)),
+            "colors": rng.uniform(size=(4, 3)),
+            "opacities": rng.uniform(size=4),
+        }
+        try:
+            image, _ = render_gaussians(**splat(**scene), extent="exact")
+        except ArgumentError as error:
+            assert re.search(r"(means|cov3ds)\[[0-3]\]", str(error))
+            refused += 1
+        else:
+            assert np.isfinite(image).all()
+    assert 0 < refused < 300
 
 
 def test_wider_than_the_image_covers_it():

@@ -2,6 +2,8 @@ import inspect
 import subprocess
 import sys
 
+import pytest
+
 import gsplat_edu
 
 SIGNATURES = {
@@ -64,6 +66,28 @@ def test_the_constants():
         "T_STOP": 1e-4,
         "TILE": 16,
         "C0": 0.28209479177387814,
+        # As in the field: C1 is one number, the others have one for each harmonic, from m = -l to l.
+        "C1": pytest.approx(0.4886025119029199),
+        "C2": pytest.approx(
+            (
+                1.0925484305920792,
+                -1.0925484305920792,
+                0.31539156525252005,
+                -1.0925484305920792,
+                0.5462742152960396,
+            )
+        ),
+        "C3": pytest.approx(
+            (
+                -0.5900435899266435,
+                2.890611442640554,
+                -0.4570457994644658,
+                0.3731763325901154,
+                -0.4570457994644658,
+                1.445305721320277,
+                -0.5900435899266435,
+            )
+        ),
     }
     assert {name: getattr(gsplat_edu, name) for name in values} == values
 

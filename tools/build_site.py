@@ -25,6 +25,7 @@ DOCUMENTS = (
     "CHANGELOG.md",
     "docs/DECISIONS.md",
     "docs/RECIPE.md",
+    "docs/PRECISION.md",
     "benchmarks/RESULTS.md",
 )
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")

@@ -43,8 +43,8 @@ COLOR_LIMIT: Final = 1e6
 the gradients of the Gaussians around it would lose all their digits to it. Source: ours."""
 
 SPLAT_LIMIT: Final = 1e15
-"""px: the kernels leave out a Gaussian whose standard deviation on the screen is beyond this. The factors of its exponent,
-the inverse of that, have squares that float32 still holds. Source: ours."""
+"""px: the native kernels leave out a Gaussian whose standard deviation on the screen is beyond this. float32 holds
+the squares of its inverse, a factor of the exponent. Source: ours."""
 
 DET_FLOOR: Final = 1e-12
 """px⁴: floor under the determinant of a screen-space covariance before its dilation, where antialiasing takes

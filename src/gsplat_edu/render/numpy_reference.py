@@ -57,18 +57,17 @@ def render_gaussians(
     image = sum_i T_i alpha_i c_i + T_final bg,  T_i = product over j nearer than i of (1 - alpha_j)
 
     Args:
-        cam: The camera: a `Camera`, or anything with its members (`CameraLike`); pixels are sampled at integer
-            coordinates.
+        cam: The camera, any with the members of a `Camera`; pixels are sampled at integer coordinates.
         means: (N, 3) centres, world units.
         cov3ds: (N, 3, 3) covariances, world units squared, symmetric and positive semi-definite.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
         bg: (3,) background colour.
         z_near: Means at this camera depth or nearer are culled, world units, >= 0.
-        extent: Which pixels a splat may reach. "box3sigma": the box of the chapter, radius
-            ceil(3 sqrt(lambda_max)), which cuts faint tails. "exact": every pixel with alpha >= 1/255.
-        stop: When nothing more is drawn. "box": a splat is skipped when its whole box is below 1e-4
-            transmittance. "tile": a 16x16 tile ends when all its pixels are. "none": never.
+        extent: Which pixels a splat may reach. "box3sigma": the chapter's box of radius ceil(3 sqrt(lambda_max)), which
+            cuts faint tails. "exact": every pixel with alpha >= 1/255.
+        stop: When nothing more is drawn. "box": a splat is skipped when its whole box is below 1e-4 transmittance.
+            "tile": a 16x16 tile ends when all its pixels are. "none": never.
         jacobian_limit: As for `project_cov3d`: the course clamps nothing, captures are trained with 1.3.
 
     Returns:
@@ -76,32 +75,24 @@ def render_gaussians(
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: NaN or infinite numbers, an opacity outside 0 to 1, a covariance that is not one, `cam` is no
-            camera, or a Gaussian in front of it whose ellipse float64 cannot hold: off the range of its numbers,
-            or so thin for its length that its inverse is noise. The message has the Gaussian's number.
+        ArgumentError: NaN or infinite numbers, an opacity outside 0 to 1, a covariance that is not one, no camera; or a
+            Gaussian, by number, whose ellipse is too large or too thin for float64.
 
     Source: Kerbl et al. 2023, eq. 2-5; Zwicker et al. 2001 for the projection.
     """
     cam = as_camera("cam", cam)
     means, cov3ds, colors, opacities = _checked(means, cov3ds, colors, opacities)
     bg, z_near = float64_array("bg", bg, (3,)), in_range("z_near", z_near, 0.0)
-    one_of("extent", extent, ("box3sigma", "exact"))
-    one_of("stop", stop, ("box", "tile", "none"))
+    _check_modes(extent, stop)
     image = np.zeros((cam.H, cam.W, 3))
     # Whole tiles are kept; pixels outside the image have no transmittance and keep no tile alive.
     padded = np.pad(np.ones((cam.H, cam.W)), ((0, -cam.H % TILE), (0, -cam.W % TILE)))
     transmittance = padded[: cam.H, : cam.W]
     for i, mean2d, cov2d in zip(*project(cam, means, cov3ds, z_near, jacobian_limit), strict=True):
-        box = _box(mean2d, cov2d, opacities[i], cam, extent)
-        T = transmittance[box]
+        T = transmittance[box := _box(mean2d, cov2d, opacities[i], cam, extent)]
         if T.size == 0 or (stop == "box" and T.max() < T_STOP):
             continue
-        if np.linalg.det(cov2d) <= RESOLVED * np.trace(cov2d) ** 2:
-            raise ArgumentError(
-                f"cov3ds[{i}]: is {np.sqrt(np.trace(cov2d)):.2g} px long on the screen and too thin for its inverse "
-                "to be more than rounding in float64; leave this Gaussian out or make it smaller"
-            )
-        alpha = _alpha(mean2d, cov2d, opacities[i], box)
+        alpha = _alpha(mean2d, _resolved(i, cov2d), opacities[i], box)
         if stop == "tile":
             alpha = np.where(_in_live_tile(padded, box), alpha, 0.0)
         image[box] += (T * alpha)[..., None] * colors[i]
@@ -182,6 +173,21 @@ def _box(
     low = np.clip(np.floor(mean2d) - np.ceil(reach), 0, (cam.W, cam.H)).astype(int)
     high = np.clip(np.ceil(mean2d) + np.ceil(reach) + 1, 0, (cam.W, cam.H)).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _check_modes(extent: Extent, stop: Stop) -> None:
+    one_of("extent", extent, ("box3sigma", "exact"))
+    one_of("stop", stop, ("box", "tile", "none"))
+
+
+def _resolved(i: np.int64, cov2d: Float64[np.ndarray, "2 2"]) -> Float64[np.ndarray, "2 2"]:
+    """Return the covariance of Gaussian i; refuse an ellipse whose inverse would be rounding."""
+    if np.linalg.det(cov2d) <= RESOLVED * np.trace(cov2d) ** 2:
+        raise ArgumentError(
+            f"cov3ds[{i}]: is {np.sqrt(np.trace(cov2d)):.2g} px long on the screen and too thin for its inverse "
+            "to be more than rounding in float64; leave this Gaussian out or make it smaller"
+        )
+    return cov2d
 
 
 def _alpha(

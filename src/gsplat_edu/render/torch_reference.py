@@ -146,7 +146,9 @@ def render_dense(
     degree = min(settings.sh_degree, gaussians.sh_degree)
     colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
     R, scales = quat_to_R_t(gaussians.quats), torch.exp(gaussians.log_scales)
-    screen = _project(gaussians.means, R * scales[:, None, :], camera, settings.jacobian_limit, factors=(R, scales))
+    screen = _project(
+        gaussians.means, R * scales[:, None, :], camera, settings.jacobian_limit, factors=(R, scales)
+    )
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     opacities = gaussians.opacities[screen.visible]
@@ -235,7 +237,7 @@ def _project(
     *,
     factors: tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]] | None = None,
 ) -> _Screen:
-    """Project; `shapes` are covariances, or M = R S of Sigma = M M' where the factors are given: thin ones keep digits."""
+    """Project; `shapes` are covariances, or M = R S where the factors are given: thin ones keep their digits."""
     R = torch.tensor(cam.R, dtype=means.dtype, device=means.device)
     means_cam = (means - torch.tensor(cam.eye, dtype=means.dtype, device=means.device)) @ R.T
     visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]

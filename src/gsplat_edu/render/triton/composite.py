@@ -1,6 +1,6 @@
 """composite: a tile's Gaussians, near to far, into its pixels; and back in the same order.
 
-    alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
+    p = log2_o - s² - t²;   alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 
 A program takes one tile and goes through its pairs in batches, as a matrix of pixels by Gaussians: T before each comes
 from a running product along the batch, the colours are a matrix product. The sums of the way back are plain sums: as
@@ -46,10 +46,10 @@ def _alphas(records, ids, mask, x, y):
     row = records + ids.to(tl.int64) * RECORD
     dx = x[:, None].to(tl.float32) - tl.load(row, mask=mask, other=0.0)[None, :]
     dy = y[:, None].to(tl.float32) - tl.load(row + 1, mask=mask, other=0.0)[None, :]
-    a, b = tl.load(row + 2, mask=mask, other=0.0), tl.load(row + 3, mask=mask, other=0.0)
-    c, log2_o = tl.load(row + 4, mask=mask, other=0.0), tl.load(row + 5, mask=mask, other=-1000.0)
-    p = log2_o[None, :] + a[None, :] * dx * dx + dy * (b[None, :] * dx + c[None, :] * dy)
-    p = tl.minimum(p, log2_o[None, :])  # the largest there is, whatever rounding says
+    sx, sy = tl.load(row + 2, mask=mask, other=0.0), tl.load(row + 3, mask=mask, other=0.0)
+    ty, log2_o = tl.load(row + 4, mask=mask, other=0.0), tl.load(row + 5, mask=mask, other=-1000.0)
+    s, t = sx[None, :] * dx + sy[None, :] * dy, ty[None, :] * dy
+    p = log2_o[None, :] - s * s - t * t
     return p, tl.where(p >= LOG2_ALPHA_MIN, tl.exp2(tl.minimum(p, LOG2_ALPHA_MAX)), 0.0)
 
 

@@ -20,8 +20,8 @@ DILATION = tl.constexpr(constants.DILATION)
 DET_FLOOR = tl.constexpr(constants.DET_FLOOR)
 
 # Places in a camera's row of numbers, see `camera_row`.
-EYE_AT, FOCAL_AT, MIDDLE_AT, SIZE_AT, BOUNDS_AT, NEAR_AT = (
-    tl.constexpr(place) for place in (9, 12, 14, 16, 18, 22)
+EYE_AT, FOCAL_AT, MIDDLE_AT, SIZE_AT, BOUNDS_AT, NEAR_AT, EYE_REST_AT = (
+    tl.constexpr(place) for place in (9, 12, 14, 16, 18, 22, 23)
 )
 
 
@@ -95,11 +95,11 @@ def rotation(w, x, y, z):
 @triton.jit
 @no_type_check
 def into_camera(means, camera, i, mask):
-    """Return mean - eye in world axes, and in camera axes."""
+    """Return mean - eye in world axes, and in camera axes; the eye comes as float32 and the rest of it."""
     m0, m1, m2 = load3(means, i, mask)
-    o0 = m0 - tl.load(camera + EYE_AT)
-    o1 = m1 - tl.load(camera + EYE_AT + 1)
-    o2 = m2 - tl.load(camera + EYE_AT + 2)
+    o0 = m0 - tl.load(camera + EYE_AT) - tl.load(camera + EYE_REST_AT)
+    o1 = m1 - tl.load(camera + EYE_AT + 1) - tl.load(camera + EYE_REST_AT + 1)
+    o2 = m2 - tl.load(camera + EYE_AT + 2) - tl.load(camera + EYE_REST_AT + 2)
     x = dot3(tl.load(camera), tl.load(camera + 1), tl.load(camera + 2), o0, o1, o2)
     y = dot3(tl.load(camera + 3), tl.load(camera + 4), tl.load(camera + 5), o0, o1, o2)
     z = dot3(tl.load(camera + 6), tl.load(camera + 7), tl.load(camera + 8), o0, o1, o2)

@@ -26,15 +26,15 @@ def _ellipse(records, i, mask):
     """Return centre, half extents, slant of the rightmost point, tangent and half width of the ellipse."""
     row = records + i * RECORD
     u, v = tl.load(row, mask=mask, other=0.0), tl.load(row + 1, mask=mask, other=0.0)
-    a = tl.load(row + 2, mask=mask, other=-1.0)
-    b = tl.load(row + 3, mask=mask, other=0.0)
-    c = tl.load(row + 4, mask=mask, other=-1.0)
+    sx = tl.load(row + 2, mask=mask, other=1.0)
+    sy = tl.load(row + 3, mask=mask, other=0.0)
+    ty = tl.load(row + 4, mask=mask, other=1.0)
     drop = tl.load(row + 5, mask=mask, other=0.0) - LOG2_ALPHA_MIN
     ex, ey = tl.load(row + 10, mask=mask, other=0.0), tl.load(row + 11, mask=mask, other=0.0)
     seen = ey > 0
-    a, c = tl.where(seen, a, -1.0), tl.where(seen, c, -1.0)
-    half = tl.sqrt(tl.maximum(drop / -a, 0.0))
-    return u, v, ex, ey, b / (2 * c), -b / (2 * a), half, mask & seen
+    sx, ty = tl.where(seen, sx, 1.0), tl.where(seen, ty, 1.0)
+    half = tl.sqrt(tl.maximum(drop, 0.0)) / sx
+    return u, v, ex, ey, sx * sy / (sy * sy + ty * ty), -sy / sx, half, mask & seen
 
 
 @triton.jit

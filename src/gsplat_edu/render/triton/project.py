@@ -2,8 +2,9 @@
 
     Sigma2d = J W Sigma W' J' + 0.3 I,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
 
-A record holds u, v, a, b, c, log2 o, red, green, blue, depth, half width, half height: alpha is
-2^(log2 o + a dx² + b dx dy + c dy²). A half width of 0 says that nothing of it can be seen.
+A record holds u, v, sx, sy, ty, log2 o, red, green, blue, depth, half width, half height: alpha is
+2^(log2 o - (sx dx + sy dy)² - (ty dy)²), whose squares cannot cancel where an ellipse is long and thin. A half width of
+0 says that nothing of it can be seen.
 """
 
 from __future__ import annotations
@@ -109,8 +110,10 @@ def project_kernel(
     W, H = tl.load(camera + SIZE_AT), tl.load(camera + SIZE_AT + 1)
     seen &= (tl.ceil(u - ex) <= W - 1) & (tl.floor(u + ex) >= 0)
     seen &= (tl.ceil(v - ey) <= H - 1) & (tl.floor(v + ey) >= 0)
+    # d' Sigma2d^-1 d = (c / det) (dx - b/c dy)² + dy² / c
+    sx = tl.sqrt(c / det * (LOG2E / 2))
     fields = (
-        u, v, -c / det * (LOG2E / 2), b / det * LOG2E, -a / det * (LOG2E / 2), tl.log(opacity) * LOG2E,
+        u, v, sx, -b / c * sx, tl.sqrt(1 / c * (LOG2E / 2)), tl.log(opacity) * LOG2E,
         tl.maximum(red, 0.0), tl.maximum(green, 0.0), tl.maximum(blue, 0.0), z, ex, ey,
     )  # fmt: skip
     for j in tl.static_range(12):

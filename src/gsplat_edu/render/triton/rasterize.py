@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -223,7 +224,7 @@ def _grid(camera: Camera) -> tuple[int, int]:
 
 
 def _camera_row(call: _Call, device: torch.device) -> Tensor:
-    """Return the camera's numbers on the device: R, eye, f, c, size, bounds of x/z and y/z, near plane.
+    """Return the camera's numbers on the device: R, eye, f, c, size, bounds of x/z and y/z, near plane, rest of eye.
 
     They are kept with the camera, so that nothing is copied when it is rendered from again.
     """
@@ -241,5 +242,8 @@ def _camera_row(call: _Call, device: torch.device) -> Tensor:
             camera.W,
             camera.H,
         ]
-        rows[key] = torch.tensor([*numbers, *x_bounds, *y_bounds, Z_NEAR], dtype=torch.float32, device=device)
+        rest = camera.eye - camera.eye.astype(np.float32)  # what float32 rounds off
+        rows[key] = torch.tensor(
+            [*numbers, *x_bounds, *y_bounds, Z_NEAR, *rest], dtype=torch.float32, device=device
+        )
     return rows[key]
