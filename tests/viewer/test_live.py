@@ -255,10 +255,10 @@ def test_nobody_opens_a_tunnel(capture, tmp_path, capfd):
         assert made.view._server.request_share_url() is None
 
 
-@pytest.fixture(scope="module")
-def guarded(capture, tmp_path_factory):
+@pytest.fixture
+def guarded(capture, tmp_path):
     """A view whose training never begins: who may come in does not depend on it."""
-    made = Training(capture, tmp_path_factory.mktemp("guarded") / "run", "--iterations", "30")
+    made = Training(capture, tmp_path / "guarded", "--iterations", "30")
     with made.view:
         yield made.view
 

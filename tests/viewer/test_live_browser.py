@@ -115,14 +115,15 @@ def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path
             until(lambda channel=channel: middle(channel) is not None, "the ball")
             # light from above moves the middle of what counts as coloured by a part of the radius, 6 to 9 px
             np.testing.assert_allclose(middle(channel), (column, row), atol=3)
-        # chosen from the list, a camera has the red ball, put before its eye, in the middle of the window
-        chosen = made.run.dataset.test[0].camera
-        before = tuple(chosen.eye + 2.5 * chosen.R[2])
-        client.scene.add_icosphere("/ball0", 0.03, color=(1.0, 0.0, 0.0), position=before)
+        # a camera chosen from the list has the red ball, put before and below its eye, below the window's middle
+        chosen, below = made.run.dataset.test[0].camera, 130  # px
+        place = chosen.eye + chosen.R.T @ (2.5 * np.array([0, below / scale / camera.fy, 1]))
+        client.scene.add_icosphere("/ball0", 0.03, color=(1.0, 0.0, 0.0), position=tuple(place))
         made.view._move(client, chosen, None)
-        half = (camera.W / 2 * scale, camera.H / 2 * scale)
+        expected = np.array([camera.W / 2 * scale, camera.H / 2 * scale + below])
         until(
-            lambda: (found := middle(0)) is not None and np.abs(found - half).max() < 3, "the camera chosen"
+            lambda: (found := middle(0)) is not None and np.abs(found - expected).max() < 3,
+            "the camera that was chosen",
         )
     assert tab.complaints == []
 

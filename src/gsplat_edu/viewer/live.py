@@ -326,18 +326,22 @@ class LiveView:
         start = dataset.train[0].camera
         reset = gui.add_button("Back to the start")
         reset.on_click(lambda event: self._send(event.client, start, self._up))
-        views = _named(dataset.train, dataset.test)
+        views = _cameras(dataset.train, dataset.test)
         cameras = gui.add_dropdown("Camera", list(views), initial_value=dataset.train[0].name)
-        cameras.on_update(lambda event: self._send(event.client, views[event.target.value].camera))
+        cameras.on_update(lambda event: self._send(event.client, views.get(event.target.value)))
 
     def _send(
-        self, browser: viser.ClientHandle | None, camera: Camera, up: Float64[np.ndarray, "3"] | None = None
+        self,
+        browser: viser.ClientHandle | None,
+        camera: Camera | None,
+        up: Float64[np.ndarray, "3"] | None = None,
     ) -> None:
-        """Ask for a browser to be moved to a camera; to what is up for all of them where its own was turned away."""
-        if browser is not None:
+        """Have a browser moved to a camera by the thread that trains; see `_move`."""
+        if browser is not None and camera is not None:  # a browser may ask for a name that is not in the list
             self._commands.put(functools.partial(self._move, browser, camera, up))
 
     def _move(self, browser: viser.ClientHandle, camera: Camera, up: Float64[np.ndarray, "3"] | None) -> None:
+        """Move a browser to a camera, with `up` upwards; with the camera's own up where None."""
         seen = browser.camera
         if not seen.update_timestamp:  # it has not said yet where it stands
             return
@@ -399,10 +403,10 @@ def _silence() -> Iterator[None]:
         logger.setLevel(before[1])
 
 
-def _named(train: Sequence[View], test: Sequence[View]) -> dict[str, View]:
-    """Return the views by the names that the list shows, in the capture's order."""
-    names = {view.name: view for view in train} | {f"{view.name} (held out)": view for view in test}
-    return dict(sorted(names.items(), key=lambda item: item[1].name))
+def _cameras(train: Sequence[View], test: Sequence[View]) -> dict[str, Camera]:
+    """Return the cameras by the names that the list shows, in the capture's order."""
+    names = {view.name: view.name for view in train} | {view.name: f"{view.name} (held out)" for view in test}
+    return {names[view.name]: view.camera for view in sorted([*train, *test], key=lambda view: view.name)}
 
 
 def _vertical_fov(camera: Camera) -> float:

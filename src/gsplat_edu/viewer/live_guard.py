@@ -55,7 +55,7 @@ class Guard:
         """
         serve, started = websockets.asyncio.server.serve, []
 
-        def guarded(*words: Any, process_request: Process, **options: Any) -> Any:  # noqa: ANN401
+        def guarded(*words: Any, process_request: Process | None = None, **options: Any) -> Any:  # noqa: ANN401
             started.append(options)
             process = functools.partial(self._process, process_request)
             options["open_timeout"] = REQUEST_SECONDS  # for the whole handshake
@@ -71,11 +71,13 @@ class Guard:
                 "--view: this version of viser cannot be guarded; install that of constraints.txt, or leave it out"
             )
 
-    def _process(self, process: Process, connection: ServerConnection, request: Request) -> Response | None:
+    def _process(
+        self, process: Process | None, connection: ServerConnection, request: Request
+    ) -> Response | None:
         """Refuse a request, or let viser answer it."""
         if (fault := self._fault(request)) is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"403 Forbidden: {fault}\n")
-        response = process(connection, request)
+        response = None if process is None else process(connection, request)
         if response is not None:
             response.headers["Cache-Control"] = "no-store"
             response.headers["Referrer-Policy"] = "no-referrer"  # the URL is a secret

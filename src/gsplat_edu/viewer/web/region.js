@@ -22,8 +22,9 @@ class Region {
   constructor(eyes) {
     const every = Math.max(1, Math.ceil(eyes.length / MOST_EYES));
     this.eyes = eyes.filter((_, i) => i % every === 0);
-    this.directions = [];
-    this.margin = Math.PI;
+    this.seen = []; // directions of the cameras
+    this.directions = []; // those, and some on the ways between them
+    this.margin = MARGIN;
   }
 
   // Sets the point that directions are seen from.
@@ -38,6 +39,7 @@ class Region {
         .sort((b, c) => dot(a, c) - dot(a, b))
         .slice(0, NEIGHBOURS),
     );
+    this.seen = directions;
     this.directions = [...directions];
     directions.forEach((a, i) => {
       for (const b of nearest[i]) {
@@ -49,7 +51,7 @@ class Region {
     });
     // sparse cameras leave more room between them
     const gaps = directions.map((a, i) => (nearest[i].length ? angleOf(dot(a, nearest[i][0])) : 0)).sort((a, b) => a - b);
-    this.margin = Math.min(WIDEST_MARGIN, MARGIN + 0.5 * (gaps[gaps.length >> 1] ?? Math.PI));
+    this.margin = Math.min(WIDEST_MARGIN, MARGIN + 0.5 * (gaps[gaps.length >> 1] ?? 0));
   }
 
   // Angle between a direction and the nearest captured one; 0 where nothing is known of the cameras.
@@ -66,9 +68,9 @@ class Region {
 
   // Radians for a drag across the longer side of the window: narrow captures turn slowly.
   turn() {
-    if (this.directions.length < 2) return this.eyes.length ? LEAST_TURN : MOST_TURN;
+    if (!this.seen.length) return MOST_TURN;
     let widest = 1;
-    for (const a of this.directions) for (const b of this.directions) widest = Math.min(widest, dot(a, b));
+    for (const a of this.seen) for (const b of this.seen) widest = Math.min(widest, dot(a, b));
     return Math.min(MOST_TURN, Math.max(LEAST_TURN, COVERED * angleOf(widest)));
   }
 }
