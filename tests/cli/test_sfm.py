@@ -93,7 +93,7 @@ def _unreadable(folder):
         (_unreadable, "holds no photo that can be decoded: 0.jpg (no image that Pillow knows), 1.jpg"),
         (_noise, "of 6 pairs, none match: the photos show too little in common; walk around the subject"),
         (_blank, "the photos show too little in common"),
-        (lambda folder: folder.write_text("hello"), "photos: is neither a folder nor a video"),
+        (lambda folder: folder.write_text("hello"), "photos: is neither a photo nor a video"),
         (
             lambda file: Image.fromarray(photograph_box(box_camera(0.0))).save(file, format="PNG"),
             "photos: is a single photo; name a folder",

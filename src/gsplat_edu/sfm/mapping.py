@@ -112,7 +112,8 @@ def map_photos(
 
     Returns:
         The model: its "folder" below `folder`, the "names" of the photos whose pose counts, "doubtful", those with a
-        pose that does not, "points", "error" in px, and the "way" that gave it; the rest is as the job "mapping" returns it.
+        pose that does not, "points", "error" in px, and the "way" that gave it; the rest is as the job "mapping"
+        returns it.
 
     Raises:
         DatasetError: no way gives enough photos a pose to be a model, or the last one failed and none gave any.
@@ -179,8 +180,8 @@ def _without_poses(total: int, connected: int) -> str:
     if connected < FEWEST:
         return no_overlap(f"of {total} photos, no {FEWEST} match one another")
     return (
-        f"{connected} of {total} photos match one another, but no poses follow from their matches; photos from one spot "
-        "show no depth: walk around the subject in small steps, and photograph something that is not flat"
+        f"{connected} of {total} photos match one another, but no poses follow from their matches; photos from one "
+        "spot show no depth: walk around the subject in small steps, and photograph something that is not flat"
     )
 
 

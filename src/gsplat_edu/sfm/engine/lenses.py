@@ -2,8 +2,8 @@
 
 Every camera begins with one focal length, one coefficient of distortion and the principal point in the middle. More
 freedom always fits the photos it was fitted to better; few photos, or poor geometry, then give intrinsics that no
-camera has. So a camera's photos are divided in two. Intrinsics found on one half are held while the poses and points of the
-other half are refined: only intrinsics that explain those photos better, both ways round, are worth having.
+camera has. So a camera's photos are divided in two. Intrinsics found on one half are held while the poses and points of
+the other half are refined: only intrinsics that explain those photos better, both ways round, are worth having.
 """
 
 from __future__ import annotations
