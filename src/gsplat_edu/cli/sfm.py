@@ -27,11 +27,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PHOTOS",
         help="a folder of photos (with masks/ or alpha, if any), or a video",
     )
-        "source",
-        type=Path,
-        metavar="PHOTOS",
-        help="a folder of photos (with masks/ or alpha, if any), or a video",
-    )
     parser.add_argument(
         "out", type=Path, metavar="OUT", help="folder of the capture; work is kept in OUT/sfm"
     )
