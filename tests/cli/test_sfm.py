@@ -86,20 +86,17 @@ def _unreadable(folder):
     ("make", "says"),
     [
         (lambda folder: None, "photos: is not there; name a folder of photos, or a video"),
-        (lambda folder: folder.mkdir(), "photos: holds no photo; name a folder of photos, or a video"),
-        (_texts, "photos: holds no photo; name a folder"),
-        (_video_inside, "photos: holds no photo; it holds a video, name that: "),
-        (lambda folder: save(folder, box_orbit(1)), "photos: holds one photo; poses need several"),
-        (
-            _unreadable,
-            "holds no photo that can be decoded: 0.jpg (not a JPEG, PNG, WebP, TIFF, BMP or PPM image), 1.jpg",
-        ),
+        (lambda folder: folder.mkdir(), "photos: holds no photos; name a folder of photos, or a video"),
+        (_texts, "photos: holds no photos; name a folder"),
+        (_video_inside, "photos: holds no photos; it holds a video, name that: "),
+        (lambda folder: save(folder, box_orbit(1)), "photos: holds one photo; poses need at least 3"),
+        (_unreadable, "holds no photo that can be decoded: 0.jpg (not a JPEG, PNG, WebP, TIFF, BMP or PPM image), 1.jpg"),
         (_noise, "of 6 pairs, none match: the photos show too little in common; walk around the subject"),
         (_blank, "the photos show too little in common"),
-        (lambda folder: folder.write_text("hello"), "photos: is neither a folder nor a video"),
+        (lambda folder: folder.write_text("hello"), "photos: is neither a photo nor a video"),
         (
             lambda file: Image.fromarray(photograph_box(box_camera(0.0))).save(file, format="PNG"),
-            "photos: is one photo; name a folder",
+            "photos: is a single photo; name a folder",
         ),
     ],
 )
@@ -213,7 +210,7 @@ def test_ctrl_c_says_that_it_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gsplat_edu.sfm.reconstruct.copy_photos", press)
     before = signal.getsignal(signal.SIGTERM)
     assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 130
-    assert "the same command goes on behind the last finished stage" in capsys.readouterr().err
+    assert "the same command resumes after the last finished stage" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGTERM) is before
 
 

@@ -43,9 +43,9 @@ def seen(number):
 
 
 def test_every_pose_of_a_sound_model_counts(work):
-    assert printed(work + "print(judge.unsupported(model), judge.agreement(model, database).contradictory)") == [
-        "{} set()"
-    ]
+    assert printed(
+        work + "print(judge.unsupported(model), judge.agreement(model, database).contradictory)"
+    ) == ["{} set()"]
 
 
 def test_a_pose_needs_thirty_points_spread_over_the_photo(work):

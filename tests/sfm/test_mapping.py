@@ -117,7 +117,8 @@ def test_the_largest_model_is_kept_where_none_has_most_photos(mapped):
     best, tried, said = mapped(4, 7, 5)  # no two ways agree
     assert tried == 3 and len(best["names"]) == 7 and best["way"] == f"{WAYS[1]}, SIMPLE_RADIAL"
     assert said == [
-        f"{way}: {count} of 10 photos have a pose that counts" for way, count in zip(WAYS, (4, 7, 5), strict=True)
+        f"{way}: {count} of 10 photos have a pose that counts"
+        for way, count in zip(WAYS, (4, 7, 5), strict=True)
     ]
 
 
@@ -168,7 +169,7 @@ def test_of_models_of_equal_worth_the_one_with_points_in_three_photos_and_a_smal
 
 
 def test_two_ways_that_agree_about_most_photos_are_the_last(mapped):
-    best, tried, said = mapped(6, 6, 7)
+    best, tried, _ = mapped(6, 6, 7)
     assert tried == 2 and len(best["names"]) == 6, "the other four share too little with them"
 
 

@@ -25,7 +25,14 @@ def image(path, pixels=None):
 
 
 @pytest.mark.parametrize(
-    "name", ["photos/masks/a.jpg.png", "photos/masks/a.png", "photos/a.jpg.mask.png", "photos/a.mask.png", "masks/a.png"]
+    "name",
+    [
+        "photos/masks/a.jpg.png",
+        "photos/masks/a.png",
+        "photos/a.jpg.mask.png",
+        "photos/a.mask.png",
+        "masks/a.png",
+    ],
 )
 def test_where_masks_lie(tmp_path, name):
     photos = [image(tmp_path / "photos" / photo) for photo in ("a.jpg", "b.jpg")]

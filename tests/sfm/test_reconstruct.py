@@ -1,11 +1,8 @@
 import json
 import shutil
 import sqlite3
-import subprocess
-import sys
 from contextlib import closing
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,7 +77,9 @@ def test_stages_are_told_with_real_counts(done):
     assert last == {stage: (pairs, pairs) if stage == "matches" else (14, 14) for stage in stages}
     assert [sentence.split(":")[0] for sentence in done.said] == list(STAGES)
     assert "14 by one camera" in done.said[0], "held upright or not, the sensor is the same"
-    assert "14 of 14 photos have a pose (incremental mapper, SIMPLE_RADIAL)" in done.said[3], "few photos fix a simple lens only"
+    assert "14 of 14 photos have a pose (incremental mapper, SIMPLE_RADIAL)" in done.said[3], (
+        "few photos fix a simple lens only"
+    )
     assert "COLMAP" not in done.said[0] and (done.out / "sfm" / "log.txt").stat().st_size > 1000
 
 

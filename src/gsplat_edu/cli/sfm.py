@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> None:
             reconstruct(options, say, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                "interrupted; the same command goes on behind the last finished stage"
+                "interrupted; the same command resumes after the last finished stage"
             ) from None
     say(f"wrote {options.out}; next: gsplat-edu train {shlex.quote(str(options.out))} --out RUN")
 

@@ -136,7 +136,7 @@ def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None
             reconstruct(SfmOptions(options.data, found), say, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                "interrupted while finding poses; the same command goes on behind the last finished stage"
+                "interrupted while finding poses; the same command resumes after the last finished stage"
             ) from None
     return replace(options, data=found)
 

@@ -57,8 +57,8 @@ SUPPORT = 30
 """Points found in a photo that fix its pose: COLMAP's own bound for placing a photo."""
 
 SUPPORT_SHARE = 0.25
-"""A camera with fewer points than that is named if it also has fewer than this share of the median camera's: in captures
-with little texture few points are all there are."""
+"""A camera with fewer points than that is named if it also has fewer than this share of the median camera's: in
+captures with little texture few points are all there are."""
 
 HALF_SUPPORT = 0.5
 """A camera that stands oddly is named if it has fewer than this share of the median camera's points."""
@@ -181,7 +181,9 @@ def check_away(survey: Survey) -> list[Finding]:
     if named := away - doubtful.keys():
         names = tuple(survey.names[i] for i in sorted(named))
         what = f"{len(names)} of {len(survey.shots)} cameras, towards what hardly another one sees"
-        advice = "look at the photos of the cameras that look away: a wrong pose spoils the scene, take it out"
+        advice = (
+            "look at the photos of the cameras that look away: a wrong pose spoils the scene, take it out"
+        )
         found.append(Finding("look away", Severity.WARNING, what, advice, names))
     if doubtful:
         names = tuple(f"{survey.names[i]} ({why})" for i, why in sorted(doubtful.items()))

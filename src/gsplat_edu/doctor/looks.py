@@ -139,12 +139,12 @@ def check_twins(survey: Survey) -> list[Finding]:
     found = []
     if moved := [(i, j) for i, j in twins if _motion(survey, i, j) > TWIN_MOTION]:
         told = tuple(f"{names[i]} and {names[j]}" for i, j in moved)
-        what = f"{counted(len(moved), 'pair')} of photos that show the same to a few per cent, but with poses that differ"
+        what = f"{counted(len(moved), 'pair')} of photos that are nearly the same, but with poses that differ"
         advice = "take out one photo of each pair that shows the same: one of the two poses is wrong"
         found.append(Finding("same photo", Severity.WARNING, what, advice, told))
     if copies := [pair for pair in twins if pair not in moved]:
         told = tuple(f"{names[i]} and {names[j]}" for i, j in copies)
-        what = f"{counted(len(copies), 'pair')} of photos that show the same to a few per cent, from one place"
+        what = f"{counted(len(copies), 'pair')} of photos that are nearly the same, from one place"
         advice = "take out one photo of each such pair: if one of them is for testing, it tests nothing"
         found.append(Finding("duplicates", Severity.WARNING, what, advice, told))
     if apart := sorted(poses - set(twins)):

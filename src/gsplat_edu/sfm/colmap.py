@@ -142,7 +142,7 @@ def limit_features(database: Path, most: int) -> None:
         with closing(sqlite3.connect(database)) as writer, writer:
             many = writer.execute("SELECT image_id FROM keypoints WHERE rows > ?", (most,)).fetchall()
             for (image,) in many:
-                kept = slice(None)
+                kept = np.arange(most)
                 for table, kind in tables:
                     query = f"SELECT rows, cols, data FROM {table} WHERE image_id = ?"
                     rows, columns, data = writer.execute(query, (image,)).fetchone()

@@ -22,8 +22,8 @@ MANY_PHOTOS = 400
 """Photos beyond which the global mapper comes first: the incremental one's time grows with their square."""
 
 ENOUGH_FOR_OPENCV = 10
-"""Photos of each camera from which a way is tried that maps with OPENCV's lens from the beginning: the simple lens of the
-other ways cannot follow a strong wide angle."""
+"""Photos of each camera from which a way is tried that maps with OPENCV's lens from the beginning: the simple lens of
+the other ways cannot follow a strong wide angle."""
 
 SAME = 0.5
 """Share of the connected photos from which two ways that agree are believed."""
@@ -98,8 +98,9 @@ def map_photos(
         progress: Told how many photos have a pose.
 
     Returns:
-        The model: its "folder" below `folder`, the "names" of the photos whose pose counts, "doubtful", those with a pose
-        that does not, "points", "error" in px, and the "way" that gave it; the rest is as the job "mapping" returns it.
+        The model: its "folder" below `folder`, the "names" of the photos whose pose counts, "doubtful", those with a
+        pose that does not, "points", "error" in px, and the "way" that gave it; the rest is as the job "mapping"
+        returns it.
 
     Raises:
         DatasetError: no way gives enough photos a pose to be a model, or the last one failed and none gave any.
@@ -111,7 +112,9 @@ def map_photos(
         out = models / str(number)
         out.mkdir(parents=True)
         try:
-            made = _mapped(folder, out, way, threads, lambda done: progress("mapping", min(done, total), total))
+            made = _mapped(
+                folder, out, way, threads, lambda done: progress("mapping", min(done, total), total)
+            )
         except DatasetError as error:
             if number == len(ways) and not found:
                 raise
@@ -133,8 +136,9 @@ def map_photos(
 
 
 def _agreed(found: Sequence[dict[str, Any]], connected: int) -> bool:
-    """Say whether two ways gave the same photos a pose that counts, most of the connected ones: then the others share
-    too little with them, and no further way is tried.
+    """Say whether two ways gave the same photos a pose that counts, most of the connected ones.
+
+    The others then share too little with them, and no further way is tried.
     """
     sets = [set(model["names"]) for model in found if len(model["names"]) > SAME * connected]
     return any(len(one & other) >= NEARLY * len(one | other) for one, other in combinations(sets, 2))
@@ -153,7 +157,9 @@ def best_model(models: Sequence[dict[str, Any]]) -> dict[str, Any]:
     worth = [len(model["names"]) * model["agreement"] for model in models]
     good = [model for model, w in zip(models, worth, strict=True) if w >= NEARLY * max(worth)]
     most = max(model["steady"] for model in good)
-    return min((model for model in good if model["steady"] >= NEARLY * most), key=lambda model: model["error"])
+    return min(
+        (model for model in good if model["steady"] >= NEARLY * most), key=lambda model: model["error"]
+    )
 
 
 def _without_poses(total: int, connected: int) -> str:
@@ -161,8 +167,8 @@ def _without_poses(total: int, connected: int) -> str:
     if connected < FEWEST:
         return no_overlap(f"of {total} photos, no {FEWEST} match one another")
     return (
-        f"{connected} of {total} photos match one another, but no poses follow from their matches; photos from one spot "
-        "show no depth: walk around the subject in small steps, and photograph something that is not flat"
+        f"{connected} of {total} photos match one another, but no poses follow from their matches; photos from one "
+        "spot show no depth: walk around the subject in small steps, and photograph something that is not flat"
     )
 
 

@@ -61,9 +61,7 @@ def check_masks(masks: Mapping[Path, Path], sizes: Mapping[Path, tuple[int, int]
             raise DatasetError(f"{mask}: the mask is {w}x{h} but its photo {W}x{H}; make them one size")
 
 
-def counting(
-    mask: Path | None, alpha: UInt8[np.ndarray, "H W"] | None
-) -> Bool[np.ndarray, "H W"] | None:
+def counting(mask: Path | None, alpha: UInt8[np.ndarray, "H W"] | None) -> Bool[np.ndarray, "H W"] | None:
     """Return where features are looked for: where a pixel counts and is not transparent; None for everywhere.
 
     Args:

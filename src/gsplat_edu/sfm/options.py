@@ -35,7 +35,7 @@ class SfmOptions:
             that look alike, and the ones taken close by. "auto": exhaustive up to 150 photos, else nearest; for
             videos nearest.
         mapper: "incremental", "global", or "auto": the former, and the other one where it does not do.
-        camera_model: COLMAP's name of the lens model; "auto": SIMPLE_RADIAL, or a freer one where the photos support it.
+        camera_model: COLMAP's name of the lens model; "auto": SIMPLE_RADIAL, or a freer one that the photos support.
         max_features: Most SIFT features of a photo.
         max_image_size: Longest side at which features are found, px. The capture has the photos at full size.
         threads: Threads of COLMAP; 0 for all.

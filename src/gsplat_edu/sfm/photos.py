@@ -236,7 +236,9 @@ def copy_photos(
     finally:
         pool.shutdown(cancel_futures=True)
     masked = mask_folder(folder)
-    for photo in facts if masked.is_dir() else ():  # COLMAP passes over photos without a mask where others have one
+    for photo in (
+        facts if masked.is_dir() else ()
+    ):  # COLMAP passes over photos without a mask where others have one
         if not (target := masked / f"{photo.copy}.png").is_file():
             write_mask(np.ones((1, 1), np.bool_), target, photo.copy_size(longest))
     return facts, unreadable

@@ -44,8 +44,8 @@ INLIERS = 15
 
 
 FEATURES, MAPPING = 2, 2
-"""Numbers of the methods: what earlier ones left in a work folder is not mixed with what these find. 1 kept more features
-of a photo than `max_features`, 1 of the mappings counted every pose."""
+"""Numbers of the methods, part of the stages' options: results that an earlier method left in a work folder are found
+anew. Before 2, photos kept more features than `max_features`, and every pose counted."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]

@@ -32,7 +32,8 @@ def needs_poses(path: str | Path) -> bool:
         path: What the user named.
 
     Raises:
-        DatasetError: it is a run's folder, an empty one, or a file of another kind, or its photos lie in several folders.
+        DatasetError: it is a run's folder, an empty one, or a file of another kind; or its photos lie in several
+            folders.
     """
     path = Path(path)
     if is_file(path):

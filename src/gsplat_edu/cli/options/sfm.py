@@ -18,7 +18,12 @@ def check(arguments: argparse.Namespace) -> None:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("source", type=Path, metavar="PHOTOS", help="a folder of photos, or a video")
+    parser.add_argument(
+        "source",
+        type=Path,
+        metavar="PHOTOS",
+        help="a folder of photos (with masks/ or alpha, if any), or a video",
+    )
     parser.add_argument(
         "out", type=Path, metavar="OUT", help="folder of the capture; work is kept in OUT/sfm"
     )
@@ -36,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     number("--frames", "frames taken from a video, at most", SfmOptions.frames)
     choice("--matcher", "which photos are compared", MATCHERS)
     choice("--mapper", "how poses are found", MAPPERS)
-    choice("--camera-model", "how the lens bends light", CAMERA_MODELS)
+    choice("--camera-model", "lens model; auto frees what held-out photos support", CAMERA_MODELS)
     number("--max-features", "features of a photo, at most", SfmOptions.max_features)
     number("--max-image-size", "longest side at which features are found, px", SfmOptions.max_image_size)
     number("--threads", "threads of COLMAP, 0 for all", SfmOptions.threads)

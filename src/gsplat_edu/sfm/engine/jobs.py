@@ -86,9 +86,7 @@ def features(
         device=pycolmap.Device.cpu,
     )
     with opened(database) as db:
-        found = {
-            image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()
-        }
+        found = {image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()}
     return {"features": found}
 
 

@@ -128,9 +128,7 @@ def _observations(model: pycolmap.Reconstruction, number: int) -> tuple[np.ndarr
     return points[good], places[good]
 
 
-def residuals(
-    model: pycolmap.Reconstruction, number: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def residuals(model: pycolmap.Reconstruction, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what a photo sees of the model, each point once.
 
     Args:

@@ -1,9 +1,9 @@
 """How much of a camera the photos tell: which intrinsics are refined, judged on photos that had no part in it.
 
 Every camera begins with one focal length, one coefficient of distortion and the principal point in the middle. More
-freedom always fits the photos it was fitted to better; few photos, or poor geometry, then give intrinsics that no camera
-has. So a camera's photos are divided in two. Intrinsics found on one half are held while the poses and points of the
-other half are refined: only intrinsics that explain those photos better, both ways round, are worth having.
+freedom always fits the photos it was fitted to better; few photos, or poor geometry, then give intrinsics that no
+camera has. So a camera's photos are divided in two. Intrinsics found on one half are held while the poses and points of
+the other half are refined: only intrinsics that explain those photos better, both ways round, are worth having.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ CENTRED = 0.1
 
 ITERATIONS = 30
 """Of the adjustments that judge; they begin at the solution of a simpler lens."""
+
 
 class Rung(NamedTuple):
     """What is refined of a camera."""
@@ -125,7 +126,7 @@ def _errors(halves: list[pycolmap.Reconstruction], rung: Rung, threads: int) -> 
         if not _believable(teacher.camera(camera)):
             return [np.inf, np.inf]
         _change(judge.camera(camera), rung.model)
-        judge.camera(camera).params = teacher.camera(camera).params
+        judge.camera(camera).params = list(teacher.camera(camera).params)
         _adjust(judge, threads, iterations=ITERATIONS, fixed={camera})
         found.append(_error(judge))
     return found
@@ -154,16 +155,14 @@ def _change(camera: pycolmap.Camera, name: str) -> None:
         return
     focal, (x, y) = camera.focal_length_x, (camera.principal_point_x, camera.principal_point_y)
     bends = [camera.params[i] for i in camera.extra_params_idxs()]
-    after = pycolmap.Camera.create_from_model_name(
-        camera.camera_id, name, focal, camera.width, camera.height
-    )
+    after = pycolmap.Camera.create_from_model_name(camera.camera_id, name, focal, camera.width, camera.height)
     params = np.array(after.params)
     for index, value in zip(after.principal_point_idxs(), (x, y), strict=True):
         params[index] = value
     for index, value in zip(after.extra_params_idxs(), bends, strict=False):
         params[index] = value
     camera.model = after.model
-    camera.params = params
+    camera.params = params.tolist()
 
 
 def _adjust(
