@@ -26,7 +26,9 @@ def written_aside(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be made or written to. What stood under `path` before is untouched.
     """
-    prefix = f".{path.stem}.{os.getpid()}-"  # the writer's process: remove_leftovers asks whether it still runs
+    prefix = (
+        f".{path.stem}.{os.getpid()}-"  # the writer's process: remove_leftovers asks whether it still runs
+    )
     with named_failure(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)

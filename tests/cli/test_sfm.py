@@ -90,7 +90,10 @@ def _unreadable(folder):
         (_texts, "photos: holds no photos; name a folder"),
         (_video_inside, "photos: holds no photos; it holds a video, name that: "),
         (lambda folder: save(folder, box_orbit(1)), "photos: holds one photo; poses need at least 3"),
-        (_unreadable, "holds no photo that can be decoded: 0.jpg (not a JPEG, PNG, WebP, TIFF, BMP or PPM image), 1.jpg"),
+        (
+            _unreadable,
+            "holds no photo that can be decoded: 0.jpg (not a JPEG, PNG, WebP, TIFF, BMP or PPM image), 1.jpg",
+        ),
         (_noise, "of 6 pairs, none match: the photos show too little in common; walk around the subject"),
         (_blank, "the photos show too little in common"),
         (lambda folder: folder.write_text("hello"), "photos: is neither a photo nor a video"),

@@ -51,7 +51,7 @@ def _evaluate(
     arguments: argparse.Namespace,
     folder: RunFolder,
     into: RunFolder | None,
-    console: Console,
+    console: Terminal,
     say: Callable[[str], None],
 ) -> None:
     backend, config = resolve_backend(arguments.backend), folder.read_config()
