@@ -54,7 +54,12 @@ def float64_array(
         array = given.astype(np.float64, copy=False)
     except ArgumentError:
         raise
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor that requires grad
+    except (
+        TypeError,
+        ValueError,
+        OverflowError,
+        RuntimeError,
+    ) as error:  # RuntimeError: a tensor that requires grad
         raise ArgumentError(f"{name}: cannot be read as an array of numbers ({error})") from None
     check_shape(name, array.shape, shape, {} if sizes is None else sizes)
     finite = np.isfinite(array)

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from gsplat_edu.camera import WORLD_UP, Camera
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.paths import common_up, orbit_of_scene, resized
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import SOG_META, read_scene
@@ -18,6 +18,9 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.validation import ArrayLike, float64_array
+
+FARTHEST_ORIGIN = 1e30
+"""World units: what is subtracted from float32 means stays in their range."""
 
 SCENE_LEVELS = 3
 """Folders between a run and its scenes: RUN/point_cloud/iteration_N/point_cloud.ply."""
@@ -128,6 +131,8 @@ def _of_run(folder: RunFolder, path: Path) -> Source:
     config = folder.read_config()
     settings = replace(render_settings(config), depth=False)
     x, y, z = float64_array("config.json: origin", config.get("origin") or ORIGIN, (3,)).tolist()
+    if max(abs(x), abs(y), abs(z)) > FARTHEST_ORIGIN:
+        raise CheckpointError(f"{folder.config}: origin: is beyond {FARTHEST_ORIGIN:g}; mend the file")
     gaussians = load_ply(path, (x, y, z))
     cameras: tuple[NamedCamera, ...] = ()
     held_out: frozenset[str] = frozenset()
