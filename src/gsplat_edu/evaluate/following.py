@@ -120,9 +120,6 @@ def path_along(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> Ca
 def point_looked_at(cameras: Sequence[Camera]) -> Vector | None:
     """Find the point that most cameras look at, whatever a minority of them does.
 
-    The point nearest to the optical axes is sought in random samples of the cameras, always the same ones; the one with
-    the smallest median angle to the axes is refined with the cameras that do not look past it.
-
     Args:
         cameras: At least one.
 
@@ -130,22 +127,38 @@ def point_looked_at(cameras: Sequence[Camera]) -> Vector | None:
         (3,) world units; None where the axes are parallel or meet behind the cameras, or where fewer than 70 % of the
         cameras have the point in their picture.
     """
+    centre = point_nearest_most_axes(cameras, PARALLEL)
+    if centre is None or np.mean([_shows(camera, centre) for camera in cameras]) < MOST:
+        return None
+    return centre
+
+
+def point_nearest_most_axes(cameras: Sequence[Camera], parallel: float) -> Vector | None:
+    """Find the point nearest to the optical axes of most cameras.
+
+    It is sought in random samples of the cameras, always the same ones: one camera turned round would draw the mean
+    along. The point with the smallest median angle to all axes is refined with the cameras that do not look past it.
+
+    Args:
+        cameras: At least one.
+        parallel: As for `gsplat_edu.camera.point_nearest_axes`.
+
+    Returns:
+        (3,) world units, perhaps behind the cameras; None where the axes are parallel.
+    """
     eyes, axes = (np.stack(rows) for rows in zip(*((c.eye, c.R[2]) for c in cameras), strict=True))
     rng, count = np.random.default_rng(0), len(cameras)
     samples = [
         np.arange(count),
         *(rng.choice(count, min(SAMPLED, count), replace=False) for _ in range(DRAWS)),
     ]
-    found = [point_nearest_axes([cameras[int(i)] for i in rows], PARALLEL) for rows in samples]
+    found = [point_nearest_axes([cameras[int(i)] for i in rows], parallel) for rows in samples]
     points = [point for point in found if point is not None]
     if not points:
         return None
     angles = min((_angles(point - eyes, axes) for point in points), key=lambda each: float(np.median(each)))
     kept = np.flatnonzero(angles <= max(PAST, PAST_FACTOR * float(np.median(angles))))
-    centre = point_nearest_axes([cameras[int(i)] for i in kept], PARALLEL)
-    if centre is None or np.mean([_shows(camera, centre) for camera in cameras]) < MOST:
-        return None
-    return centre
+    return point_nearest_axes([cameras[int(i)] for i in kept], parallel)
 
 
 def _shows(camera: Camera, point: Vector) -> bool:
