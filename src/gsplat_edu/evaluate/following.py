@@ -107,7 +107,7 @@ def path_along(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> Ca
         up = common_up(kept)
         offsets = np.stack([camera.eye for camera in kept]) - centre
         elevations = np.arcsin(np.clip(_units(offsets) @ up, -1.0, 1.0))
-        if abs(float(np.median(elevations))) > STEEP or len(kept) < 3:
+        if abs(float(np.median(elevations))) > STEEP:
             return _loop_between(kept, turns, float(np.median(np.linalg.norm(offsets, axis=1))), centre)
         return _around(kept, centre, up, turns)
     axes = np.stack([camera.R[2] for camera in cameras])
@@ -192,6 +192,12 @@ def _around(cameras: Sequence[Camera], centre: Vector, up: Vector, turns: Values
     elevations = np.arcsin(np.clip(offsets @ up / distances, -1.0, 1.0))
     low, high, rows, crossed = _covered(azimuths)
     covered = high - low
+    if covered < LEAST_LOOP and np.ptp(elevations[rows]) < LEAST_LOOP:
+        near = [cameras[i] for i in rows]
+        path = _loop_between(near, turns, float(np.median(distances[rows])), centre)
+        return CameraPath(
+            path.cameras, "the cameras stand too far apart for a path: a small loop at one place"
+        )
     # not narrower than most of a gap, or the average jumps from one camera to the next in the middle of it
     width = max(min(BANDWIDTH, covered / 6), 0.6 * crossed, 1e-6)
     data = azimuths[rows], elevations[rows], np.log(distances[rows])
