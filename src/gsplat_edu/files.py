@@ -90,6 +90,30 @@ _ADVICE = {
 """What to do about an error."""
 
 
+@contextmanager
+def named_in_utf8(path: Path) -> Iterator[Path]:
+    """Give a file a name in UTF-8 while the block runs: OpenCV crashes the process on any other.
+
+    Args:
+        path: A file that is there.
+
+    Yields:
+        The path; a link to it in a temporary folder if its name, or that of a folder above, is not UTF-8.
+
+    Raises:
+        OSError: the link cannot be made.
+    """
+    if not _SURROGATE.search(str(path)):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="gsplat-edu-") as folder:
+        link = Path(folder) / f"file{'' if _SURROGATE.search(path.suffix) else path.suffix}"
+        link.symlink_to(path.absolute())
+        yield link
+
+
+_SURROGATE = re.compile("[\ud800-\udfff]")  # stands for a byte that is not UTF-8 (PEP 383)
+
 _LEFTOVER = re.compile(r"\..*\.(\d+)-[a-z0-9_]{8}(?:\.[^.]+)?")  # temporary names of written_aside
 
 

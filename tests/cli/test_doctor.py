@@ -139,7 +139,8 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     shutil.copytree(run.path, place / "run; one")
     config = run.read_config()
     data = config["data"] | {"path": str((place / "capture one").resolve()), "resolution": 40.0}
-    RunFolder(place / "run; one").write_config(config | {"data": data, "train": {"iterations": 30}})
+    train = {"iterations": 30, "background": [1.0, 1.0, 1.0]}
+    RunFolder(place / "run; one").write_config(config | {"data": data | {"test_every": 0}, "train": train})
     said = [doctor(place / "capture one", "--no-forecast")[1], doctor(place / "run; one")[1]]
     commands = [words for text in said for words in pasted(text)]
     assert {words[0] for words in commands} >= {"train", "render"} and len(commands) >= 5
@@ -153,6 +154,8 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     assert command_line.main([*renders, "--frames", "2"]) == 0 and Path("orbit.mp4").is_file()
     longer = next(words for words in commands if "30000" in words)
     assert longer[longer.index("--resolution") + 1] == "40"
+    assert longer[longer.index("--test-every") + 1] == "0", "0 is a value, too"
+    assert longer[longer.index("--background") + 1 :][:3] == ["1", "1", "1"]
     assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_30000").is_dir()
 
 

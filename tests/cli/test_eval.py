@@ -9,6 +9,7 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.locks import LOCK
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import photo_digests
@@ -120,6 +121,8 @@ def test_another_dataset_is_scored_apart_or_not_at_all(run, other, cli, capsys, 
     assert "is not the capture of" in error and "other cameras: view_00" in error and "--out FOLDER" in error
     assert error.count("\n") == 1 and contents(run.path) == before
     words = ["eval", str(run.path), "--dataset", str(other), "--out", str(tmp_path / "apart")]
+    (tmp_path / "apart").mkdir()
+    (tmp_path / "apart" / LOCK).touch()  # an evaluation was killed here
     for _ in range(2):  # an evaluation may be done again
         assert cli(words) == 0
         assert "it is scored apart" in capsys.readouterr().out.replace("\n", " ")

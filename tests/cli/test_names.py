@@ -30,6 +30,7 @@ print("codes", [
     main(["info", data]),
     main(["info", run]),
     main(["render", run, "--dataset", "--size", "16", "--backend", "cpu"]),
+    main(["render", run, "--frames", "2", "--size", "16", "--backend", "cpu"]),
     main(["doctor", data, "--no-forecast"]),
     main(["doctor", run, "--backend", "cpu"]),
     main(["info", run + "/\\x1b[2Jgone"]),
@@ -68,7 +69,7 @@ def test_a_training_among_odd_names_in_a_locale_of_ascii(odd_capture, tmp_path):
         words, capture_output=True, env={**os.environ, **ASCII_ONLY}, timeout=600, check=False
     )
     said = ended.stdout + ended.stderr
-    assert b"codes [0, 0, 0, 0, 0, 0, 0, 2]" in ended.stdout, said.decode("ascii", "replace")
+    assert b"codes [0, 0, 0, 0, 0, 0, 0, 0, 2]" in ended.stdout, said.decode("ascii", "replace")
     assert b"\x1b" not in said and said.isascii()
     assert rb"half\ud800.png" in said and rb"run\xfe \x1b[1m" in said
     report = (tmp_path / os.fsdecode(b"run\xfe \x1b[1m") / "report.html").read_bytes().decode("utf-8")
@@ -76,6 +77,7 @@ def test_a_training_among_odd_names_in_a_locale_of_ascii(odd_capture, tmp_path):
     names = {entry["img_name"] for entry in json.loads((Path(run) / "cameras.json").read_text())}
     assert {r"images/raw\xff.png", "images/π.png"} <= names
     assert (Path(run) / "renders" / "views" / "images_π.png").is_file(), "written as UTF-8 all the same"
+    assert (Path(run) / "renders" / "orbit.mp4").is_file()
 
 
 def test_names_as_text():

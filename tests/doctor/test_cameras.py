@@ -214,7 +214,7 @@ def test_found_points_are_read_from_text_as_well(tmp_path):
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
     (model / "cameras.txt").write_text("1 PINHOLE 10 10 9 9 5 5\n")
-    rows = "1 1 0 0 0 0 0 0 1 a b.png\n1 2 7 3 4 -1 5 6 8\n2 1 0 0 0 0 0 0 1 c.png\n\n"
-    (model / "images.txt").write_text(f"# Image list\n{rows}")
-    assert observed_points(tmp_path) == {"a b.png": 2, "c.png": 0}
+    rows = b"1 1 0 0 0 0 0 0 1 a b.png\n1 2 7 3 4 -1 5 6 8\n\n2 1 0 0 0 0 0 0 1 d\\raw\xff.png\n\n"
+    (model / "images.txt").write_bytes(b"# Image list\n" + rows)
+    assert observed_points(tmp_path) == {"a b.png": 2, r"d/raw\xff.png": 0}, "named as frames are"
     assert observed_points(tmp_path / "nowhere") == {}

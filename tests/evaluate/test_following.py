@@ -229,6 +229,19 @@ def test_two_cameras_that_look_at_one_thing():
     check_smooth(cameras, 2.0)
 
 
+@pytest.mark.parametrize("azimuths", [[0, 90], [0, 120, 240], [0, 90, 180, 270]])
+def test_cameras_too_far_apart_for_a_path_get_a_loop_at_one_of_them(azimuths):
+    """All frames were one picture, or from a place between two photos that no photo was near."""
+    cameras = around(azimuths, [10] * len(azimuths))
+    path = path_along(cameras, 12, 2.0)
+    eyes, real = (np.stack([camera.eye for camera in each]) for each in (path.cameras, cameras))
+    nearest = np.linalg.norm(eyes[:, None] - real, axis=2).min(axis=0)
+    assert np.sort(nearest)[0] < 0.1 and "too far apart" in path.says
+    # half axes are 0.03 of the distance, 2.5; the view turns with the place: 0.075 / 2.5 rad, 1.7 degrees
+    assert 0.07 < np.ptp(eyes, axis=0).max() < 0.16 and off(path, cameras) < 1.8
+    check_smooth(cameras, 2.0)
+
+
 def test_equal_cameras_are_no_obstacle():
     cameras = around([0, 0, 0, 0], [10] * 4)
     assert off(path_along(cameras, 5, 2.0), cameras) < 3

@@ -1,6 +1,7 @@
 """Videos: the whole picture at any size, equal bytes, and a browser that plays them in the right colours."""
 
 import base64
+import os
 import shutil
 import struct
 
@@ -108,6 +109,15 @@ def test_equal_frames_give_equal_bytes_and_the_index_is_in_front(tmp_path):
     entry = first[first.index(b"vpcC") + 4 :]
     assert entry[4] == 0 and entry[6] == 0x82 and tuple(entry[7:10]) == (1, 1, 6)
     assert streamable(first) == first, "done already"
+
+
+def test_a_video_may_have_any_name(tmp_path):
+    """OpenCV ends the process where a name is not UTF-8."""
+    frames = [quarters(16, 24, turn) for turn in range(3)]
+    plain, odd = tmp_path / "plain.mp4", tmp_path / os.fsdecode(b"run\xfe") / os.fsdecode(b"raw\xff.mp4")
+    for path in (plain, odd):
+        write_frames(path, frames)
+    assert odd.read_bytes() == plain.read_bytes() and list(odd.parent.iterdir()) == [odd]
 
 
 def test_what_is_no_video_is_refused():

@@ -57,6 +57,17 @@ def test_a_mask_of_another_size_is_refused(tmp_path):
         copy_photos([photo], tmp_path, tmp_path / "copies", 1600)
 
 
+def test_a_mask_that_cannot_be_decoded_is_named(tmp_path):
+    """It was said of the photo, which is sound."""
+    photo = image(tmp_path / "a.png")
+    mask = image(
+        tmp_path / "masks" / "a.png", np.random.default_rng(0).integers(0, 255, (30, 40)).astype(np.uint8)
+    )
+    mask.write_bytes(mask.read_bytes()[:200])
+    facts, (reason,) = copy_photos([photo], tmp_path, tmp_path / "copies", 1600)
+    assert not facts and reason.startswith(f"a.png: its mask {mask}: cannot be decoded")
+
+
 @pytest.mark.usefixtures("colmap")
 def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
     """Photos with a mask, photos that are transparent where those are masked, and one with neither."""

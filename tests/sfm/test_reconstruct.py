@@ -239,7 +239,7 @@ def test_what_cannot_be_used_is_named_and_left_out(phone, tmp_path):
     words = "\n".join(said)
     assert "left out, cannot be decoded: broken.jpg" in words
     assert "left out, no pose was found: noise.png" in words
-    assert "8 of 9 photos" in words and "the other 1 share too little with them" in words
+    assert "8 of 9 photos" in words and "the other one shares too little with them" in words
 
 
 def test_a_job_that_fails_names_its_log(tmp_path):

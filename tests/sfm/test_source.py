@@ -39,8 +39,9 @@ def test_a_run_is_no_folder_of_photos(run, tmp_path, capsys, command):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_whose_configuration_is_damaged_is_still_one(run):
-    (run / "config.json").write_text("{")
+@pytest.mark.parametrize("contents", ["{", "[" * 100_000, '{"data": {"path": 7}}'])
+def test_a_run_whose_configuration_is_damaged_is_still_one(run, contents):
+    (run / "config.json").write_text(contents)
     with pytest.raises(DatasetError, match="name the capture it was trained on$"):
         needs_poses(run)
 

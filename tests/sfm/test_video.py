@@ -1,3 +1,4 @@
+import os
 import re
 import struct
 import subprocess
@@ -83,6 +84,19 @@ def test_frames_become_a_capture(walk, colmap, tmp_path):
     said.clear()
     reconstruct(SfmOptions(walk.path, out, frames=24), said.append)
     assert len(said) == 6 and all(sentence.endswith("(done before)") for sentence in said)
+
+
+def test_a_video_may_have_any_name(walk, tmp_path):
+    """OpenCV ends the process where a name is not UTF-8."""
+    odd = tmp_path / os.fsdecode(b"raw\xff.mp4")
+    odd.symlink_to(walk.path)
+    chosen = choose_frames(odd, 3, silent)
+    (plain, raw) = (tmp_path / "plain", tmp_path / os.fsdecode(b"frames\xfe"))
+    written = [
+        write_frames(path, chosen, folder, silent) for path, folder in ((walk.path, plain), (odd, raw))
+    ]
+    assert len(written[0]) == 3
+    assert [file.read_bytes() for file in written[0]] == [file.read_bytes() for file in written[1]]
 
 
 def test_frames_that_show_the_same_are_left_out(tmp_path):

@@ -111,22 +111,25 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
 
 
 def _options(config: dict[str, Any]) -> tuple[str, ...]:
-    """Return the options of a run that a longer one should have too: what it reads, and how much it may hold."""
-    section = config.get("train")
+    """Return the options that a longer run should have too: what it reads, its background, how much it may hold."""
+    section, data = config.get("train"), config["data"]
     train = section if isinstance(section, dict) else {}
+    background = train.get("background") or ()
     named = {
-        "--resolution": config["data"].get("resolution"),
-        "--points": config["data"].get("points"),
-        "--strategy": train.get("strategy"),
-        "--max-gaussians": train.get("max_gaussians"),
+        "--resolution": (data.get("resolution"),),
+        "--test-every": (data.get("test_every"),),
+        "--points": (data.get("points"),),
+        "--from": (data.get("scene"),),
+        "--strategy": (train.get("strategy"),),
+        "--max-gaussians": (train.get("max_gaussians"),),
+        "--background": background if any(background) else (None,),
     }
-    given = (
-        (flag, f"{value:g}" if isinstance(value, float) else str(value))
-        for flag, value in named.items()
-        if value
-    )
-    flags = ("--antialiased",) if train.get("antialiased") else ()
-    return (*(word for pair in given for word in pair), *flags)
+    words = []
+    for flag, values in named.items():
+        if None not in values:
+            words += [flag, *(f"{value:g}" if isinstance(value, float) else str(value) for value in values)]
+    flags = {"--antialiased": "antialiased", "--random-background": "random_background"}
+    return (*words, *(flag for flag, key in flags.items() if train.get(key)))
 
 
 def _exposure_beforehand(capture: Path, console: Console) -> list[Finding]:

@@ -14,7 +14,7 @@ from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.io.ply import load_ply
-from gsplat_edu.locks import locked
+from gsplat_edu.locks import LOCK, locked
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
@@ -43,7 +43,8 @@ def _check_apart(out: RunFolder) -> None:
     """Refuse to write over anything but an earlier evaluation of the same kind."""
     if out.exists():
         raise ArgumentError(f"--out: {out.path} holds a run; name a folder for this evaluation alone")
-    if out.path.is_dir() and any(out.path.iterdir()) and EVALUATED not in out.read_metrics():
+    others = out.path.is_dir() and any(path.name != LOCK for path in out.path.iterdir())
+    if others and EVALUATED not in out.read_metrics():
         raise ArgumentError(f"--out: {out.path} holds other files; name a new folder")
 
 

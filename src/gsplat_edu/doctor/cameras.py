@@ -187,14 +187,14 @@ def check_away(survey: Survey) -> list[Finding]:
         found.append(Finding("look away", Severity.WARNING, what, advice, names))
     if doubtful:
         names = tuple(f"{survey.names[i]} ({why})" for i, why in sorted(doubtful.items()))
-        what = f"{len(names)} of {len(survey.shots)} cameras have poses that little supports"
+        what = f"{len(names)} of {len(survey.shots)} cameras have poses with little support"
         advice = "take out the cameras with doubtful poses: a wrong pose spoils the scene for all others"
         found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names))
     return found
 
 
 def _doubtful(survey: Survey) -> dict[int, str]:
-    """Return the cameras whose pose little supports, and why.
+    """Return the cameras whose poses have little support, and why.
 
     Where the capture says in which photos its points were found, these counts decide, alone where they are small, or
     with an odd place or direction. Where it does not, only a camera very far from all others is named.

@@ -10,8 +10,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsplat_edu.camera import Camera, point_nearest_axes
+from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import PARALLEL, scene_extent
+from gsplat_edu.evaluate.following import point_nearest_most_axes
 
 SAMPLES = 300
 """Points that stand for what a camera sees: the median of as many ratios is known to a tenth of their spread."""
@@ -40,14 +41,8 @@ SHARED = 0.25
 LEVEL = 4
 """Power of the cosine between optical axes that shares are multiplied by: 0.56 at 30 degrees, 0.06 at 60."""
 
-PAST, PAST_FACTOR = math.radians(20.0), 3.0
-"""A camera looks past the centre whose axis is farther from it than this, and than so many times the median."""
-
 CLOSE = 0.1
 """A centre nearer than this times the extent of the cameras is where they stand, not what they look at."""
-
-SAMPLED, DRAWS = 5, 40
-"""Cameras of a sample, and samples: with one camera in five turned away 12 samples have none of them."""
 
 INWARD, OUTWARD, FORWARD, FREE = "inward", "outward", "forward", "free"
 
@@ -87,24 +82,11 @@ class Geometry:
 
     @cached_property
     def centre(self) -> Float64[np.ndarray, "3"] | None:
-        """(3,) the point nearest to the optical axes that most cameras have in front; None where there is none.
+        """(3,) the point nearest to the optical axes of most cameras, which most have in front; None if there is none.
 
-        It is sought in small samples of the cameras, and the one taken that half of the cameras look at best: one
-        camera turned round would draw the mean along. Then those that look past it are left out. Samples are the same
-        in every run.
+        `gsplat_edu.evaluate.following.point_nearest_most_axes` says how it is found.
         """
-        rng, count = np.random.default_rng(0), len(self.cameras)
-        drawn = [rng.choice(count, min(SAMPLED, count), replace=False) for _ in range(DRAWS)]
-        found = [
-            point_nearest_axes([self.cameras[int(i)] for i in rows], PARALLEL)
-            for rows in (range(count), *drawn)
-        ]
-        points = [point for point in found if point is not None]
-        if not points:
-            return None
-        angles = min((self.angles_to(point) for point in points), key=lambda angles: float(np.median(angles)))
-        kept = np.flatnonzero(angles <= max(PAST, PAST_FACTOR * float(np.median(angles))))
-        centre = point_nearest_axes([self.cameras[int(i)] for i in kept], PARALLEL)
+        centre = point_nearest_most_axes(self.cameras, PARALLEL)
         return centre if centre is not None and np.mean(self.ahead(centre) > 0) >= MOST else None
 
     def angles_to(self, point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, " C"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,8 @@ import numpy as np
 
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.errors import DatasetError
+from gsplat_edu.reading import read_bytes
+from gsplat_edu.text import legible
 
 _IMAGE = struct.Struct("<I7dI")
 _COUNT = struct.Struct("<Q")
@@ -23,17 +26,17 @@ def observed_points(capture: Path) -> dict[str, int]:
         capture: Folder with a COLMAP model.
 
     Returns:
-        The counts by the names in the model; none where there is no model or it cannot be read.
+        The counts by the names that frames of the capture have; none if there is no model or it cannot be read.
     """
     model = find_model(capture)
     if model is None:
         return {}
     try:
         if (model / "images.bin").is_file():
-            return dict(_binary((model / "images.bin").read_bytes()))
-        return dict(_text((model / "images.txt").read_text(encoding="utf-8", errors="replace")))
-    except (OSError, ValueError, struct.error, DatasetError):
-        return {}  # what is wrong with the file is told by who reads the poses
+            return dict(_binary(read_bytes(model / "images.bin")))
+        return dict(_text(read_bytes(model / "images.txt")))
+    except (OSError, ValueError, IndexError, struct.error, DatasetError):
+        return {}  # whoever reads the poses says what is wrong with the file
 
 
 def _binary(data: bytes) -> Iterator[tuple[str, int]]:
@@ -45,11 +48,17 @@ def _binary(data: bytes) -> Iterator[tuple[str, int]]:
         (count,) = _COUNT.unpack_from(data, at)
         observed = np.frombuffer(data, _OBSERVED, count, at + _COUNT.size)
         at += _COUNT.size + observed.nbytes
-        yield name.decode("utf-8", "replace").replace("\\", "/"), int((observed["point"] >= 0).sum())
+        yield _name(name), int((observed["point"] >= 0).sum())
 
 
-def _text(text: str) -> Iterator[tuple[str, int]]:
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
-    for pose, observed in zip(lines[::2], [*lines[1::2], ""], strict=False):
-        if fields := pose.split(maxsplit=9)[9:]:
-            yield fields[0].strip(), sum(int(point) >= 0 for point in observed.split()[2::3])
+def _text(data: bytes) -> Iterator[tuple[str, int]]:
+    lines = iter(data.splitlines())
+    for line in lines:
+        fields = line.split(maxsplit=9)
+        if fields and not fields[0].startswith(b"#"):
+            observed = next(lines, b"")
+            yield _name(fields[9].strip()), sum(int(point) >= 0 for point in observed.split()[2::3])
+
+
+def _name(raw: bytes) -> str:
+    return legible(os.fsdecode(raw).replace("\\", "/"))

@@ -107,7 +107,7 @@ def path_along(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> Ca
         up = common_up(kept)
         offsets = np.stack([camera.eye for camera in kept]) - centre
         elevations = np.arcsin(np.clip(_units(offsets) @ up, -1.0, 1.0))
-        if abs(float(np.median(elevations))) > STEEP or len(kept) < 3:
+        if abs(float(np.median(elevations))) > STEEP:
             return _loop_between(kept, turns, float(np.median(np.linalg.norm(offsets, axis=1))), centre)
         return _around(kept, centre, up, turns)
     axes = np.stack([camera.R[2] for camera in cameras])
@@ -120,9 +120,6 @@ def path_along(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> Ca
 def point_looked_at(cameras: Sequence[Camera]) -> Vector | None:
     """Find the point that most cameras look at, whatever a minority of them does.
 
-    The point nearest to the optical axes is sought in random samples of the cameras, always the same ones; the one with
-    the smallest median angle to the axes is refined with the cameras that do not look past it.
-
     Args:
         cameras: At least one.
 
@@ -130,22 +127,38 @@ def point_looked_at(cameras: Sequence[Camera]) -> Vector | None:
         (3,) world units; None where the axes are parallel or meet behind the cameras, or where fewer than 70 % of the
         cameras have the point in their picture.
     """
+    centre = point_nearest_most_axes(cameras, PARALLEL)
+    if centre is None or np.mean([_shows(camera, centre) for camera in cameras]) < MOST:
+        return None
+    return centre
+
+
+def point_nearest_most_axes(cameras: Sequence[Camera], parallel: float) -> Vector | None:
+    """Find the point nearest to the optical axes of most cameras.
+
+    It is sought in random samples of the cameras, always the same ones: one camera turned round would draw the mean
+    along. The point with the smallest median angle to all axes is refined with the cameras that do not look past it.
+
+    Args:
+        cameras: At least one.
+        parallel: As for `gsplat_edu.camera.point_nearest_axes`.
+
+    Returns:
+        (3,) world units, perhaps behind the cameras; None where the axes are parallel.
+    """
     eyes, axes = (np.stack(rows) for rows in zip(*((c.eye, c.R[2]) for c in cameras), strict=True))
     rng, count = np.random.default_rng(0), len(cameras)
     samples = [
         np.arange(count),
         *(rng.choice(count, min(SAMPLED, count), replace=False) for _ in range(DRAWS)),
     ]
-    found = [point_nearest_axes([cameras[int(i)] for i in rows], PARALLEL) for rows in samples]
+    found = [point_nearest_axes([cameras[int(i)] for i in rows], parallel) for rows in samples]
     points = [point for point in found if point is not None]
     if not points:
         return None
     angles = min((_angles(point - eyes, axes) for point in points), key=lambda each: float(np.median(each)))
     kept = np.flatnonzero(angles <= max(PAST, PAST_FACTOR * float(np.median(angles))))
-    centre = point_nearest_axes([cameras[int(i)] for i in kept], PARALLEL)
-    if centre is None or np.mean([_shows(camera, centre) for camera in cameras]) < MOST:
-        return None
-    return centre
+    return point_nearest_axes([cameras[int(i)] for i in kept], parallel)
 
 
 def _shows(camera: Camera, point: Vector) -> bool:
@@ -179,6 +192,12 @@ def _around(cameras: Sequence[Camera], centre: Vector, up: Vector, turns: Values
     elevations = np.arcsin(np.clip(offsets @ up / distances, -1.0, 1.0))
     low, high, rows, crossed = _covered(azimuths)
     covered = high - low
+    if covered < LEAST_LOOP and np.ptp(elevations[rows]) < LEAST_LOOP:
+        near = [cameras[i] for i in rows]
+        path = _loop_between(near, turns, float(np.median(distances[rows])), centre)
+        return CameraPath(
+            path.cameras, "the cameras stand too far apart for a path: a small loop at one place"
+        )
     # not narrower than most of a gap, or the average jumps from one camera to the next in the middle of it
     width = max(min(BANDWIDTH, covered / 6), 0.6 * crossed, 1e-6)
     data = azimuths[rows], elevations[rows], np.log(distances[rows])

@@ -14,6 +14,7 @@ import numpy as np
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import to_bytes
+from gsplat_edu.files import named_in_utf8
 from gsplat_edu.validation import ArrayLike
 
 FOURCC = "vp09"
@@ -36,7 +37,7 @@ def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: floa
     An odd width or height is padded with a copy of the last column or row: chroma has half the resolution.
 
     Args:
-        path: The file to write.
+        path: The file to write; it is there, perhaps empty.
         shown: What messages call it.
         frames: (H, W, 3) each, of one size, uint8 or float from 0 to 1; taken one at a time.
         fps: Frames per second.
@@ -45,6 +46,12 @@ def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: floa
         ArgumentError: there are no frames, their sizes differ, or OpenCV cannot encode VP9 here.
         OSError: the file cannot be written.
     """
+    with named_in_utf8(path) as plain:
+        _encode(plain, shown, frames, fps)
+    path.write_bytes(streamable(path.read_bytes()))
+
+
+def _encode(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: float) -> None:
     writer: cv2.VideoWriter | None = None
     size = (0, 0)
     try:
@@ -66,7 +73,6 @@ def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: floa
             writer.release()
     if writer is None:
         raise ArgumentError("frames: is empty; give at least one")
-    path.write_bytes(streamable(path.read_bytes()))
 
 
 def _writer(path: Path, shown: Path, size: tuple[int, int], fps: float) -> cv2.VideoWriter:

@@ -320,14 +320,17 @@ def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int) -> None:
     """Write the working copy, and its mask before it, unless it is there.
 
     Raises:
-        DatasetError: the photo cannot be decoded.
+        DatasetError: the photo or its mask cannot be decoded.
     """
     target = folder / photo.copy
     if target.is_file():
         return
     pixels, alpha = decode(path)
     size = photo.copy_size(longest)
-    counts = counting(Path(photo.mask) if photo.mask else None, alpha)
+    try:
+        counts = counting(Path(photo.mask) if photo.mask else None, alpha)
+    except DatasetError as error:
+        raise DatasetError(f"{path}: its mask {error}") from None
     if counts is not None:
         write_mask(counts, mask_folder(folder) / f"{photo.copy}.png", size)
     image = np.asarray(Photo(pixels, alpha).over(GRAY))

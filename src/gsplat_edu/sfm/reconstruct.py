@@ -288,7 +288,8 @@ class _Run:
         count = len(model["names"])
         summary = f"{count} of {total} photos have a pose ({model['way']})"
         if count < total:
-            summary += f"; the other {total - count} share too little with them"
+            others = "the other one shares" if total - count == 1 else f"the other {total - count} share"
+            summary += f"; {others} too little with them"
         return model | {"summary": summary}
 
     def _finish(self) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from gsplat_edu.data.capture import entries, is_file, is_folder
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.files import check_folder
+from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.sfm.photos import is_photo, is_run, photo_files
 from gsplat_edu.sfm.result import PARTS, published
 from gsplat_edu.sfm.video import is_video
@@ -119,7 +119,7 @@ def _check_run(folder: Path) -> None:
     if not is_run(folder):
         return
     try:
-        said = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        said = parse_json(read_text(folder / "config.json"))
         capture = said["data"]["path"] if isinstance(said["data"]["path"], str) else None
     except (OSError, ValueError, KeyError, TypeError):
         capture = None

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import written_aside
+from gsplat_edu.files import named_in_utf8, written_aside
 
 VIDEO_ENDINGS = (
     ".mp4",
@@ -124,9 +124,10 @@ def write_frames(path: Path, chosen: Sequence[int], folder: Path, progress: Prog
             if before is None or flow(before, small) >= DIFFERENT:
                 before = small
                 target = folder / f"frame_{number:06d}.jpg"
+                # not imwrite: it crashes on names that are not UTF-8, and does not say why it fails
+                _, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, FRAME_QUALITY])
                 with written_aside(target) as aside:
-                    if not cv2.imwrite(str(aside), frame, [cv2.IMWRITE_JPEG_QUALITY, FRAME_QUALITY]):
-                        raise OSError(None, "cannot be written", str(target))
+                    aside.write_bytes(data.tobytes())
                 written.append(target)
             progress("writing frames", done, len(wanted))
             if done == len(wanted):
@@ -163,19 +164,20 @@ def _intervals(motion: Float64[np.ndarray, " n"], count: int) -> Int64[np.ndarra
 def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
     # FFmpeg and OpenCV would print their complaints beside ours. FFmpeg's are looked at once, at the first video.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    cv2.utils.logging.setLogLevel(before)
-    try:
-        if not video.isOpened():
-            raise DatasetError(
-                f"{path}: is no video that OpenCV can decode; convert it, for example to H.264 in mp4"
-            )
-        # Phones store how a video was held, not the turned frames.
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-        yield video
-    finally:
-        video.release()
+    with named_in_utf8(path) as plain:
+        before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        video = cv2.VideoCapture(str(plain), cv2.CAP_FFMPEG)
+        cv2.utils.logging.setLogLevel(before)
+        try:
+            if not video.isOpened():
+                raise DatasetError(
+                    f"{path}: is no video that OpenCV can decode; convert it, for example to H.264 in mp4"
+                )
+            # Phones store how a video was held, not the turned frames.
+            video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+            yield video
+        finally:
+            video.release()
 
 
 def _every(
