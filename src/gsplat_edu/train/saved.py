@@ -61,8 +61,8 @@ def check_statistics(tensors: Mapping[str, Tensor], like: Tensor) -> None:
 def check_torch_generator(name: str, state: Tensor, generator: torch.Generator) -> None:
     """Check a state of torch's CPU generator.
 
-    torch checks each number of it, but not that they agree: if a state claims that more numbers are left than there are,
-    torch reads past the end of its own memory.
+    torch checks each number of it, but not that they agree: if a state claims that more numbers are left than there
+    are, torch reads past the end of its own memory.
     """
     check_tensor_kind(name, state, torch.uint8, generator.get_state().shape)
     data = state.contiguous().numpy().tobytes()
