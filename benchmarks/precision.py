@@ -1,6 +1,6 @@
 """What does float32 cost on extreme scenes, and why?
 
-    python benchmarks/precision.py [--scenes 2000] [--seed 24] [--smoke]
+    python benchmarks/precision.py [--scenes 2000] [--seed 24] [--smoke] [--out FILE.json]
 
 Each scene is drawn at random over many decades: focal length, distance, place in the world, scales along the axes,
 distance of the means from the image. The native kernels render it in float32 and in float64 from the same float32
@@ -10,10 +10,11 @@ step over; the table counts scenes by what was found. docs/PRECISION.md explains
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
+import hardware
 import numpy as np
 import torch
 
@@ -235,8 +236,8 @@ def gradient_error(camera: Camera, gaussians: Gaussians) -> tuple[float, str]:
     return max((error, name) for name, error in errors.items())
 
 
-def images_table(seed: int, count: int) -> None:
-    """Print how many scenes are in each class."""
+def images_table(seed: int, count: int) -> list[Verdict]:
+    """Print how many scenes are in each class; return what was found of each."""
     verdicts = [judge(*extreme_scene(seed, k)) for k in range(count)]
     print(f"float32 against float64, {count} scenes (seed {seed})")
     limits = (1e-5, 1e-4, 1e-3, 0.02)
@@ -251,10 +252,11 @@ def images_table(seed: int, count: int) -> None:
     for name, errors in sorted(groups.items(), key=lambda item: -len(item[1])):
         print(f"| {name} | {len(errors)} | {max(errors):.2g} |")
     print(f"  largest bound on rounding: {max(v.bound for v in verdicts):.2g}")
+    return verdicts
 
 
-def oracle_table(seed: int, count: int) -> None:
-    """Print how the float64 kernels agree with the NumPy oracle."""
+def oracle_table(seed: int, count: int) -> dict[str, int]:
+    """Print how the float64 kernels agree with the NumPy oracle; return how many scenes do in which way."""
     classes: Counter[str] = Counter()
     for k in range(count):
         result = oracle_error(*extreme_scene(seed, k))
@@ -269,10 +271,11 @@ def oracle_table(seed: int, count: int) -> None:
                 else "unexplained"
             ] += 1
     print(f"float64 kernels against the NumPy oracle: {dict(classes)}")
+    return dict(classes)
 
 
-def gradients_table(seed: int, count: int) -> None:
-    """Print how float64 gradients agree with autograd through the dense renderer."""
+def gradients_table(seed: int, count: int) -> list[float]:
+    """Print how float64 gradients agree with autograd through the dense renderer; return the differences."""
     errors = [
         gradient_error(*scene)[0] for k in range(count) if not is_stopped(*(scene := extreme_scene(seed, k)))
     ]
@@ -280,20 +283,24 @@ def gradients_table(seed: int, count: int) -> None:
         f"float64 gradients against autograd, {len(errors)} of {count} scenes in which no tile stops: "
         f"over 1e-6 of the largest: {sum(error > 1e-6 for error in errors)}, worst {max(errors, default=0.0):.2g}"
     )
+    return errors
 
 
 def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=2000, help="number of scenes")
+    """Print the tables and write the JSON."""
+    parser = hardware.parser("What float32 costs on extreme scenes.")
+    parser.add_argument("--scenes", type=int, default=2000, help="number of scenes (--smoke: 20)")
     parser.add_argument("--seed", type=int, default=24, help="seed of the scenes")
-    parser.add_argument("--smoke", action="store_true", help="20 scenes, to see that the script runs")
     args = parser.parse_args()
     count = 20 if args.smoke else args.scenes
     torch.set_num_threads(1)
-    images_table(args.seed, count)
-    oracle_table(args.seed, count)
-    gradients_table(args.seed, min(count, 400))
+    found: dict[str, Any] = {
+        "seed": args.seed,
+        "images": [asdict(verdict) for verdict in images_table(args.seed, count)],
+        "oracle": oracle_table(args.seed, count),
+        "gradients": gradients_table(args.seed, min(count, 400)),
+    }
+    hardware.report(found, args.out)
 
 
 if __name__ == "__main__":

@@ -20,9 +20,9 @@ import hardware
 from captures import capture
 from train_step import STAGES, measure
 
-from gsplat_edu.cli import train as command
+from gsplat_edu.cli.options import train as command
 from gsplat_edu.cli.arguments import OneLineParser, run_command
-from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.runs.training import CaptureRun, document
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
@@ -47,7 +47,7 @@ def train(options: argparse.Namespace, out: Path | None) -> None:
     evaluation = run.finish()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     result = {"seconds": run.seconds, "peak_rss_gib": peak, "metrics": evaluation.metrics, "stages_ms": table}
-    hardware.report({"capture": options.data.name, "config": run.options.document(), **result}, out)
+    hardware.report({"capture": options.data.name, "config": document(run.options), **result}, out)
     metrics = evaluation.metrics
     print(
         f"{trainer.iteration} iterations in {run.seconds:.0f} s, {len(trainer.gaussians)} Gaussians, "

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import weakref
 
 import pytest
 import torch
@@ -53,6 +54,21 @@ def test_a_tensor_outlives_the_block():
     with reused_buffers():
         image = empty(SHAPE, LIKE).fill_(3.0)
     assert bool((image == 3.0).all())
+
+
+def test_what_outlives_the_block_goes_back_one_by_one(monkeypatch):
+    """One tensor that is kept, a render to look at, keeps no other's memory."""
+    made, mapped = [], buffers._mapped
+    monkeypatch.setattr(buffers, "_mapped", lambda nbytes: made.append(mapped(nbytes)) or made[-1])
+    with reused_buffers():
+        tensors = [empty(SHAPE, LIKE) for _ in range(3)]
+        waiting = empty(SHAPE, LIKE)
+        del waiting
+    found = [weakref.ref(block) for block in made]
+    made.clear()
+    assert [ref() is not None for ref in found] == [True, True, True, False]
+    del tensors[1]
+    assert [ref() is not None for ref in found] == [True, False, True, False]
 
 
 def test_small_ones_and_those_outside_the_block_are_torchs():

@@ -7,6 +7,7 @@ import torch
 from gsplat_edu import ArgumentError, Camera, CameraLike, ShapeError, project_cov3d, render_gaussians
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
+from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_t
 
@@ -63,6 +64,12 @@ def test_a_covariance_is_projected_the_same():
 def test_the_dense_renderer_renders_the_same():
     tensors = [torch.tensor(array) for array in splats()]
     assert torch.equal(render_t(*tensors, ChapterCamera()).image, render_t(*tensors, OURS).image)
+
+
+def test_the_native_renderer_of_covariances_renders_the_same():
+    tensors = [torch.tensor(array) for array in splats()]
+    expected = render_covariances(*tensors, OURS).image
+    assert torch.equal(render_covariances(*tensors, ChapterCamera()).image, expected)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])

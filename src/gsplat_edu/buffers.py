@@ -1,4 +1,4 @@
-"""Large tensors that come and go in every iteration, in memory that is used again.
+"""Memory for the large tensors of an iteration, reused by the next one.
 
 A C library's heap is a poor place for them. A step of training makes images and gradients of several megabytes, and
 between them small tensors that live longer. glibc (2.36) cuts a 64-byte aligned block out of a larger one; once it is
@@ -29,10 +29,10 @@ import torch
 from torch import Tensor
 
 LARGE = 1 << 18
-"""Bytes below which a tensor stays in the heap: its holes are small, and other small ones fill them."""
+"""Tensors smaller than this, in bytes, stay in the heap: other small ones fill the holes that they leave."""
 
 SLACK = 1.25
-"""How much larger than the request a buffer may be that is handed out again; the number of Gaussians changes often."""
+"""A buffer is reused if it is at most this many times as large as requested; the number of Gaussians changes often."""
 
 HEAP_LIMIT = 1 << 22
 """Bytes from which glibc maps a request separately and unmaps it when it is freed (M_MMAP_THRESHOLD)."""
@@ -44,14 +44,14 @@ M_MMAP_THRESHOLD = -3
 class _Pool:
     """Mappings, those in use and those waiting for the next request.
 
-    It never holds more bytes than were once in use at the same time within the last two spans of `SPAN` requests.
+    It never holds more bytes than were in use at once within the last two spans of `SPAN` requests.
     """
 
     SPAN = 1024
 
     def __init__(self) -> None:
         self._waiting: list[mmap.mmap] = []
-        # Finalizers add to it from any thread, whenever the garbage collector runs; a lock could be held by this one.
+        # Finalizers append to it from any thread and at any moment; waiting for a lock, they could wait for themselves.
         self._returned = deque[mmap.mmap]()
         self._used = self._peak = self._peak_before = self._requests = 0
         self._closed = False
@@ -68,8 +68,18 @@ class _Pool:
             block = _mapped(-(-nbytes // mmap.PAGESIZE) * mmap.PAGESIZE)
         self._note(len(block))
         array = np.frombuffer(block, dtype=np.uint8, count=nbytes)
-        weakref.finalize(array, self._returned.append, block).atexit = False
+        weakref.finalize(array, self._take_back, block).atexit = False
         return array
+
+    def close(self) -> None:
+        """Unmap what is waiting now, and from now on whatever comes back."""
+        self._closed = True
+        self._waiting.clear()
+        self._returned.clear()
+
+    def _take_back(self, block: mmap.mmap) -> None:
+        if not self._closed:
+            self._returned.append(block)
 
     def _collect(self) -> None:
         while self._returned:
@@ -110,7 +120,7 @@ _current = _Current()
 
 @contextlib.contextmanager
 def reused_buffers() -> Iterator[None]:
-    """Let `empty` use memory again inside the block, in this thread. Blocks inside one another share theirs.
+    """Let `empty` reuse memory inside the block, in this thread. Nested blocks share one pool.
 
     From the first block on, glibc maps every other large request separately too, for as long as the process runs:
     photos that are read again and the work of density control go back to the system when they are freed. By default
@@ -119,11 +129,13 @@ def reused_buffers() -> Iterator[None]:
     """
     _limit_heap()
     before = _current.pool
-    _current.pool = before or _Pool()
+    pool = _current.pool = before or _Pool()
     try:
         yield
     finally:
         _current.pool = before
+        if before is None:
+            pool.close()
 
 
 def empty(shape: Sequence[int], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
@@ -142,7 +154,7 @@ def empty(shape: Sequence[int], like: Tensor, dtype: torch.dtype | None = None) 
 
 
 def _mapped(nbytes: int) -> mmap.mmap:
-    """Map fresh memory, which a forked child gets a copy of."""
+    """Map fresh memory; a forked child gets a copy of it."""
     if sys.platform == "win32":
         return mmap.mmap(-1, nbytes)
     return mmap.mmap(-1, nbytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)

@@ -1,4 +1,4 @@
-"""How much memory this process may still take, and refusing work that needs more before it starts.
+"""How much memory this process can still take; work that needs more is refused before it starts.
 
 Linux grants memory that it does not have and later kills the process that touches it. So a photo, an image or a list
 whose size is known is compared with what is free first.
@@ -18,7 +18,7 @@ WORTH_ASKING = 64 * 2**20
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 UNLIMITED = 2**60
-"""Limits from here on, bytes, are none."""
+"""Limits of this many bytes and more count as none."""
 
 _SHORTAGES = (
     "can't allocate memory",
@@ -34,7 +34,7 @@ def available_memory() -> int | None:
     """Return the bytes this process can still take: the least that the machine, its cgroups and its limits leave.
 
     Returns:
-        None on systems that do not tell.
+        None where the system does not say.
     """
     found = [*_machine(), *_cgroups(), *_address_space()]
     return max(0, min(found)) if found else None
@@ -44,7 +44,7 @@ def require_memory(what: str, nbytes: int, advice: str) -> None:
     """Refuse work that needs more memory than there is.
 
     Args:
-        what: The work, for the message: its subject.
+        what: The work, as the subject of the message.
         nbytes: Bytes it takes at its peak.
         advice: What to do, for the message.
 
@@ -61,7 +61,7 @@ def require_memory(what: str, nbytes: int, advice: str) -> None:
 
 
 def shortage(error: BaseException) -> str | None:
-    """Say what an error tells of memory that ran out; None where it is about something else.
+    """Return what an error says if memory ran out; None if it is about something else.
 
     Covers Python, NumPy and the native kernels (MemoryError), torch and threads (RuntimeError), OpenCV and the system.
     """

@@ -20,7 +20,7 @@ LOCK = ".lock"
 """Name of the lock in its folder. It is removed at the end; one that a killed process left locks nothing."""
 
 _FAR = 1 << 30
-"""Byte that is locked on Windows, where nobody can read a locked one: far behind what the file says."""
+"""Offset of the byte that is locked on Windows, far beyond the file's contents: a locked byte cannot be read."""
 
 _held: set[int] = set()
 
@@ -68,9 +68,7 @@ def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> It
 def _acquired(name: str, path: Path) -> int | None:
     """Return an open, locked file; None if the file system has no locks."""
     while True:
-        handle = os.open(
-            path, os.O_RDWR | os.O_CREAT, 0o666
-        )  # Python keeps it from programs that are started
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)  # programs that are started do not inherit it
         try:
             _lock(handle)
         except (BlockingIOError, PermissionError):
@@ -94,7 +92,7 @@ def _acquired(name: str, path: Path) -> int | None:
 def _release(handle: int, path: Path) -> None:
     _held.discard(handle)
     if sys.platform != "win32":
-        path.unlink(missing_ok=True)  # before it is let go: afterwards it may be another process's
+        path.unlink(missing_ok=True)  # before it is released: afterwards it may be another process's
     os.close(handle)
     if sys.platform == "win32":
         with contextlib.suppress(OSError):  # another process has opened it meanwhile

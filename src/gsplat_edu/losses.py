@@ -46,7 +46,7 @@ def photo_loss(
         # Times 0 or 1: exact, on any number of threads.
         check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
         image = _Masked.apply(image, counts)  # type: ignore[no-untyped-call]
-        target = torch.mul(target, counts, out=empty(target.shape, target))
+        target = torch.mul(target.detach(), counts, out=empty(target.shape, target))
     if image.device.type == "cuda" and image.dtype == torch.float32 and unavailable("cuda") is None:
         from gsplat_edu.render.triton.loss import l1_ssim_triton
 
@@ -122,7 +122,7 @@ def l1_ssim(
 
 
 class _Masked(torch.autograd.Function):
-    """An image times a mask of 0 and 1, in buffers that are used again."""
+    """An image times a mask of 0 and 1, in reused buffers."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, counts: Tensor) -> Tensor:  # noqa: ANN401

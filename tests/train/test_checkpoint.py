@@ -223,3 +223,19 @@ def test_what_a_training_may_leave_behind_is_taken(tiny, tmp_path):
     load_checkpoint(path, resumed)
     steps(resumed, 1)
     assert resumed.iteration == 4
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+def test_a_checkpoint_is_not_called_damaged_where_memory_ran_out(tiny, tmp_path, monkeypatch, error):
+    """Damaged files are to be deleted, and this one is whole."""
+    make, (tensors, metadata) = tiny
+    path = tmp_path / "iteration_3.safetensors"
+    write(path, tensors, metadata)
+
+    def refuse(tensor):
+        raise error
+
+    monkeypatch.setattr(torch.Tensor, "clone", refuse)
+    with pytest.raises(type(error)) as raised:
+        load_checkpoint(path, make())
+    assert raised.value is error

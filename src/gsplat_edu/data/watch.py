@@ -13,7 +13,7 @@ from pathlib import Path
 from gsplat_edu.errors import DatasetError
 
 Stamp = tuple[int, int]
-"""Size in bytes and time of the last change in ns: what is looked at before a file is hashed again."""
+"""Size in bytes and time of the last change in ns; a file is hashed again only if one of them differs."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class FileWatch:
 
     @contextmanager
     def unchanged(self, *paths: Path | None) -> Iterator[None]:
-        """Read files inside the block that are those that were read before.
+        """Check that the files read inside the block are unchanged.
 
         Args:
             paths: The files; None stands for none.
@@ -80,7 +80,7 @@ class FileWatch:
 
 
 def _stamp(path: Path) -> Stamp | None:
-    """Return size and time of a regular file; None for anything else, which whoever decodes it complains of."""
+    """Return size and time of a regular file; None for anything else, which its decoder will refuse."""
     try:
         status = path.stat()
     except (OSError, ValueError):

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsplat_edu.buffers import empty
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.constants import Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
@@ -67,7 +67,7 @@ def render_covariances(
     cov3ds: Tensor,
     colors: Tensor,
     opacities: Tensor,
-    camera: Camera,
+    camera: CameraLike,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
 ) -> RenderOutput:
@@ -78,7 +78,7 @@ def render_covariances(
         cov3ds: (N, 3, 3) covariances, world units squared, symmetric; that they are is not checked here.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
-        camera: The camera.
+        camera: The camera, a `Camera` or anything with its members.
         settings: Background, antialiasing and depth; the defaults where None.
         background: (3,) background as a tensor, to differentiate in; that of the settings where None.
 
@@ -87,7 +87,7 @@ def render_covariances(
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: an entry is NaN or infinite, or dtypes are not one of float32 and float64.
+        ArgumentError: an entry is NaN or infinite, dtypes are not one of float32 and float64, or `camera` is no camera.
 
     Differentiable in: means, cov3ds, colors, opacities, background. Not in: the camera.
     """
@@ -100,7 +100,7 @@ def render_covariances(
     if background is None:
         background = torch.tensor(settings.background, dtype=means.dtype)
     check_tensor("background", background, (3,), {})
-    call = _Call(camera, settings, 0, direct=True)
+    call = _Call(as_camera("camera", camera), settings, 0, direct=True)
     return _output(call, background, means, cov3ds, colors, opacities)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from gsplat_edu.errors import CheckpointError
 
 LARGEST_WHOLE = 2**63
-"""Whole numbers that are believed lie below this, in size."""
+"""Whole numbers have to be smaller than this in absolute value."""
 
 Check = Callable[[object], bool]
 
@@ -41,7 +41,7 @@ KINDS: Mapping[Check, str] = {
     _section: "an object",
     _place: "three numbers",
 }
-"""How each check is called in messages."""
+"""What messages call the values that each check accepts."""
 
 CONFIG: Mapping[str, Check] = {
     "version": _text,
@@ -82,7 +82,7 @@ def checked(contents: dict[str, Any], fields: Mapping[str, Check], where: str) -
 
     Args:
         contents: The file's object.
-        fields: `CONFIG`, `LOG` or `METRICS`; a dot leads into a section. A field that is missing or null is no mistake.
+        fields: `CONFIG`, `LOG` or `METRICS`; a dot leads into a section. Fields may be missing or null.
         where: The file, and the line where it has lines.
 
     Raises:

@@ -22,7 +22,7 @@ MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("it
 """What may differ all the same: files may have been moved, if their contents are equal, and a run may be extended."""
 
 MOVED = 1e-9
-"""Part of a coordinate by which a camera may differ where an origin was subtracted and added again."""
+"""Tolerance of camera coordinates, relative and absolute: subtracting an origin and adding it again rounds."""
 
 
 def check_options(folder: RunFolder, new: dict[str, Any]) -> None:

@@ -55,7 +55,8 @@ def scene_start(path: Path, config: TrainConfig, origin: ArrayLike) -> tuple[Gau
         OSError: the file cannot be read.
     """
     file = scene_file(path)
-    # A PLY is read with what is broken in it, which is left out below. A run's says nothing of antialiasing.
+    # A PLY is read with its broken Gaussians, which are left out below. The PLYs of older runs do not say whether they
+    # are antialiased; config.json does.
     scene = ply.read(file, finite=False) if format_of(file).suffix == ".ply" else read_scene(file)
     run = run_of(file)
     antialiased = scene.antialiased if run is None else render_settings(run.read_config()).antialiased

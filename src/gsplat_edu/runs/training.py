@@ -207,8 +207,7 @@ class CaptureRun:
         past = history if isinstance(history, list) else []
         self.folder.write_config(stored | {"train": train, "history": [*past, entry]})
         self._say(
-            f"{self.folder.path}: extended from {before} to {wanted} iterations; milestones and rates stay those of"
-            f" {before}"
+            f"{self.folder.path}: extended from {before} to {wanted} iterations; milestones and rates stay as they were"
         )
 
     def _take_up(self) -> None:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.files import written_aside
+from gsplat_edu.headroom import shortage
 from gsplat_edu.train.trainer import Trainer
 
 KEPT = 2
@@ -96,7 +97,7 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a checkpoint; what the block refuses of it is said of the file."""
+    """Open a checkpoint; errors that the block raises about its contents name the file."""
     try:
         with safe_open(path, framework="pt") as file:
             if (file.metadata() or {}).get("format") != FORMAT:
@@ -117,6 +118,8 @@ def _tensors(file: Any) -> dict[str, Tensor]:  # noqa: ANN401
             # A copy: what safetensors returns is the file itself, mapped into memory.
             found[name] = file.get_tensor(name).clone()
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            if shortage(error) is not None:
+                raise  # memory ran out: the file is as good as it was
             # Kinds of tensors that safetensors knows and torch does not, numbers that straddle their places.
             raise ArgumentError(f"{name[:60]!r}: is no tensor: {str(error)[:200]}") from None
     return found

@@ -23,8 +23,8 @@ OVER_CAP = ("strongest", "cut")
 VIEW_ORDERS = ("shuffled", "random")
 
 FROM_SCENE = {"means_rate": 1.6e-5, "sh_every": 0}
-"""Defaults of a run that starts from a trained scene: its Gaussians stand about where they belong, so that their rate
-starts at the geometric mean of the recipe's first and last; and its harmonics are trained, so that all are in use."""
+"""Defaults of a run that starts from a trained scene. Its Gaussians are about where they belong, so the means' rate
+starts at the geometric mean of the recipe's first and last; its harmonics are trained, so all of them are in use."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_w
 from gsplat_edu.views import Photo, View
 
 DEVICE_SHARE = 0.25
-"""Of the memory that is free on a GPU when training begins: what photos may take. Gaussians take the rest."""
+"""Fraction of the GPU memory that is free when training starts which photos may take. Gaussians take the rest."""
 
 CPU = torch.device("cpu")
 
@@ -26,7 +26,7 @@ Color = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What the render of a view is compared with, where the Gaussians are.
+    """What the render of a view is compared with, on the Gaussians' device.
 
     Args:
         image: (H, W, 3) the photo, over the background.
@@ -47,13 +47,13 @@ class ViewFeed:
 
     A photo on disk is read while the step before it runs. A photo in memory that is not opaque is put over a fixed
     background once. A GPU keeps as many targets as it has room for, and their photos are not read again; targets over
-    random backgrounds are made anew for every step.
+    random backgrounds are made for every step.
 
     Args:
         views: What to draw from, at least one.
         order: "shuffled": each once before any comes again; "random": with replacement.
         seed: Seed of the order.
-        background: Behind photos that are not opaque; None: another colour with every draw.
+        background: Behind photos that are not opaque; None: a random colour for every draw.
         device: Where the Gaussians are.
         room: Bytes of targets to keep on a GPU; `DEVICE_SHARE` of what is free where None.
     """
@@ -90,7 +90,7 @@ class ViewFeed:
         photo = None
         if view not in self._kept:
             photo = ahead[1].result() if ahead and ahead[0] == index else self._read(view)
-        self._queue.pop(0)  # not before: a photo that cannot be read is still due
+        self._queue.pop(0)  # only now: a photo that could not be read stays due
         following = self._following()
         after = self.views[following]
         if after.on_disk and after not in self._kept:
@@ -108,7 +108,7 @@ class ViewFeed:
         return flat
 
     def target(self, view: View, photo: Photo | None, background: Color) -> Target:
-        """Bring what `next` returned to where the Gaussians are; keep it there if it stays as it is and there is room.
+        """Move what `next` returned to the Gaussians' device; keep it there if it will not change and there is room.
 
         Args:
             view: The view.

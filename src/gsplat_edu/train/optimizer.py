@@ -21,7 +21,7 @@ NUMBERS = ("rate", "beta1", "beta2", "eps", "correction1", "correction2")
 """What a step takes besides tensors, in the order of the implementations' last argument."""
 
 MOMENTS = ("first", "second")
-"""What Adam keeps of each parameter, decaying means of its gradient and of that squared."""
+"""What Adam keeps for each parameter: decaying means of its gradient and of the gradient's square."""
 
 
 class Adam:
@@ -130,7 +130,7 @@ class Adam:
         """Restore what `state` returned.
 
         Raises:
-            ArgumentError: a moment is not of its parameter's dtype and shape, or not there; nothing has changed.
+            ArgumentError: a moment is missing, or differs from its parameter in dtype or shape; nothing has changed.
         """
         for part in MOMENTS:
             given = check_entries(part, moments[part], tuple(self.learning_rates))

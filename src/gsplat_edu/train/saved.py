@@ -38,7 +38,7 @@ def check_entries(name: str, given: object, names: Sequence[str]) -> dict[str, A
 
 
 def check_tensor_kind(name: str, given: Tensor, dtype: torch.dtype, shape: Sequence[int]) -> None:
-    """Check a tensor's dtype and shape."""
+    """Check that a tensor has this dtype and shape."""
     if given.dtype != dtype or tuple(given.shape) != tuple(shape):
         raise ArgumentError(
             f"{name}: is {given.dtype} of shape {tuple(given.shape)}, but has to be {dtype} of shape {tuple(shape)}"
@@ -61,8 +61,8 @@ def check_statistics(tensors: Mapping[str, Tensor], like: Tensor) -> None:
 def check_torch_generator(name: str, state: Tensor, generator: torch.Generator) -> None:
     """Check a state of torch's CPU generator.
 
-    torch checks each number of it, but not that they agree: a state that says more numbers are left than follow makes
-    it read behind its own memory.
+    torch checks each number of it, but not that they agree: if a state claims that more numbers are left than there
+    are, torch reads past the end of its own memory.
     """
     check_tensor_kind(name, state, torch.uint8, generator.get_state().shape)
     data = state.contiguous().numpy().tobytes()

@@ -256,7 +256,7 @@ class Trainer:
         self._backgrounds.bit_generator.state = given["backgrounds"]
 
     def _checked_gaussians(self, given: dict[str, Tensor]) -> Gaussians:
-        """Make Gaussians like those that training started from, however many; not finite ones may be among them."""
+        """Return the stored Gaussians once dtypes and shapes fit those at the start; some may be NaN or infinite."""
         like = self.gaussians.tensors()
         check_entries("gaussians", given, tuple(like))
         count = given["means"].shape[0] if given["means"].ndim else 0
