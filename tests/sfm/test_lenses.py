@@ -35,7 +35,7 @@ def mapped(model):
         focal = 1.03 * camera.focal_length_x
         camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
         camera.params = [focal, 500, 375, 0.0]
-    lenses._adjust(model, 1)
+    lenses.adjust(model, 1)
     return model
 
 def found(model):

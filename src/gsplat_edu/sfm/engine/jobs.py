@@ -18,6 +18,7 @@ import pycolmap
 
 from .database import add_camera, add_photo, opened, with_cameras
 from .judge import agreement, steady_points
+from .kin import placed_anew
 from .lenses import refined
 from .mappers import Options, Tell, all_at_once, incremental, mended, without_doubtful
 
@@ -167,7 +168,8 @@ def mapping(
         model = mended(begun, mapped, photos, folder, options)
         if model.num_reg_images() < 2 or not model.num_points3D():
             continue
-        model, lenses = refined(model, auto and not attempt["per_photo"], threads)
+        model, kin = (model, {}) if attempt["per_photo"] else placed_anew(model, mapped, photos, folder, options)
+        model, lenses = refined(model, auto and not attempt["per_photo"], threads, kin)
         without_doubtful(model, mapped)
         model.write_binary(folder)
         models.append(

@@ -35,6 +35,9 @@ CENTRED = 0.1
 ITERATIONS = 30
 """Of the adjustments that judge; they begin at the solution of a simpler lens."""
 
+FOLLOWED = 2
+"""Rounds of adjusting in which cameras that follow another one take over its lens."""
+
 
 class Rung(NamedTuple):
     """What is refined of a camera."""
@@ -56,8 +59,15 @@ LADDER = (
 """Lens models in the order of their freedom: 2, 3, 6 and 8 numbers."""
 
 
+class Kin(NamedTuple):
+    """A camera whose photos are scaled or cropped ones of another camera: that one, and the ratio of focal lengths."""
+
+    main: int
+    factor: float
+
+
 def refined(
-    model: pycolmap.Reconstruction, climb: bool, threads: int
+    model: pycolmap.Reconstruction, climb: bool, threads: int, kin: dict[int, Kin] | None = None
 ) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
     """Adjust everything once more, with as much freedom for each camera as its photos support.
 
@@ -65,28 +75,49 @@ def refined(
         model: A model whose cameras all have the lens model it was mapped with.
         climb: Whether freer lens models than that are considered; the principal point always is.
         threads: Threads.
+        kin: Cameras that follow another one, by their numbers.
 
     Returns:
         The adjusted model, and by the numbers of the cameras, what was refined of each.
     """
     photos = Counter(model.image(image).camera_id for image in model.reg_image_ids())
-    chosen = {camera: _climbed(model, camera, climb, threads) for camera in sorted(photos)}
+    kin = {camera: one for camera, one in (kin or {}).items() if camera in photos}
+    chosen = {camera: _climbed(model, camera, climb, threads) for camera in sorted(set(photos) - set(kin))}
     result = copy.deepcopy(model)
     for camera, rung in chosen.items():
         _change(result.camera(camera), rung.model)
-    _adjust(result, threads)
+    for _ in range(FOLLOWED if kin else 1):
+        _follow(result, kin)
+        adjust(result, threads, fixed=set(kin))
     if any(rung.centre for rung in chosen.values()):
-        fixed = {camera for camera, rung in chosen.items() if not rung.centre}
+        fixed = {camera for camera, rung in chosen.items() if not rung.centre} | set(kin)
         free = copy.deepcopy(result)
-        _adjust(free, threads, centre=True, fixed=fixed)
+        adjust(free, threads, centre=True, fixed=fixed)
         if all(_believable(free.camera(camera)) for camera in chosen):
             result = free
         else:
             chosen = {camera: rung._replace(centre=False) for camera, rung in chosen.items()}
     if not all(_believable(result.camera(camera)) for camera in chosen):
-        return model, {camera: model.camera(camera).model_name for camera in chosen}
+        return model, {camera: model.camera(camera).model_name for camera in photos}
+    if kin:
+        _follow(result, kin)
+        adjust(result, threads, fixed=set(photos))
     result.update_point_3d_errors()
-    return result, {camera: str(rung) for camera, rung in chosen.items()}
+    names = {camera: str(rung) for camera, rung in chosen.items()}
+    return result, names | {camera: names[one.main] for camera, one in kin.items()}
+
+
+def _follow(model: pycolmap.Reconstruction, kin: dict[int, Kin]) -> None:
+    """Give cameras the lens of the one they follow, at their scale; the middle moves in proportion."""
+    for number, one in kin.items():
+        camera, main = model.camera(number), model.camera(one.main)
+        params = np.array(main.params)
+        params[list(main.focal_length_idxs())] *= one.factor
+        x, y = main.principal_point_idxs()
+        params[x] = camera.width / 2 + one.factor * (params[x] - main.width / 2)
+        params[y] = camera.height / 2 + one.factor * (params[y] - main.height / 2)
+        camera.model = main.model
+        camera.params = params.tolist()
 
 
 def _climbed(model: pycolmap.Reconstruction, camera: int, climb: bool, threads: int) -> Rung:
@@ -120,14 +151,14 @@ def _errors(halves: list[pycolmap.Reconstruction], rung: Rung, threads: int) -> 
         teacher, judge = copy.deepcopy(halves[one]), copy.deepcopy(halves[other])
         (camera,) = {teacher.image(image).camera_id for image in teacher.reg_image_ids()}
         _change(teacher.camera(camera), rung.model)
-        _adjust(teacher, threads, iterations=ITERATIONS)
+        adjust(teacher, threads, iterations=ITERATIONS)
         if rung.centre:
-            _adjust(teacher, threads, iterations=ITERATIONS, centre=True)
+            adjust(teacher, threads, iterations=ITERATIONS, centre=True)
         if not _believable(teacher.camera(camera)):
             return [np.inf, np.inf]
         _change(judge.camera(camera), rung.model)
         judge.camera(camera).params = list(teacher.camera(camera).params)
-        _adjust(judge, threads, iterations=ITERATIONS, fixed={camera})
+        adjust(judge, threads, iterations=ITERATIONS, fixed={camera})
         found.append(_error(judge))
     return found
 
@@ -165,7 +196,7 @@ def _change(camera: pycolmap.Camera, name: str) -> None:
     camera.params = params.tolist()
 
 
-def _adjust(
+def adjust(
     model: pycolmap.Reconstruction,
     threads: int,
     *,
