@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsplat_edu import buffers
-from gsplat_edu.buffers import LARGE, empty, reused_buffers
+from gsplat_edu.buffers import LARGE, reusable_tensor, reused_buffers
 
 SHAPE = (LARGE // 4, 3)
 LIKE = torch.zeros(())
@@ -17,7 +17,7 @@ LIKE = torch.zeros(())
 
 def address():
     """Take a buffer, let it go, and return where it was."""
-    return empty(SHAPE, LIKE).data_ptr()
+    return reusable_tensor(SHAPE, LIKE).data_ptr()
 
 
 def test_a_buffer_that_nobody_holds_is_used_again():
@@ -37,10 +37,10 @@ def test_a_buffer_that_nobody_holds_is_used_again():
 )
 def test_a_buffer_that_somebody_holds_stays_as_it_is(hold):
     with reused_buffers():
-        first = empty(SHAPE, LIKE).fill_(7.0)
+        first = reusable_tensor(SHAPE, LIKE).fill_(7.0)
         held, where = hold(first), first.data_ptr()
         del first
-        others = [empty(SHAPE, LIKE).fill_(1.0) for _ in range(3)]
+        others = [reusable_tensor(SHAPE, LIKE).fill_(1.0) for _ in range(3)]
         assert where not in [other.data_ptr() for other in others]
     del others
     with reused_buffers():
@@ -52,7 +52,7 @@ def test_a_buffer_that_somebody_holds_stays_as_it_is(hold):
 
 def test_a_tensor_outlives_the_block():
     with reused_buffers():
-        image = empty(SHAPE, LIKE).fill_(3.0)
+        image = reusable_tensor(SHAPE, LIKE).fill_(3.0)
     assert bool((image == 3.0).all())
 
 
@@ -61,8 +61,8 @@ def test_what_outlives_the_block_goes_back_one_by_one(monkeypatch):
     made, mapped = [], buffers._mapped
     monkeypatch.setattr(buffers, "_mapped", lambda nbytes: made.append(mapped(nbytes)) or made[-1])
     with reused_buffers():
-        tensors = [empty(SHAPE, LIKE) for _ in range(3)]
-        waiting = empty(SHAPE, LIKE)
+        tensors = [reusable_tensor(SHAPE, LIKE) for _ in range(3)]
+        waiting = reusable_tensor(SHAPE, LIKE)
         del waiting
     found = [weakref.ref(block) for block in made]
     made.clear()
@@ -73,18 +73,18 @@ def test_what_outlives_the_block_goes_back_one_by_one(monkeypatch):
 
 def test_small_ones_and_those_outside_the_block_are_torchs():
     with reused_buffers():
-        assert empty((LARGE // 4 - 1,), LIKE).untyped_storage().resizable()
-        assert not empty((LARGE // 4,), LIKE).untyped_storage().resizable()
-    assert empty(SHAPE, LIKE).untyped_storage().resizable()
+        assert reusable_tensor((LARGE // 4 - 1,), LIKE).untyped_storage().resizable()
+        assert not reusable_tensor((LARGE // 4,), LIKE).untyped_storage().resizable()
+    assert reusable_tensor(SHAPE, LIKE).untyped_storage().resizable()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64, torch.uint8])
 def test_shape_and_dtype(dtype):
     with reused_buffers():
-        made = empty((300, 1000, 3), LIKE, dtype)
+        made = reusable_tensor((300, 1000, 3), LIKE, dtype)
     assert made.shape == (300, 1000, 3) and made.dtype == dtype and made.is_contiguous()
     assert made.data_ptr() % 64 == 0
-    assert empty((0, 3), LIKE).shape == (0, 3)
+    assert reusable_tensor((0, 3), LIKE).shape == (0, 3)
 
 
 def test_blocks_inside_one_another_share_and_threads_do_not():
@@ -95,7 +95,7 @@ def test_blocks_inside_one_another_share_and_threads_do_not():
         assert address() == where
         seen = []
         thread = threading.Thread(
-            target=lambda: seen.append(empty(SHAPE, LIKE).untyped_storage().resizable())
+            target=lambda: seen.append(reusable_tensor(SHAPE, LIKE).untyped_storage().resizable())
         )
         thread.start()
         thread.join()
@@ -130,9 +130,9 @@ def test_what_is_not_wanted_any_more_goes_back():
 def test_a_forked_child_has_a_copy():
     code = """
 import os, torch
-from gsplat_edu.buffers import empty, reused_buffers
+from gsplat_edu.buffers import reusable_tensor, reused_buffers
 with reused_buffers():
-    image = empty((1000, 1000), torch.zeros(())).fill_(1.0)
+    image = reusable_tensor((1000, 1000), torch.zeros(())).fill_(1.0)
     child = os.fork()
     if child == 0:
         image[:2] = 5.0

@@ -5,8 +5,8 @@ between them small tensors that live longer. glibc (2.36) cuts a 64-byte aligned
 freed, the hole is too small for the next aligned request of the same size, unless its neighbour is free as well. One
 small tensor kept per step is enough, and the process grows by an image in every iteration.
 
-Inside `reused_buffers`, `empty` maps memory of its own instead and hands it out again once nothing refers to it: not
-the tensor, not a view of it, not what autograd saved. Nobody's tensor is ever written over. When the block ends, the
+Inside `reused_buffers`, `reusable_tensor` maps memory of its own instead and hands it out again once nothing refers to
+it: not the tensor, not a view of it, not what autograd saved. Nobody's tensor is ever written over. When the block ends, the
 system gets everything back that is not in use.
 """
 
@@ -120,7 +120,7 @@ _current = _Current()
 
 @contextlib.contextmanager
 def reused_buffers() -> Iterator[None]:
-    """Let `empty` reuse memory inside the block, in this thread. Nested blocks share one pool.
+    """Let `reusable_tensor` reuse memory inside the block, in this thread. Nested blocks share one pool.
 
     From the first block on, glibc maps every other large request separately too, for as long as the process runs:
     photos that are read again and the work of density control go back to the system when they are freed. By default
@@ -138,7 +138,7 @@ def reused_buffers() -> Iterator[None]:
             pool.close()
 
 
-def empty(shape: Sequence[int], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+def reusable_tensor(shape: Sequence[int], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
     """Return an uninitialised tensor of a shape, contiguous, on another's device.
 
     Args:

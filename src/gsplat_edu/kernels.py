@@ -34,7 +34,7 @@ SUFFIXES = {torch.float32: "32", torch.float64: "64"}
 """How native names end by scalar type: float for speed, double for proof."""
 
 
-def array(tensor: Tensor) -> object:
+def native_array(tensor: Tensor) -> object:
     """Hand a tensor to the native module, which checks it.
 
     The module is built against no torch. Tensors describe themselves to it through DLPack's C interface, at next to no

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu.buffers import empty
+from gsplat_edu.buffers import reusable_tensor
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.kernels import REASON, SUFFIXES, array, kernel
+from gsplat_edu.kernels import REASON, SUFFIXES, kernel, native_array
 from gsplat_edu.render.backends import unavailable
 from gsplat_edu.validation import check_shape, in_range
 
@@ -46,7 +46,7 @@ def photo_loss(
         # Times 0 or 1: exact, on any number of threads.
         check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
         image = _Masked.apply(image, counts)  # type: ignore[no-untyped-call]
-        target = torch.mul(target.detach(), counts, out=empty(target.shape, target))
+        target = torch.mul(target.detach(), counts, out=reusable_tensor(target.shape, target))
     if image.device.type == "cuda" and image.dtype == torch.float32 and unavailable("cuda") is None:
         from gsplat_edu.render.triton.loss import l1_ssim_triton
 
@@ -127,13 +127,13 @@ class _Masked(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, counts: Tensor) -> Tensor:  # noqa: ANN401
         ctx.save_for_backward(counts)
-        return torch.mul(image, counts, out=empty(image.shape, image))
+        return torch.mul(image, counts, out=reusable_tensor(image.shape, image))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
         (counts,) = ctx.saved_tensors
-        return torch.mul(grad, counts, out=empty(grad.shape, grad)), None
+        return torch.mul(grad, counts, out=reusable_tensor(grad.shape, grad)), None
 
 
 class _L1Ssim(torch.autograd.Function):
@@ -142,11 +142,11 @@ class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:  # noqa: ANN401
         x, y = image.detach().contiguous(), target.detach().contiguous()
-        gradient = empty(x.shape, x)
+        gradient = reusable_tensor(x.shape, x)
         l1_mean, ssim_mean = kernel("loss_f", x.dtype)(
-            image=array(x),
-            target=array(y),
-            gradient=array(gradient),
+            image=native_array(x),
+            target=native_array(y),
+            gradient=native_array(gradient),
             ssim_weight=ssim_weight,
             threads=torch.get_num_threads(),
         )

@@ -28,7 +28,7 @@ KINDS = {
 """What is not read, by the kind that the system says it is of."""
 
 
-def open_file(path: Path) -> BinaryIO:
+def open_file(path: str | Path) -> BinaryIO:
     """Open a regular file to read its bytes.
 
     A pipe would block until somebody writes to it, and a device may never end.
@@ -36,6 +36,7 @@ def open_file(path: Path) -> BinaryIO:
     Raises:
         OSError: the file cannot be opened, or is a pipe, a socket, a device or a folder.
     """
+    path = Path(path)
     _check_regular(path, path.stat().st_mode)  # first: opening a device may have an effect
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     try:

@@ -17,7 +17,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.viewer import page, page_data
-from gsplat_edu.viewer.page_start import looked_at
+from gsplat_edu.viewer.page_start import pivot_of
 
 NASTY = 'a </script><script>alert(1)</script> {{facts}} "&" äöü 兎 🐕'
 
@@ -331,7 +331,7 @@ def test_where_cameras_face_one_way_the_pivot_lies_at_what_they_see(turn):
     generator = np.random.default_rng(0)
     points = generator.uniform((-30, -30, 9.5), (30, 30, 10.5), (4000, 3))
     cameras = facing_one_way(turn)
-    pivot = looked_at(cameras, 4, points)
+    pivot = pivot_of(cameras, 4, points)
     np.testing.assert_allclose(pivot[:2], cameras[4].eye[:2], atol=1e-9)
     if turn == -0.05:  # they do look at one point, 6 ahead: either will do
         assert 5 < pivot[2] < 10.6
@@ -347,5 +347,5 @@ def test_where_cameras_stand_around_something_the_pivot_is_its_centre():
     surface = np.random.default_rng(0).normal(size=(900, 3))
     surface /= np.linalg.norm(surface, axis=1, keepdims=True)
     # although one of them looks away, and its surface is nearer than the centre
-    np.testing.assert_allclose(looked_at(cameras, 0, surface), 0, atol=1e-6)
-    assert looked_at(cameras[:1], 0, np.zeros((0, 3))) @ cameras[0].R[2] > cameras[0].eye @ cameras[0].R[2]
+    np.testing.assert_allclose(pivot_of(cameras, 0, surface), 0, atol=1e-6)
+    assert pivot_of(cameras[:1], 0, np.zeros((0, 3))) @ cameras[0].R[2] > cameras[0].eye @ cameras[0].R[2]

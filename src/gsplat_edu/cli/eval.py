@@ -20,7 +20,7 @@ from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.evaluation import EVALUATED, Judged, evaluate_run
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.runs.identity import difference
+from gsplat_edu.runs.identity import capture_difference
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -62,7 +62,7 @@ def _evaluate(
     facts: dict[str, Any] = {"iterations": iteration}
     if into is not None:
         facts[EVALUATED] = {"run": str(folder.path.resolve()), "dataset": str(dataset.path.resolve())}
-    if found := difference(folder, dataset):
+    if found := capture_difference(folder, dataset):
         what = f"{dataset.path} is not the capture of {folder.path}: {found}"
         if into is None:
             raise ArgumentError(

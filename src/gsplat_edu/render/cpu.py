@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu.buffers import empty
+from gsplat_edu.buffers import reusable_tensor
 from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.constants import Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
-from gsplat_edu.kernels import SUFFIXES, array, kernel, native
+from gsplat_edu.kernels import SUFFIXES, kernel, native, native_array
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 
@@ -151,13 +151,13 @@ class _Rasterize(torch.autograd.Function):
             ),
             threads=torch.get_num_threads(),
         )
-        image = empty((camera.H, camera.W, 3), means)
-        transmittance = empty((camera.H, camera.W), means)
-        depth = empty((camera.H, camera.W) if call.settings.depth else (0,), means)
+        image = reusable_tensor((camera.H, camera.W, 3), means)
+        transmittance = reusable_tensor((camera.H, camera.W), means)
+        depth = reusable_tensor((camera.H, camera.W) if call.settings.depth else (0,), means)
         frame.composite(_images(image, transmittance, depth if call.settings.depth else None))
-        call.visible = empty((frame.num_visible,), means, torch.int64)
-        call.radii = empty((frame.num_visible, 2), means)
-        frame.visible(ids=array(call.visible), radii=array(call.radii))
+        call.visible = reusable_tensor((frame.num_visible,), means, torch.int64)
+        call.radii = reusable_tensor((frame.num_visible, 2), means)
+        frame.visible(ids=native_array(call.visible), radii=native_array(call.radii))
         call.num_pairs = frame.num_pairs
         ctx.set_materialize_grads(False)
         ctx.call, ctx.frame = call, frame
@@ -172,8 +172,8 @@ class _Rasterize(torch.autograd.Function):
         grad_image, grad_transmittance, grad_depth = (None if g is None else g.contiguous() for g in grads)
         if grad_image is None:
             grad_image = torch.zeros_like(image)
-        outgoing = [empty(p.shape, p) for p in kept]
-        norms = empty((len(kept[0]),), kept[0])
+        outgoing = [reusable_tensor(p.shape, p) for p in kept]
+        norms = reusable_tensor((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
         # Saved tensors may have moved since the forward pass, so the kernels get them again.
         ctx.frame.backward(
@@ -181,7 +181,9 @@ class _Rasterize(torch.autograd.Function):
             images=_images(image, transmittance, depth if call.settings.depth else None),
             incoming=_images(grad_image, grad_transmittance, grad_depth if call.settings.depth else None),
             gradients=native().Gradients(
-                **_arrays(outgoing, call.direct), means2d_norm=array(norms), background=array(background)
+                **_arrays(outgoing, call.direct),
+                means2d_norm=native_array(norms),
+                background=native_array(background),
             ),
         )
         call.norms = norms if call.norms is None else call.norms + norms
@@ -190,7 +192,7 @@ class _Rasterize(torch.autograd.Function):
 
 def _arrays(parameters: list[Tensor], direct: bool) -> dict[str, Any]:
     """Name six raw parameters, or means and three direct ones, as the native structures do."""
-    return dict(zip(DIRECT if direct else RAW, map(array, parameters), strict=True))
+    return dict(zip(DIRECT if direct else RAW, map(native_array, parameters), strict=True))
 
 
 def _scene(parameters: list[Tensor], direct: bool) -> Any:  # noqa: ANN401
@@ -199,9 +201,9 @@ def _scene(parameters: list[Tensor], direct: bool) -> Any:  # noqa: ANN401
 
 def _images(image: Tensor, transmittance: Tensor | None, depth: Tensor | None) -> Any:  # noqa: ANN401
     return native().Images(
-        image=array(image),
-        transmittance=None if transmittance is None else array(transmittance),
-        depth=None if depth is None else array(depth),
+        image=native_array(image),
+        transmittance=None if transmittance is None else native_array(transmittance),
+        depth=None if depth is None else native_array(depth),
     )
 
 

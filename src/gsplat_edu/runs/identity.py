@@ -77,7 +77,7 @@ def photo_digests(dataset: Dataset) -> dict[str, Any]:
         return {name: facts for (name, _), facts in zip(files, entries, strict=True)}
 
 
-def difference(folder: RunFolder, dataset: Dataset) -> str | None:
+def capture_difference(folder: RunFolder, dataset: Dataset) -> str | None:
     """Say how a capture differs from the one that a run was begun with; None if nothing does.
 
     Compared are the views, their splits and cameras, and the files of the photos. A capture that was moved or copied
@@ -111,7 +111,7 @@ def check_capture(folder: RunFolder, dataset: Dataset) -> None:
     """
     if not folder.cameras.is_file():
         folder.read_cameras()  # says what is missing
-    found = difference(folder, dataset)
+    found = capture_difference(folder, dataset)
     if found is None and folder.read_config().get("fingerprint") != fingerprint(dataset):
         found = "other start points" if folder.photos.is_file() else "other photos or start points"
     if found is not None:

@@ -170,10 +170,10 @@ def _step_natively(parameter: Tensor, m: Tensor, v: Tensor, numbers: tuple[float
     gradient = parameter.grad
     if gradient is not None:
         kernels.kernel("adam_f", parameter.dtype)(
-            parameter=kernels.array(parameter),
-            first=kernels.array(m),
-            second=kernels.array(v),
-            gradient=kernels.array(gradient.to(parameter.dtype).contiguous()),
+            parameter=kernels.native_array(parameter),
+            first=kernels.native_array(m),
+            second=kernels.native_array(v),
+            gradient=kernels.native_array(gradient.to(parameter.dtype).contiguous()),
             **dict(zip(NUMBERS, numbers, strict=True)),
             threads=torch.get_num_threads(),
         )

@@ -38,7 +38,7 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.validation import ArrayLike, in_range, whole_number
 from gsplat_edu.viewer.live_guard import Guard
-from gsplat_edu.viewer.page_start import looked_at
+from gsplat_edu.viewer.page_start import pivot_of
 from gsplat_edu.viewer.serve import LOOPBACK, free_port, url_of
 from gsplat_edu.views import View
 
@@ -305,7 +305,7 @@ class LiveView:
         cameras = [view.camera for view in self._capture.dataset.train]
         self._up = common_up(cameras)
         first, start = cameras[0], self._server.initial_camera
-        pivot = looked_at(cameras, 0, self._capture.dataset.points)
+        pivot = pivot_of(cameras, 0, self._capture.dataset.points)
         self._distance = float((pivot - first.eye) @ first.R[2])
         self._server.scene.set_up_direction(self._up)
         start.position = first.eye

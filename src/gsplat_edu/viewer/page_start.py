@@ -19,7 +19,7 @@ SIDE = 800
 ORBIT = 4
 """Cameras of the orbit that its centre is found from."""
 
-MIDDLE = 0.5
+CENTRAL_PART = 0.5
 """Part of a camera's image, along each side, in which what it looks at is sought."""
 
 
@@ -53,7 +53,7 @@ def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
     if cameras:
         opaque = scene.gaussians.logit_opacities > 0
         means = scene.gaussians.means[opaque].double().numpy(force=True)
-        return Start(cameras[index], looked_at(cameras, index, means), up, index)
+        return Start(cameras[index], pivot_of(cameras, index, means), up, index)
     if len(scene.gaussians):
         orbit = orbit_of_scene(scene.gaussians, ORBIT, SIDE, up)
     else:
@@ -62,7 +62,7 @@ def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
     return Start(orbit[0], np.zeros(3) if centre is None else centre, up, -1)
 
 
-def looked_at(
+def pivot_of(
     cameras: Sequence[Camera], index: int, points: Float[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, "3"]:
     """Find what an orbit from a camera should go around.
@@ -83,7 +83,7 @@ def looked_at(
     if centre is not None and camera.world_to_cam(centre[None])[0, 2] > 0:
         return centre
     x, y, z = camera.world_to_cam(geometry.points).T
-    across, down = 0.5 * MIDDLE * camera.W / camera.fx, 0.5 * MIDDLE * camera.H / camera.fy
+    across, down = 0.5 * CENTRAL_PART * camera.W / camera.fx, 0.5 * CENTRAL_PART * camera.H / camera.fy
     depths = z[(z > 0) & (abs(x) < across * z) & (abs(y) < down * z)]
     depth = float(np.median(depths)) if depths.size else geometry.depth
     return np.asarray(camera.eye + (depth if depth > 0 else 1.0) * camera.R[2])

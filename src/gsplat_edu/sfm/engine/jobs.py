@@ -168,7 +168,9 @@ def mapping(
         model = mended(begun, mapped, photos, folder, options)
         if model.num_reg_images() < 2 or not model.num_points3D():
             continue
-        model, kin = (model, {}) if attempt["per_photo"] else placed_anew(model, mapped, photos, folder, options)
+        model, kin = (
+            (model, {}) if attempt["per_photo"] else placed_anew(model, mapped, photos, folder, options)
+        )
         model, lenses = refined(model, auto and not attempt["per_photo"], threads, kin)
         without_doubtful(model, mapped)
         model.write_binary(folder)

@@ -32,7 +32,7 @@ GAIN = 0.02
 CENTRED = 0.1
 """Farthest that a principal point may be from the middle, as a share of the size."""
 
-ITERATIONS = 30
+REFINEMENTS = 30
 """Of the adjustments that judge; they begin at the solution of a simpler lens."""
 
 FOLLOWED = 2
@@ -50,7 +50,7 @@ class Rung(NamedTuple):
         return f"{self.model}, free centre" if self.centre else self.model
 
 
-LADDER = (
+LENS_LADDER = (
     Rung("SIMPLE_RADIAL", centre=False),
     Rung("RADIAL", centre=False),
     Rung("OPENCV", centre=False),
@@ -123,7 +123,11 @@ def _follow(model: pycolmap.Reconstruction, kin: dict[int, Kin]) -> None:
 def _climbed(model: pycolmap.Reconstruction, camera: int, climb: bool, threads: int) -> Rung:
     """Return the last rung that explains photos better that had no part in it."""
     given = Rung(model.camera(camera).model_name, centre=False)
-    rungs = [rung for rung in LADDER if rung.model != given.model] if climb else [given._replace(centre=True)]
+    rungs = (
+        [rung for rung in LENS_LADDER if rung.model != given.model]
+        if climb
+        else [given._replace(centre=True)]
+    )
     images = sorted(
         (i for i in model.reg_image_ids() if model.image(i).camera_id == camera),
         key=lambda i: model.image(i).name,
@@ -151,14 +155,14 @@ def _errors(halves: list[pycolmap.Reconstruction], rung: Rung, threads: int) -> 
         teacher, judge = copy.deepcopy(halves[one]), copy.deepcopy(halves[other])
         (camera,) = {teacher.image(image).camera_id for image in teacher.reg_image_ids()}
         _change(teacher.camera(camera), rung.model)
-        adjust(teacher, threads, iterations=ITERATIONS)
+        adjust(teacher, threads, iterations=REFINEMENTS)
         if rung.centre:
-            adjust(teacher, threads, iterations=ITERATIONS, centre=True)
+            adjust(teacher, threads, iterations=REFINEMENTS, centre=True)
         if not _believable(teacher.camera(camera)):
             return [np.inf, np.inf]
         _change(judge.camera(camera), rung.model)
         judge.camera(camera).params = list(teacher.camera(camera).params)
-        adjust(judge, threads, iterations=ITERATIONS, fixed={camera})
+        adjust(judge, threads, iterations=REFINEMENTS, fixed={camera})
         found.append(_error(judge))
     return found
 
