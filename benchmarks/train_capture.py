@@ -20,8 +20,8 @@ import hardware
 from captures import capture
 from train_step import STAGES, measure
 
-from gsplat_edu.cli.options import train as command
 from gsplat_edu.cli.arguments import OneLineParser, run_command
+from gsplat_edu.cli.options import train as command
 from gsplat_edu.runs.training import CaptureRun, document
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
