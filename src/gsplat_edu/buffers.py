@@ -6,8 +6,8 @@ freed, the hole is too small for the next aligned request of the same size, unle
 small tensor kept per step is enough, and the process grows by an image in every iteration.
 
 Inside `reused_buffers`, `reusable_tensor` maps memory of its own instead and hands it out again once nothing refers to
-it: not the tensor, not a view of it, not what autograd saved. Nobody's tensor is ever written over. When the block ends, the
-system gets everything back that is not in use.
+it: not the tensor, not a view of it, not what autograd saved. Nobody's tensor is ever written over. When the block
+ends, the system gets everything back that is not in use.
 """
 
 from __future__ import annotations
