@@ -162,7 +162,9 @@ def _explained(
     if focal not in scores:
         scores[focal] = np.array([_score(lens, main, focal, one, seed) for one in seen.values()])
     if focal not in related:
-        near = [[_score(lens, main, focal * by, one, seed) for one in seen.values()] for by in (APART, 1 / APART)]
+        near = [
+            [_score(lens, main, focal * by, one, seed) for one in seen.values()] for by in (APART, 1 / APART)
+        ]
         if max(map(sum, near)) >= AS_GOOD * scores[focal].sum():
             return None, []
     fits = scores[focal] >= AS_GOOD * np.max([scores[f] for f in related], axis=0)
