@@ -74,7 +74,7 @@ WAYS = attempts("auto", "auto", 9, 1, one_lens=True)
 def model(numbers, agreement=1.0, steady=100, error=0.5):
     """What the job "mapping" returns of a model with some photos."""
     names = [f"{i}.jpg" for i in numbers]
-    facts = {"folder": "0", "doubtful": [], "points": 200, "lens": "SIMPLE_RADIAL"}
+    facts = {"folder": "0", "doubtful": [], "points": 200, "lens": "SIMPLE_RADIAL", "per_photo": False}
     return facts | {"names": names, "agreement": agreement, "steady": steady, "error": error}
 
 
@@ -166,6 +166,14 @@ def test_of_models_of_equal_worth_the_one_with_points_in_three_photos_and_a_smal
     thin, dense = model(range(30), steady=50, error=0.1), model(range(30), steady=100, error=0.5)
     assert best_model([thin, dense]) is dense
     assert best_model([dense, model(range(30), steady=99, error=0.4)])["error"] == 0.4
+
+
+def test_a_camera_per_photo_needs_many_more_photos_to_be_taken():
+    shared, free = model(range(20)), model(range(24), error=0.1) | {"per_photo": True}
+    assert best_model([shared, free]) is shared
+    more = model(range(26)) | {"per_photo": True}
+    assert best_model([shared, more]) is more
+    assert best_model([free]) is free
 
 
 def test_two_ways_that_agree_about_most_photos_are_the_last(mapped):

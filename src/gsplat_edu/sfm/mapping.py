@@ -31,6 +31,10 @@ SAME = 0.5
 NEARLY = 0.97
 """Models whose worth is at least this share of the best one's are compared by their points as well."""
 
+FREEDOM = 1.25
+"""How many times as many photos a model with a camera per photo has to hold as the others: so many focal lengths fit
+wrong poses, too."""
+
 
 @dataclass(frozen=True)
 class Attempt:
@@ -121,7 +125,9 @@ def map_photos(
             say(f"{way}: {error}")
             continue
         found += [
-            model | {"folder": f"models/{number}/{model['folder']}", "way": f"{way}, {model['lens']}"}
+            model
+            | {"folder": f"models/{number}/{model['folder']}", "way": f"{way}, {model['lens']}"}
+            | {"per_photo": way.per_photo}
             for model in made
             if model["names"]
         ]
@@ -149,11 +155,17 @@ def best_model(models: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     The worth of a model is the number of photos whose pose counts, times the share of all their matches that agree with
     their poses. Of models of nearly equal worth, those with the most points that three photos see are taken, and of
-    these the one with the smallest reprojection error.
+    these the one with the smallest reprojection error. Models with a camera per photo are passed over unless they hold
+    many more photos.
 
     Args:
-        models: At least one, as the job "mapping" returns them.
+        models: At least one, as the job "mapping" returns them, and whether they have a camera "per_photo".
     """
+    shared = [model for model in models if not model["per_photo"]]
+    most = max((len(model["names"]) for model in shared), default=0)
+    models = shared + [
+        model for model in models if model["per_photo"] and len(model["names"]) >= FREEDOM * most
+    ]
     worth = [len(model["names"]) * model["agreement"] for model in models]
     good = [model for model, w in zip(models, worth, strict=True) if w >= NEARLY * max(worth)]
     most = max(model["steady"] for model in good)

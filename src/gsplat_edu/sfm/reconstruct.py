@@ -43,9 +43,10 @@ INLIERS = 15
 """Matches of one geometry from which two photos hang together: COLMAP's own bound."""
 
 
-FEATURES, MAPPING = 2, 2
+FEATURES, MAPPING = 2, 3
 """Numbers of the methods, part of the stages' options: results that an earlier method left in a work folder are found
-anew. Before 2, photos kept more features than `max_features`, and every pose counted."""
+anew. Before 2, photos kept more features than `max_features`, and every pose counted; before 3,
+photos of every size had a focal length of their own."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
@@ -299,7 +300,7 @@ class _Run:
             self._say(f"left out, no pose was found: {listed(facts['left_out'])}")
         if facts["doubtful"]:
             self._say(
-                f"left out, too few points in common with the others to trust the pose: {listed(facts['doubtful'])}"
+                f"left out, too little in common with the others to trust the pose: {listed(facts['doubtful'])}"
             )
         figures = f"{facts['points']:,} points, mean reprojection error {facts['error']:.2f} px"
         return facts | {"summary": f"{len(self.model['names'])} photos undistorted, {figures}"}

@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 
 from .database import add_camera, add_photo, opened, with_cameras
-from .judge import agreement, steady_points
+from .judge import agreement, scattered, steady_points
 from .kin import placed_anew
 from .lenses import refined
 from .mappers import Options, Tell, all_at_once, incremental, mended, without_doubtful
@@ -173,6 +173,8 @@ def mapping(
         )
         model, lenses = refined(model, auto and not attempt["per_photo"], threads, kin)
         without_doubtful(model, mapped)
+        if attempt["per_photo"] and model.num_reg_images() and scattered(model):
+            continue
         model.write_binary(folder)
         models.append(
             {

@@ -32,6 +32,12 @@ CONTRADICTED = 0.3
 PARALLAX = 1.5
 """Least angle between the rays to a point, degrees: COLMAP's own bound when it filters points."""
 
+ALIKE = 1.5
+"""Factor by which a photo's focal length may differ from the median where every photo has a camera of its own."""
+
+SCATTERED = 0.2
+"""Largest share of photos beyond that: real cameras do not differ so, but focal lengths that compensate wrong poses do."""
+
 
 class Agreement(NamedTuple):
     """How many verified matches agree with the poses, by photo."""
@@ -209,3 +215,11 @@ def take_out(model: pycolmap.Reconstruction, images: set[int]) -> None:
 def steady_points(model: pycolmap.Reconstruction) -> int:
     """Count the points that three photos and more see."""
     return sum(model.point3D(point).track.length() >= 3 for point in model.point3D_ids())
+
+
+def scattered(model: pycolmap.Reconstruction) -> bool:
+    """Say whether the focal lengths of a model's photos, as shares of their longer sides, are all over the place."""
+    cameras = [model.camera(model.image(image).camera_id) for image in sorted(model.reg_image_ids())]
+    shares = np.array([camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras])
+    ratio = shares / np.median(shares)
+    return bool((np.maximum(ratio, 1 / ratio) > ALIKE).mean() > SCATTERED)

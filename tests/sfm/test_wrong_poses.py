@@ -1,0 +1,100 @@
+"""Captures that invite wrong poses: every pose that is kept is right, and the other photos are named."""
+
+import math
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.textured_box import align_cameras, box_camera, photograph_box
+from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
+from sfm.textured_box import cameras_of
+
+pytestmark = pytest.mark.usefixtures("colmap")
+
+
+def captured(folder, photos, **options):
+    """Reconstruct photos; return their cameras, the truth, and what was said."""
+    (folder / "photos").mkdir()
+    for name, (pixels, _) in photos.items():
+        Image.fromarray(np.ascontiguousarray(pixels)).save(folder / "photos" / name, quality=92)
+    said = []
+    reconstruct(SfmOptions(folder / "photos", folder / "out", **options), said.append)
+    truth = {name: camera for name, (_, camera) in photos.items()}
+    return SimpleNamespace(found=cameras_of(folder / "out"), truth=truth, said="\n".join(said))
+
+
+def resized(pixels, camera, factor):
+    """Scale a photo."""
+    size = round(camera.W * factor), round(camera.H * factor)
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), _lens(camera, factor * camera.fx, *size)
+
+
+def cropped(pixels, camera, W, H):
+    """Keep the middle of a photo."""
+    x, y = (camera.W - W) // 2, (camera.H - H) // 2
+    return pixels[y : y + H, x : x + W], _lens(camera, camera.fx, W, H)
+
+
+def _lens(camera, focal, W, H):
+    return Camera(camera.R, camera.eye, focal, focal, (W - 1) / 2, (H - 1) / 2, H, W)
+
+
+@pytest.fixture(scope="module")
+def sizes(colmap, tmp_path_factory):
+    """13 photos of one size and 5 others, with few features and a path that tells little of the focal length."""
+    photos = {}
+    for i in range(18):
+        size = (240, 320) if i == 11 else (320, 240)
+        camera = box_camera(1.3 * i / 18, 0.6, size)
+        photo = photograph_box(camera), camera
+        if i == 4:
+            photo = resized(*photo, 0.5)
+        elif i == 7:
+            photo = cropped(*photo, 200, 150)
+        elif i == 9:
+            photo = cropped(*photo, 160, 120)  # the size of the fourth, of another lens
+        elif i == 14:
+            photo = cropped(*photo, 240, 240)
+        photos[f"{i:02d}.jpg"] = photo
+    return captured(tmp_path_factory.mktemp("sizes"), photos, max_features=300)
+
+
+def test_photos_of_other_sizes_have_the_lens_of_the_main_ones_scaled_or_cropped(sizes):
+    assert len(sizes.found) >= 16
+    alignment = align_cameras(sizes.found, sizes.truth)
+    # A twentieth of the distance, and five degrees: with the wrong focal length it is ten times as much.
+    assert alignment.moved.max() < 0.05 and alignment.turned.max() < 5
+    for name, camera in sizes.found.items():
+        assert camera.fx == pytest.approx(sizes.truth[name].fx, rel=0.05), name
+
+
+def test_two_lenses_of_one_size_are_not_taken_for_one(sizes):
+    missing = set(sizes.truth) - set(sizes.found)
+    assert missing & {"04.jpg", "09.jpg"} or not missing
+    assert all(name in sizes.said for name in missing)
+
+
+@pytest.fixture(scope="module")
+def two_sides(colmap, tmp_path_factory):
+    """Photos all around, those of the left and right too blurred and too plain to hold the sides together."""
+    photos, rng = {}, np.random.default_rng(1)
+    for i in range(24):
+        angle = 2 * math.pi * i / 24
+        camera = box_camera(angle, 0.45 + 0.15 * math.sin(3 * angle))
+        pixels = photograph_box(camera).astype(float)
+        if abs(math.sin(angle)) > 0.8:
+            pixels = 128 + 0.25 * (cv2.GaussianBlur(pixels, (0, 0), 3.0) - 128)
+        pixels = pixels + rng.normal(0, 4, pixels.shape)
+        photos[f"{i:02d}.jpg"] = np.clip(pixels, 0, 255).astype(np.uint8), camera
+    return captured(tmp_path_factory.mktemp("sides"), photos, max_features=400)
+
+
+def test_kept_poses_are_right_and_photos_with_too_little_are_named(two_sides):
+    assert 5 <= len(two_sides.found) < 24
+    alignment = align_cameras(two_sides.found, two_sides.truth)
+    assert alignment.moved.max() < 0.05 and alignment.turned.max() < 5
+    assert "share too little with them" in two_sides.said and "left out" in two_sides.said
