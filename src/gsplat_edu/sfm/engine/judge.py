@@ -36,7 +36,7 @@ ALIKE = 1.5
 """Factor by which a photo's focal length may differ from the median where every photo has a camera of its own."""
 
 SCATTERED = 0.2
-"""Largest share of photos beyond that: real cameras do not differ so, but focal lengths that compensate wrong poses do."""
+"""Largest share of photos beyond that: real cameras do not differ so, but focal lengths that absorb wrong poses do."""
 
 
 class Agreement(NamedTuple):
