@@ -2,6 +2,8 @@
 # PYTHON=python3.12 in front or behind chooses the interpreter; the default is python3.
 BIN := .venv/bin
 OUT ?= out/sphere.png
+# Processes that run the tests. Each test file stays in one process, so that its fixtures are made once.
+WORKERS ?= 2
 BENCH := $(if $(SMOKE),--smoke)
 export PYTHON
 
@@ -25,7 +27,7 @@ demo:
 test:
 	@tools/set_up.sh dev
 	@echo "== test: running the suite"
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 check:
 	@tools/set_up.sh dev
