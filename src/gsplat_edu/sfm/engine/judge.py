@@ -36,7 +36,7 @@ ALIKE = 1.5
 """Factor by which a photo's focal length may differ from the median where every photo has a camera of its own."""
 
 SCATTERED = 0.2
-"""Largest share of photos beyond that: no cameras are so different, but focal lengths that make up for wrong poses are."""
+"""Largest share of photos beyond that: cameras differ less, but focal lengths that make up for wrong poses do not."""
 
 
 class Agreement(NamedTuple):
