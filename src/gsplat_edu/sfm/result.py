@@ -268,5 +268,5 @@ def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
     if photo.mask is not None:
         mask = result / "masks" / f"{entry.name}.png"
         mask.parent.mkdir(parents=True, exist_ok=True)
-        counts = np.where(np.rot90(photo.mask, -entry.photo.turns), 255, 0).astype(np.uint8)
-        Image.fromarray(counts).save(mask)
+        white = np.where(np.rot90(photo.mask, -entry.photo.turns), 255, 0).astype(np.uint8)
+        Image.fromarray(white).save(mask)
