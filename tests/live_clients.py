@@ -60,7 +60,8 @@ class Training:
 
     @property
     def iteration(self):
-        return self.run.trainer.iteration
+        trainer = getattr(self.run, "trainer", None)  # the view is up before the photos are read
+        return trainer.iteration if trainer else 0
 
     def ended(self):
         """Wait for the end, which has to be a good one."""

@@ -212,7 +212,7 @@ def test_absurd_counts_allocate_nothing(tmp_path, form):
         assert "truncated" in said or "rows of vertex" in said or "more than any file holds" in said
     chunk = b"element chunk %d\nproperty int a\nelement vertex 3" % 10**30
     path.write_bytes(whole.replace(b"element vertex 3", chunk))
-    assert "is truncated: 0 of 3 rows" in refused(path)
+    assert "element chunk of" in refused(path)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_big_endian"])
