@@ -150,7 +150,7 @@ def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
             31.0,
             32.0,
             [
-                "held out are matched at 31.0 dB",
+                "renders of the held-out photos reach 31.0 dB",
                 "look very close to them",
                 "1.0 dB below the training photos;",
             ],
@@ -158,7 +158,7 @@ def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
         (26.0, 25.5, ["26.0 dB", "look close to them", "0.5 dB above the training photos"]),
         (21.0, 29.5, ["soft or partly wrong", "8.5 dB below", "so the scene has overfitted to those"]),
         (15.0, None, ["15.0 dB", "look wrong in places"]),
-        (None, 30.0, ["trained on are matched at 30.0 dB", "no photo was held out"]),
+        (None, 30.0, ["renders of the training photos reach 30.0 dB", "no photo was held out"]),
         (None, None, ["Nothing was judged"]),
     ],
 )

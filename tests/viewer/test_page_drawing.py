@@ -180,6 +180,23 @@ def test_a_trained_scene(show):
         assert likeness(drawn, visit, gaussians, one, settings) >= ALIKE
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "scale"),
+    [
+        (160, 500, 2.5),  # narrow: the height fits, the sides are cropped
+        (320, 200, 1.0),
+        (400, 200, 1.25),  # wide: the width fits, a fifth of the height is cropped
+        (800, 200, 1.25),  # no more than that; the rest shows what is beside the image
+    ],
+)
+def test_a_window_crops_the_sides_but_little_of_the_height(
+    show, random_gaussians, camera, width, height, scale
+):
+    assert (camera.W, camera.H) == (320, 200)
+    visit = show(random_gaussians(50), [("first", camera)], width=width, height=height)
+    assert visit.camera().fy == pytest.approx(camera.fy * scale)
+
+
 @pytest.mark.parametrize("dense", [1, 2])
 def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
     """In a window of another shape the camera's image covers the window: the rest is cropped."""
@@ -191,7 +208,7 @@ def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
     assert (width, height) == (360 * dense, 180 * dense)
     scale = max(width / camera.W, height / camera.H)
     assert np.allclose([window.fx, window.fy], [camera.fx * scale, camera.fy * scale])
-    assert window.cy == pytest.approx((camera.cy + 0.5) * scale - 0.5)
+    assert window.cy - 0.5 * (height - 1) == pytest.approx((camera.cy - 0.5 * (camera.H - 1)) * scale)
     assert window.cx - 0.5 * (width - 1) == pytest.approx((camera.cx - 0.5 * (camera.W - 1)) * scale)
     visit.tab.evaluate("viewer.settled()")
     screen = np.asarray(Image.open(BytesIO(visit.tab.screenshot())).convert("RGB"))

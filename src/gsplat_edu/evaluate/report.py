@@ -212,15 +212,15 @@ def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> st
     """
     test, train = (_mean_psnr(metrics, split) for split in ("test", "train"))
     steps = metrics.get("iterations")
-    after = f"After {steps:,} iterations " if isinstance(steps, int) else ""
+    after = f"After {steps:,} iterations, " if isinstance(steps, int) else ""
     if test is None:
         if train is None:
             return "Nothing was judged: no photo was compared with its render."
-        known = f"the photos it was trained on are matched at {train:.1f} dB PSNR"
+        known = f"renders of the training photos reach {train:.1f} dB PSNR"
         sentence = f"{after}{known}; no photo was held out, so nothing says how it looks from elsewhere."
         return sentence[0].upper() + sentence[1:]
     grade = next((words for least, words in GRADES if test >= least), "wrong in places")
-    parts = [f"{after}photos that were held out are matched at {test:.1f} dB PSNR: renders look {grade}"]
+    parts = [f"{after}renders of the held-out photos reach {test:.1f} dB PSNR and look {grade}"]
     if train is not None:
         gap = train - test
         how = f"{abs(gap):.1f} dB {'below' if gap > 0 else 'above'} the training photos"

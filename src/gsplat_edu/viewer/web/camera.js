@@ -16,10 +16,15 @@ function turned(vector, axis, angle) {
   return vector.map((value, i) => value * cos + around[i] * sin + axis[i] * along);
 }
 
-// What a camera shows, in a window of another shape: the middle of its image, as large as the window, and nothing
-// outside of it, which the camera did not see.
+// Most that a wide window enlarges the image beyond what fits: at most a fifth of its height is cropped.
+const MOST_CROPPED = 1.25;
+
+// What a camera shows, in a window of another shape: the middle of its image. A narrow window is filled, with the sides
+// cropped: above and below the image there is what no camera saw. A wide one keeps most of the height, since a square photo
+// of an object would lose its head and feet, and shows some more at the sides.
 function fitted(camera, width, height) {
-  const scale = Math.max(width / camera.W, height / camera.H);
+  const [across, down] = [width / camera.W, height / camera.H];
+  const scale = across > down ? Math.min(across, MOST_CROPPED * down) : down;
   const moved = (middle, from, to) => (middle + 0.5) * scale - 0.5 + 0.5 * (to - from * scale);
   return {
     ...camera,
