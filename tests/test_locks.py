@@ -20,7 +20,7 @@ with locked("--out", Path(sys.argv[1]), "gsplat-edu train", print):
     child = os.fork() if sys.argv[2] == "fork" else 1
     if child == 0:
         os.setsid()
-    print("held", child, flush=True)
+    os.write(1, f"held {child}\\n".encode())  # one write: two processes share the pipe
     sys.stdin.read()
 """
 
@@ -29,7 +29,7 @@ def holder(folder, fork="none"):
     words = [sys.executable, "-c", HOLDS, str(folder), fork]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     lines = [process.stdout.readline() for _ in range(2 if fork == "fork" else 1)]
-    assert all(line.startswith("held") for line in lines)
+    assert all(line.startswith("held") for line in lines), lines
     return process, max(int(line.split()[1]) for line in lines)
 
 

@@ -20,11 +20,11 @@ RAW_BYTES = 0xDC80, 0xDCFF
 
 
 def legible(text: str) -> str:
-    r"""Return text without lone surrogates, which every UTF-8 encoder takes.
+    """Return text without lone surrogates, which every UTF-8 encoder takes.
 
     Args:
         text: Any text. Raw bytes in it that are valid UTF-8 together, as in names read under LC_ALL=C, are decoded;
-            other raw bytes become \xNN, and other lone surrogates \uNNNN.
+            other raw bytes and lone surrogates become backslash escapes.
     """
     if not _SURROGATES.search(text):
         return text
@@ -34,7 +34,7 @@ def legible(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    r"""Return one line that is safe to print: control characters become \xNN or \uNNNN.
+    """Return one line that is safe to print: control characters become backslash escapes.
 
     Without this a file name could clear the screen, hide a warning or write its own line.
     """

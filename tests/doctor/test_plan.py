@@ -242,8 +242,9 @@ def test_a_resumed_run_takes_the_numbers_of_its_config(capture, tmp_path):
     assert CaptureRun(again.options).finished
     assert len(again.sentences) == 1 and "memory is not planned again" in again.sentences[0]
     assert plan(plain, Limits(seconds=100.0)).sentences == ()
-    with pytest.raises(CheckpointError, match="iterations = 20, not 30000"):
-        CaptureRun(taken_up(plain, ["iterations"]))
+    assert not CaptureRun(taken_up(plain, ["iterations"])).finished, (
+        "more iterations than its own extend a run"
+    )
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -252,14 +253,14 @@ def test_a_resumed_run_takes_the_numbers_of_its_config(capture, tmp_path):
     [
         ({"data": {}}, "lacks the section train"),
         ({"train": {}, "data": None}, "lacks the section train or data"),
-        ({"train": {"iterations": "many"}, "data": {}}, "iterations: is 'many'"),
+        ({"train": {"iterations": "many"}, "data": {}}, "iterations is many"),
         ({"train": {}, "data": {"resolution": -1.0}}, "resolution: is -1"),
     ],
 )
 def test_a_damaged_config_is_one_line(capture, tmp_path, stored, named):
     resumed = dataclasses.replace(options(capture, tmp_path / "run"), resume=True)
     resumed.folder.write_config(stored)
-    with pytest.raises(CheckpointError, match="mend the file") as refused:
+    with pytest.raises(CheckpointError, match="mend ") as refused:
         plan(resumed, Limits(memory=2**30))
     assert named in str(refused.value) and "\n" not in str(refused.value)
 

@@ -59,7 +59,7 @@ def walk(step, start, all_gradients):
 
 def natively(parameter, m, v, gradient, numbers):
     names = ("parameter", "first", "second", "gradient")
-    arrays = dict(zip(names, map(kernels.array, (parameter, m, v, gradient)), strict=True))
+    arrays = dict(zip(names, map(kernels.native_array, (parameter, m, v, gradient)), strict=True))
     named = dict(zip(NUMBERS, numbers, strict=True))
     kernels.kernel("adam_f", parameter.dtype)(**arrays, **named, threads=1)
 
