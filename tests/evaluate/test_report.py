@@ -173,7 +173,7 @@ def test_the_verdict_is_a_sentence_from_the_numbers(tmp_path, test, train, says)
     assert sentence.count(". ") == 0 and sentence.endswith(".") and sentence[0].isupper()
     if scores:
         assert "the worst is <i>low</i> at 12.5 dB" in sentence and sentence.startswith(
-            "After 1,500 iterations "
+            "After 1,500 iterations, "
         )
     write_report(tmp_path / "r.html", Report("t", metrics, scores=scores))
     assert sentence in Page(tmp_path / "r.html").text and "<i>" not in (tmp_path / "r.html").read_text()
