@@ -78,7 +78,7 @@ GAMMA = 2.2
 """Bytes are about light to the power of 1 / 2.2."""
 
 DARK, BRIGHT = 8.0, 247.0
-"""Values of bytes outside of which a colour is told to be cut off: ratios mean nothing there."""
+"""Values of bytes outside of which a colour counts as clipped: ratios mean nothing there."""
 
 PAIRS = 20
 """Points seen by both from which two photos are compared."""
@@ -138,20 +138,20 @@ def check_twins(survey: Survey) -> list[Finding]:
     names = survey.names
     found = []
     if moved := [(i, j) for i, j in twins if _motion(survey, i, j) > TWIN_MOTION]:
-        told = tuple(f"{names[i]} and {names[j]}" for i, j in moved)
+        named = tuple(f"{names[i]} and {names[j]}" for i, j in moved)
         what = f"{counted(len(moved), 'pair')} of photos that are nearly the same, but with poses that differ"
         advice = "take out one photo of each pair that shows the same: one of the two poses is wrong"
-        found.append(Finding("same photo", Severity.WARNING, what, advice, told))
+        found.append(Finding("same photo", Severity.WARNING, what, advice, named))
     if copies := [pair for pair in twins if pair not in moved]:
-        told = tuple(f"{names[i]} and {names[j]}" for i, j in copies)
+        named = tuple(f"{names[i]} and {names[j]}" for i, j in copies)
         what = f"{counted(len(copies), 'pair')} of photos that are nearly the same, from one place"
         advice = "take out one photo of each such pair: if one of them is for testing, it tests nothing"
-        found.append(Finding("duplicates", Severity.WARNING, what, advice, told))
+        found.append(Finding("duplicates", Severity.WARNING, what, advice, named))
     if apart := sorted(poses - set(twins)):
-        told = tuple(f"{names[i]} and {names[j]}" for i, j in apart)
+        named = tuple(f"{names[i]} and {names[j]}" for i, j in apart)
         what = f"{counted(len(apart), 'pair')} of photos that show different things"
         advice = "look at the photos that share a pose: something moved between them, or a pose is wrong"
-        found.append(Finding("same pose", Severity.WARNING, what, advice, told))
+        found.append(Finding("same pose", Severity.WARNING, what, advice, named))
     return found
 
 
