@@ -8,7 +8,9 @@ from gsplat_edu.train.config import MILESTONES, TrainConfig
 
 TEXT = (Path(__file__).parents[2] / "docs/RECIPE.md").read_text()
 # the first table; the one under "Starting from a trained scene" has other defaults
-ROWS = re.findall(r"^\| `(\w+)` \| ([^|]+) \| ([^|]+) \|$", TEXT.split("## Starting from a trained scene")[0], re.M)
+ROWS = re.findall(
+    r"^\| `(\w+)` \| ([^|]+) \| ([^|]+) \|$", TEXT.split("## Starting from a trained scene")[0], re.M
+)
 
 
 def test_every_field_and_its_default():

@@ -179,7 +179,9 @@ def test_a_window_of_any_shape_keeps_the_middle_of_the_photo(tour, three_views, 
         left, right = (np.array([-0.5, width - 0.5]) - shown.cx) / scale + camera.cx
         top, bottom = (np.array([-0.5, height - 0.5]) - shown.cy) / scale + camera.cy
         assert left + right == pytest.approx(camera.W - 1) and top + bottom == pytest.approx(camera.H - 1)
-        if width / height < camera.W / camera.H:  # a narrow window shows the whole height and nothing beyond it
+        if (
+            width / height < camera.W / camera.H
+        ):  # a narrow window shows the whole height and nothing beyond it
             assert top == pytest.approx(-0.5)
         else:  # a wide one shows four fifths of the height or more, and the whole width unless it is about as wide
             assert bottom - top >= 0.8 * camera.H - 1e-9 and bottom - top <= camera.H + 1e-9
