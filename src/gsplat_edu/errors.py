@@ -9,6 +9,8 @@
     ├── CheckpointError                      a run cannot be continued, or its state not be written
     └── NotEnoughMemoryError                 work needs more memory than is free
 
+    BackendWarning                           "auto" takes another backend than the machine suggests
+
 Every message is one line that says what is wrong, where, and what to do next. The command line prints that
 line and exits with 2.
 """
@@ -30,6 +32,10 @@ class ShapeError(ArgumentError):
 
 class BackendUnavailableError(SplatError):
     """The rendering backend that was asked for does not run here; the message says why and what does."""
+
+
+class BackendWarning(UserWarning):
+    """The backend "auto" is not the one that this machine suggests; the message says why."""
 
 
 class DatasetError(SplatError):
