@@ -106,7 +106,7 @@ def test_scenes_are_joined_on_request(convert, plain, tmp_path):
     [
         (["gone.ply", "out.ply"], "gone.ply: is not there"),
         (["IN", "out.obj"], "known are .compressed.ply, .ply, .splat, .spz, .sog, .glb, .html"),
-        (["IN", "."], "ends like no scene format"),
+        (["IN", "."], "unknown scene format"),
         (["IN", "IN/out.ply"], "is a file; name a folder"),
         (["IN", "out.ply", "--crop", "1,2,3"], "is not 6 numbers"),
         (["IN", "out.ply", "--crop", "0,0,0,1,1,nan"], "is not 6 numbers"),
