@@ -126,7 +126,7 @@ def test_an_empty_video_is_one_line(tmp_path, capsys):
         ("photos", "is where the photos themselves are"),
         (".", "is where the photos themselves are"),
         ("posed", "holds photos or poses already"),
-        ("photos/0.jpg", "0.jpg is a file; name a folder"),
+        ("photos/0.jpg", "0.jpg is a file; give a folder"),
     ],
 )
 @pytest.mark.usefixtures("colmap", "as_shipped")

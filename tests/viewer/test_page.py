@@ -236,7 +236,7 @@ def test_every_changed_byte_of_the_splats_is_told(tmp_path, whole):
         (b'"count":9', b'"number":9', "metadata 'count' is missing or invalid"),
         (b'"count":9', b'"count":8', "splats are truncated or damaged"),
         (b'"count":9', b'"count":10', "splats are truncated or damaged"),
-        (b'"count":9', b'"count":9000000000', "says it holds"),
+        (b'"count":9', b'"count":9000000000', "claims to hold"),
         (b'"count":9', b'"count":' + b"9" * 5000, "the metadata is damaged"),
         (b'"sh_degree":3', b'"sh_degree":4', "metadata 'sh_degree' is missing or invalid"),
         (b'"antialiased":null', b'"antialiased":1', "metadata 'antialiased' is missing or invalid"),
