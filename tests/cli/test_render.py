@@ -56,7 +56,7 @@ def test_a_run_is_rendered_as_an_orbit_into_its_folder(made, cli, capsys):
     printed = capsys.readouterr().out
     path = folder.renders / "orbit.mp4"
     assert printed.splitlines()[-1].startswith(f"wrote {path}: 3 images of ") and "32x24" in printed
-    assert printed.startswith("the cameras stand all round: a full circle\n")
+    assert printed.startswith("the cameras surround the scene: using a full circle\n")
     video = cv2.VideoCapture(str(path))
     frames = [video.read() for _ in range(4)]
     assert [read for read, _ in frames] == [True] * 3 + [False]
@@ -118,7 +118,7 @@ def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, ca
         (["BARE", "--dataset", "."], "is no capture"),
         (
             ["BARE", "--out", "x.gif"],
-            "x.gif: GIF is not written here; give a video (.mp4) or a folder of PNGs",
+            "x.gif: GIF is not supported; give a video (.mp4) or a folder of PNGs",
         ),
     ],
 )
@@ -139,7 +139,7 @@ def test_cameras_of_one_side_get_no_full_circle(made, cli, capsys, tmp_path):
     run.write_cameras(views[:3], [])
     assert cli(["render", str(run.path), "--frames", "4", "--out", "frames"]) == 0
     assert "the cameras cover 1" in (said := capsys.readouterr().out), said
-    assert "degrees: the path swings over those, no farther\n" in said
+    assert "degrees: the path stays within them\n" in said
 
 
 def test_help_shows_an_example(cli, capsys):

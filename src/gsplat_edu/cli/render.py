@@ -150,7 +150,7 @@ def _shot(
     names, says = None, ""
     if orbit:
         path = path_along(cameras, arguments.frames, _depth(gaussians, cameras[0]))
-        cameras, says = path.cameras, path.says
+        cameras, says = path.cameras, path.description
     else:
         names = image_file_names([name for name, _ in named])
     if arguments.size is not None:
