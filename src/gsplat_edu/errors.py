@@ -9,6 +9,8 @@
     ├── CheckpointError                      a run cannot be resumed or saved
     └── NotEnoughMemoryError                 work needs more memory than is free
 
+    BackendWarning                           "auto" takes another backend than the machine suggests
+
 Every message is one line that says what is wrong, where, and what to do next. The command line prints that
 line and exits with 2.
 """
@@ -30,6 +32,10 @@ class ShapeError(ArgumentError):
 
 class BackendUnavailableError(SplatError):
     """The requested rendering backend is unavailable here; the message says why and which one to use."""
+
+
+class BackendWarning(UserWarning):
+    """The backend "auto" is not the one that this machine suggests; the message says why."""
 
 
 class DatasetError(SplatError):

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.io import sog
+from gsplat_edu.io.sog import codec as sog
 from scene_files import random_scene
 
 COUNT = 40

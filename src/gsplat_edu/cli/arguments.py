@@ -11,12 +11,13 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from gsplat_edu.cli.printing import complain, spell_what_cannot_be_encoded
-from gsplat_edu.errors import SplatError
+from gsplat_edu.errors import BackendWarning, SplatError
 from gsplat_edu.files import described
 from gsplat_edu.headroom import shortage
 from gsplat_edu.render.settings import BACKENDS
@@ -135,7 +136,7 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
     """
     spell_what_cannot_be_encoded()
     try:
-        with _terminable():
+        with _terminable(), _one_line_warnings(program):
             command()
     except KeyboardInterrupt as interruption:
         complain(f"{program}: {str(interruption) or 'interrupted'}")
@@ -166,7 +167,32 @@ def _terminable() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        # None stands for a handler that Python did not install and cannot put back
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+@contextmanager
+def _one_line_warnings(program: str) -> Iterator[None]:
+    """Print our own warnings as a line without file and line number; others as Python does."""
+    before = warnings.showwarning
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if issubclass(category, BackendWarning):
+            complain(f"{program}: {message}")
+        else:
+            before(message, category, filename, lineno, file, line)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        warnings.simplefilter("always", BackendWarning)
+        yield
 
 
 def _line(program: str, error: Exception) -> str | None:

@@ -44,7 +44,7 @@ FORMATS = (
     Format(".ply", "ply", "Inria PLY"),
     Format(".splat", "splat", "antimatter splat", sh_degree=0, says_antialiased=False),
     Format(".spz", "spz", "Niantic SPZ"),
-    Format(".sog", "sog", "PlayCanvas SOG"),
+    Format(".sog", "sog.codec", "PlayCanvas SOG"),
     Format(".glb", "glb", "glTF with KHR_gaussian_splatting"),
 )
 """The first matching suffix wins."""
