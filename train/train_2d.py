@@ -74,7 +74,7 @@ class Fit2DOptions:
             reason = "is a folder" if self.image.is_dir() else "is not there"
             raise ArgumentError(f"--image: {self.image} {reason}; give an image file")
         if self.out.suffix.lower() != ".png":
-            raise ArgumentError(f"--out: {str(self.out)!r} has to end in .png; the curves are named after it")
+            raise ArgumentError(f"--out: {str(self.out)!r} must end in .png; the curves are named after it")
         for path in (self.out, self.curves):
             if path.resolve() == self.image.resolve():
                 raise ArgumentError(f"--out: {path} is the picture itself; choose another name")
