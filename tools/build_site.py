@@ -213,10 +213,14 @@ def _row(name: str) -> str:
     """Link a name to its definition, and summarise it by the first line of its docstring."""
     thing: Any = _found(name)
     if not (isinstance(thing, type) or inspect.isfunction(thing)):  # a type alias: its module documents it
-        return f"| {{py:obj}}`{name}` | {(getattr(thing, '__doc__', '') or '').strip().partition(chr(10))[0]} |"
+        return (
+            f"| {{py:obj}}`{name}` | {(getattr(thing, '__doc__', '') or '').strip().partition(chr(10))[0]} |"
+        )
     text = (inspect.getdoc(thing) or "").partition("\n\n")[0]
     target = f"{thing.__module__}.{thing.__qualname__}"
-    return f"| {{py:obj}}`{thing.__name__} <{target}>` | {' '.join(text.split()).replace('|', chr(92) + '|')} |"
+    return (
+        f"| {{py:obj}}`{thing.__name__} <{target}>` | {' '.join(text.split()).replace('|', chr(92) + '|')} |"
+    )
 
 
 def _records(records: list[Path]) -> str:
