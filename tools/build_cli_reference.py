@@ -120,8 +120,8 @@ def _train_3d() -> str:
     demo.add_arguments(parser)
     flags = [action.option_strings[0] for action in parser._actions[1:]]
     return (
-        "## python train/train_3d.py\n\nTrain the sphere as `gsplat-edu demo` does, and print the chapter's log. Options:"
-        f" {', '.join(f'`{flag}`' for flag in flags)} and `--debug`.\n"
+        "## python train/train_3d.py\n\nTrain the sphere as `gsplat-edu demo` does, and print the chapter's log."
+        f" Options: {', '.join(f'`{flag}`' for flag in flags)} and `--debug`.\n"
     )
 
 

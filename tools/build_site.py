@@ -190,10 +190,8 @@ def _reference(name: str) -> str:
 def _public_api() -> str:
     """Write the first page of the reference: the public API by topic, then every package."""
     parts = ["# Reference\n\nThe public API first; the pages of all packages and modules follow.\n"]
-    for topic, names in PUBLIC.items():
-        if isinstance(names, str):
-            everything = importlib.import_module(names).__all__
-            names = [f"{names}.{name}" for name in everything if callable(_found(f"{names}.{name}"))]
+    for topic, listed in PUBLIC.items():
+        names = _names(listed) if isinstance(listed, str) else listed
         parts.append(f"## {topic}\n\n| name | what it is |\n|---|---|")
         parts += [_row(name) for name in names]
         parts.append("")
@@ -202,6 +200,12 @@ def _public_api() -> str:
     parts += ["## Packages\n", _toctree("maxdepth: 1", packages)]
     parts += ["## Modules\n", _toctree("maxdepth: 1", ["gsplat_edu", *(n for n in top if n not in packages)])]
     return "\n".join(parts)
+
+
+def _names(module: str) -> list[str]:
+    """Name the functions and classes of a module's `__all__`."""
+    everything = [f"{module}.{name}" for name in importlib.import_module(module).__all__]
+    return [name for name in everything if callable(_found(name))]
 
 
 def _found(name: str) -> object:
