@@ -56,19 +56,19 @@ class TrainConfig:
         start_scale: Factor on the initial scales, which are the root mean squared distance to 3 neighbours.
         strategy: "adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "none": fixed number.
         max_gaussians: Cap on the number of Gaussians; None for no cap. mcmc requires one.
-        over_cap: adc: which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with the
-            largest gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors,
+        over_cap: adc: which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with
+            the largest gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors,
             clones, children; the parent of dropped children is removed too (the course).
         densify_start: Densification begins after this iteration. (2023; both strategies)
         densify_stop: Densification ends before this iteration. (2023)
         densify_every: Densify at iterations that are a multiple of this. (2023; 2024)
-        grad_threshold: adc: Gaussians whose mean gradient norm, in normalised device coordinates, exceeds this are cloned
-            or split. (2023)
+        grad_threshold: adc: Gaussians whose mean gradient norm, in normalised device coordinates, exceeds this are
+            cloned or split. (2023)
         percent_dense: adc: fraction of the extent; among these, larger Gaussians are split, smaller ones cloned. (2023)
         split_shrink: adc: divisor of the scales of the two children of a split. (2023)
         min_opacity: Gaussians below this opacity are pruned (2023) or relocated (2024).
-        prune_scale: adc: fraction of the extent; larger Gaussians are pruned after the first opacity reset; 0 prunes none.
-            (2023)
+        prune_scale: adc: fraction of the extent; larger Gaussians are pruned after the first opacity reset; 0 prunes
+            none. (2023)
         prune_screen_size: adc: Gaussians with a larger half axis in an image, px, are pruned after the first opacity
             reset; 0 prunes none. (2023 has 20, but it never took effect there)
         reset_every: adc: iterations between opacity resets while densifying; 0 for none. (2023)
@@ -76,7 +76,8 @@ class TrainConfig:
         mcmc_stop: mcmc: `densify_stop` of this strategy. (2024's code)
         mcmc_start_opacity: mcmc: `start_opacity` of this strategy. (2024's code)
         mcmc_start_scale: mcmc: `start_scale` of this strategy. (2024's code)
-        mcmc_growth: mcmc: growth factor of the number of Gaussians per densification, up to the cap. (2024, section 4.3)
+        mcmc_growth: mcmc: growth factor of the number of Gaussians per densification, up to the cap. (2024, section
+            4.3)
         mcmc_noise: mcmc: noise on the means, relative to their learning rate. (2024, section 4.1: lambda_noise)
         mcmc_opacity_weight: mcmc: weight of the mean opacity in the loss. (2024, eq. 10: lambda_o)
         mcmc_scale_weight: mcmc: weight of the mean scale in the loss. (2024, eq. 10: lambda_Sigma)
