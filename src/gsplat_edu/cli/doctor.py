@@ -65,7 +65,7 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         diagnosis = examine(survey)
     if arguments.no_forecast or diagnosis.hopeless:
         return diagnosis, ()
-    from gsplat_edu.doctor.forecast import forecast  # it measures this machine, which takes a moment
+    from gsplat_edu.budget.forecast import forecast  # it measures this machine, which takes a moment
 
     try:
         said = forecast(load_dataset(arguments.path, settings), config, backend=backend).lines()
