@@ -19,9 +19,16 @@ from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap
 from gsplat_edu.sfm.mapping import attempts, map_photos, no_overlap
-from gsplat_edu.sfm.masks import find_masks
+from gsplat_edu.sfm.masks import find_masks, unused_folders
 from gsplat_edu.sfm.options import SfmOptions as SfmOptions
-from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, mask_folder, photo_files
+from gsplat_edu.sfm.photos import (
+    PhotoFacts,
+    copy_photos,
+    fingerprint,
+    mask_folder,
+    photo_files,
+    stored_mask,
+)
 from gsplat_edu.sfm.result import build_capture, note_published, publish, published
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
@@ -209,8 +216,27 @@ class _Run:
         kinds = "one camera" if lenses == 1 else f"{lenses} kinds of camera or zoom"
         summary = f"{len(photos)} by {kinds}; {known} say their focal length"
         if masked := sum(bool(photo.mask) for photo in photos):
-            summary += f"; {masked} have a mask"
+            summary += "; all have a mask" if masked == len(photos) else f"; {masked} of them have a mask"
+        self._note_masks(files, photos)
         return {"summary": summary, "photos": [asdict(photo) for photo in photos], "unreadable": unreadable}
+
+    def _note_masks(self, files: Sequence[Path], photos: Sequence[PhotoFacts]) -> None:
+        """Say which masks are not used, and which of two ways to lie was assumed."""
+        for folder in unused_folders(files, find_masks(files)):
+            self._say(
+                f"{folder}: not used, none of its images is named like a photo (PHOTO.png or PHOTO.jpg.png)"
+            )
+        stored = stored_mask(self.folder / "photos", "").parent
+        open_ = [
+            photo.name
+            for photo in photos
+            if photo.mask and photo.turns and (photo.turns == 2 or photo.W == photo.H)
+            if Path(photo.mask).parent != stored
+        ]
+        if open_:
+            self._say(
+                f"masks taken as the photos are stored, not upright, which their sizes leave open: {listed(open_)}"
+            )
 
     def _features(self) -> dict[str, Any]:
         total, most = len(self.photos), self.options.max_features
