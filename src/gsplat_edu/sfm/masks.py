@@ -64,8 +64,8 @@ def unused_folders(files: Sequence[Path], masks: Mapping[Path, Path]) -> list[Pa
 def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, int, int]]) -> set[Path]:
     """Find the photos whose masks are upright, not as the photo's pixels are stored; check the sizes of all.
 
-    The size tells, unless the photo is square or stands on its head. What the other masks are decides about those; where
-    they do not tell, masks are as stored, which is COLMAP's convention.
+    Sizes tell, unless the photo is square or upside down. Then the other masks decide; if they do not tell either, the
+    mask is taken as stored, which is COLMAP's convention.
 
     Args:
         masks: As `find_masks` returns them.
@@ -88,7 +88,7 @@ def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, i
                 "mask away"
             )
         if turns:
-            kind = either if (W, H) == turned else stored if size == (W, H) else upright
+            kind = either if turned == (W, H) else stored if size == (W, H) else upright
             kind.add(photo)
     return upright | either if upright and not stored else upright
 

@@ -212,26 +212,11 @@ def copy_photos(
         DatasetError: a mask is neither as large as its photo nor as its photo upright.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    facts, unreadable = list[PhotoFacts](), list[str]()
-    headers = list[tuple[Path, PhotoFacts]]()
-    masks = find_masks(files)
-    for number, path in enumerate(files):
-        try:
-            found = _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")
-            headers.append((path, replace(found, mask=str(masks[path]) if path in masks else "")))
-        except ValueError as error:
-            unreadable.append(f"{path.relative_to(source).as_posix()} ({error})")
-    upright = upright_masks(masks, {path: (photo.W, photo.H, photo.turns) for path, photo in headers})
+    headers, upright, unreadable = _headers(files, source, folder)
+    facts = list[PhotoFacts]()
     largest = max((photo.W * photo.H for _, photo in headers), default=1)
     pool = ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, AT_ONCE // largest)))
-    headers = [
-        (path, replace(photo, mask=str(stored_mask(folder, photo.copy))) if path in upright else photo)
-        for path, photo in headers
-    ]
-    futures = [
-        pool.submit(_copy, path, photo, folder, longest, masks[path] if path in upright else None)
-        for path, photo in headers
-    ]
+    futures = [pool.submit(_copy, path, photo, folder, longest, upright.get(path)) for path, photo in headers]
     try:
         for done, ((_, photo), future) in enumerate(zip(headers, futures, strict=True), 1):
             try:
@@ -250,6 +235,32 @@ def copy_photos(
         if not (target := masked / f"{photo.copy}.png").is_file():
             write_mask(np.ones((1, 1), np.bool_), target, photo.copy_size(longest))
     return facts, unreadable
+
+
+def _headers(
+    files: Sequence[Path], source: Path, folder: Path
+) -> tuple[list[tuple[Path, PhotoFacts]], dict[Path, Path], list[str]]:
+    """Read the headers of photos.
+
+    Returns:
+        The facts of each file that is a photo, the masks that are upright, and names and reasons of the other files.
+
+    Raises:
+        DatasetError: a mask is neither as large as its photo nor as its photo upright.
+    """
+    found, unreadable, masks = list[tuple[Path, PhotoFacts]](), list[str](), find_masks(files)
+    for number, path in enumerate(files):
+        try:
+            photo = _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")
+            found.append((path, replace(photo, mask=str(masks.get(path, "")))))
+        except ValueError as error:
+            unreadable.append(f"{path.relative_to(source).as_posix()} ({error})")
+    turned = upright_masks(masks, {path: (photo.W, photo.H, photo.turns) for path, photo in found})
+    headers = [
+        (path, replace(photo, mask=str(stored_mask(folder, photo.copy))) if path in turned else photo)
+        for path, photo in found
+    ]
+    return headers, {path: masks[path] for path in turned}, unreadable
 
 
 def _facts(path: Path, name: str, copy: str) -> PhotoFacts:
