@@ -14,7 +14,10 @@
 #include <limits>
 #include <utility>
 
+#include "buffers.h"
+#include "dispatch.h"
 #include "frame.h"
+#include "loss.h"
 #include "threads.h"
 
 using namespace gsplat;
@@ -288,11 +291,11 @@ int64_t free_memory() {
     PyObject *found = PyObject_CallNoArgs(free_memory_function);
     const int64_t bytes = found && found != Py_None ? int64_t(PyLong_AsLongLong(found)) : -1;
     Py_XDECREF(found);
-    if (PyErr_Occurred()) {  // not knowing is no reason to end a training
-        PyErr_Clear();
-        return -1;
-    }
-    return bytes;
+    if (!PyErr_Occurred()) return bytes;
+    // Out of memory, or the interpreter is ending: not knowing is no reason to end a training. An interrupt is.
+    if (!PyErr_ExceptionMatches(PyExc_MemoryError) && !PyErr_ExceptionMatches(PyExc_ImportError)) throw nb::python_error();
+    PyErr_Clear();
+    return -1;
 }
 
 }  // namespace

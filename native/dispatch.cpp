@@ -4,7 +4,7 @@
 #include <stdexcept>
 #include <string>
 
-#include "frame.h"
+#include "dispatch.h"
 
 namespace gsplat {
 
