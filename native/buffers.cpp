@@ -23,7 +23,8 @@ class OutOfMemory : public std::bad_alloc {
   public:
     OutOfMemory(size_t bytes, int64_t free) {
         const double gib = 1.0 / double(1 << 30);
-        std::snprintf(text_, sizeof text_, "the renderer needs a block of %.2f GiB, but %.2f GiB are free", double(bytes) * gib, double(free) * gib);
+        std::snprintf(text_, sizeof text_, "the renderer needs a block of %.2f GiB, but %.2f GiB are free", double(bytes) * gib,
+                      double(free) * gib);
     }
     const char *what() const noexcept override { return text_; }
 
@@ -78,8 +79,8 @@ Buffer::~Buffer() {
     std::lock_guard<std::mutex> lock(*spares_lock);
     spares().push_back({data_, capacity_});
     if (spares().size() > MAX_SPARES) {
-        auto smallest = std::min_element(spares().begin(), spares().end(),
-                                         [](const Spare &a, const Spare &b) { return a.capacity < b.capacity; });
+        auto smallest =
+            std::min_element(spares().begin(), spares().end(), [](const Spare &a, const Spare &b) { return a.capacity < b.capacity; });
         std::free(smallest->data);
         spares().erase(smallest);
     }

@@ -23,7 +23,9 @@ class Buffer {
     // grant memory that it does not have.
     void *reserve(size_t bytes);
     template <class T>
-    T *as() const { return static_cast<T *>(data_); }
+    T *as() const {
+        return static_cast<T *>(data_);
+    }
 
   private:
     void *data_ = nullptr;

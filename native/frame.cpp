@@ -41,7 +41,10 @@ void Frame<T>::project(const Scene<T> &scene) {
     Timer timer(seconds_[0]);
     const size_t n = size_t(std::max<int64_t>(n_, 1));
     Buffer block_visible;
-    ProjectArgs<T> args{scene, camera_, settings_, static_cast<Splat<T> *>(splats_.reserve(n * sizeof(Splat<T>))),
+    ProjectArgs<T> args{scene,
+                        camera_,
+                        settings_,
+                        static_cast<Splat<T> *>(splats_.reserve(n * sizeof(Splat<T>))),
                         static_cast<uint32_t *>(visible_.reserve(n * 4)),
                         static_cast<uint32_t *>(block_visible.reserve(size_t(blocks() + 1) * 4))};
     parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project(args, block); });
@@ -64,7 +67,8 @@ template <class T>
 void Frame<T>::intersect() {
     Timer timer(seconds_[2]);
     const int64_t tiles = grid_.tiles();
-    const int64_t chunks = std::clamp<int64_t>(visible_count_ / 512, 1, std::min<int64_t>(16 * int64_t(threads_), 1 + 8 * visible_count_ / tiles));
+    const int64_t chunks =
+        std::clamp<int64_t>(visible_count_ / 512, 1, std::min<int64_t>(16 * int64_t(threads_), 1 + 8 * visible_count_ / tiles));
     Buffer next_buffer;
     auto *next = static_cast<uint32_t *>(next_buffer.reserve(size_t(chunks * tiles) * 4));
     std::memset(next, 0, size_t(chunks * tiles) * 4);
@@ -94,8 +98,15 @@ void Frame<T>::intersect() {
 template <class T>
 void Frame<T>::composite(const Outputs<T> &out) {
     Timer timer(seconds_[3]);
-    CompositeArgs<T> args{splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_,
-                          out.image, out.transmittance, out.depth,
+    CompositeArgs<T> args{splats(),
+                          pairs_.as<Pair>(),
+                          tile_begin_.as<uint32_t>(),
+                          grid_,
+                          camera_,
+                          settings_,
+                          out.image,
+                          out.transmittance,
+                          out.depth,
                           static_cast<uint32_t *>(done_.reserve(size_t(grid_.tiles()) * 4))};
     parallel(threads_, grid_.tiles(), [&](int64_t tile, int) { kernels<T>().composite(args, int32_t(tile)); });
 }
@@ -104,12 +115,13 @@ template <class T>
 void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out,
                         T *background) {
     Buffer slots, tile_background;
-    CompositeBackwardArgs<T> args{
-        {splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, forward.image,
-         forward.transmittance, forward.depth, done_.as<uint32_t>()},
-        in.image, in.transmittance, in.depth,
-        static_cast<T *>(slots.reserve((size_t(pairs_count_) + 1) * SLOT * sizeof(T))),
-        static_cast<T *>(tile_background.reserve(size_t(grid_.tiles()) * 3 * sizeof(T)))};
+    CompositeBackwardArgs<T> args{{splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, forward.image,
+                                   forward.transmittance, forward.depth, done_.as<uint32_t>()},
+                                  in.image,
+                                  in.transmittance,
+                                  in.depth,
+                                  static_cast<T *>(slots.reserve((size_t(pairs_count_) + 1) * SLOT * sizeof(T))),
+                                  static_cast<T *>(tile_background.reserve(size_t(grid_.tiles()) * 3 * sizeof(T)))};
     {
         Timer timer(seconds_[4]);
         parallel(threads_, grid_.tiles(), [&](int64_t tile, int) { kernels<T>().composite_backward(args, int32_t(tile)); });
