@@ -91,7 +91,7 @@ def test_mcmc_is_expected_to_grow_as_it_does():
     shapes |= {"sh_rest": (100, 0, 3), "logit_opacities": (100,)}
     gaussians = Gaussians(**{name: torch.ones(*shape) for name, shape in shapes.items()}).trainable()
     strategy = MCMC(config, torch.Generator().manual_seed(0))
-    optimizer = Adam(gaussians, config.learning_rates)
+    optimizer = Adam(gaussians.tensors(), config.learning_rates)
     counts = []
     for iteration in range(400):
         counts.append(len(gaussians))

@@ -1,6 +1,6 @@
 """Blender's synthetic scenes: transforms_train.json, transforms_val.json and transforms_test.json.
 
-The frames are those of transforms.json. Source: the scenes of Mildenhall et al. 2020, "NeRF".
+The frames are as in transforms.json. Source: the scenes of Mildenhall et al. 2020, "NeRF".
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ TRAIN_FILE = "transforms_train.json"
 
 
 def read_blender(folder: Path) -> Capture:
-    """Read a Blender scene: its training views, and to test with those of test, or of val where there is no test.
+    """Read a Blender scene: its training views, and the test views from test, or from val if there is no test.
 
     Args:
         folder: The folder with transforms_train.json.
