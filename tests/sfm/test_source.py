@@ -34,7 +34,7 @@ def test_a_run_is_no_folder_of_photos(run, tmp_path, capsys, command):
     out = ["--out"] if command == "train" else []
     assert main([command, str(run), *out, str(tmp_path / "out")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "is a run, and its pictures are renders, not photos" in line
+    assert "is a run, whose pictures are renders, not photos" in line
     assert line.endswith("name the capture it was trained on, captures/desk")
     assert not (tmp_path / "out").exists()
 
