@@ -257,7 +257,7 @@ def test_a_run_that_goes_on_keeps_its_poses(tmp_path):
     options = train_options_from(build_parser(["train"]).parse_args(words))
     said = []
     assert _with_poses(options, Console(file=io.StringIO()), said.append).data == found
-    assert len(said) == 1 and "holds the poses that this run began with" in said[0]
+    assert len(said) == 1 and "using the poses that this run started with" in said[0]
 
 
 @pytest.mark.usefixtures("as_shipped", "never")

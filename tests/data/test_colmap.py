@@ -200,7 +200,7 @@ def test_a_model_of_no_images(capture):
 @pytest.mark.parametrize("lost", ["cameras", "images"])
 def test_half_a_model(capture, lost):
     (capture / "sparse" / "0" / f"{lost}.bin").unlink()
-    with pytest.raises(DatasetError, match="not both of cameras and images"):
+    with pytest.raises(DatasetError, match="needs both cameras and images"):
         load_dataset(capture)
 
 

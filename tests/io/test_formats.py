@@ -44,7 +44,7 @@ def test_reading_what_was_written_and_writing_it_again_gives_the_same_scene(tmp_
 def test_what_a_format_leaves_out_is_said(tmp_path):
     scene = random_scene(3)
     assert losses("a.ply", scene) == []
-    assert "up to degree 0; those up to 3 are left out" in losses("a.splat", scene)[0]
+    assert "up to degree 0; degrees up to 3 are dropped" in losses("a.splat", scene)[0]
 
 
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])

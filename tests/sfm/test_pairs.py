@@ -3,9 +3,9 @@ import numpy as np
 from gsplat_edu.sfm.pairs import (
     all_pairs,
     largest_part,
-    photo_descriptors,
     nearest_pairs,
     on_the_ground,
+    photo_descriptors,
     sequential_pairs,
 )
 
