@@ -25,8 +25,8 @@ SVG_FACTS = ("Creator", "Date", "Format", "Type")
 """Metadata that matplotlib writes into an SVG by default (dates and addresses); left out here."""
 
 RUN_CURVES = (
-    ("loss", "training loss", "loss of the iteration's view"),
     ("loss", "training loss", "loss of each iteration's view"),
+    ("psnr", "held-out views", "PSNR of the test views (dB)"),
     ("num_gaussians", "density control", "number of Gaussians"),
     ("ms", "speed", "ms per iteration"),
 )
