@@ -39,7 +39,16 @@ class BackendWarning(UserWarning):
 
 
 class DatasetError(SplatError):
-    """A capture cannot be read; the message names the file, and the line or image where there is one."""
+    """A capture cannot be read; the message names the file, and the line or image where there is one.
+
+    Args:
+        message: One line: what is wrong, where, and what to do next.
+        reason: What is wrong in a few words, for a list in which the file stands already; None for the message.
+    """
+
+    def __init__(self, message: str, reason: str | None = None) -> None:
+        super().__init__(message)
+        self.reason = message if reason is None else reason
 
 
 class SceneFormatError(SplatError):

@@ -53,6 +53,16 @@ def test_a_clean_capture_fits_on_a_screen_and_ends_with_advice(doctor, capture):
     )
 
 
+def test_the_recommended_training_is_the_one_that_was_asked_about(doctor, capture):
+    """A forecast for 800 iterations at half size used to end with the command for 30,000 at full size."""
+    folder, *_ = capture
+    code, said = doctor(folder, "--no-forecast", "--iterations", "800", "--resolution", "2")
+    words = next(line for line in said.splitlines() if "train: " in line).partition("train: ")[2]
+    assert code == 0
+    assert words == f"gsplat-edu train {folder} --iterations 800 --resolution 2 --out out/capture"
+    assert "--iterations 3000" not in said
+
+
 def test_faults_are_named_and_the_exit_code_stays_0(doctor, capture, tmp_path):
     _, views, points, colors = capture
     write_colmap(tmp_path, views, points, colors)

@@ -12,7 +12,7 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO
 
@@ -46,6 +46,35 @@ class OneLineParser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:  # noqa: ANN401
         super().__init__(allow_abbrev=False, **options)
+        self._common: frozenset[str] | None = None
+
+    def show_in_help(self, names: Iterable[str]) -> None:
+        """Make --help show only these options, and add --help-all, which shows every option.
+
+        Args:
+            names: Destinations of the options, for example "max_gaussians".
+        """
+        self.add_argument("--help-all", action=_HelpAll, nargs=0, help="show every option and exit")
+        self._common = frozenset({"help", "help_all", *names})
+
+    def format_help(self) -> str:
+        """Return the text of --help; see `show_in_help`."""
+        common = self._common
+        if common is None:
+            return super().format_help()
+        hidden = [action for action in self._actions if action.option_strings and action.dest not in common]
+        texts = [action.help for action in hidden]
+        for action in hidden:
+            action.help = argparse.SUPPRESS
+        try:
+            return super().format_help()
+        finally:
+            for action, text in zip(hidden, texts, strict=True):
+                action.help = text
+
+    def format_help_all(self) -> str:
+        """Return the text of --help-all: every option."""
+        return super().format_help()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
         """Refuse an unknown option before argparse misses others, and say which one is spelled alike."""
@@ -69,10 +98,21 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(EXIT_BAD_INPUT, printable(f"{self.prog}: {message}{end} see {self.prog} --help") + "\n")
 
 
+class _HelpAll(argparse.Action):
+    """Print the help of every option and exit."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        """Print and exit."""
+        assert isinstance(parser, OneLineParser)
+        print(parser.format_help_all(), end="")
+        parser.exit()
+
+
 def add_backend(parser: argparse._ActionsContainer) -> None:
     """Add the option --backend."""
     names = ", ".join(("auto", *BACKENDS))
-    parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+    text = f"what renders: {names}; auto takes cuda if there is a GPU that passes a comparison with cpu, else cpu (default: auto)"
+    parser.add_argument("--backend", default="auto", metavar="NAME", help=text)
 
 
 def whole_number_text(text: str) -> int:

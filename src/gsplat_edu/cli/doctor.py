@@ -26,7 +26,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.train.config import recipe
+from gsplat_edu.train.config import RECIPE_ITERATIONS, recipe
 
 EXIT_HOPELESS = 1
 """Exit code if training would be pointless."""
@@ -62,16 +62,26 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         task = bar.add_task("photos", total=None)
         survey = prepare(arguments.path, lambda done, total: bar.update(task, completed=done, total=total))
         bar.add_task("comparing", total=None)
-        diagnosis = examine(survey)
+        diagnosis = examine(survey, _forecast_options(arguments))
     if arguments.no_forecast or diagnosis.hopeless:
         return diagnosis, ()
-    from gsplat_edu.doctor.forecast import forecast  # it measures this machine, which takes a moment
+    from gsplat_edu.budget.forecast import forecast  # it measures this machine, which takes a moment
 
     try:
         said = forecast(load_dataset(arguments.path, settings), config, backend=backend).lines()
     except DatasetError as error:
         said = [f"none, because training would fail: {error}"]
     return diagnosis, table_lines(zip(("forecast", *[""] * len(said)), said, strict=False))
+
+
+def _forecast_options(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return the options of the training that is forecast where they are not the defaults."""
+    words: tuple[str, ...] = ()
+    if arguments.iterations != RECIPE_ITERATIONS:
+        words += ("--iterations", str(arguments.iterations))
+    if arguments.resolution is not None:
+        words += ("--resolution", f"{arguments.resolution:g}")
+    return words
 
 
 def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:

@@ -15,15 +15,17 @@ from types import ModuleType
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
+from gsplat_edu.budget.deadline import Deadline, stopwatch
+from gsplat_edu.budget.pace import Pace
+from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.train import options_from
+from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.points import read_points_ply
-from gsplat_edu.doctor.pace import Pace
-from gsplat_edu.doctor.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
@@ -63,15 +65,17 @@ def run(arguments: argparse.Namespace) -> None:
 def _run(
     arguments: argparse.Namespace, console: Console, say: Callable[[str], None], live: ModuleType | None
 ) -> None:
-    chosen = _planned(arguments, console, say)
+    seconds = arguments.time_limit
+    deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
+    chosen = _planned(arguments, deadline, console, say)
     with interruptible() as interrupted, ExitStack() as closing:
         capture = CaptureRun(chosen.options, say)
         if capture.finished:
             return
         callbacks: list[Callback] = []
         ends = interrupted
-        if arguments.time_limit is not None:
-            pace = Pace(capture, arguments.time_limit, extend=chosen.by_time, say=say)
+        if deadline is not None:
+            pace = Pace(capture, deadline, extend=chosen.by_time, say=say)
             callbacks.append(pace)
             ends = functools.partial(_either, interrupted, pace.over)
         view = None
@@ -141,10 +145,12 @@ def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None
     return replace(options, data=found)
 
 
-def _planned(arguments: argparse.Namespace, console: Console, say: Callable[[str], None]) -> Plan:
+def _planned(
+    arguments: argparse.Namespace, deadline: Deadline | None, console: Console, say: Callable[[str], None]
+) -> Plan:
     """Find poses if necessary, and choose the options that the limits leave open."""
     options = _with_poses(options_from(arguments), console, say)
-    limits = Limits(arguments.max_memory, arguments.time_limit)
+    limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
     chosen = plan(options, limits, given, rescale=not arguments.no_rescale)
     for sentence in chosen.sentences:

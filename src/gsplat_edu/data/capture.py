@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.images import PhotoFile, image_size
 from gsplat_edu.data.lens import Lens, undistorted_pinhole
+from gsplat_edu.data.notes import Note
 from gsplat_edu.errors import DatasetError
 
 ROTATION_SLACK = 1e-2
@@ -81,7 +82,7 @@ class Capture:
         layout: "COLMAP", "transforms.json" or "Blender".
         frames: In any order; at least one.
         cloud: The capture's points; None if it has none.
-        notes: Sentences for the user.
+        notes: Facts that the user should know.
         no_cloud: The reason for missing points.
         cube: Half the edge of the cube around the origin that contains the scene, if the layout defines it.
     """
@@ -89,7 +90,7 @@ class Capture:
     layout: str
     frames: tuple[Frame, ...]
     cloud: Cloud | None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     no_cloud: str = "the capture has no points"
     cube: float | None = None
 
@@ -168,13 +169,6 @@ def is_outside(folder: Path, name: str) -> bool:
     return not Path(place).is_relative_to(top)
 
 
-def outside_note(outside: Sequence[Path], folder: Path) -> str:
-    """Say which files are read from elsewhere because the capture says so."""
-    more = f" and {len(outside) - 1} more files" if len(outside) > 1 else ""
-    verb = "lie" if more else "lies"
-    return f"{outside[0]}{more} {verb} outside of {folder}; the capture names {'them' if more else 'it'}"
-
-
 def entries(folder: Path) -> list[Path]:
     """List a folder.
 
@@ -197,11 +191,6 @@ def find_photo(path: Path) -> Path | None:
         return path
     copies = (_copy(path, name) for name in PHOTO_FOLDERS[1:])
     return next((copy for copy in copies if copy is not None), None)
-
-
-def missing_note(missing: Sequence[str], total: int) -> str:
-    """Say how many photos have no file."""
-    return f"{len(missing)} of {total} photos have no file: skipped, first {missing[0]}"
 
 
 def checked_frame(where: str, frame: Frame) -> Frame:
@@ -264,9 +253,8 @@ def photo_file(
     rescaled = size != (frame.lens.W, frame.lens.H)
     lens = _fitted(frame, path, size)
     if frame.mask is not None and (mask_size := size_of(frame.mask)) != size:
-        raise DatasetError(
-            f"{frame.mask}: the mask is {_spelled(mask_size)} but its photo {_spelled(size)}; make them one size"
-        )
+        reason = f"the mask is {_spelled(mask_size)} but its photo {_spelled(size)}"
+        raise DatasetError(f"{frame.mask}: {reason}; make them one size", reason)
     W, H = _target(*size, resolution)
     # A mask has the size of the full photo, so a photo with a mask is always downscaled here.
     smaller = _smaller_copy(path, resolution) if frame.mask is None else None
@@ -277,7 +265,7 @@ def photo_file(
     try:
         pinhole = _resized(undistorted_pinhole(lens), W, H)
     except DatasetError as error:
-        raise DatasetError(f"{frame.name}: {error}") from None
+        raise DatasetError(f"{frame.name}: {error}", error.reason) from None
     camera = Camera(frame.R, frame.eye, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, H, W)
     return PhotoFile(path, frame.mask, lens, W, H, background), camera, rescaled
 
@@ -288,9 +276,10 @@ def _fitted(frame: Frame, path: Path, size: tuple[int, int]) -> Lens:
     # Both sizes may have been rounded by up to a pixel of the smaller one of photo and camera.
     slack = max(1.0, W / lens.W) * (1.0 + lens.H / lens.W)
     if abs(H - lens.H * W / lens.W) > slack:
+        what = f"is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect ratio"
         raise DatasetError(
-            f"{path}: the photo of {frame.name} is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect "
-            "ratio; was the photo cropped or turned after the poses were found?"
+            f"{path}: the photo of {frame.name} {what}; was the photo cropped or turned after the poses were found?",
+            f"the photo {what}",
         )
     return _resized(lens, W, H)
 

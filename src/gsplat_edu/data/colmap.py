@@ -30,11 +30,10 @@ from gsplat_edu.data.capture import (
     is_file,
     is_folder,
     is_outside,
-    missing_note,
-    outside_note,
     unit_colors,
 )
 from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels, UnclearMasks
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.gaussian_math import quat_to_R
 from gsplat_edu.reading import read_bytes, read_text
@@ -139,12 +138,10 @@ def read_colmap(folder: Path, model: Path) -> Capture:
         frame = Frame(name, photos[pose.name], lenses[pose.camera], R, eye, masks.get(pose.name))
         frames.append(checked_frame(where, frame))
     if missing:
-        notes.append(missing_note(missing, len(poses)))
+        notes.append(MissingPhotos(len(missing), len(poses), missing[0]))
     others = [place.name for place in _numbered(model.parent) if place != model]
     if model.name.isdecimal() and others and (model.parent == folder or model.parent.name == "sparse"):
-        notes.append(
-            f"{model.parent} holds {len(others) + 1} models: {model.name} is read, {', '.join(others)} not"
-        )
+        notes.append(OtherModels(model.parent, model.name, tuple(others)))
     return Capture("COLMAP", tuple(frames), read_points(model), tuple(notes))
 
 
@@ -237,7 +234,7 @@ def _photo_folders(folder: Path, model: Path) -> tuple[list[Path], list[Path]]:
 
 def _files(
     folder: Path, model: Path, names: Sequence[str]
-) -> tuple[dict[str, Path], dict[str, Path], list[str]]:
+) -> tuple[dict[str, Path], dict[str, Path], list[Note]]:
     """Find photos and masks by the names of the images, and report unused files.
 
     A file outside the folders of its image's name is used if no other image has the same bare name.
@@ -265,15 +262,12 @@ def _files(
             unclear.append(legible(name))
     _check_single(model, names, photos)
     _check_single(model, names, masks)
-    notes = list[str]()
+    notes = list[Note]()
     outside = [photos[name] for name in names if name in photos and is_outside(folder, name)]
     if outside:
-        notes.append(outside_note(outside, folder))
+        notes.append(FilesOutside(outside[0], len(outside), folder))
     if unclear:
-        notes.append(
-            f"{len(unclear)} of {len(names)} photos have a mask only by a bare name that several share: not used, "
-            f"first {unclear[0]}; put masks into folders as the photos are"
-        )
+        notes.append(UnclearMasks(len(unclear), len(names), unclear[0]))
     return photos, masks, notes
 
 

@@ -27,6 +27,7 @@ from gsplat_edu.data.capture import (
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import ImageStore, PhotoFile, image_size
+from gsplat_edu.data.notes import TwoLayouts
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
@@ -121,7 +122,7 @@ def load_dataset(
     """
     path = Path(path)
     capture = read_capture(path)
-    notes = list(capture.notes)
+    notes = [str(note) for note in capture.notes]
     frames = sorted(capture.frames, key=lambda frame: frame.name)
     frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
     size_of = functools.cache(image_size)
@@ -185,8 +186,7 @@ def read_capture(path: Path) -> Capture:
     model = find_model(path)
     if is_file(path / "transforms.json"):
         capture = read_transforms(path / "transforms.json")
-        note = f"{path} holds transforms.json and a COLMAP model: the poses are those of transforms.json"
-        return capture if model is None else replace(capture, notes=(note, *capture.notes))
+        return capture if model is None else replace(capture, notes=(TwoLayouts(path), *capture.notes))
     if model is not None:
         return read_colmap(path, model)
     places = ", ".join("the folder itself" if place == "." else place for place in PLACES)

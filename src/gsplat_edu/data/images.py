@@ -230,5 +230,5 @@ def _undecodable(path: Path, error: BaseException) -> SplatError:
     if "cannot identify" in reason:
         reason = f"it is not a {SPELLED} image"
     return DatasetError(
-        f"{path}: cannot be decoded ({reason}); replace the file, or take it out of the capture"
+        f"{path}: cannot be decoded ({reason}); replace the file, or take it out of the capture", reason
     )

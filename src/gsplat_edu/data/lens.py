@@ -148,9 +148,11 @@ def undistorted_pinhole(lens: Lens) -> Lens:
         return replace(lens, coefficients=())
     size, coefficients = (lens.W, lens.H), _padded(lens)
     if max(size) >= MAX_REMAPPED:
+        reason = (
+            f"a photo of {lens.W}x{lens.H} px cannot be undistorted here, only sides below {MAX_REMAPPED} px"
+        )
         raise DatasetError(
-            f"a photo of {lens.W}x{lens.H} px cannot be undistorted here, only sides below {MAX_REMAPPED} px; "
-            "undistort it with `colmap image_undistorter`, or make it smaller"
+            f"{reason}; undistort it with `colmap image_undistorter`, or make it smaller", reason
         )
     try:
         if lens.fisheye:
@@ -183,7 +185,8 @@ def _not_a_pinhole(lens: Lens, why: str) -> DatasetError:
     return DatasetError(
         f"distortion {lens.coefficients} at focal length {lens.fx:g} px cannot be undone in a pinhole image: {why}; "
         "check the calibration, or undistort the capture with a tool made for wide lenses, such as "
-        "`colmap image_undistorter`"
+        "`colmap image_undistorter`",
+        why,
     )
 
 

@@ -27,12 +27,11 @@ from gsplat_edu.data.capture import (
     find_photo,
     is_file,
     is_outside,
-    missing_note,
-    outside_note,
 )
 from gsplat_edu.data.colmap import find_model, points_file, read_points
 from gsplat_edu.data.images import image_size
 from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.reading import parse_json, read_text
@@ -79,13 +78,16 @@ def read_transforms(path: Path) -> Capture:
     frames, missing, outside = read_frames(path, contents)
     if not frames:
         raise nothing_found(path, missing)
-    notes = [missing_note(missing, len(frames) + len(missing))] if missing else []
+    notes = list[Note]()
+    if missing:
+        notes.append(MissingPhotos(len(missing), len(frames) + len(missing), missing[0]))
     cloud, no_cloud = _cloud(path, contents)
     if "ply_file_path" in contents and is_outside(
         path.parent, points := _tidy(str(contents["ply_file_path"]))
     ):
         outside.append(path.parent / points)
-    notes += [outside_note(outside, path.parent)] if outside else []
+    if outside:
+        notes.append(FilesOutside(outside[0], len(outside), path.parent))
     return Capture("transforms.json", tuple(frames), cloud, tuple(notes), no_cloud or Capture.no_cloud)
 
 

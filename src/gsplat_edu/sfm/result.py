@@ -83,8 +83,8 @@ def build_capture(
         progress: Told how many photos are undistorted.
 
     Returns:
-        "points", "error" in px of the undistorted photos, "left_out", the names of photos without a pose, and
-        "doubtful", those whose pose did not count.
+        "points", "error" in px of the undistorted photos, "left_out", the names of photos without a pose, "unclear",
+        those of another size whose focal length is unclear, and "doubtful", the others whose pose did not count.
 
     Raises:
         DatasetError: a photo cannot be decoded any more, or COLMAP failed.
@@ -118,10 +118,12 @@ def build_capture(
         scale=move.s,
         photos={entry.photo.copy: entry.entry() for entry in entries},
     )
-    doubtful = set(model["doubtful"]) - placed
+    unclear = set(model["unclear"]) - placed
+    doubtful = set(model["doubtful"]) - placed - unclear
     out = [photo for photo in photos if photo.copy not in placed]
     return facts | {
-        "left_out": [photo.name for photo in out if photo.copy not in doubtful],
+        "left_out": [photo.name for photo in out if photo.copy not in doubtful | unclear],
+        "unclear": [photo.name for photo in out if photo.copy in unclear],
         "doubtful": [photo.name for photo in out if photo.copy in doubtful],
     }
 
