@@ -53,7 +53,7 @@ def test_antialiasing_is_kept_or_said_to_be_lost(tmp_path, suffix, antialiased):
     scene = replace(random_scene(3, 0), antialiased=antialiased)
     write_scene(tmp_path / f"a{suffix}", scene)
     kept = read_scene(tmp_path / f"a{suffix}").antialiased
-    said = [note for note in losses(f"a{suffix}", scene) if "antialiasing" in note]
+    said = [note for note in losses(f"a{suffix}", scene) if "antialiased" in note]
     assert len(said) == (0 if bool(kept) == antialiased else 1)
 
 
