@@ -77,7 +77,7 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
             no curve.
 
     Returns:
-        The figure; None where there is nothing to draw.
+        The figure; None if there is nothing to draw.
     """
     curves = []
     for key, title, label in RUN_CURVES:
