@@ -24,6 +24,7 @@ if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: to
 
 import slices
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
+from slices import pytest_collection_modifyitems, pytest_report_header, pytest_runtest_makereport  # noqa: F401
 
 # Whatever was started in the background of a shell ignores Ctrl-C, and so would every program that is tested.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -32,33 +33,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=100)
 settings.register_profile("soak", deadline=None, max_examples=5_000, print_blob=True)
 settings.load_profile("soak" if slices.SOAK else "repeatable")
-
-FIRST = ()
-"""Files that take longest. A file stays in one process, so the long ones start while there are others left to share."""
-
-
-def pytest_report_header() -> str:
-    """Say which slice of the long tests runs."""
-    return "sliced tests: every case" if slices.SOAK else f"sliced tests: GSPLAT_EDU_SLICE={slices.SEED}"
-
-
-@pytest.hookimpl(trylast=True)  # after -k and -m
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the cases that this slice has not, and put the longest files first."""
-    kept, left_out = (list(items), []) if slices.SOAK else slices.split(items, slices.SEED)
-    if left_out:
-        config.hook.pytest_deselected(items=left_out)
-    ranks = {name: i for i, name in enumerate(FIRST)}
-    items[:] = sorted(kept, key=lambda item: ranks.get(item.nodeid.partition("::")[0], len(FIRST)))
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
-    """Say below the failure of a sliced test how the same slice is drawn again."""
-    report = yield
-    if report.failed and item.get_closest_marker("sliced") and not slices.SOAK:
-        report.sections.append(("slice", slices.HOW_TO_REPEAT))
-    return report
 
 
 @pytest.fixture
