@@ -3,7 +3,7 @@
 BIN := .venv/bin
 OUT ?= out/sphere.png
 # Processes that run the tests. Each test file stays in one process, so that its fixtures are made once; the longest
-# files start first (tests/conftest.py), so that no process is left with a long one at the end.
+# files start first (tests/slices.py), so that no process is left with a long one at the end.
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 BENCH := $(if $(SMOKE),--smoke)
@@ -12,14 +12,14 @@ export PYTHON
 .PHONY: help demo test soak check sanitize bench notebooks site clean
 
 help:
-	@echo "make demo        train the sphere on the embedded scene; writes $(OUT), curves and scene"
-	@echo "make test        all tests; of the long ones the slice that the commit draws"
-	@echo "make soak        every case of the long tests, large fuzzing runs, chapters on the full budget: hours"
-	@echo "make check       lint, format, types, layering and the house's limits"
-	@echo "make sanitize    native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
-	@echo "make bench       measure; prints tables and writes out/bench/*.json (SMOKE=1: only see that it runs)"
+	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
+	@echo "make test        run all tests; of the sliced ones, the cases that the commit draws"
+	@echo "make soak        run every case of the sliced tests, large fuzzing runs and the full chapters: hours"
+	@echo "make check       lint, format, types, import layers and size limits"
+	@echo "make sanitize    run the native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
+	@echo "make bench       benchmarks; prints tables and writes out/bench/*.json (SMOKE=1: only check that they run)"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
-	@echo "make site        chapters, documents and reference as pages, out/site/index.html"
+	@echo "make site        build the site: chapters, documents and reference, out/site/index.html"
 	@echo "make clean       remove .venv, out and caches"
 
 demo:

@@ -3,8 +3,8 @@
     python tests/training_bits.py --record
 
 writes the hashes of every instruction set that this machine can run into tests/golden/training_bits.json. A change of
-the trainer that is meant to keep the numbers must keep the hashes; one that changes them records them again, in a commit
-that says why.
+the trainer that is meant to keep the numbers must keep the hashes; one that changes them records them again, and its
+commit says why.
 """
 
 import argparse
@@ -119,8 +119,8 @@ def compiler() -> str:
 def arithmetic() -> str:
     """Name what a training's bits depend on besides our own code: a new name is another machine, not a mistake.
 
-    The libraries' exponentials, roots, products of matrices and generators differ from one CPU to another. Their results
-    are part of the name, so a CPU that computes as a known one does is known too.
+    The libraries' exponentials, roots, products of matrices and generators differ from one CPU to another. Their
+    results are part of the name, so a CPU that computes as a known one does is known too.
     """
     probe, rng = hashlib.sha256(), np.random.default_rng(0)
     numbers = rng.normal(size=4099)

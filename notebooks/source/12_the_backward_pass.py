@@ -312,7 +312,7 @@ for key, theirs in grads["dense"].items():
 start = random_ball(5000, torch.Generator().manual_seed(6)).trainable()
 before, slope = start.means.detach().numpy().astype(float), rng.normal(size=(5000, 3))
 start.means.grad = torch.tensor(slope, dtype=torch.float32)
-Adam(start, {"means": 0.01}).step(start)
+Adam(start.tensors(), {"means": 0.01}).step(start.tensors())
 m, v = 0.1 * slope / (1 - 0.9), 0.001 * slope**2 / (1 - 0.999)  # both moments, freed of their start at zero
 error = np.abs(start.means.detach().numpy() - (before - 0.01 * m / (np.sqrt(v) + 1e-8))).max()
 print(f"Adam's first step: worst difference {error:.1e}")

@@ -98,7 +98,7 @@ def test_a_datasets_cameras_a_size_and_a_background_can_be_asked_for(made, cli, 
 def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, capsys):
     bare = made[2]
     assert cli(["render", str(bare), "--frames", "2", "--size", "40", "--out", "frames"]) == 0
-    assert "does not say from where it was photographed: a full circle" in capsys.readouterr().out
+    assert "has no cameras: using a full circle" in capsys.readouterr().out
     image = pixels(tmp_path / "frames" / "frame_0001.png").astype(int).sum(axis=2)
     assert image.shape == (40, 40) and image[15:25, 15:25].min() > 0
     assert cli(["render", str(bare), "--frames", "2", "--size", "40"]) == 0
@@ -108,9 +108,9 @@ def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, ca
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["gone"], "gone: is not there; give the folder of a run, or a scene file"),
-        (["."], "is no run (it has no config.json)"),
-        (["BARE", "--dataset"], "--dataset: a scene file comes without cameras"),
+        (["gone"], "gone: does not exist; give a run folder or a scene file"),
+        (["."], "is not a run (config.json is missing)"),
+        (["BARE", "--dataset"], "--dataset: a scene file has no cameras"),
         (["BARE", "--frames", "0"], "--frames: is 0"),
         (["BARE", "--size", "0"], "--size: is 0"),
         (["BARE", "--fps", "-1"], "--fps: is -1"),
