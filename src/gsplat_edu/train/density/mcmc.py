@@ -37,10 +37,10 @@ NOISE_THRESHOLD = 0.005
 
 
 class MCMC:
-    """Relocate the dead, grow up to the cap, add noise, regularise.
+    """Relocate the dead, grow up to the cap, add noise; `gsplat_edu.train.objective` has its regularisers.
 
     Args:
-        config: Window, growth, noise and weights; `max_gaussians` has to be set.
+        config: Window, growth and noise; `max_gaussians` has to be set.
         generator: Source of the places and of the noise.
 
     Raises:
@@ -52,17 +52,8 @@ class MCMC:
             raise ArgumentError("max_gaussians: mcmc grows up to a cap and needs one, for example 200000")
         self.config, self.generator, self.cap = config, generator, config.max_gaussians
 
-    @torch.no_grad()
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
-        """Add the gradients of the regularisers: weight_o mean(opacity) + weight_s mean(scale)."""
-        config, opacities, scales = self.config, gaussians.opacities, gaussians.scales
-        pulls = (
-            (gaussians.logit_opacities, config.mcmc_opacity_weight * opacities * (1 - opacities)),
-            (gaussians.log_scales, config.mcmc_scale_weight * scales),
-        )
-        for parameter, pull in pulls:
-            if parameter.grad is not None and parameter.numel():
-                parameter.grad += pull / parameter.numel()
+        """Do nothing: neither relocation nor growth asks for what the renders show."""
 
     @torch.no_grad()
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
