@@ -10,13 +10,13 @@ export PYTHON
 .PHONY: help demo test check sanitize bench notebooks site clean
 
 help:
-	@echo "make demo        train the sphere on the embedded scene; writes $(OUT), curves and scene"
-	@echo "make test        all tests"
-	@echo "make check       lint, format, types, layering and the house's limits"
-	@echo "make sanitize    native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
-	@echo "make bench       measure; prints tables and writes out/bench/*.json (SMOKE=1: only see that it runs)"
+	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
+	@echo "make test        run all tests"
+	@echo "make check       lint, format, types, import layers and size limits"
+	@echo "make sanitize    run the native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
+	@echo "make bench       benchmarks; prints tables and writes out/bench/*.json (SMOKE=1: only check that they run)"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
-	@echo "make site        chapters, documents and reference as pages, out/site/index.html"
+	@echo "make site        build the site: chapters, documents and reference, out/site/index.html"
 	@echo "make clean       remove .venv, out and caches"
 
 demo:

@@ -126,7 +126,7 @@ def test_an_empty_video_is_one_line(tmp_path, capsys):
         ("photos", "is where the photos themselves are"),
         (".", "is where the photos themselves are"),
         ("posed", "holds photos or poses already"),
-        ("photos/0.jpg", "0.jpg is a file; name a folder"),
+        ("photos/0.jpg", "0.jpg is a file; give a folder"),
     ],
 )
 @pytest.mark.usefixtures("colmap", "as_shipped")
@@ -213,7 +213,7 @@ def test_ctrl_c_says_that_it_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gsplat_edu.sfm.reconstruct.copy_photos", press)
     before = signal.getsignal(signal.SIGTERM)
     assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 130
-    assert "the same command resumes after the last finished stage" in capsys.readouterr().err
+    assert "the same command resumes after the last completed stage" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGTERM) is before
 
 
@@ -243,7 +243,7 @@ def test_a_finished_run_is_asked_for_before_its_capture_is_replaced(tmp_path, ca
     (tmp_path / "run" / "config.json").write_text("{}")
     assert main(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run")]) != 0
     said = capsys.readouterr().err
-    assert "holds a run already; add --resume" in said and said.count("\n") == 1
+    assert "already holds a run; add --resume" in said and said.count("\n") == 1
 
 
 @pytest.mark.usefixtures("never")

@@ -57,7 +57,7 @@ def test_the_other_strategies_and_colours():
 
 def test_every_field_of_the_recipe_has_an_option(capsys):
     with pytest.raises(SystemExit):
-        main(["train", "--help"])
+        main(["train", "--help-all"])
     said = capsys.readouterr().out
     for field in dataclasses.fields(TrainConfig):
         assert f"--{field.name.replace('_', '-')}" in said, field.name

@@ -99,7 +99,7 @@ def test_one_photo_is_trained_on(tmp_path, small):
     dataset = load_dataset(tmp_path)
     assert len(dataset.train) == 1 and dataset.test == ()
     assert any("one photo" in note for note in dataset.notes)
-    assert any("no points: 100,000 random ones" in note for note in dataset.notes)
+    assert any("no points: starting from 100,000 random points" in note for note in dataset.notes)
     assert np.isfinite(dataset.points).all()
     with pytest.raises(DatasetError, match="to train on"):
         load_dataset(tmp_path, DataSettings(test_every=8))
@@ -289,9 +289,9 @@ def test_ready_made_sizes_are_the_photos_where_there_are_no_others(written, reso
 
 @pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + ".json", "a\0b"])
 def test_names_that_nothing_can_have(tmp_path, name):
-    with pytest.raises(DatasetError, match="is no folder and no"):
+    with pytest.raises(DatasetError, match="is neither a folder nor"):
         load_dataset(tmp_path / name)
-    with pytest.raises(DatasetError, match="name a point cloud"):
+    with pytest.raises(DatasetError, match="give a point cloud"):
         read_points_ply(tmp_path / name)
 
 

@@ -218,7 +218,7 @@ def test_large_photos_are_photos(tmp_path, name, limit, monkeypatch):
 
 def test_an_absurd_size_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("gsplat_edu.image_files.MAX_PIXELS", 100)
-    with pytest.raises(DatasetError, match=r"a\.png: .*16x12 px are more than a photo has"):
+    with pytest.raises(DatasetError, match=r"a\.png: .*16x12 px is too large for a photo"):
         image_size(saved(tmp_path, Image.fromarray(NOISE)))
 
 

@@ -220,12 +220,12 @@ def edited(path, change):
     ("change", "says"),
     [
         (lambda d: d["nodes"][0].update(rotation=[1, 0, 0, 0]), "a node's transform"),
-        (lambda d: d["accessors"][1].update(componentType=5121), "other numbers than float32"),
-        (lambda d: d["accessors"][1].update(count=10**15), "beyond its end"),
-        (lambda d: d["accessors"][1].update(count=7.0), "beyond its end"),
+        (lambda d: d["accessors"][1].update(componentType=5121), "not float32"),
+        (lambda d: d["accessors"][1].update(count=10**15), "beyond the file's end"),
+        (lambda d: d["accessors"][1].update(count=7.0), "beyond the file's end"),
         (lambda d: d["accessors"][1].update(count=4), "different numbers of splats"),
-        (lambda d: d["bufferViews"][1].update(byteStride=32), "interleaves"),
-        (lambda d: d["bufferViews"][1].update(byteOffset=-4), "beyond its end"),
+        (lambda d: d["bufferViews"][1].update(byteStride=32), "interleaved"),
+        (lambda d: d["bufferViews"][1].update(byteOffset=-4), "beyond the file's end"),
         (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SCALE"), "without KHR"),
         (
             lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SH_DEGREE_0_COEF_0"),

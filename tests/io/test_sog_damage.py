@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.io import sog
+from gsplat_edu.io.sog import codec as sog
 from scene_files import random_scene
 
 COUNT = 40
@@ -136,7 +136,7 @@ def test_bombs_do_not_go_off(tmp_path, contents):
 
     messages = []
     assert peak_of(said, path) < 16 << 20
-    assert "says it holds 314,572,800 bytes in a file of" in messages[0]
+    assert "claims to hold 314,572,800 bytes in a file of" in messages[0]
 
     path.write_bytes(bomb.replace((300 << 20).to_bytes(4, "little"), (100).to_bytes(4, "little")))
     assert peak_of(said, path) < 16 << 20
@@ -226,7 +226,7 @@ NUMBERS = ["scales.codebook", "sh0.codebook", "shN.codebook", "means.mins", "mea
             (_set("count", value), "number from 0 to 67108864 in count")
             for value in (-1, 1.5, True, None, 2**26 + 1, 10**99)
         ),
-        (_set("count", 2**26), "says it holds 6,174,015,488 bytes in a file of"),
+        (_set("count", 2**26), "claims to hold 6,174,015,488 bytes in a file of"),
         (_set("count", COUNT * 10), "has 8x8 pixels for 400 splats"),
         (_set("shN.count", 0), "number from 1 to 65536 in shN.count"),
         (_set("shN.count", 65537), "number from 1 to 65536 in shN.count"),
@@ -275,7 +275,7 @@ def test_names_that_lead_elsewhere_are_refused(tmp_path, contents, name):
         (b"\xff\xfe\x00", "is no JSON"),
         (b'{"count": NaN}', "is no JSON (NaN is no number of JSON)"),
         (b'{"count": -Infinity}', "is no JSON (-Infinity is no number of JSON)"),
-        (b'{"a":' * 200_000, "is no JSON (nested too deep)"),
+        (b'{"a":' * 200_000, "is no JSON (nested too deeply)"),
         (b"9" * 5000, "is no JSON"),
         (b"[]", "has no object"),
         (b"{}", "is SOG of no version"),

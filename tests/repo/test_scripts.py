@@ -22,6 +22,7 @@ TRAININGS = {
 }
 
 ELSEWHERE = {
+    "build_cli_reference.py": "tests/repo/test_cli_reference.py",
     "build_notebooks.py": "tests/repo/test_notebooks.py",
     "build_site.py": "tests/repo/test_site.py",
     "chapter_figures.py": "tests/repo/test_notebooks.py",

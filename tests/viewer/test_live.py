@@ -192,7 +192,7 @@ def trained(out, capture, *words, watch=None):
             watch(made)
         made.ended()
         tensors, numbers = made.run.trainer.state()
-        made.run.finish(lambda split, score: made.view.look("judging"))
+        made.run.finish(lambda split, score: made.view.update("evaluating"))
     scene = out / "point_cloud" / "iteration_400" / "point_cloud.ply"
     bits = {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
     return bits, repr(numbers), scene.read_bytes()
@@ -391,7 +391,7 @@ def test_the_camera_list_and_the_way_back(capture, tmp_path):
             ahead = np.subtract(client.moved["SetCameraLookAtMessage"]["look_at"], position)
             np.testing.assert_allclose(ahead / np.linalg.norm(ahead), camera.R[2], atol=1e-6)
         client.moved.clear()
-        client.press("Back to the start")
+        client.press("Reset view")
         until(lambda: "SetCameraPositionMessage" in client.listened().moved, "the start")
         start = dataset.train[0].camera
         np.testing.assert_allclose(client.moved["SetCameraPositionMessage"]["position"], start.eye, atol=1e-6)
@@ -429,11 +429,11 @@ def test_everything_is_closed_after_an_error(capture, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--view-port", "8080"], "--view-port: is looked at with --view only"),
-        (["--view-host", "0.0.0.0"], "--view-host: is looked at with --view only"),
+        (["--view-port", "8080"], "--view-port: has an effect only with --view"),
+        (["--view-host", "0.0.0.0"], "--view-host: has an effect only with --view"),
         (
             ["--view", "--view-port", "TAKEN"],
-            "--view-port: TAKEN is taken on 127.0.0.1; give another, or 0 for",
+            "--view-port: TAKEN is in use on 127.0.0.1; choose another port, or 0 for",
         ),
         (
             ["--view", "--view-port", "70000"],
@@ -441,11 +441,11 @@ def test_everything_is_closed_after_an_error(capture, tmp_path):
         ),
         (
             ["--view", "--view-port", "0", "--view-host", "no such host"],
-            "--view-host: 'no such host' is no address",
+            "--view-host: 'no such host' is not an address",
         ),
         (
             ["--view", "--view-port", "0", "--view-host", "203.0.113.1"],
-            "--view-host: cannot listen at 203.0.113.1",
+            "--view-host: cannot listen on 203.0.113.1",
         ),
     ],
 )

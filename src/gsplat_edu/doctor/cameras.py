@@ -186,10 +186,11 @@ def check_away(survey: Survey) -> list[Finding]:
         )
         found.append(Finding("look away", Severity.WARNING, what, advice, names))
     if doubtful:
-        names = tuple(f"{survey.names[i]} ({why})" for i, why in sorted(doubtful.items()))
+        order = sorted(doubtful)
+        names, reasons = tuple(survey.names[i] for i in order), tuple(doubtful[i] for i in order)
         what = f"{len(names)} of {len(survey.shots)} cameras have poses with little support"
         advice = "take out the cameras with doubtful poses: a wrong pose spoils the scene for all others"
-        found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names))
+        found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons))
     return found
 
 

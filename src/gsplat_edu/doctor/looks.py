@@ -20,6 +20,9 @@ from gsplat_edu.doctor.geometry import inside
 from gsplat_edu.doctor.photos import COARSE, WORK_SIDE
 from gsplat_edu.doctor.survey import Shot, Survey
 
+EXPOSURE = "exposure"
+"""Name of findings about brightness, before and after training."""
+
 ENOUGH = 3
 """Neighbours from which a photo is compared with them; with fewer, with all photos."""
 
@@ -209,15 +212,15 @@ def check_exposure(survey: Survey) -> list[Finding]:
     light, tint = gains.light, gains.tint
     found = []
     if len(jumping := [i for i in np.argsort(-np.abs(light)) if abs(light[i]) > unsure * JUMP]):
-        names = tuple(f"{survey.names[i]} ({light[i]:+.1f})" for i in jumping)
+        names = tuple(survey.names[i] for i in jumping)
+        stops = tuple(f"{light[i]:+.1f}" for i in jumping)
         what = f"{len(names)} of {len(light)} photos, in stops against neighbours that see the same"
-        first = survey.names[jumping[0]]
-        advice = f"look at {first}: did the exposure jump, or your shadow fall on the scene? fix it or leave it out"
-        found.append(Finding("exposure", Severity.WARNING, what, advice, names))
+        advice = f"look at {names[0]}: did the exposure jump, or your shadow fall on the scene? fix it or leave it out"
+        found.append(Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops))
     elif (share := gains.differing(unsure * JUMP)) > DIFFERING:
         what = f"{100 * share:.0f} % of neighbours differ by more than {unsure * JUMP:.1f} stops: photos in a row"
         advice = "fix the exposure while you take photos: part of them is brighter than the rest"
-        found.append(Finding("exposure", Severity.WARNING, what, advice))
+        found.append(Finding(EXPOSURE, Severity.WARNING, what, advice))
     if len(tinted := [i for i in np.argsort(-tint) if tint[i] > unsure * TINT]):
         names = tuple(survey.names[i] for i in tinted)
         what = f"{len(names)} of {len(tint)} photos, against neighbours that see the same"

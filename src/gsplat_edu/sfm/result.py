@@ -17,8 +17,8 @@ from PIL import Image
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.colmap import read_cameras, read_images, read_points
-from gsplat_edu.data.images import AT_ONCE, PhotoFile, develop
-from gsplat_edu.data.lens import Lens, straightened
+from gsplat_edu.data.images import AT_ONCE, PhotoFile, load_photo
+from gsplat_edu.data.lens import Lens, undistorted_pinhole
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussian_math import quat_to_R
@@ -83,8 +83,8 @@ def build_capture(
         progress: Told how many photos are undistorted.
 
     Returns:
-        "points", "error" in px of the undistorted photos, "left_out", the names of photos without a pose, and
-        "doubtful", those whose pose did not count.
+        "points", "error" in px of the undistorted photos, "left_out", the names of photos without a pose, "unclear",
+        those of another size whose focal length is unclear, and "doubtful", the others whose pose did not count.
 
     Raises:
         DatasetError: a photo cannot be decoded any more, or COLMAP failed.
@@ -99,7 +99,7 @@ def build_capture(
     for photo, name in zip(chosen, output_names(chosen), strict=True):
         pose = poses[photo.copy]
         lens = lenses[pose.camera].resized(photo.W, photo.H)
-        pinhole = turned(straightened(lens), photo.turns)
+        pinhole = turned(undistorted_pinhole(lens), photo.turns)
         entries.append(Undistorted(photo, name, lens, pinhole))
         R = quat_to_R(pose.quat)
         cameras.append(_camera(pinhole, np.linalg.matrix_power(QUARTER, photo.turns) @ R, -R.T @ pose.shift))
@@ -118,10 +118,12 @@ def build_capture(
         scale=move.s,
         photos={entry.photo.copy: entry.entry() for entry in entries},
     )
-    doubtful = set(model["doubtful"]) - placed
+    unclear = set(model["unclear"]) - placed
+    doubtful = set(model["doubtful"]) - placed - unclear
     out = [photo for photo in photos if photo.copy not in placed]
     return facts | {
-        "left_out": [photo.name for photo in out if photo.copy not in doubtful],
+        "left_out": [photo.name for photo in out if photo.copy not in doubtful | unclear],
+        "unclear": [photo.name for photo in out if photo.copy in unclear],
         "doubtful": [photo.name for photo in out if photo.copy in doubtful],
     }
 
@@ -255,7 +257,7 @@ def _write_photos(
 def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
     lens = entry.lens
     counts = Path(entry.photo.mask) if entry.photo.mask else None
-    photo = develop(PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None))
+    photo = load_photo(PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None))
     pixels = np.asarray(photo.image)
     if photo.alpha is not None:
         pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)

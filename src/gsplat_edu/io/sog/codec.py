@@ -3,8 +3,8 @@
 A .sog is a zip of a meta.json and WebP images, and the same files may lie in a folder, named by its meta.json. Every
 image but one has a pixel for each splat: the low and the high bytes of positions, rotations, scales, colours with
 opacities, labels of harmonics. Scales and colours are bytes that choose from codebooks of 256 numbers; labels choose
-from a palette of up to 65,536 sets of harmonics, which is an image of its own. `gsplat_edu.io.sog_values` has the
-positions and rotations, `gsplat_edu.io.sog_palette` the codebooks and the palette.
+from a palette of up to 65,536 sets of harmonics, which is an image of its own. `gsplat_edu.io.sog.values` has the
+positions and rotations, `gsplat_edu.io.sog.palette` the codebooks and the palette.
 
 Written splats stand in another order: along a Morton curve, so that neighbours in an image are neighbours in the scene
 and the images become small. Opacities are rounded to 1/255. A rotation keeps 8 bits a component; the one that turns
@@ -32,12 +32,12 @@ from jaxtyping import Float32, UInt8
 
 from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io import sog_files as files
 from gsplat_edu.io.quantize import byte_to_logit, check_expansion, logit_to_byte
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.io.sog_meta import MOST_SPLATS, SHN, Harmonics, Meta, from_json, to_json
-from gsplat_edu.io.sog_palette import MOST_ENTRIES, codebook, nearest_in_codebook, palette
-from gsplat_edu.io.sog_values import (
+from gsplat_edu.io.sog import files
+from gsplat_edu.io.sog.meta import MOST_SPLATS, SHN, Harmonics, Meta, from_json, to_json
+from gsplat_edu.io.sog.palette import MOST_ENTRIES, codebook, nearest_in_codebook, palette
+from gsplat_edu.io.sog.values import (
     FIRST_TAG,
     morton_order,
     pixels_to_quats,

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.io.sog_palette import CODEBOOK, MOST_ENTRIES
-from gsplat_edu.io.sog_values import LARGEST_LOG, Range
+from gsplat_edu.io.sog.palette import CODEBOOK, MOST_ENTRIES
+from gsplat_edu.io.sog.values import LARGEST_LOG, Range
 from gsplat_edu.reading import parse_json
 
 VERSION = 2
