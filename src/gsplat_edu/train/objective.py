@@ -101,8 +101,8 @@ def make_objective(config: TrainConfig) -> Objective:
     """
     terms: dict[str, Term] = {PHOTO: PhotoTerm(config.ssim_weight)}
     if config.strategy == "mcmc":
-        terms["opacity"] = MeanOpacity(config.mcmc_opacity_weight)
-        terms["scale"] = MeanScale(config.mcmc_scale_weight)
+        terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
+        terms["scale"] = MeanScale(config.mcmc.scale_weight)
     return Objective(terms)
 
 

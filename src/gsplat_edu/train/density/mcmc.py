@@ -59,7 +59,7 @@ class MCMC:
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Relocate and grow where the schedule has it; add noise after every step."""
         config, events = self.config, list[Change]()
-        due = config.densify_start < iteration < config.mcmc_stop and iteration % config.densify_every == 0
+        due = config.densify_start < iteration < config.mcmc.stop and iteration % config.densify_every == 0
         if due and len(gaussians):
             dead = (gaussians.opacities <= config.min_opacity) | ~gaussians.finite_rows()
             num_relocated = self._relocate(gaussians, optimizer, torch.nonzero(dead)[:, 0])
@@ -83,7 +83,7 @@ class MCMC:
 
     def _grow(self, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, int]:
         count = len(gaussians)
-        num_added = max(min(self.cap, int(self.config.mcmc_growth * count)) - count, 0)
+        num_added = max(min(self.cap, int(self.config.mcmc.growth * count)) - count, 0)
         if not num_added:
             return gaussians, 0
         weights = torch.where(gaussians.finite_rows(), gaussians.opacities.double(), 0.0)
@@ -126,7 +126,7 @@ class MCMC:
         R, scales = unchecked_rotations(gaussians.quats.detach()), gaussians.scales
         wander = (R @ (scales.square() * (R.mT @ draw[..., None])[..., 0])[..., None])[..., 0]
         gate = torch.sigmoid(NOISE_SHARPNESS * (NOISE_THRESHOLD - gaussians.opacities))
-        means += (rate * self.config.mcmc_noise) * gate[:, None] * wander
+        means += (rate * self.config.mcmc.noise) * gate[:, None] * wander
 
     def state(self) -> State:
         """Return the generator."""
