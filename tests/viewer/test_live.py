@@ -22,7 +22,7 @@ from gsplat_edu import quat_to_R
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.errors import ArgumentError, NotEnoughMemoryError
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.train.checkpoint import list_checkpoints
@@ -121,6 +121,25 @@ def test_while_the_camera_moves_pictures_are_smaller(capture, tmp_path):
         assert widths == [(32, 48, 3), (80, 120, 3)], "0.4 of the width first"
         time.sleep(2 * live.STILL_EVERY)
         assert len(client.listened().pictures) == 2, "paused and at rest, there is nothing to draw"
+
+
+def test_the_panel_says_why_a_picture_is_missing(capture, tmp_path, monkeypatch):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
+        client.move()
+        client.press("Pause")
+        client.paused_at()
+        right = made.view._render
+
+        def fail(gaussians, camera):
+            raise NotEnoughMemoryError("an image of 120x80 px: needs 9.0 GiB of memory, but 1.0 GiB are free")
+
+        monkeypatch.setattr(made.view, "_render", fail)
+        client.move(position=(0.0, 0.1, -4.0))
+        client.says("`not drawn: an image of 120x80 px: needs 9.0 GiB of memory, but 1.0 GiB are free`")
+        monkeypatch.setattr(made.view, "_render", right)
+        client.move(position=(0.0, 0.2, -4.0))
+        until(lambda: "not drawn" not in client.listened().text, "a panel without the failure")
+        assert "**paused**" in client.text
 
 
 def test_pause_step_and_resume(capture, tmp_path):
