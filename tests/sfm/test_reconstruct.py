@@ -1,9 +1,11 @@
+import itertools
 import json
 import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import asdict, replace
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -42,14 +44,30 @@ def test_every_photo_gets_its_pose(done):
 
 
 def test_photos_are_upright_and_undistorted(done):
+    """A photo shows what it showed, where it showed it: in no quarter moved by a pixel.
+
+    The cameras have no distortion, so all that undistortion may move is the bend of the lens that was found, and
+    photos explain that lens to less than a pixel. What moves by d px keeps a correlation of exp(-d²/4s²) with itself
+    even in a texture without any structure, once it is blurred by s px: 0.94 at d = 1 and s = 2.
+    """
     for view in load_dataset(done.out, DataSettings(test_every=0)).train:
-        taken = photograph_box(done.truth[view.name]).astype(float)
-        written = view.read().image.astype(float)
+        taken, written = (
+            cv2.GaussianBlur(image.astype(np.float32).mean(axis=2), (0, 0), 2)
+            for image in (photograph_box(done.truth[view.name]), view.read().image)
+        )
+        H, W = taken.shape
         assert written.shape == taken.shape
-        # The lens that was found bends the photo by less than two pixels: apart from that it is the one taken.
-        inner = (slice(20, -20), slice(20, -20))
-        small = [image[inner][::8, ::8].mean(axis=2).ravel() for image in (taken, written)]
-        assert np.corrcoef(*small)[0, 1] > 0.5, view.name
+        for quarter in itertools.product(
+            (slice(20, H // 2), slice(H // 2, -20)), (slice(20, W // 2), slice(W // 2, -20))
+        ):
+            shift, _ = cv2.phaseCorrelate(
+                np.ascontiguousarray(taken[quarter]), np.ascontiguousarray(written[quarter])
+            )
+            assert np.hypot(*shift) < 1, (view.name, quarter)
+            assert np.corrcoef(taken[quarter].ravel(), written[quarter].ravel())[0, 1] > 0.94, (
+                view.name,
+                quarter,
+            )
 
 
 def test_points_lie_on_the_box_and_the_floor(done):

@@ -111,7 +111,7 @@ class _HelpAll(argparse.Action):
 def add_backend(parser: argparse._ActionsContainer) -> None:
     """Add the option --backend."""
     names = ", ".join(("auto", *BACKENDS))
-    text = f"what renders: {names}; auto takes cuda if there is a GPU that passes a comparison with cpu, else cpu (default: auto)"
+    text = f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu (default: auto)"
     parser.add_argument("--backend", default="auto", metavar="NAME", help=text)
 
 

@@ -24,7 +24,7 @@ COMMANDS = {
     "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",
     "info": "summarise a capture, a run or a scene file on one screen",
 }
-"""Commands and their summaries. Each has a module `gsplat_edu.cli.NAME` with `run`, and one in `gsplat_edu.cli.options`."""
+"""Commands and their summaries. Each has a module in `gsplat_edu.cli`, with `run`, and one in `cli.options`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.camera import Camera, point_nearest_axes
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.paths import PARALLEL, common_up
+from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.io.edit import Similarity
 
 DISTANCE = 5.0
@@ -51,7 +51,7 @@ def upright(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) -> Si
     ahead = ahead / np.linalg.norm(ahead)
     R = np.stack([np.cross(down, ahead), down, ahead])
     depth = _depth(cameras, points)
-    centre = point_nearest_axes(cameras, PARALLEL)
+    centre = point_nearest_axes(cameras)
     if centre is not None:
         before = np.sum((centre - eyes) * forwards, axis=1) > 0
         distance = float(np.median(np.linalg.norm(eyes - centre, axis=1)))

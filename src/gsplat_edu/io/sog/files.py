@@ -21,7 +21,7 @@ from PIL import Image
 
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import named_failure, written_aside
-from gsplat_edu.image_files import opened_image
+from gsplat_edu.image_files import UNDECODABLE, opened_image
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.ply_table import LFS_POINTER
 from gsplat_edu.reading import read_bytes
@@ -53,16 +53,6 @@ _UNZIPPABLE = (
     OSError,
     ValueError,
     OverflowError,
-)
-
-_UNDECODABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    RuntimeError,
-    OverflowError,
-    struct.error,
 )
 
 
@@ -265,6 +255,6 @@ def decode(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
     try:
         with opened_image(data, formats=["WEBP"]) as image:
             pixels: UInt8[np.ndarray, "H W 4"] = np.asarray(image.convert("RGBA"))
-    except _UNDECODABLE:
+    except UNDECODABLE:
         raise SceneFormatError(f"{path}: {name} is a damaged WebP image; get the file again") from None
     return pixels
