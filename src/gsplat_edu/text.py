@@ -1,4 +1,4 @@
-"""Text that quotes names from files: how it is shown on a terminal, written to a file, and turned into a file name.
+"""Text for people: short numbers, and names from files on a terminal, in a file, and as a file name.
 
 A name on Linux is bytes, and the text of a JSON file may hold halves of a surrogate pair. Python keeps a byte that it
 could not decode as a lone surrogate (PEP 383). No encoding takes these, so a report could fail on its title.
@@ -15,8 +15,22 @@ _SURROGATES = re.compile("[\ud800-\udfff]")
 _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
 """Characters that move the cursor, change colours, break a line or reverse the direction of text."""
 
+MOST_SPELLED = 1e12
+"""From this on `short_number` uses an exponent."""
+
 RAW_BYTES = 0xDC80, 0xDCFF
 """Lone surrogates that stand for the bytes 0x80 to 0xFF."""
+
+
+def short_number(value: float, digits: int) -> str:
+    """Write a number with a few significant digits; a large one with all digits of its whole part, not 1e+03.
+
+    Args:
+        value: The number.
+        digits: Significant digits.
+    """
+    text = f"{value:.{digits}g}"
+    return f"{value:,.0f}" if "e+" in text and abs(value) < MOST_SPELLED else text
 
 
 def legible(text: str) -> str:

@@ -1,7 +1,7 @@
 import numpy as np
 from matplotlib.image import imread
 
-from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
+from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, run_curves_figure, save_figure
 
 
 def test_panels_show_the_images_given_clipped(tmp_path):
@@ -30,3 +30,18 @@ def test_curves_are_labelled_and_hold_the_numbers():
     for axes in (loss, count):
         assert axes.get_title() and axes.get_xlabel() and axes.get_ylabel()
     assert loss.get_yscale() == "log"
+
+
+def test_the_curves_of_a_run_share_their_iterations_and_survive_a_busy_moment():
+    """One evaluation at iteration 5,000 stood on an axis from 4,800 to 5,200; one pause flattened all speeds."""
+    log = [{"iteration": 50 * i, "loss": 1.0 / i, "ms": 20.0 + i % 3} for i in range(1, 101)]
+    log[40]["ms"] = 6000.0
+    log.append({"iteration": 5000, "psnr": 30.0})
+    loss, psnr, speed, _ = run_curves_figure(log).axes
+    assert loss.get_xlim() == psnr.get_xlim() == speed.get_xlim()
+    assert psnr.get_xlim()[0] == 0 and 5000 < psnr.get_xlim()[1] < 5200
+    assert speed.get_ylim() == (0, 44) and "up to 6,000 ms are cut off" in speed.get_title()
+    (even,) = [
+        a for a in run_curves_figure([{"iteration": i, "ms": 20.0 + i % 3} for i in (1, 2)]).axes if a.lines
+    ]
+    assert even.get_title() == "speed" and even.get_ylim()[1] > 22

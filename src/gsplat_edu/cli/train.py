@@ -87,7 +87,7 @@ def _run(
         if interrupted():
             raise KeyboardInterrupt(
                 f"interrupted after {capture.trainer.iteration} iterations;"
-                " the same command with --resume goes on from there"
+                " the same command with --resume continues from there"
             )
         with _bar(console, "") as bar:
             task = bar.add_task("judging", total=len(capture.dataset.test) + len(capture.dataset.train))

@@ -200,7 +200,7 @@ def _length(run: Trained) -> list[Finding]:
 def _fit(run: Trained) -> list[Finding]:
     if not run.train or _mean(run.train) >= POOR:
         return []
-    what = f"the views of training have {_mean(run.train):.1f} dB in the mean: not even they are explained"
+    what = f"the training views reach only {_mean(run.train):.1f} dB in the mean: the scene does not explain even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
     advice = f"check poses and intrinsics{place}"
     return [Finding("poor fit", Severity.WARNING, what, advice)]
@@ -212,7 +212,7 @@ def _outliers(run: Trained) -> list[Finding]:
         return []
     low.sort(key=lambda view: view.psnr)
     names = tuple(f"{view.name} ({view.psnr:.1f} dB)" for view in low)
-    what = f"{len(low)} of {len(run.train) + len(run.test)} photos, far from what the scene shows"
+    what = f"{len(low)} of {len(run.train) + len(run.test)} photos differ widely from what the scene shows"
     advice = (
         f"look at {low[0].name} beside its render: blurred, badly posed, in shadow? then train without it"
     )
@@ -236,8 +236,10 @@ def _gap(run: Trained) -> list[Finding]:
     gap = _mean(run.train) - _mean(run.test)
     if gap < OVERFITTED:
         return []
-    what = f"test views are {gap:.1f} dB below those of training: the scene knows its {len(run.train)} photos by heart"
-    advice = "take more photos, from between those there are; with these, stop earlier or cap --max-gaussians"
+    what = f"test views are {gap:.1f} dB below the training views: the scene has memorised its {len(run.train)} photos"
+    advice = (
+        "take more photos between the existing ones; with these, stop earlier or set a lower --max-gaussians"
+    )
     return [Finding("overfitted", Severity.WARNING, what, advice)]
 
 
@@ -266,7 +268,7 @@ def _floaters(run: Trained) -> list[Finding]:
     if not veiled:
         return []
     names = tuple(f"{view.name} ({100 * view.veiled:.0f} %)" for view in veiled)
-    what = f"{counted(len(veiled), 'view')} through splats that hang close to the camera"
+    what = f"{counted(len(veiled), 'view')} with splats that hang close to the camera"
     advice = "start from real points, not random ones, and leave out exposure jumps; convert --crop cuts away the rest"
     return [Finding("floaters", Severity.WARNING, what, advice, names)]
 

@@ -10,6 +10,7 @@ from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.doctor.costs import Facts, Footprint, Measurements, expected_counts
 from gsplat_edu.doctor.probe import probe
 from gsplat_edu.runs.training import RunOptions
+from gsplat_edu.text import short_number
 from gsplat_edu.train.config import TrainConfig
 
 SAVING = 4e8
@@ -60,7 +61,7 @@ class Forecast:
     def lines(self) -> list[str]:
         """Say it: time, memory, and how sure that is."""
         parts = ", ".join(f"{name} {spelled_seconds(s)}" for name, s in self.seconds.items() if s >= 0.5)
-        first, last = (f"{1e3 * s:.3g}" for s in self.steps)
+        first, last = (short_number(1e3 * s, 3) for s in self.steps)
         grown = " to ".join(f"{count:,}" for count in dict.fromkeys(self.gaussians))
         held = ", ".join(f"{name} {spelled_bytes(size)}" for name, size in self.memory.items())
         return [

@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -20,6 +21,10 @@ DPI = 150
 
 CURVE_POINTS = 400
 """Points of a curve of a report; of a longer one the means of equal stretches are drawn."""
+
+MOST_SHOWN, SHOWN_QUANTILE = 2.0, 0.95
+"""The curve of the speed is cut off at twice its 95 % quantile: a computer that was busy or asleep for a moment would
+flatten the rest."""
 
 SVG_FACTS = ("Creator", "Date", "Format", "Type")
 """What matplotlib says of a drawing unless told not to: dates and addresses."""
@@ -86,6 +91,7 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
             curves.append((key, title, label, _thinned(np.array(pairs, dtype=np.float64))))
     if not curves:
         return None
+    last = max(float(points[-1, 0]) for *_, points in curves)
     rows = math.ceil(len(curves) / 2)
     figure = Figure(figsize=(10, 2.9 * rows), layout="constrained")
     grid = figure.subplots(rows, 2, squeeze=False).ravel()
@@ -95,11 +101,23 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
         axes.grid(alpha=0.3)
         if key == "loss" and points[:, 1].min() > 0:
             axes.set_yscale("log")
+        axes.set_xlim(
+            0.0, 1.03 * last if last > 0 else 1.0
+        )  # the same for all: one evaluation has a place too
         if key in ("num_gaussians", "ms"):
             axes.set_ylim(0, None)
+        if key == "ms":
+            _cut_peaks(axes, title, points[:, 1])
     for axes in grid[len(curves) :]:
         axes.axis("off")
     return figure
+
+
+def _cut_peaks(axes: Axes, title: str, values: Float[np.ndarray, " Q"]) -> None:
+    """Cut off moments that were far slower than the rest, and say how slow they were."""
+    top, peak = MOST_SHOWN * float(np.quantile(values, SHOWN_QUANTILE)), float(values.max())
+    if 0.0 < top < peak:
+        axes.set(ylim=(0.0, top), title=f"{title} (peaks of up to {peak:,.0f} ms are cut off)")
 
 
 def svg_element(figure: Figure) -> str:
