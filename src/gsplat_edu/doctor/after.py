@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, command, counted, new_run
+from gsplat_edu.doctor.forecast import spelled_seconds
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.gaussians import Gaussians
@@ -152,7 +153,17 @@ def _train_longer(run: Trained) -> str:
     name = f"{run.path.resolve().name}_{RECIPE_ITERATIONS}"
     length = ("--iterations", str(RECIPE_ITERATIONS))
     words = command("train", run.capture, *length, *run.options, "--out", new_run(name))
-    return f"train for longer: {words}"
+    return f"train for longer{_at_its_pace(run)}: {words}"
+
+
+def _at_its_pace(run: Trained) -> str:
+    """Say what the recipe's length takes if an iteration takes what the last ones took: on a slow computer, hours."""
+    late = [ms for iteration, ms in _pairs(run.log, "ms", run.reached) if iteration > 0.75 * run.reached]
+    if not late:
+        return ""
+    return (
+        f" ({spelled_seconds(1e-3 * RECIPE_ITERATIONS * float(np.median(late)))} or more at this run's pace)"
+    )
 
 
 def view_lines(run: Trained) -> list[str]:
