@@ -274,7 +274,7 @@ def check_coverage(survey: Survey) -> list[Finding]:
                 "one side",
                 Severity.NOTE,
                 what,
-                "look at the scene from where the cameras stood: its back is empty",
+                "take photos of the other side as well, if it is to be seen: without them the scene is empty there",
             )
         ]
     found = []
