@@ -14,6 +14,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from gsplat_edu.files import written_aside
 
@@ -74,7 +75,7 @@ def curves_figure(losses: Sequence[float], counts: Sequence[int]) -> Figure:
     return figure
 
 
-def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
+def run_curve_figures(log: Sequence[Mapping[str, Any]]) -> list[Figure]:
     """Plot a run's log: loss, PSNR of evaluations, number of Gaussians, ms per iteration.
 
     Args:
@@ -82,35 +83,40 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
             no curve.
 
     Returns:
-        The figure; None where there is nothing to draw.
+        One figure for each curve; they share the range of iterations.
     """
     curves = []
     for key, title, label in RUN_CURVES:
         pairs = [(line["iteration"], line[key]) for line in log if _drawable(line, key)]
         if pairs:
             curves.append((key, title, label, _thinned(np.array(pairs, dtype=np.float64))))
-    if not curves:
-        return None
-    last = max(float(points[-1, 0]) for *_, points in curves)
-    rows = math.ceil(len(curves) / 2)
-    figure = Figure(figsize=(10, 2.9 * rows), layout="constrained")
-    grid = figure.subplots(rows, 2, squeeze=False).ravel()
-    for axes, (key, title, label, points) in zip(grid, curves, strict=False):
+    last = max((float(points[-1, 0]) for *_, points in curves), default=0.0)
+    figures = []
+    for key, title, label, points in curves:
+        figure = Figure(figsize=(5, 2.9), layout="constrained")
+        axes = figure.subplots()
         axes.plot(*points.T, linewidth=1.0, marker="o" if len(points) < 40 else "", markersize=3)
         axes.set(title=title, xlabel="iteration", ylabel=label)
+        axes.set_xlim(0.0, 1.03 * last if last > 0 else 1.0)
         axes.grid(alpha=0.3)
         if key == "loss" and points[:, 1].min() > 0:
-            axes.set_yscale("log")
-        axes.set_xlim(
-            0.0, 1.03 * last if last > 0 else 1.0
-        )  # the same for all: one evaluation has a place too
+            _decades(axes, points[:, 1])
         if key in ("num_gaussians", "ms"):
             axes.set_ylim(0, None)
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         if key == "ms":
             _cut_peaks(axes, title, points[:, 1])
-    for axes in grid[len(curves) :]:
-        axes.axis("off")
-    return figure
+        figures.append(figure)
+    return figures
+
+
+def _decades(axes: Axes, values: Float[np.ndarray, " Q"]) -> None:
+    """Make the vertical axis logarithmic, with a few plain numbers: 0.2, not 2 x 10^-1."""
+    axes.set_yscale("log")
+    wide = values.max() > 10 * values.min()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 3) if wide else (1, 1.5, 2, 3, 5, 7)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _cut_peaks(axes: Axes, title: str, values: Float[np.ndarray, " Q"]) -> None:
@@ -120,10 +126,15 @@ def _cut_peaks(axes: Axes, title: str, values: Float[np.ndarray, " Q"]) -> None:
         axes.set(ylim=(0.0, top), title=f"{title} (peaks of up to {peak:,.0f} ms are cut off)")
 
 
-def svg_element(figure: Figure) -> str:
-    """Return a figure as an <svg> element to stand in a page, the same to the byte for the same figure."""
+def svg_element(figure: Figure, name: str = "figure") -> str:
+    """Return a figure as an <svg> element to stand in a page, the same to the byte for the same figure.
+
+    Args:
+        figure: The figure.
+        name: Goes into the ids of its parts, which have to differ from those of another figure on the page.
+    """
     text = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": "gsplat_edu", "svg.fonttype": "path"}):
+    with mpl.rc_context({"svg.hashsalt": f"gsplat_edu {name}", "svg.fonttype": "path"}):
         FigureCanvasAgg(figure).figure.savefig(text, format="svg", metadata=dict.fromkeys(SVG_FACTS))
     drawing = text.getvalue()
     return drawing[drawing.index("<svg") :]  # without the XML and DOCTYPE lines, which a page has of its own
