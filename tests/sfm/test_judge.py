@@ -110,3 +110,26 @@ print(max(abs(mended.image(i).projection_center() - truth[i]).max() for i in tru
     assert set(json.loads(broken)) >= {5, 9}
     assert after == "{} set() 14"
     assert float(off) < 0.2, "a fifth of what the nearer one was moved by"
+
+
+def test_focal_lengths_that_are_all_over_the_place(work):
+    """Of ten photos with a camera each: nine tenths and one tenth within a factor of two, or not."""
+    script = """
+from engine.judge import scattered
+
+def spread(factors):
+    made = pycolmap.Reconstruction()
+    for number, factor in enumerate(factors, 1):
+        size = 320 * (1 + number % 2)  # shares of the longer side are compared
+        lens = pycolmap.Camera(
+            model="SIMPLE_RADIAL", width=size, height=240, params=[factor * size, size / 2, 120, 0], camera_id=number
+        )
+        made.add_camera_with_trivial_rig(lens)
+        image = pycolmap.Image(name=str(number), keypoints=np.zeros((0, 2)), camera_id=number, image_id=number)
+        made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    return scattered(made)
+
+print(spread([1.1] * 21), spread([1.0] * 19 + [0.2, 6.0]))  # two odd ones of 21 are no scatter
+print(spread([1.0] * 10 + [1.95] * 11), spread([1.0] * 10 + [2.05] * 11))  # one zoom, or two
+"""
+    assert printed(work + script) == ["False False", "False True"]

@@ -79,3 +79,28 @@ def test_the_centre_is_freed_where_it_is_off():
     lens, fx, fy, cx, cy = found
     assert lens == "OPENCV, free centre"
     assert (fx, fy, cx, cy) == pytest.approx((815, 815, 560, 350), abs=8)
+
+
+def test_a_lens_that_photos_were_placed_with_is_given_up_and_judged():
+    """As the mapper leaves a free lens: fx, fy and the distortion fit what noise there is."""
+    script = """
+def free(model, params):
+    for number in list(model.cameras):
+        model.camera(number).model = pycolmap.CameraModelId.OPENCV
+        model.camera(number).params = params
+    lenses.adjust(model, 1)
+    lenses.simplified(model, "SIMPLE_RADIAL", 1)
+    refined, names = lenses.refined(model, True, 1)
+    (number,) = names
+    camera = refined.camera(number)
+    print(json.dumps([names[number], camera.focal_length_x, camera.focal_length_y, list(camera.params[-4:])]))
+
+free(scene("SIMPLE_RADIAL", [815, 500, 375, 0.02], 12), [845, 859, 516, 370, 0.05, -0.1, 0.01, -0.01])
+crooked = [815, 815, 500, 375, -0.2, 0.12, 0.02, -0.03]
+free(scene("OPENCV", crooked, 20, points=500, noise=0.1), [*crooked[:4], -0.19, 0.1, 0.01, -0.02])
+"""
+    plain, crooked = outcome(script)
+    assert plain[0] == "SIMPLE_RADIAL" and plain[1] == plain[2] == pytest.approx(815, rel=0.01)
+    assert crooked[0].startswith("OPENCV") and crooked[1:3] == pytest.approx([815, 815], rel=0.01)
+    k1, _, p1, p2 = crooked[3]  # the second coefficient shows in the corners alone
+    assert (k1, p1, p2) == pytest.approx((-0.2, 0.02, -0.03), abs=0.02)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+from gsplat_edu.data.notes import MissingPhotos
 from gsplat_edu.doctor.cameras import (
     check_away,
     check_coverage,
@@ -16,7 +17,7 @@ from gsplat_edu.doctor.cameras import (
     check_sizes,
 )
 from gsplat_edu.doctor.cloud import check_cloud
-from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable, is_missing
+from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
 from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.looks import check_blur, check_exposure, check_twins
 from gsplat_edu.doctor.survey import Survey
@@ -79,7 +80,8 @@ def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
     facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
     if len(survey.shots) > 1:
         facts.append(("cameras", _stand(survey)))
-    return (*facts, *(("", note) for note in survey.notes if not is_missing(note)))
+    # `check_missing` reports the photos that have no file
+    return (*facts, *(("", str(note)) for note in survey.notes if not isinstance(note, MissingPhotos)))
 
 
 def _stand(survey: Survey) -> str:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from gsplat_edu.data.colmap import read_cameras, read_images
-from gsplat_edu.data.lens import straightened
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call
 from gsplat_edu.sfm.source import FEWEST
@@ -21,9 +20,15 @@ ENOUGH = 0.8
 MANY_PHOTOS = 400
 """Photos beyond which the global mapper comes first: the incremental one's time grows with their square."""
 
-ENOUGH_FOR_OPENCV = 10
-"""Photos of each camera from which a way is tried that maps with OPENCV's lens from the beginning: the simple lens of
-the other ways cannot follow a strong wide angle."""
+ENOUGH_FOR_FREE = 20
+"""Photos of each camera from which placing them with a freer lens is tried: from so many on, held-out photos judge what
+of it stays (`gsplat_edu.sfm.engine.lenses.WITNESSES`)."""
+
+MAIN = 0.5
+"""Share of the photos that are of one size from which the others follow those (`gsplat_edu.sfm.engine.kin`)."""
+
+OWN = 10
+"""Photos of one size from which their focal length is their own matter."""
 
 SAME = 0.5
 """Share of the connected photos from which two ways that agree are believed."""
@@ -31,9 +36,9 @@ SAME = 0.5
 NEARLY = 0.97
 """Models whose worth is at least this share of the best one's are compared by their points as well."""
 
-FREEDOM = 1.25
-"""How many times as many photos a model with a camera per photo has to hold as the others: so many focal lengths fit
-wrong poses, too."""
+PER_PHOTO = 6 / 8
+"""Worth of a photo with a camera of its own: its points have to fix eight numbers, the pose, a focal length and a
+coefficient of distortion, instead of six."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +48,21 @@ class Attempt:
     Args:
         mapper: "incremental" (Schönberger and Frahm 2016) or "global" (Pan et al. 2024, GLOMAP).
         model: COLMAP's camera model.
+        free: Photos are placed with a freer lens than they are begun with otherwise.
         per_photo: Every photo has a camera of its own.
         loose: Lower thresholds.
     """
 
     mapper: str
     model: str
+    free: bool = False
     per_photo: bool = False
     loose: bool = False
 
     def __str__(self) -> str:
         """Say what it does."""
         words = [f"{self.mapper} mapper"] + [self.model] * (self.model != "auto")
+        words += ["a freer lens at first"] * self.free
         words += ["a camera per photo"] * self.per_photo + ["lower thresholds"] * self.loose
         return ", ".join(words)
 
@@ -66,24 +74,61 @@ def attempts(mapper: str, model: str, photos: int, cameras: int, one_lens: bool)
         mapper: What the user asked for, or "auto".
         model: What the user asked for, or "auto".
         photos: How many there are.
-        cameras: By how many cameras, as far as EXIF and sizes tell.
+        cameras: How many cameras they are mapped with.
         one_lens: They are known to be of one camera, as the frames of a video are.
     """
     order = ["incremental", "global"] if photos <= MANY_PHOTOS else ["global", "incremental"]
     order = order if mapper == "auto" else [mapper]
     ways = [Attempt(name, model) for name in order]
     steady = "incremental" if mapper == "auto" else mapper
-    if model == "auto" and photos >= ENOUGH_FOR_OPENCV * cameras:
-        ways.append(Attempt(steady, "OPENCV"))
+    if model == "auto" and photos >= ENOUGH_FOR_FREE * cameras:
+        ways.append(Attempt(steady, model, free=True))
     ways.append(Attempt(steady, model, loose=True))
     if not one_lens and cameras < photos:
         ways.append(Attempt(steady, model, per_photo=True, loose=True))
     return ways
 
 
+def shared_cameras(groups: Sequence[Mapping[str, Any]]) -> dict[int, int]:
+    """Find cameras of several sizes that are mapped as one: photos scaled, each to another size.
+
+    A camera of one or two photos fixes its focal length badly, and if most photos are of such cameras, there is no main
+    one to compare with. Photos of the same kind, by EXIF, and of the same aspect then share a camera. Photos of one
+    camera that were cropped, each to another aspect, still have one each.
+
+    Args:
+        groups: Of photos that share a size: "names", "width" and "height", px, and their "kind" by EXIF.
+
+    Returns:
+        The number of the camera that replaces another one, from 1 in the order of the groups. Empty where most photos
+        are of one size.
+    """
+    total = sum(len(group["names"]) for group in groups)
+    if max((len(group["names"]) for group in groups), default=0) >= MAIN * total:
+        return {}
+    few = [number for number, group in enumerate(groups, 1) if len(group["names"]) < OWN]
+    few.sort(key=lambda number: (-groups[number - 1]["width"], number))  # scaled to the largest
+    shared, leaders = dict[int, int](), list[int]()
+    for number in few:
+        group = groups[number - 1]
+        alike = (other for other in leaders if _scaled(groups[other - 1], group))
+        if (leader := next(alike, None)) is None:
+            leaders.append(number)
+        else:
+            shared[number] = leader
+    return shared
+
+
+def _scaled(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Say whether photos may be of one camera, scaled: each side is off by half a pixel of rounding at most."""
+    W, H, w, h = one["width"], one["height"], other["width"], other["height"]
+    return bool(one["kind"] == other["kind"] and abs(W * h - H * w) <= 0.5 * (W + H + w + h))
+
+
 def map_photos(
     folder: Path,
     ways: Sequence[Attempt],
+    shared: Mapping[int, int],
     total: int,
     connected: int,
     threads: int,
@@ -95,6 +140,7 @@ def map_photos(
     Args:
         folder: Holds database.db and photos/; models/ is made anew.
         ways: In this order.
+        shared: Cameras that are replaced by a camera of the same aspect, by their numbers.
         total: How many photos there are.
         connected: How many of them hang together by matches.
         threads: For COLMAP.
@@ -103,8 +149,8 @@ def map_photos(
 
     Returns:
         The model: its "folder" below `folder`, the "names" of the photos whose pose counts, "doubtful", those with a
-        pose that does not, "points", "error" in px, and the "way" that gave it; the rest is as the job "mapping"
-        returns it.
+        pose that does not, "unclear", those of them whose focal length is why, "points", "error" in px, and the "way"
+        that gave it; the rest is as the job "mapping" returns it.
 
     Raises:
         DatasetError: no way gives enough photos a pose to be a model, or the last one failed and none gave any.
@@ -117,7 +163,7 @@ def map_photos(
         out.mkdir(parents=True)
         try:
             made = _mapped(
-                folder, out, way, threads, lambda done: progress("mapping", min(done, total), total)
+                folder, out, way, shared, threads, lambda done: progress("mapping", min(done, total), total)
             )
         except DatasetError as error:
             if number == len(ways) and not found:
@@ -154,23 +200,22 @@ def best_model(models: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Choose a model.
 
     The worth of a model is the number of photos whose pose counts, times the share of all their matches that agree with
-    their poses. Of models of nearly equal worth, those with the most points that three photos see are taken, and of
-    these the one with the smallest reprojection error. Models with a camera per photo are passed over unless they hold
-    many more photos.
+    their poses, times `PER_PHOTO` if every photo has a camera of its own. Of models of nearly equal worth, those with
+    the most points that three photos see are taken, and of these the one with the smallest reprojection error; one with
+    a camera per photo last.
 
     Args:
         models: At least one, as the job "mapping" returns them, and whether they have a camera "per_photo".
     """
-    shared = [model for model in models if not model["per_photo"]]
-    most = max((len(model["names"]) for model in shared), default=0)
-    models = shared + [
-        model for model in models if model["per_photo"] and len(model["names"]) >= FREEDOM * most
+    worth = [
+        len(model["names"]) * model["agreement"] * (PER_PHOTO if model["per_photo"] else 1.0)
+        for model in models
     ]
-    worth = [len(model["names"]) * model["agreement"] for model in models]
     good = [model for model, w in zip(models, worth, strict=True) if w >= NEARLY * max(worth)]
     most = max(model["steady"] for model in good)
     return min(
-        (model for model in good if model["steady"] >= NEARLY * most), key=lambda model: model["error"]
+        (model for model in good if model["steady"] >= NEARLY * most),
+        key=lambda model: (model["per_photo"], model["error"]),
     )
 
 
@@ -185,7 +230,12 @@ def _without_poses(total: int, connected: int) -> str:
 
 
 def _mapped(
-    folder: Path, out: Path, way: Attempt, threads: int, progress: Callable[[int], None]
+    folder: Path,
+    out: Path,
+    way: Attempt,
+    shared: Mapping[int, int],
+    threads: int,
+    progress: Callable[[int], None],
 ) -> list[dict[str, Any]]:
     """Map in one way, and return the models."""
     found = call(
@@ -196,6 +246,7 @@ def _mapped(
         photos=str(folder / "photos"),
         out=str(out),
         attempt=asdict(way),
+        shared=dict(shared),
         threads=threads,
         seed=COLMAP_SEED,
     )["models"]
@@ -215,7 +266,7 @@ def _usable(out: Path, model: dict[str, Any]) -> dict[str, Any]:
     folder, good = out / model["folder"], dict[int, bool]()
     for number, lens in read_cameras(folder / "cameras.bin").items():
         try:
-            straightened(lens)
+            lens.undistorted()
             good[number] = True
         except DatasetError:
             good[number] = False

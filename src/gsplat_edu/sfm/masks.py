@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
-from gsplat_edu.data.capture import is_file
+from gsplat_edu.data.capture import PHOTO_ENDINGS, entries, is_file, is_folder
 from gsplat_edu.data.images import decode_mask, image_size
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
@@ -45,20 +45,52 @@ def find_masks(files: Sequence[Path]) -> dict[Path, Path]:
     return found
 
 
-def check_masks(masks: Mapping[Path, Path], sizes: Mapping[Path, tuple[int, int]]) -> None:
-    """Check that masks are as large as their photos.
+def unused_folders(files: Sequence[Path], masks: Mapping[Path, Path]) -> list[Path]:
+    """List the folders masks/ inside the photos' folder and next to it that hold images, none of them a photo's mask.
+
+    Args:
+        files: The photos.
+        masks: As `find_masks` returns them.
+    """
+    used = {mask.parent for mask in masks.values()}
+    folders = {folder for path in files[:1] for folder in _folders(path)}
+    return [
+        folder
+        for folder in sorted(folders - used)
+        if is_folder(folder) and any(path.suffix.lower() in PHOTO_ENDINGS for path in entries(folder))
+    ]
+
+
+def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, int, int]]) -> set[Path]:
+    """Find the photos whose masks are upright, not as the photo's pixels are stored; check the sizes of all.
+
+    Sizes tell, unless the photo is square or upside down. Then the other masks decide; if they do not tell either, the
+    mask is taken as stored, which is COLMAP's convention.
 
     Args:
         masks: As `find_masks` returns them.
-        sizes: Widths and heights of the photos, px; photos that are not in it are passed over.
+        shapes: Width, height and quarter turns clockwise to upright of the photos; photos that are not in it are passed
+            over.
 
     Raises:
-        DatasetError: one is not, or is no image.
+        DatasetError: a mask is neither as large as its photo nor as its photo upright, or is no image.
     """
+    stored, upright, either = set[Path](), set[Path](), set[Path]()
     for photo, mask in masks.items():
-        if photo in sizes and (size := image_size(mask)) != sizes[photo]:
-            (w, h), (W, H) = size, sizes[photo]
-            raise DatasetError(f"{mask}: the mask is {w}x{h} but its photo {W}x{H}; make them one size")
+        if photo not in shapes:
+            continue
+        W, H, turns = shapes[photo]
+        size, turned = image_size(mask), ((H, W) if turns % 2 else (W, H))
+        if size not in ((W, H), turned):
+            also = f" ({H}x{W} upright)" if turns % 2 else ""
+            raise DatasetError(
+                f"{mask}: the mask is {size[0]}x{size[1]} but its photo {W}x{H}{also}; make them one size, or move the "
+                "mask away"
+            )
+        if turns:
+            kind = either if turned == (W, H) else stored if size == (W, H) else upright
+            kind.add(photo)
+    return upright | either if upright and not stored else upright
 
 
 def counting(mask: Path | None, alpha: UInt8[np.ndarray, "H W"] | None) -> Bool[np.ndarray, "H W"] | None:
@@ -77,8 +109,23 @@ def counting(mask: Path | None, alpha: UInt8[np.ndarray, "H W"] | None) -> Bool[
     return counts
 
 
+def turn_mask(mask: Path, turns: int, target: Path) -> None:
+    """Write a mask that is upright as its photo's pixels are stored.
+
+    Args:
+        mask: The file.
+        turns: Quarter turns clockwise that bring the photo upright.
+        target: The file to write.
+
+    Raises:
+        DatasetError: the mask cannot be decoded.
+    """
+    counts = np.ascontiguousarray(np.rot90(decode_mask(mask), turns))
+    write_mask(counts, target, (counts.shape[1], counts.shape[0]))
+
+
 def write_mask(counts: Bool[np.ndarray, "H W"], target: Path, size: tuple[int, int]) -> None:
-    """Write a mask for COLMAP.
+    """Write a mask.
 
     Args:
         counts: Where features are looked for.
@@ -92,9 +139,11 @@ def write_mask(counts: Bool[np.ndarray, "H W"], target: Path, size: tuple[int, i
 
 
 def _places(photo: Path, names: Sequence[str]) -> Iterator[Path]:
-    for name in names:
-        yield photo.with_name(name + MASK_ENDING)
-    for folder in (photo.parent / "masks", photo.parent.with_name("masks") if photo.parent.name else None):
-        for name in names if folder is not None else ():
-            assert folder is not None
-            yield folder / f"{name}.png"
+    yield from (photo.with_name(name + MASK_ENDING) for name in names)
+    yield from (folder / f"{name}.png" for folder in _folders(photo) for name in names)
+
+
+def _folders(photo: Path) -> list[Path]:
+    """List where masks of photos lie, besides the photos' own folder: inside it, and next to it."""
+    beside = [photo.parent.with_name("masks")] if photo.parent.name not in ("", "masks") else []
+    return [photo.parent / "masks", *beside]

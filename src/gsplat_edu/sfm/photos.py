@@ -20,7 +20,7 @@ from gsplat_edu.data.images import AT_ONCE, decode
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.image_files import SPELLED, UNDECODABLE, is_image, opened_image
-from gsplat_edu.sfm.masks import MASK_ENDING, check_masks, counting, find_masks, write_mask
+from gsplat_edu.sfm.masks import MASK_ENDING, counting, find_masks, turn_mask, upright_masks, write_mask
 from gsplat_edu.views import Photo
 
 PASSED_OVER = frozenset(("masks", *PHOTO_FOLDERS[1:]))
@@ -55,7 +55,7 @@ class PhotoFacts:
         focal: Focal length by EXIF, px; None where it does not say.
         camera: Equal for photos that one camera took with one lens and zoom.
         place: Latitude and longitude in degrees and height in m by EXIF; None where it does not say.
-        mask: File of its mask; empty where it has none.
+        mask: File of its mask, turned as the photo is stored; empty where it has none.
     """
 
     name: str
@@ -194,7 +194,8 @@ def copy_photos(
     """Write a working copy of every photo that can be decoded. Copies that are there already are kept.
 
     Copies have names without spaces, which COLMAP's lists of pairs need, and are RGB in 8 bits: pycolmap reads fewer
-    kinds of files than Pillow. A photo with a mask or with transparent parts gets a mask beside them, masks/COPY.png.
+    kinds of files than Pillow. A photo with a mask or with transparent parts gets a mask beside them, masks/COPY.png; a
+    mask that is upright where the photo is stored turned is written again, turned back, to masks/stored/COPY.png.
 
     Args:
         files: The photos.
@@ -208,22 +209,14 @@ def copy_photos(
         unreadable: Of the others: name and reason.
 
     Raises:
-        DatasetError: a mask is not as large as its photo.
+        DatasetError: a mask is neither as large as its photo nor as its photo upright.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    facts, unreadable = list[PhotoFacts](), list[str]()
-    headers = list[tuple[Path, PhotoFacts]]()
-    masks = find_masks(files)
-    for number, path in enumerate(files):
-        try:
-            found = _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")
-            headers.append((path, replace(found, mask=str(masks[path]) if path in masks else "")))
-        except ValueError as error:
-            unreadable.append(f"{path.relative_to(source).as_posix()} ({error})")
-    check_masks(masks, {path: (photo.W, photo.H) for path, photo in headers})
+    headers, upright, unreadable = _headers(files, source, folder)
+    facts = list[PhotoFacts]()
     largest = max((photo.W * photo.H for _, photo in headers), default=1)
     pool = ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, AT_ONCE // largest)))
-    futures = [pool.submit(_copy, path, photo, folder, longest) for path, photo in headers]
+    futures = [pool.submit(_copy, path, photo, folder, longest, upright.get(path)) for path, photo in headers]
     try:
         for done, ((_, photo), future) in enumerate(zip(headers, futures, strict=True), 1):
             try:
@@ -242,6 +235,32 @@ def copy_photos(
         if not (target := masked / f"{photo.copy}.png").is_file():
             write_mask(np.ones((1, 1), np.bool_), target, photo.copy_size(longest))
     return facts, unreadable
+
+
+def _headers(
+    files: Sequence[Path], source: Path, folder: Path
+) -> tuple[list[tuple[Path, PhotoFacts]], dict[Path, Path], list[str]]:
+    """Read the headers of photos.
+
+    Returns:
+        The facts of each file that is a photo, the masks that are upright, and names and reasons of the other files.
+
+    Raises:
+        DatasetError: a mask is neither as large as its photo nor as its photo upright.
+    """
+    found, unreadable, masks = list[tuple[Path, PhotoFacts]](), list[str](), find_masks(files)
+    for number, path in enumerate(files):
+        try:
+            photo = _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")
+            found.append((path, replace(photo, mask=str(masks.get(path, "")))))
+        except ValueError as error:
+            unreadable.append(f"{path.relative_to(source).as_posix()} ({error})")
+    turned = upright_masks(masks, {path: (photo.W, photo.H, photo.turns) for path, photo in found})
+    headers = [
+        (path, replace(photo, mask=str(stored_mask(folder, photo.copy))) if path in turned else photo)
+        for path, photo in found
+    ]
+    return headers, {path: masks[path] for path in turned}, unreadable
 
 
 def _facts(path: Path, name: str, copy: str) -> PhotoFacts:
@@ -316,8 +335,8 @@ def _place(gps: dict[int, object]) -> tuple[float, float, float] | None:
     return angles[0], angles[1], height if math.isfinite(height) else 0.0
 
 
-def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int) -> None:
-    """Write the working copy, and its mask before it, unless it is there.
+def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, upright: Path | None) -> None:
+    """Write the working copy, and its mask before it, unless it is there; an upright mask is turned back first.
 
     Raises:
         DatasetError: the photo or its mask cannot be decoded.
@@ -328,6 +347,8 @@ def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int) -> None:
     pixels, alpha = decode(path)
     size = photo.copy_size(longest)
     try:
+        if upright is not None:
+            turn_mask(upright, photo.turns, Path(photo.mask))
         counts = counting(Path(photo.mask) if photo.mask else None, alpha)
     except DatasetError as error:
         raise DatasetError(f"{path}: its mask {error}") from None
@@ -343,3 +364,8 @@ def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int) -> None:
 def mask_folder(folder: Path) -> Path:
     """Return where the masks of working copies lie, given where these do."""
     return folder.with_name("masks")
+
+
+def stored_mask(folder: Path, copy: str) -> Path:
+    """Return where the mask of a photo is written that was upright, given where the working copies lie."""
+    return mask_folder(folder) / "stored" / f"{copy}.png"

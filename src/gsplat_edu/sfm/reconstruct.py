@@ -18,10 +18,17 @@ from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap
-from gsplat_edu.sfm.mapping import attempts, map_photos, no_overlap
-from gsplat_edu.sfm.masks import find_masks
+from gsplat_edu.sfm.mapping import attempts, map_photos, no_overlap, shared_cameras
+from gsplat_edu.sfm.masks import find_masks, unused_folders
 from gsplat_edu.sfm.options import SfmOptions as SfmOptions
-from gsplat_edu.sfm.photos import PhotoFacts, copy_photos, fingerprint, mask_folder, photo_files
+from gsplat_edu.sfm.photos import (
+    PhotoFacts,
+    copy_photos,
+    fingerprint,
+    mask_folder,
+    photo_files,
+    stored_mask,
+)
 from gsplat_edu.sfm.result import build_capture, note_published, publish, published
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
@@ -43,10 +50,10 @@ INLIERS = 15
 """Matches of one geometry from which two photos hang together: COLMAP's own bound."""
 
 
-FEATURES, MAPPING = 2, 3
+FEATURES, MAPPING = 2, 4
 """Numbers of the methods, part of the stages' options: results that an earlier method left in a work folder are found
 anew. Before 2, photos kept more features than `max_features`, and every pose counted; before 3,
-photos of every size had a focal length of their own."""
+photos of every size had a focal length of their own; before 4, also where every photo has a size of its own."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
@@ -209,8 +216,27 @@ class _Run:
         kinds = "one camera" if lenses == 1 else f"{lenses} kinds of camera or zoom"
         summary = f"{len(photos)} by {kinds}; {known} say their focal length"
         if masked := sum(bool(photo.mask) for photo in photos):
-            summary += f"; {masked} have a mask"
+            summary += "; all have a mask" if masked == len(photos) else f"; {masked} of them have a mask"
+        self._note_masks(files, photos)
         return {"summary": summary, "photos": [asdict(photo) for photo in photos], "unreadable": unreadable}
+
+    def _note_masks(self, files: Sequence[Path], photos: Sequence[PhotoFacts]) -> None:
+        """Say which masks are not used, and which of two ways to lie was assumed."""
+        for folder in unused_folders(files, find_masks(files)):
+            self._say(
+                f"{folder}: not used, none of its images is named like a photo (PHOTO.png or PHOTO.jpg.png)"
+            )
+        stored = stored_mask(self.folder / "photos", "").parent
+        open_ = [
+            photo.name
+            for photo in photos
+            if photo.mask and photo.turns and (photo.turns == 2 or photo.W == photo.H)
+            if Path(photo.mask).parent != stored
+        ]
+        if open_:
+            self._say(
+                f"masks taken as the photos are stored, not upright, which their sizes leave open: {listed(open_)}"
+            )
 
     def _features(self) -> dict[str, Any]:
         total, most = len(self.photos), self.options.max_features
@@ -262,8 +288,10 @@ class _Run:
         chosen = pairs.sequential_pairs(count, overlap)
         if kind == "sequential":
             return chosen
-        looks = pairs.looks(self.folder / "database.db", [photo.copy for photo in self.photos], COLMAP_SEED)
-        chosen |= pairs.nearest_pairs(looks, farther * ALIKE[origin], overlap + 1)
+        described = pairs.photo_descriptors(
+            self.folder / "database.db", [photo.copy for photo in self.photos], COLMAP_SEED
+        )
+        chosen |= pairs.nearest_pairs(described, farther * ALIKE[origin], overlap + 1)
         places = [photo.place for photo in self.photos if photo.place is not None]
         if len(places) == count:
             chosen |= pairs.nearest_pairs(pairs.on_the_ground(places), farther * CLOSE_BY)
@@ -284,13 +312,20 @@ class _Run:
 
     def _map(self, connected: int) -> dict[str, Any]:
         options, total = self.options, len(self.photos)
-        ways = attempts(options.mapper, options.camera_model, total, len(self.groups), self.video)
-        model = map_photos(self.folder, ways, total, connected, self.threads, self._say, self._progress)
+        shared = shared_cameras(self.groups)
+        cameras = len(self.groups) - len(shared)
+        ways = attempts(options.mapper, options.camera_model, total, cameras, self.video)
+        model = map_photos(
+            self.folder, ways, shared, total, connected, self.threads, self._say, self._progress
+        )
         count = len(model["names"])
         summary = f"{count} of {total} photos have a pose ({model['way']})"
-        if count < total:
-            others = "the other one shares" if total - count == 1 else f"the other {total - count} share"
-            summary += f"; {others} too little with them"
+        unclear = len(set(model["unclear"]) - set(model["names"]))
+        if left := total - count - unclear:
+            others = "the other one shares" if left == 1 else f"the other {left} share"
+            summary += f"; {others if not unclear else f'{left} others share'} too little with them"
+        if unclear:
+            summary += f"; the focal length of {unclear} of another size is unclear"
         return model | {"summary": summary}
 
     def _finish(self) -> dict[str, Any]:
@@ -298,6 +333,11 @@ class _Run:
         publish(self.folder, self.options.out)
         if facts["left_out"]:
             self._say(f"left out, no pose was found: {listed(facts['left_out'])}")
+        if facts["unclear"]:
+            self._say(
+                "left out, of another size than the main camera's photos, and no single focal length explains them: "
+                f"{listed(facts['unclear'])}; use photos as the camera wrote them, neither cropped nor scaled"
+            )
         if facts["doubtful"]:
             self._say(
                 f"left out, too little in common with the others to trust the pose: {listed(facts['doubtful'])}"
@@ -327,6 +367,7 @@ def _groups(photos: Sequence[PhotoFacts], longest: int) -> list[dict[str, Any]]:
             focal = None if photo.focal is None else photo.focal * width / photo.W
             groups[photo.camera] = {
                 "names": [],
+                "kind": photo.camera.partition(" ")[2],
                 "focal": focal,
                 "width": width,
                 "height": height,

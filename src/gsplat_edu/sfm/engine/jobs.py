@@ -19,7 +19,7 @@ import pycolmap
 from .database import add_camera, add_photo, opened, with_cameras
 from .judge import agreement, scattered, steady_points
 from .kin import placed_anew
-from .lenses import refined
+from .lenses import Kin, refined, simplified
 from .mappers import Options, Tell, all_at_once, incremental, mended, without_doubtful
 
 BLOCK = 64
@@ -31,6 +31,10 @@ FOCAL = 0.85
 
 FIRST_LENS = "SIMPLE_RADIAL"
 """Lens model that mapping begins with where the user names none; see `lenses`."""
+
+FREE_LENS = "OPENCV"
+"""Lens model that photos are placed with where `FIRST_LENS` places too few, as it does for strong wide angles. The lens
+it finds is then dropped, and held-out photos judge how much of one is refined, as in the other ways."""
 
 
 def features(
@@ -130,7 +134,14 @@ def matches(tell: Tell, database: str, pairs: str, threads: int, seed: int) -> d
 
 
 def mapping(
-    tell: Tell, database: str, photos: str, out: str, attempt: dict[str, Any], threads: int, seed: int
+    tell: Tell,
+    database: str,
+    photos: str,
+    out: str,
+    attempt: dict[str, Any],
+    shared: dict[str, int],
+    threads: int,
+    seed: int,
 ) -> dict[str, Any]:
     """Find poses and points, in one way.
 
@@ -140,21 +151,22 @@ def mapping(
         photos: Folder of the photos, for the colours of the points.
         out: Folder for the models; it is empty.
         attempt: "mapper", "incremental" or "global"; "model", the cameras' model, or "auto" to find out how much of it
-            the photos tell; "per_photo", whether every photo has a camera of its own; "loose", whether thresholds are
-            low.
+            the photos tell; "free", whether photos are placed with `FREE_LENS` before that is found out; "per_photo",
+            whether every photo has a camera of its own; "loose", whether thresholds are low.
+        shared: Cameras that are replaced by a camera of the same aspect, by their numbers.
         threads: Threads, -1 for all.
         seed: Of all random draws.
 
     Returns:
         "models", of each: its "folder" in `out`, "names" of the photos whose pose counts, "doubtful" those of the
-        photos whose pose does not, "points", "steady", those that three photos see, "agreement", the share of all
-        matches that fit the poses, "lens", what was refined of the camera with the most photos, and "error", the mean
-        reprojection error in px of the photos that were given.
+        photos whose pose does not, "unclear" those of them whose focal length is why, "points", "steady", those that
+        three photos see, "agreement", the share of all matches that fit the poses, "lens", what was refined of the
+        camera with the most photos, and "error", the mean reprojection error in px of the photos that were given.
     """
     pycolmap.set_random_seed(seed)
-    auto = attempt["model"] == "auto"
-    lens = FIRST_LENS if auto else attempt["model"]
-    mapped = with_cameras(database, f"{out}/database.db", lens, attempt["per_photo"])
+    lens = FREE_LENS if attempt["free"] else FIRST_LENS if attempt["model"] == "auto" else attempt["model"]
+    by_number = {int(camera): leader for camera, leader in shared.items()}
+    mapped = with_cameras(database, f"{out}/database.db", lens, attempt["per_photo"], by_number)
     options = Options(bool(attempt["loose"]), threads, seed)
     if attempt["mapper"] == "global":
         found = all_at_once(mapped, photos, out, options)
@@ -164,31 +176,46 @@ def mapping(
     for number, begun in sorted(found.items()):
         folder = Path(out) / str(number)
         folder.mkdir(exist_ok=True)
-        placed = _names(begun)
-        model = mended(begun, mapped, photos, folder, options)
-        if model.num_reg_images() < 2 or not model.num_points3D():
-            continue
-        model, kin = (
-            (model, {}) if attempt["per_photo"] else placed_anew(model, mapped, photos, folder, options)
-        )
-        model, lenses = refined(model, auto and not attempt["per_photo"], threads, kin)
-        without_doubtful(model, mapped)
-        if attempt["per_photo"] and model.num_reg_images() and scattered(model):
-            continue
-        model.write_binary(folder)
-        models.append(
-            {
-                "folder": folder.name,
-                "names": _names(model),
-                "doubtful": sorted(set(placed) - set(_names(model))),
-                "points": model.num_points3D(),
-                "steady": steady_points(model),
-                "agreement": agreement(model, mapped).share,
-                "lens": lenses[_main_camera(model)] if model.num_reg_images() else lens,
-                "error": float(model.compute_mean_reprojection_error()) if model.num_points3D() else 0.0,
-            }
-        )
+        facts = _judged(begun, mapped, photos, folder, attempt, options)
+        models += [] if facts is None else [facts]
     return {"models": models}
+
+
+def _judged(
+    begun: pycolmap.Reconstruction,
+    database: str,
+    photos: str,
+    folder: Path,
+    attempt: dict[str, Any],
+    options: Options,
+) -> dict[str, Any] | None:
+    """Keep what counts of a mapper's model, refine it, and write it to a folder; None where nothing is left."""
+    auto, per_photo = attempt["model"] == "auto", attempt["per_photo"]
+    placed, kin, unclear = _names(begun), dict[int, Kin](), list[str]()
+    model = mended(begun, database, photos, folder, options)
+    if model.num_reg_images() < 2 or not model.num_points3D():
+        return None
+    if attempt["free"]:
+        simplified(model, FIRST_LENS, options.threads)
+    if not per_photo:
+        anew, kin, out = placed_anew(model, database, photos, folder, options)
+        unclear, model = sorted(model.image(image).name for image in out), anew
+    model, lenses = refined(model, auto and not per_photo, options.threads, kin)
+    without_doubtful(model, database)
+    if not model.num_reg_images() or (per_photo and scattered(model)):
+        return None
+    model.write_binary(folder)
+    return {
+        "folder": folder.name,
+        "names": _names(model),
+        "doubtful": sorted(set(placed) - set(_names(model))),
+        "unclear": unclear,
+        "points": model.num_points3D(),
+        "steady": steady_points(model),
+        "agreement": agreement(model, database).share,
+        "lens": lenses[_main_camera(model)],
+        "error": float(model.compute_mean_reprojection_error()) if model.num_points3D() else 0.0,
+    }
 
 
 def _names(model: pycolmap.Reconstruction) -> list[str]:

@@ -54,7 +54,7 @@ class Seen(NamedTuple):
 
 def placed_anew(
     model: pycolmap.Reconstruction, database: str, photos: str, folder: Path, options: Options
-) -> tuple[pycolmap.Reconstruction, dict[int, Kin]]:
+) -> tuple[pycolmap.Reconstruction, dict[int, Kin], set[int]]:
     """Place the photos of cameras that have few, with a focal length that the main camera's explains.
 
     A camera whose photos two different focal lengths explain equally well loses them.
@@ -67,7 +67,8 @@ def placed_anew(
         options: Threads and seed.
 
     Returns:
-        The model, and the cameras that are scaled or cropped versions of another one.
+        The model, the cameras that are scaled or cropped versions of another one, and the photos that were taken out
+        because no single focal length explains them.
     """
     images = {
         camera: [i for i in sorted(model.reg_image_ids()) if model.image(i).camera_id == camera]
@@ -81,11 +82,11 @@ def placed_anew(
     others = {image for camera in few for image in images[camera]}
     stay = model.num_reg_images() - len(others)
     if not few or stay < max(LEAST, model.num_reg_images() / 2):
-        return model, {}
+        return model, {}, set()
     rest = copy.deepcopy(model)
     take_out(rest, others)
     if rest.num_reg_images() < LEAST or not rest.num_points3D():
-        return model, {}
+        return model, {}, set()
     adjust(rest, options.threads)
     kin, left = dict[int, Kin](), {camera: list(images[camera]) for camera in few}
     for number in range(ROUNDS):
@@ -96,7 +97,7 @@ def placed_anew(
         work.mkdir()
         rest = _triangulated(rest, database, photos, work, options)
         left = {camera: [i for i in rows if i not in found] for camera, rows in left.items()}
-    return rest, kin
+    return rest, kin, others - set(rest.reg_image_ids())
 
 
 def _placed(

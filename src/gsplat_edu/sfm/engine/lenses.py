@@ -107,6 +107,29 @@ def refined(
     return result, names | {camera: names[one.main] for camera, one in kin.items()}
 
 
+def simplified(model: pycolmap.Reconstruction, name: str, threads: int) -> None:
+    """Give all cameras a simpler lens model and the principal point in the middle, and adjust everything.
+
+    How much more their photos support can then be judged by `refined`, as in models that were mapped so.
+
+    Args:
+        model: Changed.
+        name: Of the lens model, with one focal length.
+        threads: Threads.
+    """
+    for number, camera in model.cameras.items():
+        bends = [camera.params[i] for i in camera.extra_params_idxs()]
+        after = pycolmap.Camera.create_from_model_name(
+            number, name, camera.mean_focal_length(), camera.width, camera.height
+        )
+        params = np.array(after.params)
+        for index, value in zip(after.extra_params_idxs(), bends, strict=False):
+            params[index] = value
+        camera.model = after.model
+        camera.params = params.tolist()
+    adjust(model, threads)
+
+
 def _follow(model: pycolmap.Reconstruction, kin: dict[int, Kin]) -> None:
     """Give cameras the lens of the one they follow, at their scale; the middle moves in proportion."""
     for number, one in kin.items():

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import torch
 
+from gsplat_edu.budget.costs import Facts, Footprint, Measurements, expected_counts
+from gsplat_edu.budget.probe import probe
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
-from gsplat_edu.doctor.costs import Facts, Footprint, Measurements, expected_counts
-from gsplat_edu.doctor.probe import probe
 from gsplat_edu.runs.training import RunOptions
-from gsplat_edu.text import short_number
+from gsplat_edu.text import short_number, spelled_seconds
 from gsplat_edu.train.config import TrainConfig
 
 SAVING = 4e8
@@ -77,16 +77,6 @@ class Forecast:
 def spelled_bytes(size: float) -> str:
     """Write a size: 1.25 GiB, 204 MiB."""
     return f"{size / 2**30:.3g} GiB" if size >= 2**30 else f"{size / 2**20:.0f} MiB"
-
-
-def spelled_seconds(seconds: float) -> str:
-    """Write a duration: 12 s, 3 min 40 s, 2 h 5 min."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
 def predict(
