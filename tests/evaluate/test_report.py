@@ -273,7 +273,7 @@ def test_every_kind_of_number_has_its_own_curve():
         {"iteration": i, "loss": 1.0 + i, "psnr": 20.0 + i, "num_gaussians": 300 + i, "ms": 4.0 + i}
         for i in (1, 2)
     ]
-    panels = run_curves_figure(log).axes
+    panels = [axes for figure in run_curve_figures(log) for axes in figure.axes]
     assert [axes.get_title() for axes in panels] == [
         "training loss",
         "held-out views",

@@ -34,8 +34,8 @@ PARALLAX = 1.5
 
 SCATTERED = 2.0
 """Largest ratio of the 90th to the 10th percentile of the focal lengths where every photo has a camera of its own. For
-one lens it is about 1.1. Cameras in wrong places absorb that in their focal lengths: 2.7 on a capture of a box with four
-equal sides. In between is a zoom that was used within its range."""
+one lens it is about 1.1. Cameras in wrong places absorb that in their focal lengths: 2.7 on a capture of a box with
+four equal sides. In between is a zoom that was used within its range."""
 
 
 class Agreement(NamedTuple):
