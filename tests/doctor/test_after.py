@@ -247,6 +247,17 @@ def test_a_short_training_is_not_fine(scene, reached, gain, severity, says):
     assert ("better photos" in advice) is (severity is not Severity.WARNING)
 
 
+def test_a_longer_training_says_how_long_it_takes_at_the_pace_of_this_one(scene):
+    """The command for 30,000 iterations stood there alone after 400 that took 0.8 s each: a day's work by surprise."""
+    gaussians, views = scene
+    log = [{"iteration": i, "ms": 50.0 if i <= 300 else 800.0} for i in range(10, 401, 10)]
+    run = trained(gaussians, views, reached=400, planned=400, log=log, capture=Path("a"))
+    (found,) = [finding for finding in examine_run(run).findings if finding.name == "short training"]
+    assert found.advice.startswith(
+        "train for longer (6 h 40 min or more at this run's pace): gsplat-edu train a "
+    )
+
+
 @pytest.mark.parametrize(("factor", "rising"), [(0.8, True), (1.0, False)])
 def test_without_test_views_the_loss_says_whether_it_still_falls(scene, factor, rising):
     gaussians, views = scene

@@ -107,7 +107,7 @@ def test_a_hole_in_an_orbit(diagnosed, orbit, missing, name):
     assert [f.name for f in found] == ([name] if name else [])
     if name == "hole":
         assert found[0].severity is Severity.WARNING
-        assert f"no camera in {15 * (missing + 1)} degrees" in found[0].sentence
+        assert f"a gap of {15 * (missing + 1)} degrees" in found[0].sentence
         assert views[4].name in found[0].advice and views[5 + missing].name in found[0].advice
     elif name:
         assert found[0].severity is Severity.NOTE, "a thing on a wall has no back"

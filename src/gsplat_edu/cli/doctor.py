@@ -26,7 +26,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.train.config import RECIPE_ITERATIONS, recipe
+from gsplat_edu.train.config import RECIPE_ITERATIONS, TrainConfig, recipe
 
 EXIT_HOPELESS = 1
 """Exit code if training would be pointless."""
@@ -132,7 +132,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--test-every": (data.get("test_every"),),
         "--points": (data.get("points"),),
         "--from": (data.get("scene"),),
-        "--strategy": (train.get("strategy"),),
+        "--strategy": (None if train.get("strategy") == TrainConfig.strategy else train.get("strategy"),),
         "--max-gaussians": (train.get("max_gaussians"),),
         "--background": background if any(background) else (None,),
     }

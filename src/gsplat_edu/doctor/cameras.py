@@ -13,6 +13,7 @@ from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.text import short_number
 
 OFF_CENTRE = 0.1
 """Distance of the principal point from the middle, in sides of the image, from which it is told: lenses sit within a
@@ -111,24 +112,19 @@ def check_intrinsics(survey: Survey) -> list[Finding]:
 def _oddities(shot: Shot, zoomed: bool) -> list[tuple[str, str]]:
     """Return what is odd about a photo's intrinsics: its kind, and in words."""
     lens, found = shot.lens, list[tuple[str, str]]()
+    fx, fy, cx, cy = (short_number(value, 4) for value in (lens.fx, lens.fy, lens.cx, lens.cy))
     if lens.uneven:
-        found.append(
-            ("uneven", f"fx is {lens.fx:.4g} px and fy {lens.fy:.4g}, but pixels of cameras are square")
-        )
+        found.append(("uneven", f"fx is {fx} px and fy {fy}, but real pixels are square"))
     aside = max(abs(lens.cx - (lens.W - 1) / 2) / lens.W, abs(lens.cy - (lens.H - 1) / 2) / lens.H)
     if aside > OFF_CENTRE:
-        middle = f"{(lens.W - 1) / 2:.4g}, {(lens.H - 1) / 2:.4g}"
-        found.append(
-            (
-                "off centre",
-                f"the principal point ({lens.cx:.4g}, {lens.cy:.4g}) px is far from the middle, ({middle})",
-            )
-        )
+        middle = ", ".join(short_number((side - 1) / 2, 4) for side in (lens.W, lens.H))
+        what = f"the principal point ({cx}, {cy}) px is far from the middle, ({middle})"
+        found.append(("off centre", what))
     field = 2.0 * math.atan(0.5 * max(lens.W / lens.fx, lens.H / lens.fy))
     if not (NARROWEST < field < WIDEST or lens.fisheye):
-        found.append(("field", f"a field of view of {math.degrees(field):.0f} degrees is hard to believe"))
+        found.append(("field", f"a field of view of {math.degrees(field):.0f} degrees is implausible"))
     if zoomed:
-        found.append(("zoom", f"a focal length of {lens.fx:.4g} px is not that of the other photos"))
+        found.append(("zoom", f"a focal length of {fx} px differs from that of the other photos"))
     return found
 
 
@@ -153,8 +149,8 @@ def check_sizes(survey: Survey) -> list[Finding]:
         return []
     (w, h), lens = other[0].size, other[0].lens
     first = f"first {w}x{h} for {lens.W}x{lens.H}"
-    what = f"{len(other)} of {len(survey.shots)} photos are not as large as their camera, {first}"
-    advice = "if photos were cut, not made smaller, calibrate again: their intrinsics are rescaled"
+    what = f"{len(other)} of {len(survey.shots)} photos differ in size from their camera, {first}"
+    advice = "if photos were cropped, not resized, calibrate again: their intrinsics are only rescaled"
     names = tuple(shot.name for shot in other) if len(other) < len(survey.shots) else ()
     return [Finding("sizes", Severity.NOTE, what, advice, names)]
 
@@ -170,7 +166,9 @@ def check_parallax(survey: Survey) -> list[Finding]:
     what = (
         "all cameras stand at one place"
         if same
-        else (f"all cameras stand within {100 * geometry.spread:.2g} % of the distance to what they see")
+        else (
+            f"all cameras stand within {short_number(100 * geometry.spread, 2)} % of the distance to what they see"
+        )
     )
     advice = "walk while you take the photos: turning on the spot shows no depth, and no scene can be found"
     return [Finding("no parallax", Severity.FATAL, what, advice)]
@@ -182,7 +180,7 @@ def check_away(survey: Survey) -> list[Finding]:
     doubtful, found = _doubtful(survey, away), list[Finding]()
     if named := away - doubtful.keys():
         names = tuple(survey.names[i] for i in sorted(named))
-        what = f"{len(names)} of {len(survey.shots)} cameras, towards what hardly another one sees"
+        what = f"{len(names)} of {len(survey.shots)} cameras point at something that hardly any other camera sees"
         advice = (
             "look at the photos of the cameras that look away: a wrong pose spoils the scene, take it out"
         )
@@ -293,25 +291,25 @@ def check_coverage(survey: Survey) -> list[Finding]:
     widest = int(np.argmax(gaps))
     if 2.0 * math.pi - gaps[widest] < TURN:
         covered = math.degrees(2.0 * math.pi - float(gaps[widest]))
-        what = f"the cameras go {covered:.0f} degrees round what they look at"
+        what = f"the cameras cover {covered:.0f} degrees around what they look at"
         return [
             Finding(
                 "one side",
                 Severity.NOTE,
                 what,
-                "look at the scene from where the cameras stood: its back is empty",
+                "take photos of the other side as well, if it is to be seen: without them the scene is empty there",
             )
         ]
     found = []
     if gaps[widest] > max(HOLE, HOLE_FACTOR * float(np.median(gaps))):
         edges = tuple(survey.names[order[k % len(order)]] for k in (widest, widest + 1))
-        what = f"no camera in {math.degrees(gaps[widest]):.0f} degrees of the turn, between {edges[0]} and {edges[1]}"
+        what = f"a gap of {math.degrees(gaps[widest]):.0f} degrees without a camera, between {edges[0]} and {edges[1]}"
         advice = f"take photos between where {edges[0]} and {edges[1]} were taken: that side of the scene is guessed"
         found.append(Finding("hole", Severity.WARNING, what, advice))
     low, high = np.quantile(elevations, (0.05, 0.95))
     if high - low < ONE_HEIGHT:
-        what = f"the cameras look from one height, elevations within {math.degrees(high - low):.0f} degrees"
-        advice = "add a turn of photos from higher up: seen from there the scene will have holes"
+        what = f"all cameras look from about the same height, elevations within {math.degrees(high - low):.0f} degrees"
+        advice = "add a round of photos from higher up: without it the scene has holes when seen from there"
         found.append(Finding("one height", Severity.NOTE, what, advice))
     return found
 
