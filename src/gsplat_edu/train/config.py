@@ -110,8 +110,8 @@ class AdcConfig:
     grad_threshold: float = _number(
         2e-4,
         _not_negative,
-        "Gaussians are cloned or split if the mean norm of their image-plane gradient, in normalised device"
-        " coordinates, exceeds this.",
+        "Clone or split Gaussians whose mean image-plane gradient norm, in normalised device coordinates, exceeds"
+        " this.",
         "2023",
     )
     percent_dense: float = _number(
