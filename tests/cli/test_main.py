@@ -33,7 +33,7 @@ def test_the_seed_decides_the_run(tmp_path, capsys):
 def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
     arguments = ["demo", "--iters", "1", "--size", "8", "--k0", "5", "--out", str(tmp_path / "s.png")]
     assert main([*arguments, "--backend", "torch"]) == 0
-    assert "reduced: --cap 800 (the chapter's: --cap 1600)" in capsys.readouterr().out
+    assert "reduced to --cap 800 (the chapter uses --cap 1600)" in capsys.readouterr().out
     assert main(arguments) == 0
     assert "reduced" not in capsys.readouterr().out, "the kernels take the chapter's budget"
 
