@@ -47,6 +47,8 @@ check:
 	@$(BIN)/ruff check .
 	@echo "== check: ruff, format"
 	@$(BIN)/ruff format --check .
+	@echo "== check: clang-format"
+	@$(BIN)/clang-format --dry-run --Werror native/*.h native/*.cpp benchmarks/ladder/*.h benchmarks/ladder/*.cpp
 	@echo "== check: mypy, strict over src"
 	@$(BIN)/mypy
 	@echo "== check: import-linter, who may import whom"

@@ -145,7 +145,7 @@ def test_an_interrupted_run_goes_on(done, phone, tmp_path):
     # Other options begin again from the stage that they concern, and the old result goes when the new one is there.
     said = []
     reconstruct(replace(options, camera_model="SIMPLE_RADIAL"), said.append)
-    assert said[3] == "mapping: camera_model differ from those before; again from here"
+    assert said[3] == "mapping: camera_model changed; repeating this stage and the later ones"
     assert [sentence.endswith("(done before)") for sentence in said] == [True] * 3 + [False] * 3
     assert set(cameras_of(options.out)) == set(whole)
 
@@ -204,7 +204,7 @@ def test_photos_put_there_before_a_run_was_finished_stay(phone, tmp_path):
     with pytest.raises(StoppedError):
         reconstruct(options, progress=stop)  # goes on: its own work is no reason not to
     (options.out / "images").mkdir()
-    with pytest.raises(ArgumentError, match="holds photos or poses already"):
+    with pytest.raises(ArgumentError, match="already holds photos or poses"):
         reconstruct(options)
 
 
@@ -262,7 +262,7 @@ def test_what_cannot_be_used_is_named_and_left_out(phone, tmp_path):
 
 def test_a_job_that_fails_names_its_log(tmp_path):
     with pytest.raises(
-        DatasetError, match=r"failed with code 1: the last lines of .*log\.txt say why"
+        DatasetError, match=r"failed with code 1: see the last lines of .*log\.txt"
     ) as failure:
         call(
             "finish",
