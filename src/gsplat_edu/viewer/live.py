@@ -148,7 +148,7 @@ class LiveView:
         self._left = math.inf  # iterations until the training pauses
         self._free_at = self._figures_at = -math.inf
         self._seen_at = -math.inf
-        self._said = ""
+        self._state = self._said = self._failure = ""
         with ExitStack() as closing:
             self._server, token = _server(host, port, closing)
             self.url = f"{url_of(host, self._server.get_port())}?token={token}"
@@ -256,13 +256,18 @@ class LiveView:
         browser = min(due, key=lambda candidate: candidate.drawn_at)
         browser.drawn, browser.drawn_at = self._wanted(browser, now), now
         seen, width = browser.handle.camera, browser.drawn[1]
+        canvas = (seen.image_width, seen.image_height)
         try:
-            canvas = (seen.image_width, seen.image_height)
             camera = browser_camera(seen.wxyz, seen.position, seen.fov, canvas, width)
+        except ArgumentError:
+            return  # the browser has sent no camera yet, or an invalid one: the next may be valid
+        try:
             with torch.no_grad():
                 image = self._render(self._trainer.gaussians, camera).image
-        except (SplatError, MemoryError, torch.cuda.OutOfMemoryError):
-            return  # no camera yet, or an invalid one: training continues and the next camera may be valid
+        except (SplatError, MemoryError, torch.cuda.OutOfMemoryError) as error:
+            self._note_failure(f"not drawn: {str(error) or 'out of memory'}")
+            return
+        self._note_failure("")
         levels = torch.nan_to_num(image).clamp(0.0, 1.0) * 255.0 + 0.5
         with warnings.catch_warnings():  # viser warns if the browser has just disconnected
             warnings.simplefilter("ignore")
@@ -287,8 +292,15 @@ class LiveView:
             return True
         return wanted != browser.drawn and now - browser.drawn_at >= STILL_EVERY
 
+    def _note_failure(self, failure: str) -> None:
+        """Show in the panel why the last image was not drawn, or that it was: training continues either way."""
+        if failure != self._failure:
+            self._failure = failure
+            self._say(self._state)
+
     def _say(self, state: str) -> None:
         """Show the metrics of the last step."""
+        self._state = state
         lines = [f"**{state}**"]
         if self._event is not None and self._trainer is not None:
             total = self._trainer.config.iterations
@@ -299,6 +311,8 @@ class LiveView:
             ]
             if self._trainer.last is not None:
                 lines.append(f"PSNR {_psnr(self._trainer):.2f} dB (last photo)")
+        if self._failure:
+            lines.append(f"`{self._failure.replace('`', '')}`")
         said = "  \n".join(lines)  # two spaces force a line break in Markdown
         if said != self._said:
             self._said = self._figures.content = said

@@ -171,7 +171,7 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         "--image-memory",
         type=bytes_text,
         metavar="SIZE",
-        help="memory for decoded photos, for example 500MB; photos beyond it are read again for each use (default: 4GiB)",
+        help="memory for decoded photos, for example 500MB; others are read again for each use (default: 4GiB)",
     )
     behind = group.add_mutually_exclusive_group()
     behind.add_argument("--white-background", action="store_true", help="white background (default: black)")
@@ -184,12 +184,12 @@ def _meanings() -> dict[str, str]:
     """Return the description of each field in the docstring of `TrainConfig`."""
     text = (inspect.getdoc(TrainConfig) or "").partition("Args:")[2].partition("Raises:")[0]
     entries = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
-    found = {name: " ".join(words.split()).replace("%", "%%") for name, words in entries}
+    found = {name: " ".join(words.replace("`", "").split()).replace("%", "%%") for name, words in entries}
     return {field.name: found.get(field.name, "") for field in fields(TrainConfig)}
 
 
 def _add_field(group: argparse._ArgumentGroup, name: str, default: object, meaning: str) -> None:
-    flag, text = f"--{name.replace('_', '-')}", f"{meaning} (default: {default})"
+    flag, text = f"--{name.replace('_', '-')}", f"{meaning.rstrip('.')} (default: {default})"
     if isinstance(default, bool):
         group.add_argument(flag, action="store_true", default=None, help=text)
     elif isinstance(default, str):
