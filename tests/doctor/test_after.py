@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.cli.doctor import _exposure_beforehand
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
-from gsplat_edu.doctor.finding import Finding, Severity
+from gsplat_edu.doctor.finding import Finding, Severity, diagnosis_lines
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.gaussians import Gaussians
@@ -277,3 +279,13 @@ def test_what_the_photos_show_before_training_is_not_gone_after_it(scene):
     assert (
         found.sentence.startswith("1 of 12 photos; the scene fits them") and "exposure" not in diagnosis.fine
     )
+
+
+def test_that_exposure_was_not_compared_is_said(scene, tmp_path):
+    gaussians, views = scene
+    findings, why = _exposure_beforehand(tmp_path / "gone", Terminal())
+    assert findings == [] and "gone" in why
+    said = diagnosis_lines(examine_run(trained(gaussians, views, uncompared=why)))
+    (line,) = [line for line in said if line.startswith("exposure ")]
+    assert line.endswith(f"not between photos: {why}")
+    assert not any("not between" in line for line in diagnosis_lines(examine_run(trained(gaussians, views))))

@@ -274,4 +274,5 @@ def interruptible() -> Iterator[Callable[[], bool]]:
         yield lambda: came
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            # None stands for a handler that Python did not install and cannot put back
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -102,9 +102,8 @@ def build_capture(
         lens = lenses[pose.camera].scaled(photo.W, photo.H)
         pinhole = lens.undistorted().turned(photo.turns)
         entries.append(Undistorted(photo, name, lens, pinhole))
-        R = quat_to_R(pose.quat)
-        upright_R = np.linalg.matrix_power(QUARTER, photo.turns) @ R
-        cameras.append(Camera.posed(upright_R, -R.T @ pose.shift, pinhole))
+        R, turn = quat_to_R(pose.quat), np.linalg.matrix_power(QUARTER, photo.turns)
+        cameras.append(Camera.posed(turn @ R, -R.T @ pose.shift, pinhole))
     cloud = read_points(found)
     if cloud is None:
         raise DatasetError(f"{found}: holds no points; the photos show too little in common")
