@@ -40,11 +40,17 @@ EVERYWHERE = ("help", "help_all", "debug")
 
 def reference() -> str:
     """Return the text of docs/CLI.md."""
-    summary = [f"| [`gsplat-edu {name}`](#gsplat-edu-{name}) | {_cell(text)} |" for name, text in COMMANDS.items()]
+    summary = [
+        f"| [`gsplat-edu {name}`](#gsplat-edu-{name}) | {_cell(text)} |" for name, text in COMMANDS.items()
+    ]
     parts = [PREAMBLE, "\n".join(["| command | what it does |", "|---|---|", *summary]) + "\n"]
     for name in COMMANDS:
         parts.append(_section(f"gsplat-edu {name}", _command(name)))
-    parts += [_section("python train/train_2d.py", _script("train_2d.py").build_parser()), _train_3d(), _make()]
+    parts += [
+        _section("python train/train_2d.py", _script("train_2d.py").build_parser()),
+        _train_3d(),
+        _make(),
+    ]
     return "\n".join(parts)
 
 
@@ -114,8 +120,8 @@ def _train_3d() -> str:
     demo.add_arguments(parser)
     flags = [action.option_strings[0] for action in parser._actions[1:]]
     return (
-        "## python train/train_3d.py\n\nTrain the sphere as `gsplat-edu demo` does, and print the chapter's log. Options:"
-        f" {', '.join(f'`{flag}`' for flag in flags)} and `--debug`.\n"
+        "## python train/train_3d.py\n\nTrain the sphere as `gsplat-edu demo` does, and print the chapter's log."
+        f" Options: {', '.join(f'`{flag}`' for flag in flags)} and `--debug`.\n"
     )
 
 

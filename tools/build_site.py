@@ -190,10 +190,8 @@ def _reference(name: str) -> str:
 def _public_api() -> str:
     """Write the first page of the reference: the public API by topic, then every package."""
     parts = ["# Reference\n\nThe public API first; the pages of all packages and modules follow.\n"]
-    for topic, names in PUBLIC.items():
-        if isinstance(names, str):
-            everything = importlib.import_module(names).__all__
-            names = [f"{names}.{name}" for name in everything if callable(_found(f"{names}.{name}"))]
+    for topic, listed in PUBLIC.items():
+        names = _names(listed) if isinstance(listed, str) else listed
         parts.append(f"## {topic}\n\n| name | what it is |\n|---|---|")
         parts += [_row(name) for name in names]
         parts.append("")
@@ -202,6 +200,12 @@ def _public_api() -> str:
     parts += ["## Packages\n", _toctree("maxdepth: 1", packages)]
     parts += ["## Modules\n", _toctree("maxdepth: 1", ["gsplat_edu", *(n for n in top if n not in packages)])]
     return "\n".join(parts)
+
+
+def _names(module: str) -> list[str]:
+    """Name the functions and classes of a module's `__all__`."""
+    everything = [f"{module}.{name}" for name in importlib.import_module(module).__all__]
+    return [name for name in everything if callable(_found(name))]
 
 
 def _found(name: str) -> object:
@@ -213,10 +217,14 @@ def _row(name: str) -> str:
     """Link a name to its definition, and summarise it by the first line of its docstring."""
     thing: Any = _found(name)
     if not (isinstance(thing, type) or inspect.isfunction(thing)):  # a type alias: its module documents it
-        return f"| {{py:obj}}`{name}` | {(getattr(thing, '__doc__', '') or '').strip().partition(chr(10))[0]} |"
+        return (
+            f"| {{py:obj}}`{name}` | {(getattr(thing, '__doc__', '') or '').strip().partition(chr(10))[0]} |"
+        )
     text = (inspect.getdoc(thing) or "").partition("\n\n")[0]
     target = f"{thing.__module__}.{thing.__qualname__}"
-    return f"| {{py:obj}}`{thing.__name__} <{target}>` | {' '.join(text.split()).replace('|', chr(92) + '|')} |"
+    return (
+        f"| {{py:obj}}`{thing.__name__} <{target}>` | {' '.join(text.split()).replace('|', chr(92) + '|')} |"
+    )
 
 
 def _records(records: list[Path]) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.intrinsics import Intrinsics
 from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
 
 WORLD_UP = (0.0, -1.0, 0.0)
@@ -23,6 +24,10 @@ WORLD_UP = (0.0, -1.0, 0.0)
 
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of R R' - I accepted for a rotation, to allow rotations stored as float32 text."""
+
+PARALLEL = 1e-3
+"""Smallest eigenvalue of mean(I - d d') at which the intersection of the optical axes d is well defined. Below it
+(about 1.8 degrees between axes) the intersection is noise."""
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Float64[np.ndarray, "3 3"]:
@@ -135,6 +140,27 @@ class Camera:
         """
         H, W = whole_number("H", H, 1), whole_number("W", W, 1)
         return cls(look_at(eye, target, up), eye, fx, fy, W / 2, H / 2, H, W)
+
+    @classmethod
+    def posed(cls, R: ArrayLike, eye: ArrayLike, intrinsics: Intrinsics) -> Camera:
+        """Make a camera from a pose and intrinsics.
+
+        Args:
+            R: (3, 3) world-to-camera rotation.
+            eye: (3,) camera centre, world units.
+            intrinsics: Of a pinhole; `Intrinsics.undistorted` gives that of a lens.
+
+        Raises:
+            ShapeError: R is not (3, 3) or eye not (3,).
+            ArgumentError: as for the constructor.
+        """
+        i = intrinsics
+        return cls(R, eye, i.fx, i.fy, i.cx, i.cy, i.H, i.W)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Focal lengths, principal point and image size as one value."""
+        return Intrinsics(self.W, self.H, self.fx, self.fy, self.cx, self.cy)
 
     def jacobian_bounds(self, limit: float | None) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the bounds of x/z and y/z for evaluating the projection's Jacobian.
@@ -288,14 +314,13 @@ def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius:
     return Camera.looking_at(radius * np.array(direction), (0.0, 0.0, 0.0), fx, fx, size, size)
 
 
-def point_nearest_axes(cameras: Sequence[Camera], parallel: float) -> Float64[np.ndarray, "3"] | None:
+def point_nearest_axes(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"] | None:
     """Find the point nearest to all optical axes in the least-squares sense.
 
     p minimises sum_i |(I - d_i d_i') (p - e_i)|²,  e_i: centre of camera i,  d_i: its viewing direction
 
     Args:
         cameras: At least one.
-        parallel: Smallest eigenvalue of mean_i (I - d_i d_i') for which the point is well defined.
 
     Returns:
         (3,) world units; None if the axes are so nearly parallel that their intersection is noise.
@@ -304,28 +329,7 @@ def point_nearest_axes(cameras: Sequence[Camera], parallel: float) -> Float64[np
     axes = np.stack([camera.R[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     A, mean = across.mean(axis=0), eyes.mean(axis=0)
-    if np.linalg.eigvalsh(A)[0] < parallel:
+    if np.linalg.eigvalsh(A)[0] < PARALLEL:
         return None
     b = (across @ (eyes - mean)[:, :, None]).mean(axis=0)[:, 0]
     return np.asarray(mean + np.linalg.solve(A, b))
-
-
-def scaled_intrinsics(
-    fx: float, fy: float, cx: float, cy: float, sx: float, sy: float
-) -> tuple[float, float, float, float]:
-    """Return the intrinsics of the same photo at another size.
-
-    f' = f s,  c' = (c + 1/2) s - 1/2: this keeps the image's edge in place, not the centre of its first pixel.
-
-    Args:
-        fx: Focal length along x, px.
-        fy: Focal length along y, px.
-        cx: Column of the principal point, px.
-        cy: Row of the principal point, px.
-        sx: New width over old.
-        sy: New height over old.
-
-    Returns:
-        fx', fy', cx', cy', px.
-    """
-    return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5

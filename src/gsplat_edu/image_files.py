@@ -40,6 +40,7 @@ UNDECODABLE = (
     IndexError,
     TypeError,
     OverflowError,
+    RuntimeError,
     struct.error,
 )
 """Exceptions of Pillow for files that are truncated, corrupt, absurdly large or not images."""

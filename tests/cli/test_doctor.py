@@ -96,7 +96,7 @@ def test_bad_input_is_one_line_and_2(doctor, capture, tmp_path):
     (tmp_path / "empty").mkdir()
     for words, text in (
         ([tmp_path / "gone"], "does not exist; give a dataset folder or a run folder"),
-        ([tmp_path / "empty"], "is no capture"),
+        ([tmp_path / "empty"], "is not a capture"),
         ([capture[0], "--resolution", "0.5"], "resolution"),
         ([capture[0], "--backend", "abacus"], "abacus"),
         ([capture[0], "--backend", "torch"], "--no-forecast"),

@@ -97,7 +97,7 @@ def test_a_dataset_is_described_and_no_photo_is_decoded(info, tmp_path, monkeypa
 
 def test_what_is_none_of_them_is_one_line(info, tmp_path):
     assert "does not exist; give a dataset folder" in info(tmp_path / "gone", code=2)
-    assert "is no capture" in info(tmp_path, code=2)
+    assert "is not a capture" in info(tmp_path, code=2)
     (tmp_path / "a.txt").write_text("hello")
     assert "a.txt: unknown scene format" in info(tmp_path / "a.txt", code=2)
 

@@ -101,7 +101,7 @@ def test_a_process_that_may_take_little_more(tmp_path):
     assert re.fullmatch(
         r"gsplat-edu render: ran out of memory \(the renderer needs a block of 0\.\d\d GiB, but 0\.\d\d GiB are "
         r"free\); "
-        r"close other programs, or give a smaller --size",
+        r"close other programs, or reduce --size",
         third,
     )
     assert not out.exists() or not list(out.iterdir()), "nothing half done is left"

@@ -115,7 +115,7 @@ def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, ca
         (["BARE", "--size", "0"], "--size: is 0"),
         (["BARE", "--fps", "-1"], "--fps: is -1"),
         (["BARE", "--backend", "abacus"], "backend 'abacus'"),
-        (["BARE", "--dataset", "."], "is no capture"),
+        (["BARE", "--dataset", "."], "is not a capture"),
         (
             ["BARE", "--out", "x.gif"],
             "x.gif: GIF is not supported; give a video (.mp4) or a folder of PNGs",

@@ -179,7 +179,7 @@ def _syntax_error(folder):
 
 CAPTURE = procedural_capture(16, 3, splats=20)
 FAULTS = {
-    _nothing: "holds no photos, it is empty",
+    _nothing: "is empty",
     _photos_only: "poses",
     _no_images: "view_000.png",
     _corrupt_jpeg: "view_002.png",

@@ -244,7 +244,7 @@ def test_json_made_to_break_parsers(tmp_path, text):
     with pytest.raises(DatasetError, match=r"transforms\.json: is not JSON"):
         load_dataset(tmp_path)
     (tmp_path / "meta.json").write_text(text)
-    with pytest.raises(SceneFormatError, match="its metadata is no JSON"):
+    with pytest.raises(SceneFormatError, match="its metadata is not JSON"):
         read_scene(tmp_path / "meta.json")
 
 

@@ -282,7 +282,7 @@ def test_blenders_val_is_left_out_and_told(tmp_path, small):
     shutil.copy(tmp_path / "transforms_test.json", tmp_path / "transforms_val.json")
     dataset = load_dataset(tmp_path)
     assert len(dataset.train) == 6 and len(dataset.test) == 3
-    assert any(note.startswith("transforms_val.json: its photos are left out") for note in dataset.notes)
+    assert any(note.startswith("transforms_val.json: its photos are ignored") for note in dataset.notes)
 
 
 @pytest.mark.parametrize(

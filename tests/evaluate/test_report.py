@@ -267,6 +267,21 @@ def test_few_views_are_all_shown(tmp_path, count):
     assert Page(tmp_path / "r.html").tags.count("img") == 3 * min(count, 8)
 
 
+def test_every_kind_of_number_has_its_own_curve():
+    log = [
+        {"iteration": i, "loss": 1.0 + i, "psnr": 20.0 + i, "num_gaussians": 300 + i, "ms": 4.0 + i}
+        for i in (1, 2)
+    ]
+    panels = run_curves_figure(log).axes
+    assert [axes.get_title() for axes in panels] == [
+        "training loss",
+        "held-out views",
+        "density control",
+        "speed",
+    ]
+    assert [axes.lines[0].get_ydata()[0] for axes in panels] == [2.0, 21.0, 301.0, 5.0]
+
+
 def test_curves_are_of_what_the_log_has():
     assert run_curves_figure([]) is None
     assert run_curves_figure([{"iteration": 1, "loss": None}, {"loss": 2.0}]) is None

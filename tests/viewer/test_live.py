@@ -192,27 +192,29 @@ def test_the_end_of_the_program_ends_a_pause(capture, tmp_path):
         assert checkpoint.stem == f"iteration_{held}", "what was trained is saved"
 
 
-def test_a_pause_is_not_counted_as_training(capture, tmp_path):
+def test_a_pause_is_not_counted_as_training(capture, tmp_path, monkeypatch):
+    """The clock goes forward by an hour during the pause: the run takes less than that."""
+    clock, ahead = time.perf_counter, []
+    monkeypatch.setattr(time, "perf_counter", lambda: clock() + sum(ahead))
     with training(capture, tmp_path / "run", "--iterations", "200") as made, Client(made.view) as client:
-        began = time.perf_counter()
         client.move()
         client.press("Step")
         client.paused_at()
-        time.sleep(2.0)
+        ahead.append(3600.0)
         client.press("Resume")
         made.ended()
-        assert made.run.seconds < time.perf_counter() - began - 1.9
+    assert 0 < made.run.seconds < 3600
 
 
 def trained(out, capture, *words, watch=None):
     """Return all of a checkpoint but its clock, and the scene's bytes, of a training that `watch` was let at."""
-    with training(capture, out, "--iterations", "400", "--random-background", *words) as made:
+    with training(capture, out, "--iterations", "200", "--random-background", *words) as made:
         if watch is not None:
             watch(made)
         made.ended()
         tensors, numbers = made.run.trainer.state()
         made.run.finish(lambda split, score: made.view.update("evaluating"))
-    scene = out / "point_cloud" / "iteration_400" / "point_cloud.ply"
+    scene = out / "point_cloud" / "iteration_200" / "point_cloud.ply"
     bits = {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
     return bits, repr(numbers), scene.read_bytes()
 
@@ -241,7 +243,7 @@ def test_a_training_has_the_same_bits_whoever_watches_it(capture, tmp_path, stra
     words = STRATEGIES[strategy]
     alone = trained(tmp_path / "alone", capture, *words)
     assert trained(tmp_path / "watched", capture, *words, watch=watch) == alone
-    assert len(seen) > 20, "it was watched"
+    assert len(seen) > 10, "it was watched"
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -508,6 +510,7 @@ def test_the_finished_scene_is_shown_until_the_last_browser_goes(capture, tmp_pa
             assert staying.is_alive()
         staying.join(PATIENCE)
         assert not staying.is_alive() and not made.view.watched
-        began = time.monotonic()
-        made.view.stay()
-        assert time.monotonic() - began < 5, "nobody is there: it does not stay"
+        again = threading.Thread(target=made.view.stay)
+        again.start()
+        again.join(PATIENCE)
+        assert not again.is_alive(), "nobody is there: it does not stay"

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import UInt8
 
 from gsplat_edu.budget.costs import Measurements, Speed, expected_counts
-from gsplat_edu.camera import Camera, scaled_intrinsics
+from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import Dataset, scene_extent
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.images import save_png, side_by_side
@@ -199,9 +199,9 @@ def _halved(view: View) -> View:
         for plane in (photo.image, photo.alpha, photo.mask)
     )
     H, W = -(-camera.H // 2), -(-camera.W // 2)
-    intrinsics = scaled_intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, W / camera.W, H / camera.H)
     assert image is not None  # a photo has one
-    return View(Camera(camera.R, camera.eye, *intrinsics, H, W), image, alpha=alpha, mask=mask)
+    small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(W, H))
+    return View(small, image, alpha=alpha, mask=mask)
 
 
 def judging_seconds(

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO
 
-from gsplat_edu.cli.printing import complain, spell_what_cannot_be_encoded
+from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.errors import BackendWarning, SplatError
 from gsplat_edu.files import described
 from gsplat_edu.headroom import shortage
@@ -111,7 +111,7 @@ class _HelpAll(argparse.Action):
 def add_backend(parser: argparse._ActionsContainer) -> None:
     """Add the option --backend."""
     names = ", ".join(("auto", *BACKENDS))
-    text = f"what renders: {names}; auto takes cuda if there is a GPU that passes a comparison with cpu, else cpu (default: auto)"
+    text = f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu (default: auto)"
     parser.add_argument("--backend", default="auto", metavar="NAME", help=text)
 
 
@@ -174,7 +174,7 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
     Returns:
         Exit code: 0; 2 for bad input, a file that cannot be written, or insufficient memory; 130 if interrupted.
     """
-    spell_what_cannot_be_encoded()
+    escape_unencodable_characters()
     try:
         with _terminable(), _one_line_warnings(program):
             command()

@@ -123,7 +123,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
 
 
 def _options(config: dict[str, Any]) -> tuple[str, ...]:
-    """Return the options that a longer run should have too: what it reads, its background, how much it may hold."""
+    """Return the options to repeat in a longer run: input, background, limits."""
     section, data = config.get("train"), config["data"]
     train = section if isinstance(section, dict) else {}
     background = train.get("background") or ()

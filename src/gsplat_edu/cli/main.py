@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
-from gsplat_edu.cli.printing import complain, spell_what_cannot_be_encoded
+from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.render.settings import check_backend
 
 COMMANDS = {
@@ -24,7 +24,7 @@ COMMANDS = {
     "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",
     "info": "summarise a capture, a run or a scene file on one screen",
 }
-"""Commands and their summaries. Each has a module `gsplat_edu.cli.NAME` with `run`, and one in `gsplat_edu.cli.options`."""
+"""Commands and their summaries. Each has a module in `gsplat_edu.cli`, with `run`, and one in `cli.options`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0; 2 for bad input; 130 when interrupted.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
-    spell_what_cannot_be_encoded()
+    escape_unencodable_characters()
     try:
         parser = build_parser(words)
         parsed = parser.parse_args(words)

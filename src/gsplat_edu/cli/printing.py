@@ -17,7 +17,7 @@ def complain(sentence: str) -> None:
     print(printable(sentence), file=sys.stderr)
 
 
-def spell_what_cannot_be_encoded() -> None:
+def escape_unencodable_characters() -> None:
     """Escape characters that the locale cannot encode, on standard output and error, to avoid UnicodeEncodeError."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):

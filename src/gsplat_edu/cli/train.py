@@ -39,7 +39,7 @@ from gsplat_edu.viewer.export import check_target
 from gsplat_edu.viewer.serve import exposure
 
 LINES = 20
-"""Number of progress lines where there is no terminal for a progress bar."""
+"""Number of progress lines if there is no terminal for a progress bar."""
 
 NAME_WIDTH = 20
 """Characters of a view's name in the progress bar."""

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.images import PhotoFile, image_size
-from gsplat_edu.data.lens import Lens, undistorted_pinhole
+from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
 from gsplat_edu.errors import DatasetError
 
@@ -263,10 +263,10 @@ def photo_file(
         W, H = size_of(path)
         lens = _fitted(frame, path, (W, H))
     try:
-        pinhole = _resized(undistorted_pinhole(lens), W, H)
+        pinhole = lens.undistorted().scaled(W, H)
     except DatasetError as error:
         raise DatasetError(f"{frame.name}: {error}", error.reason) from None
-    camera = Camera(frame.R, frame.eye, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, H, W)
+    camera = Camera.posed(frame.R, frame.eye, pinhole)
     return PhotoFile(path, frame.mask, lens, W, H, background), camera, rescaled
 
 
@@ -281,13 +281,13 @@ def _fitted(frame: Frame, path: Path, size: tuple[int, int]) -> Lens:
             f"{path}: the photo of {frame.name} {what}; was the photo cropped or turned after the poses were found?",
             f"the photo {what}",
         )
-    return _resized(lens, W, H)
+    return _scaled(lens, W, H)
 
 
 @lru_cache(maxsize=4096)
-def _resized(lens: Lens, W: int, H: int) -> Lens:
-    """Resize a lens, with a cache: the frames of a capture share a few lenses."""
-    return lens.resized(W, H)
+def _scaled(lens: Lens, W: int, H: int) -> Lens:
+    """Scale a lens, with a cache: the frames of a capture share a few lenses."""
+    return lens.scaled(W, H)
 
 
 def _target(W: int, H: int, resolution: float | None) -> tuple[int, int]:

@@ -43,12 +43,6 @@ FAR = 1e4
 EXTENT_MARGIN = 1.1
 """Factor between the cameras' spread and the extent (the code of Kerbl et al. 2023)."""
 
-PARALLEL = 1e-4
-"""Smallest mean squared sine between optical axes that counts as an intersection: about half a degree."""
-
-UNEVEN = 1.5
-"""Warn when the ratio of the two focal lengths exceeds this; real pixels are nearly square."""
-
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
@@ -233,7 +227,7 @@ def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
             f"{len(others)} of {len(frames)} photos differ in size from their camera, first {others[0].name}: "
             "intrinsics rescaled"
         )
-    uneven = [frame for frame in frames if not 1 / UNEVEN < frame.lens.fx / frame.lens.fy < UNEVEN]
+    uneven = [frame for frame in frames if frame.lens.uneven]
     if uneven:
         lens = uneven[0].lens
         notes.append(
@@ -279,7 +273,7 @@ def _random_start(
         where = f"in the cube +-{capture.cube:g}"
     else:
         half_edge = scene_extent(cameras)
-        centre = point_nearest_axes(cameras, PARALLEL)
+        centre = point_nearest_axes(cameras)
         if centre is None:
             centre = np.mean([camera.eye for camera in cameras], axis=0)
         made = random_cloud(centre, half_edge)

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from gsplat_edu.camera import scaled_intrinsics
 from gsplat_edu.errors import DatasetError
+from gsplat_edu.intrinsics import Intrinsics
 
 PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of a perspective lens in OpenCV's order; k4 to k6 belong to the denominator."""
@@ -47,7 +47,7 @@ FOLD_GRID = 128
 
 
 @dataclass(frozen=True)
-class Lens:
+class Lens(Intrinsics):
     """Intrinsics of a camera, including distortion.
 
     Args:
@@ -64,12 +64,6 @@ class Lens:
         DatasetError: a size or focal length is not positive, or a number is NaN or infinite.
     """
 
-    W: int
-    H: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
     coefficients: tuple[float, ...] = ()
     fisheye: bool = False
 
@@ -90,21 +84,9 @@ class Lens:
         """Whether this differs from a pinhole. A fisheye always does, even with zero coefficients."""
         return self.fisheye or any(self.coefficients)
 
-    @property
-    def K(self) -> Float64[np.ndarray, "3 3"]:
-        """Intrinsics (3, 3), px."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-
-    def resized(self, W: int, H: int) -> Lens:
-        """Return the lens of the same photo at another size, see `gsplat_edu.camera.scaled_intrinsics`.
-
-        Args:
-            W: New width, px.
-            H: New height, px.
-        """
-        intrinsics = (self.fx, self.fy, self.cx, self.cy)
-        fx, fy, cx, cy = scaled_intrinsics(*intrinsics, W / self.W, H / self.H)
-        return replace(self, W=W, H=H, fx=fx, fy=fy, cx=cx, cy=cy)
+    def undistorted(self) -> Intrinsics:
+        """Return the pinhole of the undistorted photo, see `undistorted_pinhole`."""
+        return undistorted_pinhole(self)
 
 
 def lens_of(values: Mapping[str, float], W: int, H: int, *, fisheye: bool = False) -> Lens:
@@ -127,7 +109,7 @@ def lens_of(values: Mapping[str, float], W: int, H: int, *, fisheye: bool = Fals
 
 
 @lru_cache(maxsize=4096)
-def undistorted_pinhole(lens: Lens) -> Lens:
+def undistorted_pinhole(lens: Lens) -> Intrinsics:
     """Return the pinhole with the largest field of view that shows nothing outside the photo.
 
     OpenCV finds the largest rectangle of directions covered by the photo and stretches it over the image, each axis on
@@ -136,16 +118,16 @@ def undistorted_pinhole(lens: Lens) -> Lens:
     some pixels may still lie outside; `undistortion` marks them.
 
     Args:
-        lens: The original camera; returned unchanged if it is a pinhole.
+        lens: The original camera.
 
     Returns:
-        A lens without distortion, of the same size and with the same ratio of focal lengths.
+        Intrinsics for the same size and with the same ratio of focal lengths; the lens's own if it does not distort.
 
     Raises:
         DatasetError: the photo is too large, or no such pinhole has a plausible focal length and field of view.
     """
     if not lens.distorts:
-        return replace(lens, coefficients=())
+        return Intrinsics(lens.W, lens.H, lens.fx, lens.fy, lens.cx, lens.cy)
     size, coefficients = (lens.W, lens.H), _padded(lens)
     if max(size) >= MAX_REMAPPED:
         reason = (
@@ -178,7 +160,7 @@ def undistorted_pinhole(lens: Lens) -> Lens:
     )
     if (angle := math.atan(slope)) > MAX_ANGLE:
         raise _not_a_pinhole(lens, f"it would look {math.degrees(angle):.0f} degrees to the side")
-    return Lens(lens.W, lens.H, float(fx), float(fy), float(cx), float(cy))
+    return Intrinsics(lens.W, lens.H, float(fx), float(fy), float(cx), float(cy))
 
 
 def _not_a_pinhole(lens: Lens, why: str) -> DatasetError:
@@ -204,7 +186,7 @@ def bands(H: int) -> Iterator[slice]:
 
 
 def undistortion(lens: Lens, band: slice) -> Maps:
-    """Return the maps from some rows of `undistorted_pinhole(lens)` to a photo of `lens`.
+    """Return the maps from some rows of `lens.undistorted()` to a photo of `lens`.
 
     A pixel is valid if its position lies within the photo's edges (half a pixel beyond the outermost pixel centres) and
     the image is not folded there.
@@ -216,12 +198,12 @@ def undistortion(lens: Lens, band: slice) -> Maps:
     Raises:
         DatasetError: as for `undistorted_pinhole`, or no pixel of the photo remains.
     """
-    pinhole, unfolded = undistorted_pinhole(lens), _unfolded(lens)
+    pinhole, unfolded = lens.undistorted(), _unfolded(lens)
     h = band.stop - band.start
     u, v = _maps(lens, replace(pinhole, H=h, cy=pinhole.cy - band.start))
     valid = (u >= -0.5) & (u <= lens.W - 0.5) & (v >= -0.5) & (v <= lens.H - 0.5)
     if unfolded is not None:
-        # Pixel centres of the grid, as in `Lens.resized`. Between valid and invalid grid points nothing is valid.
+        # Pixel centres of the grid, as in `Intrinsics.scaled`. Between valid and invalid grid points nothing is valid.
         x = (np.arange(lens.W, dtype=np.float32) + 0.5) * (unfolded.shape[1] / lens.W) - 0.5
         y = (np.arange(band.start, band.stop, dtype=np.float32) + 0.5) * (unfolded.shape[0] / lens.H) - 0.5
         X, Y = np.meshgrid(x, y)
@@ -241,7 +223,7 @@ def _unfolded(lens: Lens) -> UInt8[np.ndarray, "h w"] | None:
     """
     scale = min(1.0, FOLD_GRID / max(lens.W, lens.H))
     w, h = max(2, round(scale * lens.W)), max(2, round(scale * lens.H))
-    small, pinhole = lens.resized(w, h), undistorted_pinhole(lens).resized(w, h)
+    small, pinhole = lens.scaled(w, h), lens.undistorted().scaled(w, h)
     u, v = (plane.astype(np.float64) for plane in _maps(small, pinhole))
     u_y, u_x = np.gradient(u)
     v_y, v_x = np.gradient(v)
@@ -254,7 +236,7 @@ def _unfolded(lens: Lens) -> UInt8[np.ndarray, "h w"] | None:
     return None if good.all() else np.where(good, 255, 0).astype(np.uint8)
 
 
-def _maps(lens: Lens, pinhole: Lens) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+def _maps(lens: Lens, pinhole: Intrinsics) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Return the column and row in a photo of `lens`, px, for each pixel of an image of `pinhole`."""
     make = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
     u, v = make(lens.K, _padded(lens), np.eye(3), pinhole.K, (pinhole.W, pinhole.H), cv2.CV_32FC1)

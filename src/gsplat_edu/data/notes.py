@@ -1,4 +1,4 @@
-"""What a reader notes about a capture: values with fields, whose text is the sentence for the user."""
+"""Notes about a capture: values with fields; `str` gives the sentence for the user."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class MissingPhotos:
-    """Photos that the capture lists and that have no file.
+    """Photos that the capture lists but that have no file.
 
     Args:
-        missing: How many there are.
-        total: Photos that the capture lists.
+        missing: Number of such photos.
+        total: Number of photos listed by the capture.
         first: Name of the first one.
     """
 
@@ -27,11 +27,11 @@ class MissingPhotos:
 
 @dataclass(frozen=True)
 class FilesOutside:
-    """Files that are read from outside the capture's folder because the capture names them.
+    """Files outside the capture's folder that the capture refers to.
 
     Args:
         first: The first of them.
-        count: How many there are.
+        count: Number of such files.
         folder: The capture's folder.
     """
 
@@ -48,11 +48,11 @@ class FilesOutside:
 
 @dataclass(frozen=True)
 class UnclearMasks:
-    """Photos whose mask is not used: it has a bare name that several photos share.
+    """Photos whose mask is ignored, because several photos share its bare name.
 
     Args:
-        photos: How many photos there are of that kind.
-        total: Photos that the capture lists.
+        photos: Number of such photos.
+        total: Number of photos listed by the capture.
         first: Name of the first one.
     """
 
@@ -63,14 +63,14 @@ class UnclearMasks:
     def __str__(self) -> str:
         """Return the sentence."""
         return (
-            f"{self.photos} of {self.total} photos have a mask only by a bare name that several share: not used, "
-            f"first {self.first}; put masks into folders as the photos are"
+            f"{self.photos} of {self.total} photos have a mask whose bare name several photos share: ignored, "
+            f"first {self.first}; put masks into the same folders as the photos"
         )
 
 
 @dataclass(frozen=True)
 class OtherModels:
-    """COLMAP models beside the one that is read.
+    """COLMAP models other than the one that is read.
 
     Args:
         folder: The folder that holds them.
@@ -90,11 +90,11 @@ class OtherModels:
 
 @dataclass(frozen=True)
 class UnusedSplit:
-    """A list of photos that is not read because another one is there to test with.
+    """A list of photos that is ignored because another list provides the test views.
 
     Args:
-        unused: Name of the file that is left out.
-        used: Name of the file with the photos to test with.
+        unused: Name of the ignored file.
+        used: Name of the file with the test views.
     """
 
     unused: str
@@ -102,7 +102,7 @@ class UnusedSplit:
 
     def __str__(self) -> str:
         """Return the sentence."""
-        return f"{self.unused}: its photos are left out; {self.used} is there to test with"
+        return f"{self.unused}: its photos are ignored; {self.used} provides the test views"
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,7 @@ class TwoLayouts:
 
     def __str__(self) -> str:
         """Return the sentence."""
-        return (
-            f"{self.folder} holds transforms.json and a COLMAP model: the poses are those of transforms.json"
-        )
+        return f"{self.folder} holds transforms.json and a COLMAP model: using the poses of transforms.json"
 
 
 Note = MissingPhotos | FilesOutside | UnclearMasks | OtherModels | UnusedSplit | TwoLayouts

@@ -13,10 +13,6 @@ from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.evaluate.paths import common_up
 
-UNEVEN = 1.1
-"""Ratio of the focal lengths from which pixels are told not to be square. Those of cameras are, and good calibrations
-find it within 1 %."""
-
 OFF_CENTRE = 0.1
 """Distance of the principal point from the middle, in sides of the image, from which it is told: lenses sit within a
 few per cent, and a photo that was cut after its calibration is off by what was cut."""
@@ -109,7 +105,7 @@ def check_intrinsics(survey: Survey) -> list[Finding]:
 def _oddities(shot: Shot, zoomed: bool) -> list[tuple[str, str]]:
     """Return what is odd about a photo's intrinsics: its kind, and in words."""
     lens, found = shot.lens, list[tuple[str, str]]()
-    if not 1 / UNEVEN < lens.fx / lens.fy < UNEVEN:
+    if lens.uneven:
         found.append(
             ("uneven", f"fx is {lens.fx:.4g} px and fy {lens.fy:.4g}, but pixels of cameras are square")
         )

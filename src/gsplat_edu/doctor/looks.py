@@ -17,7 +17,7 @@ from jaxtyping import Float32, Float64
 from gsplat_edu.doctor.cameras import looking_away
 from gsplat_edu.doctor.finding import Finding, Severity, counted
 from gsplat_edu.doctor.geometry import inside
-from gsplat_edu.doctor.photos import COARSE, WORK_SIDE
+from gsplat_edu.doctor.photos import BRIGHT, COARSE, DARK, GAMMA, WORK_SIDE
 from gsplat_edu.doctor.survey import Shot, Survey
 
 EXPOSURE = "exposure"
@@ -76,12 +76,6 @@ thing."""
 
 AGREEING = 0.75
 """Share of the neighbours that have to say the same, by half of it at least: one edge of a shadow is no exposure."""
-
-GAMMA = 2.2
-"""Bytes are about light to the power of 1 / 2.2."""
-
-DARK, BRIGHT = 8.0, 247.0
-"""Values of bytes outside of which a colour counts as clipped: ratios mean nothing there."""
 
 PAIRS = 20
 """Points seen by both from which two photos are compared."""

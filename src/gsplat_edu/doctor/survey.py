@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera, scaled_intrinsics
+from gsplat_edu.camera import Camera
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
 from gsplat_edu.data.dataset import read_capture
 from gsplat_edu.data.lens import Lens
@@ -138,8 +138,7 @@ def _shot(frame: Frame) -> Shot | Refused:
     except DatasetError as error:
         return Refused(frame.name, error.reason)
     h, w = look.thumbnail.shape[:2]
-    intrinsics = scaled_intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, w / camera.W, h / camera.H)
-    small = Camera(camera.R, camera.eye, *intrinsics, h, w)
+    small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(w, h))
     return Shot(frame.name, frame.lens, (camera.W, camera.H), small, look)
 
 

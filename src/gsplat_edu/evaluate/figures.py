@@ -25,8 +25,8 @@ SVG_FACTS = ("Creator", "Date", "Format", "Type")
 """Metadata that matplotlib writes into an SVG by default (dates and addresses); left out here."""
 
 RUN_CURVES = (
-    ("loss", "training loss", "loss of the iteration's view"),
     ("loss", "training loss", "loss of each iteration's view"),
+    ("psnr", "held-out views", "PSNR of the test views (dB)"),
     ("num_gaussians", "density control", "number of Gaussians"),
     ("ms", "speed", "ms per iteration"),
 )
@@ -77,7 +77,7 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
             gets no curve, and a single term, which is the loss, none of its own.
 
     Returns:
-        The figure; None where there is nothing to draw.
+        The figure; None if there is nothing to draw.
     """
     curves = []
     for key, title, label in RUN_CURVES:

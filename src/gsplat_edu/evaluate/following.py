@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsplat_edu.camera import Camera, look_at, point_nearest_axes
-from gsplat_edu.evaluate.paths import PARALLEL, common_up
+from gsplat_edu.camera import Camera, as_camera, look_at, point_nearest_axes
+from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.validation import in_range, whole_number
 
 Vector = Float64[np.ndarray, "3"]
@@ -127,13 +127,13 @@ def point_looked_at(cameras: Sequence[Camera]) -> Vector | None:
         (3,) world units; None if the axes are parallel or meet behind the cameras, or if fewer than 70 % of the cameras
         have the point in view.
     """
-    centre = point_nearest_most_axes(cameras, PARALLEL)
+    centre = point_nearest_most_axes(cameras)
     if centre is None or np.mean([_shows(camera, centre) for camera in cameras]) < MOST:
         return None
     return centre
 
 
-def point_nearest_most_axes(cameras: Sequence[Camera], parallel: float) -> Vector | None:
+def point_nearest_most_axes(cameras: Sequence[Camera]) -> Vector | None:
     """Find the point nearest to the optical axes of most cameras.
 
     Each candidate is the point nearest to the axes of a random sample of the cameras (with a fixed seed): a single
@@ -142,7 +142,6 @@ def point_nearest_most_axes(cameras: Sequence[Camera], parallel: float) -> Vecto
 
     Args:
         cameras: At least one.
-        parallel: As for `gsplat_edu.camera.point_nearest_axes`.
 
     Returns:
         (3,) world units, possibly behind the cameras; None if the axes are parallel.
@@ -153,13 +152,13 @@ def point_nearest_most_axes(cameras: Sequence[Camera], parallel: float) -> Vecto
         np.arange(count),
         *(rng.choice(count, min(SAMPLED, count), replace=False) for _ in range(DRAWS)),
     ]
-    found = [point_nearest_axes([cameras[int(i)] for i in rows], parallel) for rows in samples]
+    found = [point_nearest_axes([cameras[int(i)] for i in rows]) for rows in samples]
     points = [point for point in found if point is not None]
     if not points:
         return None
     angles = min((_angles(point - eyes, axes) for point in points), key=lambda each: float(np.median(each)))
     kept = np.flatnonzero(angles <= max(PAST, PAST_FACTOR * float(np.median(angles))))
-    return point_nearest_axes([cameras[int(i)] for i in kept], parallel)
+    return point_nearest_axes([cameras[int(i)] for i in kept])
 
 
 def _shows(camera: Camera, point: Vector) -> bool:
@@ -359,7 +358,7 @@ def _chain(apart: Float64[np.ndarray, "n n"]) -> Int64[np.ndarray, " m"]:
 
 
 def _like(camera: Camera, R: Float64[np.ndarray, "3 3"], eye: Vector) -> Camera:
-    return Camera(R, eye, camera.fx, camera.fy, camera.cx, camera.cy, camera.H, camera.W)
+    return Camera.posed(R, eye, as_camera("camera", camera).intrinsics)
 
 
 def _units(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:

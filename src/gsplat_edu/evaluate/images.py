@@ -50,7 +50,7 @@ NOT_WRITTEN = frozenset(
 )
 """Suffixes of image and video formats that are not supported; a folder is unlikely to be meant by them."""
 
-Frame = UInt8[np.ndarray, "H W 3"]
+RgbBytes = UInt8[np.ndarray, "H W 3"]
 
 
 def save_png(path: Path, image: ArrayLike) -> None:
@@ -70,7 +70,7 @@ def save_png(path: Path, image: ArrayLike) -> None:
         picture.save(aside, format="PNG")
 
 
-def side_by_side(images: Sequence[ArrayLike]) -> Frame:
+def side_by_side(images: Sequence[ArrayLike]) -> RgbBytes:
     """Put images of equal height side by side, with a thin grey line between them.
 
     Args:
@@ -88,7 +88,7 @@ def side_by_side(images: Sequence[ArrayLike]) -> Frame:
     pictures = [to_bytes(image) for image in images]
     height = pictures[0].shape[0]
     line = np.full((height, SEPARATOR_WIDTH, 3), SEPARATOR_GREY, dtype=np.uint8)
-    row: list[Frame] = []
+    row: list[RgbBytes] = []
     for picture in pictures:
         check_shape("images", picture.shape, (height, "W", 3), {})
         row += [line, picture] if row else [picture]

@@ -8,16 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import WORLD_UP, Camera, scaled_intrinsics
+from gsplat_edu.camera import WORLD_UP, Camera, as_camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
 Vector = Float64[np.ndarray, "3"]
-
-PARALLEL = 1e-3
-"""Smallest eigenvalue of mean(I - f f') at which the intersection of the optical axes is well defined. Below it (about
-1.8 degrees between axes) the intersection is noise."""
 
 SPREAD = 0.01
 """The right axes define up from this mean square along their second principal direction (a spread of 6 degrees)."""
@@ -91,11 +87,10 @@ def resized(camera: Camera, longest: int) -> Camera:
     Raises:
         ArgumentError: longest is not a whole number of at least 1.
     """
-    longest = whole_number("longest", longest, 1)
+    camera, longest = as_camera("camera", camera), whole_number("longest", longest, 1)
     share = longest / max(camera.W, camera.H)
     W, H = (max(1, round(side * share)) for side in (camera.W, camera.H))
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return Camera(camera.R, camera.eye, *scaled_intrinsics(*intrinsics, W / camera.W, H / camera.H), H, W)
+    return Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(W, H))
 
 
 def common_up(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:

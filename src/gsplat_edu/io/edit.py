@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, as_camera
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
@@ -72,8 +72,7 @@ class Similarity:
     def camera(self, camera: Camera) -> Camera:
         """Return the camera that has the same view of the transformed scene as `camera` has of the original."""
         eye = self.s * self.R @ camera.eye + self.t
-        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.H, camera.W)
-        return Camera(camera.R @ self.R.T, eye, *intrinsics)
+        return Camera.posed(camera.R @ self.R.T, eye, as_camera("camera", camera).intrinsics)
 
     def scene(self, scene: Scene) -> Scene:
         """Transform a scene: means, rotations, scales, SH coefficients and the up direction.

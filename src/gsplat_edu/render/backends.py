@@ -1,4 +1,4 @@
-"""Which rendering backends this machine has, and why not the others. Nothing falls back silently."""
+"""The rendering backends of this machine, and the reasons why others are unavailable. No silent fallbacks."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from gsplat_edu.render.settings import check_backend
 
 
 def resolve_backend(name: str, device: torch.device | None = None) -> str:
-    """Turn a backend's name, or "auto", into the backend that will run.
+    """Resolve a backend's name, or "auto", to the backend that will run.
 
     The first use of cuda in a process checks its kernels on the device (`gsplat_edu.render.self_check`).
 
     Args:
-        name: "auto" for cuda where torch sees a GPU whose kernels pass the check, else cpu; or a backend by name.
-        device: The device of the tensors to render, if they are on one yet: "auto" does not move them.
+        name: "auto" selects cuda if torch sees a GPU whose kernels pass the check, else cpu; or a backend by name.
+        device: The device of the tensors to render, if they exist already: "auto" does not move them.
 
     Returns:
         The name of an available backend.
 
     Raises:
-        BackendUnavailableError: there is no such backend, or it does not run here; the message says why.
+        BackendUnavailableError: the backend does not exist or cannot run here; the message says why.
 
     Warns:
-        BackendWarning: "auto" takes cpu although there is a GPU, since the kernels fail the check.
+        BackendWarning: "auto" selects cpu although there is a GPU, because its kernels fail the check.
     """
     if name == "auto":
         on_gpu = torch.cuda.is_available() if device is None else device.type == "cuda"
@@ -53,11 +53,11 @@ def _warn_once(message: str) -> None:
 
 
 def unavailable(name: str, device: torch.device | None = None) -> str | None:
-    """Say why a backend does not run on this machine; None where it does.
+    """Return why a backend cannot run on this machine; None if it can.
 
     Args:
         name: The backend.
-        device: The GPU that cuda is to run on; the current one where None.
+        device: The GPU for cuda; None means the current one.
     """
     if name == "cpu":
         return kernels.REASON
@@ -74,10 +74,10 @@ def unavailable(name: str, device: torch.device | None = None) -> str | None:
 
 
 def interpreted() -> bool:
-    """Say whether Triton's kernels run in its interpreter, on CPU tensors, to be tested without a GPU."""
+    """Return whether Triton's kernels run in its interpreter, on CPU tensors, for tests without a GPU."""
     return os.environ.get("TRITON_INTERPRET", "0").lower() in ("1", "true", "on", "yes", "y")
 
 
 def device_of(backend: str) -> torch.device:
-    """Return where a backend wants its tensors."""
+    """Return the device on which a backend needs its tensors."""
     return torch.device("cuda" if backend == "cuda" and torch.cuda.is_available() else "cpu")

@@ -55,7 +55,7 @@ class Exported:
     def line(self) -> str:
         """Summarise the comparison in one line."""
         size = f"{self.num_bytes:,} bytes, {self.num_bytes / max(self.num_gaussians, 1):.1f} per splat"
-        lowest = f"lowest {self.worst_psnr:.2f} ({self.worst_view})"
+        lowest = f"worst {self.worst_psnr:.2f} ({self.worst_view})"
         return f"{self.path}: PSNR {self.psnr:.2f} dB over {self.num_views} views, {lowest}; {size}"
 
     def document(self) -> dict[str, Any]:

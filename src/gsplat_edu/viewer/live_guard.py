@@ -6,7 +6,7 @@ or a WebSocket must pass three checks before viser sees it:
 - Host names this computer (`gsplat_edu.viewer.serve.names_this_computer`); this prevents DNS rebinding.
 - Origin, required for a WebSocket, has the same host and port: the page was served here.
 - The token, random for each run, is in the URL or in the cookie set when the page was opened with it. viser's client
-drops the URL's query before it opens the WebSocket, so there the cookie carries the token.
+  drops the URL's query before it opens the WebSocket, so there the cookie carries the token.
 """
 
 from __future__ import annotations

@@ -32,7 +32,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="highest degree of spherical harmonics to keep (default: %(default)s)",
     )
     parser.add_argument(
-        "--min-opacity", type=float, default=0.0, metavar="A", help="drop Gaussians with a lower opacity (default: 0)"
+        "--min-opacity",
+        type=float,
+        default=0.0,
+        metavar="A",
+        help="drop Gaussians with a lower opacity (default: 0)",
     )
     parser.add_argument(
         "--crop",

@@ -40,7 +40,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="the run's capture, if its folder has moved",
     )
-    after.add_argument(
-        "--all-views", action="store_true", help="list the PSNR of every view, worst first"
-    )
+    after.add_argument("--all-views", action="store_true", help="list the PSNR of every view, worst first")
     add_backend(parser)

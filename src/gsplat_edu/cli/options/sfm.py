@@ -25,7 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of photos, optionally with masks/ or alpha, or a video",
     )
     parser.add_argument(
-        "out", type=Path, metavar="OUT", help="folder of the capture to write; intermediate results are kept in OUT/sfm"
+        "out",
+        type=Path,
+        metavar="OUT",
+        help="folder of the capture to write; intermediate results are kept in OUT/sfm",
     )
 
     def number(flag: str, text: str, default: int) -> None:
@@ -41,9 +44,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     number("--frames", "maximum number of frames taken from a video", SfmOptions.frames)
     choice("--matcher", "which pairs of photos are matched", MATCHERS)
     choice("--mapper", "COLMAP mapper", MAPPERS)
-    choice("--camera-model", "lens model (auto refines as many parameters as held-out photos support)", CAMERA_MODELS)
+    choice(
+        "--camera-model",
+        "lens model (auto refines as many parameters as held-out photos support)",
+        CAMERA_MODELS,
+    )
     number("--max-features", "maximum number of features per photo", SfmOptions.max_features)
-    number("--max-image-size", "longest side of the photos for feature detection, px", SfmOptions.max_image_size)
+    number(
+        "--max-image-size", "longest side of the photos for feature detection, px", SfmOptions.max_image_size
+    )
     number("--threads", "threads of COLMAP; 0 for all", SfmOptions.threads)
 
 

@@ -176,7 +176,7 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         "--image-memory",
         type=bytes_text,
         metavar="SIZE",
-        help="memory for decoded photos, for example 500MB; photos beyond it are read again for each use (default: 4GiB)",
+        help="memory for decoded photos, for example 500MB; others are read again for each use (default: 4GiB)",
     )
     behind = group.add_mutually_exclusive_group()
     behind.add_argument("--white-background", action="store_true", help="white background (default: black)")

@@ -20,10 +20,8 @@ function turned(vector, axis, angle) {
 const MOST_CROPPED = 1.25;
 
 // Fits a camera to a window of another shape around the centre of its image. A narrow window is filled and the sides
-// are
-// cropped, since no camera saw anything above and below the image. A wide window keeps most of the height, since a
-// square
-// photo of an object would lose its top and bottom, and shows some more at the sides.
+// are cropped, since no camera saw anything above and below the image. A wide window keeps most of the height, since a
+// square photo of an object would lose its top and bottom, and shows some more at the sides.
 function fitted(camera, width, height) {
   const [across, down] = [width / camera.W, height / camera.H];
   const scale = across > down ? Math.min(across, MOST_CROPPED * down) : down;
@@ -96,8 +94,7 @@ class View {
   }
 
   // The camera's axes after turning to the right and down by given angles; never across the zenith, where left and
-  // right
-  // would swap.
+  // right would swap.
   turnedHead(right, down) {
     const level = this.camera.R.map((row) => turned(row, this.up, -right));
     const R = level.map((row) => turned(row, level[0], -down));

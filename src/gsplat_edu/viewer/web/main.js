@@ -55,8 +55,7 @@ class Viewer {
   }
 
   // For programs: draws with exactly this camera, regardless of the window's size, and returns float32 RGB with the
-  // first
-  // row on top. The camera stays until the user moves.
+  // first row on top. The camera stays until the user moves.
   async setCamera(camera) {
     this.exact = camera;
     await this.settled();

@@ -16,8 +16,7 @@ function layout(facts) {
 }
 
 // Returns the splats as typed arrays by name. The text is removed from the page piece by piece, so that it and the
-// numbers
-// are never in memory together.
+// numbers are never in memory together.
 async function unpackSplats(facts) {
   const parts = layout(facts).map((part) => ({ ...part, length: facts.count * part.channels * part.texels }));
   const total = parts.reduce((sum, part) => sum + part.length * part.type.BYTES_PER_ELEMENT, 0);

@@ -111,8 +111,7 @@ void main() {
     conic = vec3(c, -b, a) / det;
 
     // The quad is tightest along the ellipse's long axis. A quad in any direction contains the ellipse, so the axis
-    // need
-    // not be exact.
+    // need not be exact.
     float root = sqrt(0.25 * (a - c) * (a - c) + b * b);
     vec2 axis = a > c ? vec2(0.5 * (a - c) + root, b) : vec2(b, 0.5 * (c - a) + root);
     axis = root > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
