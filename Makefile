@@ -2,21 +2,24 @@
 # PYTHON=python3.12 in front or behind chooses the interpreter; the default is python3.
 BIN := .venv/bin
 OUT ?= out/sphere.png
-# Processes that run the tests. Each test file stays in one process, so that its fixtures are made once.
+# Processes that run the tests. Each test file stays in one process, so that its fixtures are made once; the longest
+# files start first (tests/slices.py), so that no process is left with a long one at the end.
 WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 BENCH := $(if $(SMOKE),--smoke)
 export PYTHON
 
-.PHONY: help demo test check sanitize bench notebooks site clean
+.PHONY: help demo test soak check sanitize bench notebooks site clean
 
 help:
-	@echo "make demo        train the sphere on the embedded scene; writes $(OUT), curves and scene"
-	@echo "make test        all tests"
-	@echo "make check       lint, format, types, layering and the house's limits"
-	@echo "make sanitize    native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
-	@echo "make bench       measure; prints tables and writes out/bench/*.json (SMOKE=1: only see that it runs)"
+	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
+	@echo "make test        run all tests; of the sliced ones, the cases that the commit draws"
+	@echo "make soak        run every case of the sliced tests, large fuzzing runs and the full chapters: hours"
+	@echo "make check       lint, format, types, import layers and size limits"
+	@echo "make sanitize    run the native tests on a build with AddressSanitizer and UndefinedBehaviorSanitizer"
+	@echo "make bench       benchmarks; prints tables and writes out/bench/*.json (SMOKE=1: only check that they run)"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
-	@echo "make site        chapters, documents and reference as pages, out/site/index.html"
+	@echo "make site        build the site: chapters, documents and reference, out/site/index.html"
 	@echo "make clean       remove .venv, out and caches"
 
 demo:
@@ -27,7 +30,16 @@ demo:
 test:
 	@tools/set_up.sh dev
 	@echo "== test: running the suite"
-	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	@$(PYTEST)
+
+soak:
+	@tools/set_up.sh dev
+	@echo "== soak: every case of the sliced tests"
+	@GSPLAT_EDU_SOAK=1 $(PYTEST) -m sliced
+	@echo "== soak: damaged checkpoints and configurations under sanitizers"
+	@GSPLAT_EDU_SOAK=1 tools/sanitize.sh
+	@echo "== soak: chapters on the full budget"
+	@$(BIN)/python tools/build_notebooks.py --out out/soak/notebooks
 
 check:
 	@tools/set_up.sh dev
@@ -35,6 +47,8 @@ check:
 	@$(BIN)/ruff check .
 	@echo "== check: ruff, format"
 	@$(BIN)/ruff format --check .
+	@echo "== check: clang-format"
+	@$(BIN)/clang-format --dry-run --Werror native/*.h native/*.cpp benchmarks/ladder/*.h benchmarks/ladder/*.cpp
 	@echo "== check: mypy, strict over src"
 	@$(BIN)/mypy
 	@echo "== check: import-linter, who may import whom"

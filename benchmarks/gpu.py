@@ -28,6 +28,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.optimizer import Adam
+from gsplat_edu.train.schedule import gaussian_groups
 
 
 class Scale(NamedTuple):
@@ -106,7 +107,7 @@ def iteration(gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer:
     """Take one step of training."""
     output = render(gaussians, cam, settings=SETTINGS, backend="cuda")
     photo_loss(output.image, photo).backward()
-    optimizer.step(gaussians)
+    optimizer.step(gaussians.tensors())
 
 
 def stages(count: int, width: int, height: int, rounds: int) -> dict[str, float]:
@@ -114,7 +115,7 @@ def stages(count: int, width: int, height: int, rounds: int) -> dict[str, float]
     gaussians, cam = scene(count, "cuda"), camera(width, height)
     photo = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, device="cuda")
     config = TrainConfig()
-    optimizer = Adam(gaussians, config.learning_rates, eps=config.adam_eps)
+    optimizer = Adam(gaussians.tensors(), gaussian_groups(config, 1.0))
     torch.cuda.reset_peak_memory_stats()
     found = {"iteration": milliseconds(lambda: iteration(gaussians, cam, photo, optimizer), rounds)}
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]

@@ -26,7 +26,8 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.train.optimizer import Adam
+from gsplat_edu.train.optimizer import Adam, ParameterGroup
+from gsplat_edu.train.schedule import gaussian_groups
 from gsplat_edu.views import View
 
 STAGES = ("project", "sort", "intersect", "composite", "composite_backward", "project_backward")
@@ -39,7 +40,7 @@ def measure(scene: Gaussians, views: Sequence[View], rounds: int = 20) -> dict[s
     The scene is not changed.
     """
     config, gaussians = TrainConfig(), scene.trainable()
-    optimizer = Adam(gaussians, config.learning_rates | {"means": 0.0}, eps=config.adam_eps)
+    optimizer = Adam(gaussians.tensors(), gaussian_groups(config, 1.0) | {"means": ParameterGroup(0.0)})
     settings = RenderSettings(depth=False, jacobian_limit=config.jacobian_limit)
     found: dict[str, list[float]] = {
         name: [] for name in (*STAGES, "loss", "Adam", "rest", "iteration", "pairs")
@@ -54,7 +55,7 @@ def measure(scene: Gaussians, views: Sequence[View], rounds: int = 20) -> dict[s
         t2 = time.perf_counter()
         loss.backward()
         t3 = time.perf_counter()
-        optimizer.step(gaussians)
+        optimizer.step(gaussians.tensors())
         t4 = time.perf_counter()
         if k < WARM_UP:
             continue

@@ -49,10 +49,14 @@ constexpr Kind KIND = std::is_same_v<T, float> ? Kind::F32 : Kind::F64;
 
 inline nb::dlpack::dtype dtype_of(Kind kind) {
     switch (kind) {
-        case Kind::F32: return nb::dtype<float>();
-        case Kind::F64: return nb::dtype<double>();
-        case Kind::U8: return nb::dtype<uint8_t>();
-        default: return nb::dtype<int64_t>();
+        case Kind::F32:
+            return nb::dtype<float>();
+        case Kind::F64:
+            return nb::dtype<double>();
+        case Kind::U8:
+            return nb::dtype<uint8_t>();
+        default:
+            return nb::dtype<int64_t>();
     }
 }
 
@@ -100,7 +104,9 @@ struct Array {
     bool contiguous = false, here = false, given = false;
 
     template <class T>
-    T *as() const { return static_cast<T *>(data); }
+    T *as() const {
+        return static_cast<T *>(data);
+    }
     explicit operator bool() const { return given; }
     bool is(Kind kind) const { return dtype == dtype_of(kind); }
 
@@ -223,7 +229,8 @@ class Arguments {
             if (tensor.ndim > MOST_AXES) return found;
             found.owner = nb::borrow(given), found.dtype = tensor.dtype;
             const char *address = static_cast<const char *>(tensor.data);
-            found.describe(address ? address + tensor.byte_offset : nullptr, tensor.device.device_type, tensor.ndim, tensor.shape, tensor.strides);
+            found.describe(address ? address + tensor.byte_offset : nullptr, tensor.device.device_type, tensor.ndim, tensor.shape,
+                           tensor.strides);
             return found;
         }
         nb::ndarray<> writable;
@@ -231,12 +238,14 @@ class Arguments {
             if (written) found.held = nb::ndarray<nb::ro>(writable);
             if (found.held.ndim() > size_t(MOST_AXES)) return found;
             found.dtype = found.held.dtype();
-            found.describe(found.held.data(), found.held.device_type(), int(found.held.ndim()), found.held.shape_ptr(), found.held.stride_ptr());
+            found.describe(found.held.data(), found.held.device_type(), int(found.held.ndim()), found.held.shape_ptr(),
+                           found.held.stride_ptr());
         }
         return found;
     }
 
-    [[noreturn]] void refuse(const char *name, const Array &found, std::initializer_list<Kind> kinds, const Shape *wanted, bool written) const {
+    [[noreturn]] void refuse(const char *name, const Array &found, std::initializer_list<Kind> kinds, const Shape *wanted,
+                             bool written) const {
         std::string text = "has to be ";
         for (const Kind *kind = kinds.begin(); kind != kinds.end(); ++kind)
             text += (kind == kinds.begin() ? "" : " or ") + spelled(dtype_of(*kind));

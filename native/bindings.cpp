@@ -14,7 +14,10 @@
 #include <limits>
 #include <utility>
 
+#include "buffers.h"
+#include "dispatch.h"
 #include "frame.h"
+#include "loss.h"
 #include "threads.h"
 
 using namespace gsplat;
@@ -81,8 +84,17 @@ struct SceneArrays : PerGaussian {
 
     template <class T>
     Scene<T> as() const {
-        return {n, means.as<T>(), quats.as<T>(), log_scales.as<T>(), sh0.as<T>(), sh_rest.as<T>(), logit_opacities.as<T>(),
-                int32_t(rest), cov3ds.as<T>(), colors.as<T>(), opacities.as<T>()};
+        return {n,
+                means.as<T>(),
+                quats.as<T>(),
+                log_scales.as<T>(),
+                sh0.as<T>(),
+                sh_rest.as<T>(),
+                logit_opacities.as<T>(),
+                int32_t(rest),
+                cov3ds.as<T>(),
+                colors.as<T>(),
+                opacities.as<T>()};
     }
 };
 
@@ -98,8 +110,8 @@ struct GradientArrays : PerGaussian {
 
     template <class T>
     SceneGrads<T> as() const {
-        return {means.as<T>(), quats.as<T>(), log_scales.as<T>(), sh0.as<T>(), sh_rest.as<T>(), logit_opacities.as<T>(),
-                cov3ds.as<T>(), colors.as<T>(), opacities.as<T>(), means2d_norm.as<T>()};
+        return {means.as<T>(),           quats.as<T>(),  log_scales.as<T>(), sh0.as<T>(),       sh_rest.as<T>(),
+                logit_opacities.as<T>(), cov3ds.as<T>(), colors.as<T>(),     opacities.as<T>(), means2d_norm.as<T>()};
     }
 };
 
@@ -126,8 +138,7 @@ struct BoundFrame {
     Frame<T> frame;
 
     BoundFrame(const SceneArrays &scene, const Camera &camera, const Settings &settings, int threads)
-        : n(scene.n), rest(scene.rest), direct(scene.direct), H(camera.H), W(camera.W),
-          frame(scene.as<T>(), camera, settings, threads) {}
+        : n(scene.n), rest(scene.rest), direct(scene.direct), H(camera.H), W(camera.W), frame(scene.as<T>(), camera, settings, threads) {}
 
     void check(const Arguments &a, const char *name, const PerGaussian &given) const {
         if (!given.means.is(KIND<T>)) a.fail(name, "is of another dtype than the frame");
@@ -229,17 +240,15 @@ void adam(nb::args positional, nb::kwargs given) {
     const Array parameter = a.array_of_any_shape("parameter", KIND<T>, true);
     const Array first = a.array("first", {KIND<T>}, parameter.shape, true), second = a.array("second", {KIND<T>}, parameter.shape, true);
     const Array gradient = a.array("gradient", {KIND<T>}, parameter.shape);
-    AdamArgs<T> args{parameter.as<T>(), first.as<T>(), second.as<T>(), gradient.as<T>(),
-                     a.number("rate"), a.number("beta1"), a.number("beta2"), a.number("eps"),
-                     a.number("correction1"), a.number("correction2")};
+    AdamArgs<T> args{parameter.as<T>(), first.as<T>(),     second.as<T>(),  gradient.as<T>(),        a.number("rate"),
+                     a.number("beta1"), a.number("beta2"), a.number("eps"), a.number("correction1"), a.number("correction2")};
     const int threads = int(a.whole("threads", 1, MOST_THREADS));
     a.finish();
     const int64_t size = parameter.shape.size();
     nb::gil_scoped_release release;
     constexpr int64_t GRAIN = 1 << 15;
-    parallel(threads, (size + GRAIN - 1) / GRAIN, [&](int64_t task, int) {
-        kernels<T>().adam(args, task * GRAIN, std::min(size, (task + 1) * GRAIN));
-    });
+    parallel(threads, (size + GRAIN - 1) / GRAIN,
+             [&](int64_t task, int) { kernels<T>().adam(args, task * GRAIN, std::min(size, (task + 1) * GRAIN)); });
 }
 
 // -> (mean |x - y|, mean SSIM); the gradient is written.
@@ -254,8 +263,14 @@ std::array<double, 2> loss_of(nb::args positional, nb::kwargs given) {
     a.finish();
     if (image.shape[0] > MOST || image.shape[1] > MOST / 3) a.fail("image", "is too large");
     const bool bytes = target.is(Kind::U8);
-    LossArgs<T> args{image.as<T>(), bytes ? nullptr : target.as<T>(), bytes ? target.as<uint8_t>() : nullptr,
-                     int32_t(image.shape[0]), int32_t(image.shape[1]), ssim_weight, gradient.as<T>(), nullptr};
+    LossArgs<T> args{image.as<T>(),
+                     bytes ? nullptr : target.as<T>(),
+                     bytes ? target.as<uint8_t>() : nullptr,
+                     int32_t(image.shape[0]),
+                     int32_t(image.shape[1]),
+                     ssim_weight,
+                     gradient.as<T>(),
+                     nullptr};
     nb::gil_scoped_release release;
     std::array<double, 2> means;
     loss<T>(args, &means[0], &means[1], threads);
@@ -288,11 +303,11 @@ int64_t free_memory() {
     PyObject *found = PyObject_CallNoArgs(free_memory_function);
     const int64_t bytes = found && found != Py_None ? int64_t(PyLong_AsLongLong(found)) : -1;
     Py_XDECREF(found);
-    if (PyErr_Occurred()) {  // not knowing is no reason to end a training
-        PyErr_Clear();
-        return -1;
-    }
-    return bytes;
+    if (!PyErr_Occurred()) return bytes;
+    // Out of memory, or the interpreter is ending: not knowing is no reason to end a training. An interrupt is.
+    if (!PyErr_ExceptionMatches(PyExc_MemoryError) && !PyErr_ExceptionMatches(PyExc_ImportError)) throw nb::python_error();
+    PyErr_Clear();
+    return -1;
 }
 
 }  // namespace

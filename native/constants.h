@@ -1,4 +1,5 @@
 // Made by tools/generate_constants.py from src/gsplat_edu/constants.py. Do not edit.
+// clang-format off
 #pragma once
 
 namespace gsplat {

@@ -4,7 +4,7 @@
 #include <stdexcept>
 #include <string>
 
-#include "frame.h"
+#include "dispatch.h"
 
 namespace gsplat {
 
@@ -61,7 +61,10 @@ void choose_isa(const char *name) {
         if (asked && !candidate.runs) reason = "this machine lacks it";
         if (candidate.runs && (!name || asked)) best = candidate.table;
     }
-    if (!best) throw std::invalid_argument((name ? "GSPLAT_EDU_ISA=" + std::string(name) + ": " + reason : "this machine is too old for the native kernels") + "; there are " + built);
+    if (!best)
+        throw std::invalid_argument(
+            (name ? "GSPLAT_EDU_ISA=" + std::string(name) + ": " + reason : "this machine is too old for the native kernels") +
+            "; there are " + built);
     chosen = best;
 }
 
@@ -71,8 +74,12 @@ const Isa &isa() {
 }
 
 template <>
-const Kernels<float> &kernels<float>() { return isa().f32; }
+const Kernels<float> &kernels<float>() {
+    return isa().f32;
+}
 template <>
-const Kernels<double> &kernels<double>() { return isa().f64; }
+const Kernels<double> &kernels<double>() {
+    return isa().f64;
+}
 
 }  // namespace gsplat

@@ -2,43 +2,11 @@
 #pragma once
 
 #include <array>
-#include <memory>
 
+#include "buffers.h"
 #include "kernels.h"
 
 namespace gsplat {
-
-// The instruction set in use; set once at import, or by name in tests. Throws std::invalid_argument with a reason.
-const Isa &isa();
-void choose_isa(const char *name);
-// Names of those this build has and this machine runs, best last.
-int list_isas(const char **names, int capacity);
-
-template <class T>
-const Kernels<T> &kernels();
-
-// What is asked before a large block is allocated: the bytes that are free, negative where nobody knows. None at first.
-using FreeMemory = int64_t (*)();
-void ask_before_large_blocks(FreeMemory free_memory);
-
-// Memory that is kept when its owner goes and handed to the next one that asks, so that frames of changing size do
-// not grow the process.
-class Buffer {
-  public:
-    Buffer() = default;
-    ~Buffer();
-    Buffer(const Buffer &) = delete;
-    Buffer &operator=(const Buffer &) = delete;
-    // At least `bytes`; what was in it is lost. Throws std::bad_alloc, for a large block also where the system would
-    // grant memory that it does not have.
-    void *reserve(size_t bytes);
-    template <class T>
-    T *as() const { return static_cast<T *>(data_); }
-
-  private:
-    void *data_ = nullptr;
-    size_t capacity_ = 0;
-};
 
 template <class T>
 struct Outputs {
@@ -80,9 +48,5 @@ class Frame {
     std::array<double, 6> seconds_{};
     Buffer splats_, visible_, sorted_, pairs_of_, slot_begin_, pairs_, tile_begin_, done_;
 };
-
-// (1 - k) L1 + k (1 - SSIM): the two means, and the gradient to args.grad. Sums and scratch are provided.
-template <class T>
-void loss(LossArgs<T> args, double *l1, double *ssim, int threads);
 
 }  // namespace gsplat

@@ -101,12 +101,11 @@ GSPLAT_INLINE void harmonics_backward(int degree, T x, T y, T z, const T *g, T *
     if (degree < 3) return;
     const T xx = x * x, yy = y * y, zz = z * z;
     const T a = T(C3[6]), b = T(C3[1]), c = T(C3[4]), e = T(C3[3]), f = T(C3[5]);
-    d[0] += 6 * a * x * y * g[9] + b * y * z * g[10] - 2 * c * x * y * g[11] - 6 * e * x * z * g[12] +
-            c * (4 * zz - 3 * xx - yy) * g[13] + 2 * f * x * z * g[14] + 3 * a * (xx - yy) * g[15];
-    d[1] += 3 * a * (xx - yy) * g[9] + b * x * z * g[10] + c * (4 * zz - xx - 3 * yy) * g[11] -
-            6 * e * y * z * g[12] - 2 * c * x * y * g[13] - 2 * f * y * z * g[14] - 6 * a * x * y * g[15];
-    d[2] += b * x * y * g[10] + 8 * c * y * z * g[11] + 3 * e * (2 * zz - xx - yy) * g[12] + 8 * c * x * z * g[13] +
-            f * (xx - yy) * g[14];
+    d[0] += 6 * a * x * y * g[9] + b * y * z * g[10] - 2 * c * x * y * g[11] - 6 * e * x * z * g[12] + c * (4 * zz - 3 * xx - yy) * g[13] +
+            2 * f * x * z * g[14] + 3 * a * (xx - yy) * g[15];
+    d[1] += 3 * a * (xx - yy) * g[9] + b * x * z * g[10] + c * (4 * zz - xx - 3 * yy) * g[11] - 6 * e * y * z * g[12] -
+            2 * c * x * y * g[13] - 2 * f * y * z * g[14] - 6 * a * x * y * g[15];
+    d[2] += b * x * y * g[10] + 8 * c * y * z * g[11] + 3 * e * (2 * zz - xx - yy) * g[12] + 8 * c * x * z * g[13] + f * (xx - yy) * g[14];
 }
 
 // The shape of one Gaussian on its way to the screen, with what the backward pass needs again. In double, whatever the

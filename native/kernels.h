@@ -150,10 +150,8 @@ struct LossArgs {
 
     int64_t bands() const { return (H + SSIM_BAND - 1) / SSIM_BAND; }
     // Numbers of scratch that a thread needs.
-    static constexpr int64_t SCRATCH =
-        4 * (SSIM_BAND + 4 * SSIM_HALF) * SSIM_MAP + 3 * (SSIM_BAND + 2 * SSIM_HALF) * SSIM_STRIP;
+    static constexpr int64_t SCRATCH = 4 * (SSIM_BAND + 4 * SSIM_HALF) * SSIM_MAP + 3 * (SSIM_BAND + 2 * SSIM_HALF) * SSIM_STRIP;
 };
-
 
 constexpr int64_t BLOCK = 256;                         // Gaussians a thread takes at a time
 

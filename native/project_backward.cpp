@@ -33,8 +33,8 @@ GSPLAT_INLINE Whitened whiten(const Camera &cam, const Settings &set, const Proj
 }
 
 // From the gradients d of J W (two rows t, `total` the sum of d . t) and of the image position to the mean in camera axes.
-GSPLAT_INLINE void mean_gradient(const Projected &g, const Camera &cam, const double *d0, const double *d1, double total,
-                                 const double *uv, double *dp) {
+GSPLAT_INLINE void mean_gradient(const Projected &g, const Camera &cam, const double *d0, const double *d1, double total, const double *uv,
+                                 double *dp) {
     const double iz = g.iz, x = g.p[0] * iz, y = g.p[1] * iz;  // x/z, y/z
     double w0 = 0, w1 = 0;                                     // d . (row 2 of W)
     for (int k = 0; k < 3; ++k) w0 += d0[k] * cam.R[6 + k], w1 += d1[k] * cam.R[6 + k];
@@ -111,16 +111,15 @@ GSPLAT_INLINE double direct_gradient(const ProjectBackwardArgs<T> &args, int64_t
     // Gradient of a, of b (once for both places) and of c: L' N L / 2.
     double a = m.sx * m.sx * m.m00 / 2, b = m.sx * (m.sy * m.m00 + m.ty * m.m01);
     double c = (m.sy * (m.sy * m.m00 + 2 * m.ty * m.m01) + m.ty * m.ty * m.m11) / 2;
-    if (args.settings.antialiased && g.det0 > DET_FLOOR)
-        a += h / 2 * g.c0 / g.det0, b -= h * g.b0 / g.det0, c += h / 2 * g.a0 / g.det0;
+    if (args.settings.antialiased && g.det0 > DET_FLOOR) a += h / 2 * g.c0 / g.det0, b -= h * g.b0 / g.det0, c += h / 2 * g.a0 / g.det0;
     double total = 0;
     for (int k = 0; k < 3; ++k) {
         d0[k] = 2 * a * g.r0[k] + b * g.r1[k];
         d1[k] = 2 * c * g.r1[k] + b * g.r0[k];
         total += d0[k] * g.t0[k] + d1[k] * g.t1[k];
         for (int j = 0; j < 3; ++j)
-            args.grads.cov3ds[9 * i + 3 * k + j] = T(a * g.t0[k] * g.t0[j] + c * g.t1[k] * g.t1[j] +
-                                                     b / 2 * (g.t0[k] * g.t1[j] + g.t1[k] * g.t0[j]));
+            args.grads.cov3ds[9 * i + 3 * k + j] =
+                T(a * g.t0[k] * g.t0[j] + c * g.t1[k] * g.t1[j] + b / 2 * (g.t0[k] * g.t1[j] + g.t1[k] * g.t0[j]));
     }
     return total;
 }
@@ -152,8 +151,7 @@ void one(const ProjectBackwardArgs<T> &args, int64_t i) {
         for (int j = 0; j < SLOT; ++j) sums[j] += in[j];
     Projected g;
     Shade<T> shade;
-    if (!project_shape(args.scene, args.camera, args.settings, i, g) ||
-        !project_color(args.scene, args.settings, i, g, shade))
+    if (!project_shape(args.scene, args.camera, args.settings, i, g) || !project_color(args.scene, args.settings, i, g, shade))
         return zero(args, i);
 
     double slot[SLOT];
@@ -164,12 +162,10 @@ void one(const ProjectBackwardArgs<T> &args, int64_t i) {
     args.grads.means2d_norm[i] = T(sqrt_(nx * nx + ny * ny));
 
     double d0[3], d1[3], dp[3], dmean[3];
-    const double total = args.scene.quats ? raw_gradient(args, i, g, m, slot[H], d0, d1)
-                                          : direct_gradient(args, i, g, m, slot[H], d0, d1);
+    const double total = args.scene.quats ? raw_gradient(args, i, g, m, slot[H], d0, d1) : direct_gradient(args, i, g, m, slot[H], d0, d1);
     mean_gradient(g, args.camera, d0, d1, total, uv, dp);
     dp[2] += slot[DEPTH];
-    for (int k = 0; k < 3; ++k)
-        dmean[k] = args.camera.R[k] * dp[0] + args.camera.R[3 + k] * dp[1] + args.camera.R[6 + k] * dp[2];
+    for (int k = 0; k < 3; ++k) dmean[k] = args.camera.R[k] * dp[0] + args.camera.R[3 + k] * dp[1] + args.camera.R[6 + k] * dp[2];
     if (args.scene.quats) {
         color_gradient(args, i, shade, sums, dmean);
         args.grads.logit_opacities[i] = T((1 - g.opacity) * slot[H]);

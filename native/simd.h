@@ -121,8 +121,8 @@ GSPLAT_INLINE bool any_at_least(VD v, double x) {
     return any != 0;
 }
 
-// 2^min(p, most), 0 where p < least; most <= 0 and -126 <= least. n = round(p) (by adding and subtracting 1.5 * 2^23, which -ffast-math would fold away), then a
-// polynomial of degree 5 on [-1/2, 1/2] fitted for its relative error, 2.4e-7.
+// 2^min(p, most), 0 where p < least; most <= 0 and -126 <= least. n = round(p) (by adding and subtracting 1.5 * 2^23, which -ffast-math
+// would fold away), then a polynomial of degree 5 on [-1/2, 1/2] fitted for its relative error, 2.4e-7.
 GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
 #if GSPLAT_VECTOR_BYTES == 64
     const __mmask16 keep = _mm512_cmp_ps_mask((__m512)p, _mm512_set1_ps(least), _CMP_GE_OQ);

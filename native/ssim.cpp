@@ -54,8 +54,7 @@ GSPLAT_INLINE void cut_target(const LossArgs<T> &args, int64_t row, const Strip 
 template <class V, class T>
 GSPLAT_INLINE V blur_y(const T *in, int64_t stride) {
     V sum = splat(T(SSIM_TAP[0])) * load<V>(in);
-    for (int k = 1; k <= HALF; ++k)
-        sum += splat(T(SSIM_TAP[k])) * (load<V>(in - k * stride) + load<V>(in + k * stride));
+    for (int k = 1; k <= HALF; ++k) sum += splat(T(SSIM_TAP[k])) * (load<V>(in - k * stride) + load<V>(in + k * stride));
     return sum;
 }
 
@@ -64,8 +63,7 @@ template <class T, class F>
 GSPLAT_INLINE void strips(const LossArgs<T> &args, int64_t band, F body) {
     const int64_t width = int64_t(args.W) * CHANNELS, first = band * SSIM_BAND;
     const int64_t last = vmin<int64_t>(first + SSIM_BAND, args.H);
-    for (int64_t x0 = 0; x0 < width; x0 += STRIP)
-        body(Strip{first, last, x0, vmin<int64_t>(STRIP, width - x0), width, args.H});
+    for (int64_t x0 = 0; x0 < width; x0 += STRIP) body(Strip{first, last, x0, vmin<int64_t>(STRIP, width - x0), width, args.H});
 }
 
 // G along x of x, y, x² + y² and xy, for every row that the strip's maps need: four planes of IN_ROWS x MAP.
@@ -145,8 +143,8 @@ GSPLAT_INLINE double gradient(const LossArgs<T> &args, const Strip &s, const T *
         V row_sum{}, column = iota<T>();
         for (int64_t i = 0; i < s.count; i += Vector<T>::LANES, column += splat(T(Vector<T>::LANES))) {
             const V a = load<V>(x.strip() + i), b = load<V>(y.strip() + i), difference = a - b;
-            const V d = blur_y<V>(in + i, STRIP) + two * a * blur_y<V>(in + OUT_PLANE + i, STRIP) +
-                        b * blur_y<V>(in + 2 * OUT_PLANE + i, STRIP);
+            const V d =
+                blur_y<V>(in + i, STRIP) + two * a * blur_y<V>(in + OUT_PLANE + i, STRIP) + b * blur_y<V>(in + 2 * OUT_PLANE + i, STRIP);
             const V sign = (a > b ? l1 : V{}) - (a < b ? l1 : V{});
             store_some(args.grad + row * s.width + s.x0 + i, sign - ssim * d, s.count - i);
             row_sum += column < splat(T(s.count)) ? (difference > V{} ? difference : -difference) : V{};

@@ -7,6 +7,10 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+# One thread: several processes run tests at once, and threads that wait for one another burn the processors' time.
+# Tests of several threads ask for them. Set before torch is imported; the programs that tests start inherit it.
+os.environ["OMP_NUM_THREADS"] = "1"
+
 import jaxtyping
 import numpy as np
 import pytest
@@ -18,14 +22,17 @@ if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: to
     sys.modules["gsplat_edu._native"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(sys.modules["gsplat_edu._native"])
 
+import slices
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
+from slices import pytest_collection_modifyitems, pytest_report_header, pytest_runtest_makereport  # noqa: F401
 
 # Whatever was started in the background of a shell ignores Ctrl-C, and so would every program that is tested.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The same examples in every run: a failure seen once is seen again.
-settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=200)
-settings.load_profile("repeatable")
+# The same examples in every run: a failure seen once is seen again. `make soak` looks at others, and at more.
+settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=100)
+settings.register_profile("soak", deadline=None, max_examples=5_000, print_blob=True)
+settings.load_profile("soak" if slices.SOAK else "repeatable")
 
 
 @pytest.fixture

@@ -26,8 +26,8 @@ CANVAS = (120, 80)
 POSE = {"wxyz": LEVEL, "position": (0.1, -0.05, -3.0), "fov": 0.8, "image_width": 120, "image_height": 80}
 GROWING = ["--max-gaussians", "600", "--densify-start", "5", "--densify-every", "10"]
 STRATEGIES = {
-    "adc": ["--densify-stop", "350", "--grad-threshold", "1e-4", "--reset-every", "100"],
-    "mcmc": ["--strategy", "mcmc", "--mcmc-stop", "350"],
+    "adc": ["--densify-stop", "150", "--grad-threshold", "1e-4", "--reset-every", "60"],
+    "mcmc": ["--strategy", "mcmc", "--mcmc-stop", "150"],
 }
 
 

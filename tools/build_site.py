@@ -2,32 +2,90 @@
 
     python tools/build_site.py [--out out/site]
 
-The pages are gathered in the layout of the repository, so that their links hold; a link to a module leads to its page
-of the reference. A warning of the generator stops the build with exit code 1. Notebooks are shown as they were built.
+Pages are gathered in the layout of the repository, so that their relative links stay valid; a link to a module leads to
+its page of the reference. A warning from the generator stops the build with exit code 1. Notebooks are shown as built,
+with their set-up cells folded.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
+import importlib
+import inspect
 import json
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "src" / "gsplat_edu"
-DOCUMENTS = (
-    "README.md",
-    "ARCHITECTURE.md",
-    "CHANGELOG.md",
-    "docs/DECISIONS.md",
-    "docs/RECIPE.md",
-    "docs/PRECISION.md",
-    "benchmarks/RESULTS.md",
-)
+USE = {
+    "README.md": "Install and first run",
+    "docs/GUIDE.md": "Guide",
+    "docs/CLI.md": "Command line",
+    "docs/FORMATS.md": "Scene formats",
+    "docs/RECIPE.md": "Training parameters",
+    "benchmarks/RESULTS.md": "Measured results",
+}
+"""Documents for users, with their titles in the sidebar."""
+
+BUILD_ON = {
+    "docs/PYTHON.md": "Python examples",
+    "reference/index.md": "Reference",
+    "ARCHITECTURE.md": "Architecture",
+    "docs/DECISIONS.md": "Conventions",
+    "docs/decisions/index.md": "Decision records",
+    "docs/PRECISION.md": "Precision",
+    "CONTRIBUTING.md": "Contributing",
+    "CHANGELOG.md": "Changelog",
+}
+"""Documents for developers; the two indices are written here."""
+
+PICTURES = ("docs/images/sphere.png", "docs/images/capture.jpg")
+TILES = ("notebooks/11_tiles.ipynb", 0)
+"""Figure of a chapter that the landing page shows: the notebook, and which of its figures."""
+
+PUBLIC = {
+    "Course (NumPy, from `gsplat_edu`)": "gsplat_edu",
+    "Rendering": (
+        "gsplat_edu.render.api.render",
+        "gsplat_edu.gaussians.Gaussians",
+        "gsplat_edu.camera.Camera",
+        "gsplat_edu.render.settings.RenderSettings",
+        "gsplat_edu.render.output.RenderOutput",
+        "gsplat_edu.render.cpu.render_covariances",
+        "gsplat_edu.render.torch_reference.render_t",
+    ),
+    "Captures": (
+        "gsplat_edu.data.dataset.load_dataset",
+        "gsplat_edu.data.dataset.scene_extent",
+        "gsplat_edu.views.View",
+        "gsplat_edu.views.Photo",
+    ),
+    "Training": (
+        "gsplat_edu.train.config.recipe",
+        "gsplat_edu.train.config.TrainConfig",
+        "gsplat_edu.train.initialize.from_points",
+        "gsplat_edu.train.initialize.make_strategy",
+        "gsplat_edu.train.trainer.Trainer",
+        "gsplat_edu.losses.photo_loss",
+    ),
+    "Scene files": (
+        "gsplat_edu.io.formats.read_scene",
+        "gsplat_edu.io.formats.write_scene",
+        "gsplat_edu.io.scene.Scene",
+        "gsplat_edu.io.ply.load_ply",
+        "gsplat_edu.io.ply.save_ply",
+    ),
+}
+"""The public API: the names of a module's `__all__`, or names by their full path."""
+
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 
 
@@ -77,40 +135,117 @@ def gather(stage: Path) -> None:
     Args:
         stage: The folder, empty.
     """
-    decisions = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
-    documents = [*map(Path, DOCUMENTS), *decisions]
+    records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
+    documents = [Path(name) for name in (*USE, *BUILD_ON) if not name.endswith("/index.md")]
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
-    for page in documents:
+    for page in [*documents, *records]:
         _write(stage / page, relinked((ROOT / page).read_text(encoding="utf-8"), page, stage))
     for page in chapters:
         notebook = json.loads((ROOT / page).read_text(encoding="utf-8"))
         for cell in notebook["cells"]:
             if cell["cell_type"] == "markdown":
                 cell["source"] = relinked("".join(cell["source"]), page, stage)
+        fold_set_up(notebook)
         _write(stage / page, json.dumps(notebook))
-    names = modules()
-    for name in names:
+    for name in modules():
         _write(stage / "reference" / f"{name}.md", _reference(name))
-    _write(stage / "index.md", _index(documents, chapters, names))
+    _write(stage / "reference" / "index.md", _public_api())
+    _write(stage / "docs" / "decisions" / "index.md", _records(records))
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
+    for picture in PICTURES:
+        shutil.copyfile(ROOT / picture, stage / "static" / Path(picture).name)
+    (stage / "static" / "tiles.png").write_bytes(_figure(*TILES))
+    landing = (stage / "index.md").read_text(encoding="utf-8")
+    _write(stage / "index.md", landing + _contents(chapters))
+
+
+def fold_set_up(notebook: dict[str, Any]) -> None:
+    """Fold the code of cells that begin with imports; what they print or draw stays visible.
+
+    Args:
+        notebook: The notebook; its cells are changed.
+    """
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code" and re.match(r"(import|from) ", "".join(cell["source"])):
+            cell["metadata"] = {**cell["metadata"], "tags": ["hide-input"]}
+
+
+def _figure(page: str, number: int) -> bytes:
+    """Return a figure of an executed notebook, a PNG."""
+    notebook = json.loads((ROOT / page).read_text(encoding="utf-8"))
+    outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+    figures = [output["data"]["image/png"] for output in outputs if "image/png" in output.get("data", {})]
+    return base64.b64decode("".join(figures[number]))
 
 
 def _reference(name: str) -> str:
-    # The package's own names stand where they are defined; there they are linked.
+    """Write the page of a module; that of a package lists its modules."""
+    # The package's own names are indexed where they are defined.
     again = "   :no-index:\n" if "." not in name else ""
-    return f"# {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}```\n"
+    page = f"# {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}```\n"
+    inside = [other for other in modules() if other.rpartition(".")[0] == name and name != "gsplat_edu"]
+    return page + ("\n## Modules\n\n" + _toctree("maxdepth: 1", inside) if inside else "")
 
 
-def _index(documents: list[Path], chapters: list[Path], names: list[str]) -> str:
-    parts = ["# gsplat_edu\n\n3D Gaussian Splatting: the course, the documents and the reference.\n"]
-    sections = {
-        "The course": [str(page.with_suffix("")) for page in chapters],
-        "Documents": [str(page.with_suffix("")) for page in documents],
-        "Reference": [f"reference/{name}" for name in names],
-    }
-    for title, pages in sections.items():
-        parts.append(f"```{{toctree}}\n:caption: {title}\n:maxdepth: 1\n\n" + "\n".join(pages) + "\n```\n")
+def _public_api() -> str:
+    """Write the first page of the reference: the public API by topic, then every package."""
+    parts = ["# Reference\n\nThe public API first; the pages of all packages and modules follow.\n"]
+    for topic, listed in PUBLIC.items():
+        names = _names(listed) if isinstance(listed, str) else listed
+        parts.append(f"## {topic}\n\n| name | what it is |\n|---|---|")
+        parts += [_row(name) for name in names]
+        parts.append("")
+    top = [name for name in modules() if name.count(".") == 1]
+    packages = [name for name in top if any(other.startswith(f"{name}.") for other in modules())]
+    parts += ["## Packages\n", _toctree("maxdepth: 1", packages)]
+    parts += ["## Modules\n", _toctree("maxdepth: 1", ["gsplat_edu", *(n for n in top if n not in packages)])]
     return "\n".join(parts)
+
+
+def _names(module: str) -> list[str]:
+    """Name the functions and classes of a module's `__all__`."""
+    everything = [f"{module}.{name}" for name in importlib.import_module(module).__all__]
+    return [name for name in everything if callable(_found(name))]
+
+
+def _found(name: str) -> object:
+    module, _, attribute = name.rpartition(".")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _row(name: str) -> str:
+    """Link a name to its definition, and summarise it by the first line of its docstring."""
+    thing: Any = _found(name)
+    if not (isinstance(thing, type) or inspect.isfunction(thing)):  # a type alias: its module documents it
+        return (
+            f"| {{py:obj}}`{name}` | {(getattr(thing, '__doc__', '') or '').strip().partition(chr(10))[0]} |"
+        )
+    text = (inspect.getdoc(thing) or "").partition("\n\n")[0]
+    target = f"{thing.__module__}.{thing.__qualname__}"
+    return (
+        f"| {{py:obj}}`{thing.__name__} <{target}>` | {' '.join(text.split()).replace('|', chr(92) + '|')} |"
+    )
+
+
+def _records(records: list[Path]) -> str:
+    head = "# Decision records\n\nOne short record for each choice that was hard to make.\n\n"
+    return head + _toctree("maxdepth: 1", [page.stem for page in records])
+
+
+def _toctree(options: str, pages: Iterable[str]) -> str:
+    return f"```{{toctree}}\n:{options}\n\n" + "\n".join(pages) + "\n```\n"
+
+
+def _contents(chapters: list[Path]) -> str:
+    """Write the sidebar: the three ways in."""
+    sections = {
+        "Learn": [str(page.with_suffix("")) for page in chapters],
+        "Use": [f"{title} <{name.removesuffix('.md')}>" for name, title in USE.items()],
+        "Build on": [f"{title} <{name.removesuffix('.md')}>" for name, title in BUILD_ON.items()],
+    }
+    return "\n".join(
+        _toctree(f"caption: {title}\n:hidden:\n:maxdepth: 2", pages) for title, pages in sections.items()
+    )
 
 
 def _write(path: Path, text: str) -> None:

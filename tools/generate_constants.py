@@ -38,6 +38,7 @@ def header() -> str:
     """Return the text of the header."""
     lines = [
         "// Made by tools/generate_constants.py from src/gsplat_edu/constants.py. Do not edit.",
+        "// clang-format off",
         "#pragma once",
     ]
     lines += ["", "namespace gsplat {", "", f"constexpr int TILE = {c.TILE};"]

@@ -1,5 +1,6 @@
 #!/bin/sh
 # Build the native module with AddressSanitizer and UndefinedBehaviorSanitizer and run its tests on that build.
+# With GSPLAT_EDU_SOAK=1, thousands of damaged checkpoints and configurations (tests/slices.py).
 set -eu
 cd "$(dirname "$0")/.."
 python=$PWD/.venv/bin/python
@@ -12,8 +13,6 @@ cmake --build "$build"
 "$python" tools/check_objects.py "$build"
 # Python itself is not instrumented, so the runtime comes in by preload; its own leaks, and torch's, are not ours.
 preload="$(g++ -print-file-name=libasan.so) $(g++ -print-file-name=libubsan.so)"
-# 2,000 damaged files: 850 checkpoints of either density strategy and 300 configurations.
-export GSPLAT_EDU_FUZZ_CHECKPOINTS="${GSPLAT_EDU_FUZZ_CHECKPOINTS:-850}" GSPLAT_EDU_FUZZ_CONFIGS="${GSPLAT_EDU_FUZZ_CONFIGS:-300}"
 LD_PRELOAD="$preload" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
-    GSPLAT_TEST_NATIVE="$build" "$python" -m pytest -q tests/native tests/test_losses.py tests/train/test_optimizer.py \
+    GSPLAT_TEST_NATIVE="$build" "$python" -m pytest -q -n "${WORKERS:-2}" --dist loadfile tests/native tests/test_losses.py tests/train/test_optimizer.py \
     tests/train/test_checkpoint.py tests/fuzz/test_checkpoints.py tests/fuzz/test_configs.py -m "not own_process" -p no:cacheprovider --capture=sys

@@ -74,7 +74,7 @@ class Fit2DOptions:
             reason = "is a folder" if self.image.is_dir() else "is not there"
             raise ArgumentError(f"--image: {self.image} {reason}; give an image file")
         if self.out.suffix.lower() != ".png":
-            raise ArgumentError(f"--out: {str(self.out)!r} has to end in .png; the curves are named after it")
+            raise ArgumentError(f"--out: {str(self.out)!r} must end in .png; the curves are named after it")
         for path in (self.out, self.curves):
             if path.resolve() == self.image.resolve():
                 raise ArgumentError(f"--out: {path} is the picture itself; choose another name")
@@ -140,12 +140,8 @@ def train(options: Fit2DOptions) -> None:
     say(f"wrote {options.out}, {options.curves}")
 
 
-def main(given: list[str] | None = None) -> int:
-    """Read the command line and fit.
-
-    Args:
-        given: The arguments; those of the process where None.
-    """
+def build_parser() -> OneLineParser:
+    """Build the parser of the command line."""
     parser = OneLineParser(
         prog="train_2d.py",
         description="Fit a picture with 2D splats, every gradient written by hand in NumPy.",
@@ -156,13 +152,13 @@ def main(given: list[str] | None = None) -> int:
         type=Path,
         metavar="FILE",
         default=PHOTO,
-        help="the picture (default: the portrait that matplotlib brings along)",
+        help="picture to fit (default: the portrait of Grace Hopper that comes with matplotlib)",
     )
     for flag, default, text in (
         ("--splats", 500, "number of splats"),
-        ("--iters", 600, "steps"),
-        ("--size", 128, "longer side of the picture in px; a smaller picture keeps its size"),
-        ("--seed", 8, "seed of the start"),
+        ("--iters", 600, "iterations"),
+        ("--size", 128, "longer side to which the picture is downscaled, px"),
+        ("--seed", 8, "seed of the initial splats"),
     ):
         number = f"{text} (default: {default})"
         parser.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=number)
@@ -171,10 +167,19 @@ def main(given: list[str] | None = None) -> int:
         type=Path,
         metavar="X.png",
         default=Path("out/image.png"),
-        help="the picture beside the fit; X_curves.png goes beside it (default: %(default)s)",
+        help="figure to write, picture beside fit; X_curves.png is written beside it (default: %(default)s)",
     )
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
-    options = vars(parser.parse_args(given))
+    return parser
+
+
+def main(given: list[str] | None = None) -> int:
+    """Read the command line and fit.
+
+    Args:
+        given: The arguments; those of the process where None.
+    """
+    options = vars(build_parser().parse_args(given))
     debug = options.pop("debug")
     return run_command("train_2d.py", lambda: train(Fit2DOptions(**options)), debug)
 

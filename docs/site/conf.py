@@ -19,6 +19,8 @@ html_css_files = ["site.css"]
 
 # What a notebook shows was made by tools/build_notebooks.py.
 nb_execution_mode = "off"
+nb_code_prompt_show = "Show the set-up code"
+nb_code_prompt_hide = "Hide the set-up code"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 

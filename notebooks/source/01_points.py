@@ -283,10 +283,10 @@ plt.show()
 # %% [markdown]
 # ## No slope
 #
-# Holes and flicker are ugly. What rules points out for this course is something else. The scene is going to be
-# *found*: compare the picture with a photo, ask in which direction each point would have to move to make the
-# difference smaller, move it a little, repeat. So take one white point, a photo of it in its right place, and
-# the sum of squared differences as it is moved towards that place.
+# Holes and flicker are ugly. For this course points fail for another reason. The scene is going to be *found*:
+# compare the picture with a photo, ask in which direction each point would have to move to make the difference
+# smaller, move it a little, repeat. So take one white point, a photo of it in its right place, and the sum of
+# squared differences as it is moved towards that place.
 
 # %%
 small = Camera.looking_at(eye=[0, 0, 0], target=[0, 0, 1], fx=24, fy=24, H=24, W=24)
@@ -340,7 +340,7 @@ for radius, slope in slopes.items():
 # ## The obvious fix
 #
 # The figure has given it away: let a point cover more than one pixel. A disc of radius $r$ covers a pixel if its
-# centre is within $r$ of it. A pixel now listens to $\pi r^2$ pixels' worth of points, and the holes go as
+# centre is within $r$ of it. A pixel now sees the points of $\pi r^2$ pixels, and the fraction of holes is
 # $e^{-\lambda \pi r^2}$.
 
 # %%
@@ -382,9 +382,9 @@ plt.show()
 # %% [markdown]
 # ## The next failure
 #
-# Size was needed; it is not what was missing. A disc says of every pixel that it is covered or that it is not,
-# and a number that is either 0 or 1 cannot change a little. Whatever a disc does at its rim, it does between
-# one position and the next.
+# Size was needed, but it is not enough. A disc says of every pixel that it is covered or that it is not, and a
+# number that is either 0 or 1 cannot change a little. Whatever a disc does at its rim, it does between one
+# position and the next.
 
 # %%
 inside_rim = [bool(mask_at(u, 2.3)[12, 12]) for u in (9.6999, 9.7001)]
@@ -393,5 +393,5 @@ assert inside_rim == [False, True]
 
 # %% [markdown]
 # What a point wants is an extent without a rim: full at its centre, less a little further out, and nothing far
-# away, with no place in between where it jumps. What function that is, and how it gets to be wide in one
-# direction and narrow in another, is the matter of [chapter 02](02_gaussians_in_2d.ipynb).
+# away, with no place in between where it jumps. [Chapter 02](02_gaussians_in_2d.ipynb) finds that function, and
+# makes it wide in one direction and narrow in another.

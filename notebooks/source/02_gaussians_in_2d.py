@@ -14,9 +14,9 @@
 # %% [markdown]
 # # 02 - Gaussians in two dimensions
 #
-# [Chapter 01](01_points.ipynb) gave its points an extent, and the extent had a rim. Below, a disc moves
-# across a picture that has other things to do than to sit on the pixels' grid. How much light it puts into the
-# picture should not depend on where it is. It does, and it changes in jumps.
+# [Chapter 01](01_points.ipynb) gave its points an extent, and the extent had a rim. Below, a disc moves across
+# a picture by fractions of a pixel. How much light it puts into the picture should not depend on where it is.
+# It does, and it changes in jumps.
 
 # %%
 import os
@@ -52,11 +52,11 @@ plt.show()
 # %% [markdown]
 # ## A footprint without a rim
 #
-# Wanted is a function of the offset from the centre: 1 in the middle, falling smoothly, nothing far away. Many
-# do that. Ask one thing more. To work it out quickly for a whole image it would be good if it came apart into a
-# factor for the columns and one for the rows, $g(x)\,g(y)$; and a round blob must not betray where the columns
-# and rows are, so the product may depend on $r^2 = x^2 + y^2$ alone. Take logarithms, with
-# $g(x) = e^{\ell(x^2)}$ and $\ell(0) = 0$:
+# We want a function of the offset from the centre: 1 in the middle, falling smoothly to nothing far away. Many
+# functions do that, so ask for one thing more. To evaluate it quickly for a whole image it should separate into
+# a factor for the columns and one for the rows, $g(x)\,g(y)$; and since a round blob must not reveal the
+# directions of the grid, the product may depend on $r^2 = x^2 + y^2$ alone. Take logarithms, with $g(x) =
+# e^{\ell(x^2)}$ and $\ell(0) = 0$:
 #
 # $$\ell(x^2) + \ell(y^2) = \ell(x^2 + y^2).$$
 #
@@ -64,8 +64,8 @@ plt.show()
 #
 # $$g(r) = e^{-r^2 / 2\sigma^2}.$$
 #
-# The number in the exponent is written so that $\sigma$ is the standard deviation, in pixels. The disc is asked
-# again, and the Gaussian with it: how much light, and how far from the picture that has it at 0?
+# The number in the exponent is written so that $\sigma$ is the standard deviation, in pixels. The same question
+# for the disc and the Gaussian: how much light is there, and how far is the picture from the one at offset 0?
 
 # %%
 bells = [np.exp(-((pixel_x - place) ** 2 + pixel_y**2) / (2 * 1.6**2)) for place in places]
@@ -152,7 +152,7 @@ assert peaks[0] == 1.0 and peaks[2] > 1e3
 # %% [markdown]
 # In the middle the ellipse has all but become a line. One small push further an eigenvalue is negative: along that
 # axis the exponent grows, the contours are hyperbolas, and what should have been a blob is brightest at infinity.
-# The border is where $\Sigma_{xy}^2 = \Sigma_{xx}\Sigma_{yy}$, and a step on the three numbers does not look.
+# The border is where $\Sigma_{xy}^2 = \Sigma_{xx}\Sigma_{yy}$, and a step on the three numbers can cross it.
 #
 # So do not store $\Sigma$. Store $A$, in whatever form, and multiply. For any direction $w$
 #
@@ -177,9 +177,9 @@ assert proper[1] == 1.0 and proper[0] < 0.5
 #
 # $$\int g \, dp = 2\pi\sqrt{\det\Sigma}.$$
 #
-# Divided by it, a splat would be the fainter the larger it is, and a wall of big splats transparent. Left alone,
-# the value at the centre is the opacity there, whatever the size. The mass is how much the splat paints in all,
-# and a sum over pixels should be it.
+# Divided by it, a larger splat would be fainter, and a wall of big splats transparent. Without the division the
+# value at the centre is the opacity there, whatever the size. The integral is the total amount of paint, and a
+# sum over pixels should equal it.
 
 # %%
 mass = 2 * np.pi * np.sqrt(np.linalg.det(leaning))
@@ -193,8 +193,8 @@ assert abs(summed / mass - 1) < 8 * np.exp(-2 * np.pi**2 * np.linalg.eigvalsh(le
 # %% [markdown]
 # ## Narrower than a pixel
 #
-# The tolerance in that check is a warning. It is tiny when the narrowest axis is a pixel wide. Pixels ask for the value
-# at one place each, and a splat can be so narrow that no pixel asks where it is. In one dimension the sum
+# The tolerance in that check is a warning. It is tiny when the narrowest axis is a pixel wide. Each pixel takes the
+# value at one place, and a splat can be so narrow that it lies between all of these places. In one dimension the sum
 # over pixels at $k$ of a bell at $x$ can be written with the bell's frequencies (Poisson's summation):
 #
 # $$\sum_k e^{-(k-x)^2/2\sigma^2} = \sqrt{2\pi}\,\sigma
@@ -347,7 +347,7 @@ assert np.abs(means[MODES[2]] / means[MODES[2]][0] - 1).max() < ripple
 #
 # an ellipse that reaches $\sqrt{2\ln(255\,o)}$ standard deviations. Its bounding box has the half extents
 # $\sqrt{2\ln(255\,o)\,\Sigma_{xx}}$ and $\sqrt{2\ln(255\,o)\,\Sigma_{yy}}$, because $x = a^\top q$, with $a$
-# the first row of $A$, is at most $|a|\,|q|$, and $|a|^2 = \Sigma_{xx}$. The custom of the field is 3 standard
+# the first row of $A$, is at most $|a|\,|q|$, and $|a|^2 = \Sigma_{xx}$. The usual choice is 3 standard
 # deviations, whatever the opacity.
 
 # %%

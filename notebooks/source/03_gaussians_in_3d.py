@@ -15,7 +15,7 @@
 # # 03 - Gaussians in three dimensions, and cameras
 #
 # [Chapter 02](02_gaussians_in_2d.ipynb) ended with a splat that is a mark on one picture. Suppose there are two
-# pictures of a rod, with the right splat in each, and a third view is wanted from between them. The splats'
+# pictures of a rod, with the right splat in each, and we want a third view from between them. The splats'
 # numbers can be averaged. The middle panel is what comes of it.
 
 # %%
@@ -65,10 +65,10 @@ assert fitted[-1][0, 0] > 30 * np.var(rod[:, 0])
 # ## Six numbers
 #
 # In three dimensions nothing about the formula changes: a mean $\mu$, a symmetric $3 \times 3$ covariance
-# $\Sigma$, and $\exp(-\frac12 (x-\mu)^\top\Sigma^{-1}(x-\mu))$. A symmetric $3 \times 3$ matrix has six
-# numbers, and the last chapter has seen what happens to free entries when they are pushed. Now they are pushed by
-# something that means well. A flat disc is given by its values at some points; plain gradient descent on the six
-# numbers starts from a ball and is to find it.
+# $\Sigma$, and $\exp(-\frac12 (x-\mu)^\top\Sigma^{-1}(x-\mu))$. A symmetric $3 \times 3$ matrix has six numbers,
+# and the last chapter showed what happens when entries are changed freely. Now gradient descent changes them. A
+# flat disc is given by its values at some points; plain gradient descent on the six numbers starts from a ball
+# and has to find it.
 
 # %%
 disc_scales, disc_quat = np.array([0.5, 0.4, 0.06]), np.array([0.9, 0.3, -0.2, 0.1])
@@ -231,8 +231,8 @@ plt.show()
 # %% [markdown]
 # ## In front of a camera
 #
-# The splat is in the world; a picture of it is wanted. Take the simple camera first, one that forgets depth, as
-# the first picture of this course did. It is affine, $u = A x + b$ with a $2 \times 3$ matrix $A$, and
+# The splat is in the world; now we need a picture of it. Take the simple camera first, one that forgets depth,
+# as the first picture of this course did. It is affine, $u = A x + b$ with a $2 \times 3$ matrix $A$, and
 #
 # $$u = A\,(\mu + R S q) + b = (A\mu + b) + (A R S)\,q$$
 #
@@ -313,7 +313,7 @@ assert shifts[0] > 5 * shifts[-1] and skews[0] > 0.5
 # the camera the image has its mean in one place, the image of its mean in another, and a long tail on one side. If
 # nothing were culled it would have no mean at all: some points lie as near to depth 0 as one likes.
 #
-# What the bent image looks like can be had exactly, without samples. The shell of the Gaussian at $k$ standard
+# The shape of the bent image can be computed exactly, without samples. The shell of the Gaussian at $k$ standard
 # deviations has an outline in the image: where rays just touch it. Let $m$ be the mean in camera coordinates. A plane
 # through the camera with normal $n$ touches the shell when its distance from the mean, $|n \cdot m|$, is what the
 # shell reaches in that direction, $k\sqrt{n^\top\Sigma n}$. So

@@ -92,9 +92,8 @@ plt.show()
 # %% [markdown]
 # ## Linear up close
 #
-# What survives linear maps is to be put through a map that is not linear. Then the map has to give way. Near the
-# mean $m$, in camera coordinates, the pinhole $\pi(x, y, z) = (f_x x/z + c_x,\; f_y y/z + c_y)$ is its tangent and a
-# remainder,
+# A Gaussian survives linear maps, and this map is not linear. So we replace the map. Near the mean $m$, in camera
+# coordinates, the pinhole $\pi(x, y, z) = (f_x x/z + c_x,\; f_y y/z + c_y)$ is its tangent and a remainder,
 #
 # $$\pi(m + h) = \pi(m) + J h + O(f\,|h|^2 / z^2).$$
 #

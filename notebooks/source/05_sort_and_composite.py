@@ -15,10 +15,9 @@
 # # 05 - Which one is in front
 #
 # [Chapter 04](04_splatting.ipynb) gave every Gaussian its ellipse, and ended with a sphere whose far side was painted
-# over the near one. The scene here is the same: `sphere_shell` of
-# [gsplat_edu.scenes](../src/gsplat_edu/scenes.py), flat disks on the unit sphere, coloured by where they are. It is
-# a good thing to be wrong about, because the right picture is known without any splats: where a ray first meets the
-# sphere, that point's colour.
+# over the near one. The scene here is the same: `sphere_shell` of [gsplat_edu.scenes](../src/gsplat_edu/scenes.py),
+# flat disks on the unit sphere, coloured by where they are. It makes a good test, because the right picture is known
+# without any splats: each ray shows the colour of the point where it first meets the sphere.
 
 # %%
 import os
@@ -96,8 +95,8 @@ show({"added": added, "averaged": averaged, "the sphere": truth}, "two ways of n
 print(f"mean error: added and clipped {off(np.clip(added, 0, 1)):.3f}, averaged {off(averaged):.3f}")
 
 # %% [markdown]
-# Adding burns out. Averaging mixes the front with the back, which here have opposite colours. Both ask every splat and
-# forget that some of them stand behind others. What is missing is not a better sum. It is *hiding*.
+# Adding burns out. Averaging mixes the front with the back, which here have opposite colours. Both use every splat and
+# ignore that some of them stand behind others. What is missing is not a better sum. It is *hiding*.
 
 # %% [markdown]
 # ## Light through layers
@@ -110,8 +109,8 @@ print(f"mean error: added and clipped {off(np.clip(added, 0, 1)):.3f}, averaged 
 # $$C = \sum_i T_i\, \alpha_i\, c_i + T_{N+1}\, b, \qquad T_i = \prod_{j < i} (1 - \alpha_j).$$
 #
 # $T_i$ is the *transmittance* in front of layer $i$, the share of light that gets from there to the eye. It starts
-# at 1 and only falls. That is why the sum is worth having next to the recursion: it can be walked from the front,
-# keeping $C$ and $T$, and whoever walks from the front notices when nothing more can come.
+# at 1 and only falls. That is the advantage of the sum over the recursion: it can be evaluated from the front,
+# keeping $C$ and $T$, and then we notice when nothing more can come.
 
 
 # %%
@@ -194,9 +193,9 @@ assert max(differences) < 1e-12
 # little, and each can say by how much at most. Let the colours lie between 0 and $c_{max}$.
 #
 # **Alpha is at most 0.99.** An opaque splat would make $T$ zero for ever: nothing behind it would have a gradient, and
-# whoever recovers $T_i$ from the back, dividing by $1 - \alpha_i$, would divide by zero. Take the first splat of a
-# pixel that is clamped. In front of it nothing changes. From there on, of the light $T \le 1$ that is left, at most
-# 0.01 goes to other colours than it would have: the image is wrong by at most $0.01\, c_{max}$.
+# recovering $T_i$ from the back, by dividing by $1 - \alpha_i$, would divide by zero. Take the first splat of a pixel
+# that is clamped. In front of it nothing changes. From there on, of the light $T \le 1$ that is left, at most 0.01
+# goes to other colours than it would have: the image is wrong by at most $0.01\, c_{max}$.
 #
 # **Alpha below 1/255 is zero.** A Gaussian is nowhere zero; without a floor each splat is in each pixel. Dropping a
 # layer of alpha $\delta$ changes $C$ by $T \delta$ times a difference of colours, at most $\delta\, c_{max}$: less than

@@ -76,7 +76,7 @@ plt.show()
 #
 # `gsplat-edu demo` finds such a setting. It is shown renders of a sphere, moves the numbers of a random cloud until
 # its own renders look like them, and writes them down. How it knows where to move them is the question this page ends
-# on. Here it is run as it is, for the sake of what it leaves behind: a file.
+# on. Here it is run unchanged, for the file that it writes.
 
 # %%
 scratch = tempfile.TemporaryDirectory()
@@ -134,8 +134,8 @@ for key, values in by_hand.items():
 #
 # ## What happens when one forgets
 #
-# The file holds what was trained, and trained were *raw* values. Each passes through a function of its own before it
-# is drawn. Nothing in the file says so, and a reader that forgets one of them gets a picture all the same:
+# The file holds what was trained: *raw* values. Each passes through a function of its own before it is drawn.
+# Nothing in the file says so, and a reader that forgets one of them gets a picture all the same:
 
 # %%
 held_out = capture.held_out.camera
@@ -190,14 +190,14 @@ plt.show()
 # as large as the scene, and there is fog. Colours as stored lack a factor and an offset, and it is another sphere. The
 # other two are the kind that is passed on. Opacities as stored drop every splat below one half and make most others
 # solid; here the solid ones cover the rest, and it hardly shows. A quaternion that is not of length 1 is no rotation:
-# a short one turns too little and shrinks across its axis, and the rim frays. Whoever sees that blames the training.
+# a short one turns too little and shrinks across its axis, and the rim frays. It looks like a fault of the training.
 #
 # ## Why not store what is drawn
 #
 # Because an optimiser adds. It adds a small number, of either sign, to every parameter, thousands of times, and knows
 # of no fences. A scale has to stay above zero. Cutting it off at a bound has no slope beyond the bound, so what has
-# once gone over never comes back. A function is wanted from all numbers to the positive ones, and one more wish picks
-# it: equal steps should be equal factors, since ten per cent of a pebble and of a house matter alike. With
+# once gone over never comes back. We need a function from all numbers to the positive ones, and one more requirement
+# selects it: equal steps should be equal factors, since ten per cent matter as much for a pebble as for a house. With
 # $f(x + \delta) = k(\delta) f(x)$ for all $x$, the slope is $f' = k'(0) f$, and that leaves the exponential.
 #
 # $$s = e^{x}, \qquad \frac{\partial s}{\partial x} = s$$
@@ -389,6 +389,6 @@ plt.show()
 
 # %% [markdown]
 # So a number can be asked: change it, draw again, see whether the picture got better. It is the only way there has
-# been up to here, and it takes a picture for each number of each step. What is wanted is the way back: from the pixels
-# that are wrong to all the numbers at once, in one go. It exists, and it is short enough to be walked by hand where
-# there is no third dimension: [chapter 08](08_fit_an_image.ipynb).
+# been up to here, and it takes a picture for each number of each step. We need the way back: from the wrong pixels to
+# all the numbers at once, in one pass. It exists, and without the third dimension it is short enough to derive by
+# hand: [chapter 08](08_fit_an_image.ipynb).

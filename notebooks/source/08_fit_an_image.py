@@ -110,7 +110,7 @@ assert gap < 1e-12
 #
 # $$L = \frac{1}{3HW} \sum (I - I^*)^2, \qquad g = \frac{\partial L}{\partial I} = \frac{2\,(I - I^*)}{3HW}$$
 #
-# Quoted is the same number in decibels, the peak signal-to-noise ratio of what a screen would show, clipped to 0 to 1:
+# It is usually quoted in decibels, as the peak signal-to-noise ratio of what a screen would show, clipped to 0 to 1:
 # $\mathrm{PSNR} = -10 \log_{10} L$. Ten decibels more are a tenth of the error.
 
 # %%
@@ -119,13 +119,13 @@ print(f"mean squared error {shown:.4f}, PSNR {-10 * np.log10(shown):.2f} dB")
 assert np.isclose(psnr_2d(wrong.image, photo), -10 * np.log10(shown), rtol=1e-12, atol=0)
 
 # %% [markdown]
-# ## The answer without a thought
+# ## The brute-force answer
 #
 # How much is the third splat's angle to blame? Turn it a little, draw again, look. Turn it back and beyond, draw
 # again. The difference over the distance is the derivative, for any formula whatever. It needs two pictures for each
-# number, and once the step has been taken it needs them again. The derivatives have to come out of one pass. But what
-# differences are too slow to do they can judge: on a scene so small that all of them can be had, every formula below
-# has to agree with them.
+# number, and once the step has been taken it needs them again. The derivatives have to come out of one pass. But
+# differences, too slow for training, can check it: on a scene so small that all of them can be computed, every
+# formula below has to agree with them.
 #
 # A difference means something only where the function is smooth. Alpha jumps at 1/255 and has a corner at 0.99, so the
 # scene is one where no alpha comes near either: a few pixels, and splats wider than the image. How close must the

@@ -16,10 +16,10 @@
 #
 # In two dimensions every gradient could be written down by hand and checked by hand. In three, a splat
 # reaches a pixel through a quaternion, a covariance, a perspective that is only linear up close, and a
-# sort. Each link has a derivative, and each will have to be written down once more when there are kernels
-# to write it into. Today something else is missing: a scene that was *learned*. So the gradients are
-# borrowed. The forward pass is rewritten in torch, autograd differentiates it, and this page does two
-# things with the result: it checks that what was borrowed is right, and it measures what borrowing costs.
+# sort. Each link has a derivative, and the kernels of later chapters will need each of them written out.
+# Today something else is missing: a scene that was *learned*. So the gradients are borrowed. The forward
+# pass is rewritten in torch, autograd differentiates it, and this page does two things with the result:
+# it checks that what was borrowed is right, and it measures what borrowing costs.
 #
 # Nothing is captured with a lens here. The NumPy renderer photographs a sphere whose every splat is
 # known, and a random cloud has to turn into that sphere. Whatever is missing at the end is the fault of
@@ -109,7 +109,7 @@ assert abs(difference.mean() / 7.6515e-9 - 1) < 0.01
 assert rounding.max() < 1e-12
 
 # %% [markdown]
-# ## Borrowed gradients, checked like one's own
+# ## Borrowed gradients, checked like our own
 #
 # Autograd differentiates whatever it is given, a wrong formula as well as a right one; the check above is
 # what says that the formula is right. What is left to check is the derivative. Four splats, sixteen
@@ -158,8 +158,8 @@ print("spherical harmonics, degrees 0 to 3: autograd agrees with finite differen
 # stored as a logit and scale as a logarithm, so that no step of the optimiser can leave the range where
 # they make sense.
 #
-# The numbers of the run, and every way in which it is simpler than the original recipe, stand in one
-# place. This is that place:
+# The parameters of the run, and every way in which it is simpler than the original recipe, are listed
+# in one place:
 
 # %%
 print(inspect.getdoc(course))
@@ -287,8 +287,7 @@ assert share < 0.1
 
 # %% [markdown]
 # That is a toy. A capture made with a phone has millions of pixels where this has thousands, and as many
-# splats, and both factors multiply. Nothing about the mathematics has to change for it: what is wanted is
-# a renderer that does the work that shows and leaves the rest. It will be made of kernels that do what
-# this page did, formula for formula, and it will have to give the same image and the same gradients. The
-# first of them is going to be the plainest thing that works, so that there is something to be faster
-# than.
+# splats, and both factors multiply. The mathematics does not have to change: we need a renderer that does
+# only the work that shows. It will be made of kernels that do what this page did, formula for formula,
+# and it will have to give the same image and the same gradients. The first of them is going to be the
+# plainest thing that works, so that there is something to be faster than.

@@ -124,10 +124,10 @@ LADDER = ROOT / "benchmarks" / "ladder"
 print((LADDER / "naive.cpp").read_text())
 
 # %% [markdown]
-# The line with `continue` is the floor. The last lines of the loop count, because a count is a
-# measurement that does not depend on the weather. The page compiles this with the C++ compiler of the
-# machine and calls it through `ctypes`; inside the package the same step is made once, at installation,
-# and [gsplat_edu.kernels](../src/gsplat_edu/kernels.py) is the door that every call goes through.
+# The line with `continue` is the floor. The last lines of the loop count, because a count does not
+# depend on how busy the machine is. The page compiles this with the C++ compiler of the machine and
+# calls it through `ctypes`; inside the package the same step is made once, at installation, and
+# [gsplat_edu.kernels](../src/gsplat_edu/kernels.py) is what every call goes through.
 #
 # ## Is it right?
 #
@@ -272,7 +272,7 @@ print(source[source.index("@triton.jit") : source.index("def where")].strip())
 
 # %% [markdown]
 # Where there is no GPU Triton interprets the source: each operation becomes one of NumPy on the whole
-# block. This proves that the kernel is right and says nothing about how fast it is, so the scene is small.
+# block. This checks that the kernel is right and says nothing about how fast it is, so the scene is small.
 
 # %%
 small = splats.scene(40, 24, seed=4, stretch=3.0)
@@ -343,5 +343,5 @@ assert mattered_share < 0.05
 
 # %% [markdown]
 # That is one image. And of the reads behind it, next to none leave a trace in the picture. The pixel
-# cannot know beforehand which splats will matter to it, because it looks at all of them alike. Somebody
-# else has to make it a list.
+# cannot know beforehand which splats will matter to it, because it looks at all of them alike. It needs
+# a list that something else has made.

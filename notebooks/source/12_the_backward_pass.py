@@ -82,7 +82,7 @@ plt.show()
 
 # %% [markdown]
 # It grows with pixels times splats, and almost all of it is for pairs that do not show. A kernel keeps next to
-# nothing: it works the values out again on the way back. What has to be known for that is one pixel.
+# nothing: it computes the values again on the way back. One pixel is enough to see how.
 #
 # ## One pixel
 #
@@ -133,8 +133,8 @@ plt.show()
 # ## The same, near to far
 #
 # Nothing has to be recovered if the way back is walked in the order of the way there: $T_i$ comes out as it did then,
-# to the bit. What is behind is then what is not yet in front. For a loss with $g = \partial L / \partial C$ keep one
-# scalar, all of the image's share that is still to come:
+# to the bit. What is behind is then what has not been subtracted yet. For a loss with $g = \partial L / \partial C$
+# keep one scalar, all of the image's share that is still to come:
 #
 # $$ R = g \cdot C \quad\text{at first, and at each splat}\quad R \leftarrow R - T_i \alpha_i \, (g \cdot c_i),
 # \qquad \frac{\partial L}{\partial \alpha_i} = T_i \, (g \cdot c_i) - \frac{R}{1 - \alpha_i} . $$
@@ -312,7 +312,7 @@ for key, theirs in grads["dense"].items():
 start = random_ball(5000, torch.Generator().manual_seed(6)).trainable()
 before, slope = start.means.detach().numpy().astype(float), rng.normal(size=(5000, 3))
 start.means.grad = torch.tensor(slope, dtype=torch.float32)
-Adam(start, {"means": 0.01}).step(start)
+Adam(start.tensors(), {"means": 0.01}).step(start.tensors())
 m, v = 0.1 * slope / (1 - 0.9), 0.001 * slope**2 / (1 - 0.999)  # both moments, freed of their start at zero
 error = np.abs(start.means.detach().numpy() - (before - 0.01 * m / (np.sqrt(v) + 1e-8))).max()
 print(f"Adam's first step: worst difference {error:.1e}")
@@ -321,7 +321,8 @@ assert error < 4 * 2.0**-23  # positions up to one, and a step of a hundredth
 # %% [markdown]
 # ## The same training, again
 #
-# The run of chapter 09, capture, cloud, seed, schedule and all. Only the renderer is another one. All on one thread.
+# The run of chapter 09, capture, cloud, seed, schedule and all. Only the renderer differs. Everything runs on one
+# thread.
 
 # %%
 torch.set_num_threads(1)
@@ -381,9 +382,9 @@ plt.show()
 # %% [markdown]
 # ## The next failure
 #
-# Look at what was given for nothing: photos without noise, each with its camera, exact to the last bit. How much
-# hangs on that? A camera turned by two and a half degrees sees its image a twentieth of the width away. Shift every
-# photo by up to so much, each its own way, and train again.
+# So far the photos came without noise, each with a camera that is exact to the last bit. How much hangs on that? A
+# camera turned by two and a half degrees sees its image a twentieth of the width away. Shift every photo by up to
+# so much, each its own way, and train again.
 
 # %%
 moved = [

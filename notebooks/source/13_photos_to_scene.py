@@ -15,9 +15,9 @@
 # # 13 - From photos to a scene
 #
 # Everything so far was trained on photos that a renderer took, from cameras that were written down before the first
-# photo existed. A phone writes a folder of photos. Where it was held it does not say, its focal length not reliably
-# either, and one photo in twenty is shaken. [Chapter 12](12_the_backward_pass.ipynb) made training fast, but fast
-# training on cameras that are wrong arrives early at nothing.
+# photo existed. A phone writes a folder of photos. It does not say where it was held, its focal length is not
+# reliable, and one photo in twenty is blurred by motion. [Chapter 12](12_the_backward_pass.ipynb) made training
+# fast, but fast training on cameras that are wrong arrives early at nothing.
 #
 # The photos of this page are taken of a box with painted sides on a painted floor
 # ([gsplat_edu.data.textured_box](../src/gsplat_edu/data/textured_box.py)). OpenCV draws them, not a splat of ours,
@@ -231,8 +231,8 @@ assert np.median(off["found"]) < 1 < np.median(off["guess"])
 # it is. So poses are compared with the truth after the similarity $x' = s R x + t$ that brings the centres closest
 # (Umeyama 1991).
 #
-# What is left has a size that can be said beforehand. A lens of $f$ pixels sees a pixel as $1/f$ radians, and from
-# the distance $4$ a pixel is $4/f$ world units. Features are better than a pixel, but focal length and distortion are
+# The size of the remaining error can be predicted. A lens of $f$ pixels sees a pixel as $1/f$ radians, and from the
+# distance $4$ a pixel is $4/f$ world units. Features are better than a pixel, but focal length and distortion are
 # found from the same few photos and take up some of the poses: two pixels' worth is allowed, of angle and of place.
 
 # %%
@@ -388,7 +388,7 @@ print(f"{held} bytes a Gaussian while it trains: ten million take {held / 100:.1
 shutil.rmtree(WORK)
 
 # %% [markdown]
-# The others are of one kind: what the model has no number for it explains with the numbers it has.
+# The others are of one kind: the model absorbs what it has no parameters for into the parameters it has.
 #
 # - **What moves, what mirrors.** A scene has one state: people become fog, a reflection a room behind the wall.
 # - **Exposure.** Two photos that disagree about a wall are both believed: the colour that depends on the direction

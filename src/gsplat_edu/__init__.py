@@ -1,7 +1,7 @@
 """3D Gaussian Splatting that runs on the computer you have, explains itself, and gives the same answer twice.
 
-The names here are the NumPy half of the system, the chapter's own. Training lives in `gsplat_edu.train`,
-differentiable rendering in `gsplat_edu.render.api`; those import torch, these do not.
+The names here are the NumPy part of the system, as in the chapters. Training is in `gsplat_edu.train`, differentiable
+rendering in `gsplat_edu.render.api`; those import torch, these do not.
 """
 
 from gsplat_edu.camera import Camera, CameraLike, look_at, orbit_camera

@@ -1,13 +1,13 @@
-"""Memory for the large tensors of an iteration, reused by the next one.
+"""Memory for an iteration's large tensors, reused by the next iteration.
 
-A C library's heap is a poor place for them. A step of training makes images and gradients of several megabytes, and
-between them small tensors that live longer. glibc (2.36) cuts a 64-byte aligned block out of a larger one; once it is
-freed, the hole is too small for the next aligned request of the same size, unless its neighbour is free as well. One
-small tensor kept per step is enough, and the process grows by an image in every iteration.
+A C library's heap handles them badly. A training step makes images and gradients of several megabytes, and between them
+small tensors that live longer. glibc (2.36) cuts a 64-byte aligned block out of a larger one; once it is freed, the
+hole is too small for the next aligned request of the same size, unless its neighbour is free as well. One small tensor
+kept per step is enough to make the process grow by an image in every iteration.
 
-Inside `reused_buffers`, `reusable_tensor` maps memory of its own instead and hands it out again once nothing refers to
-it: not the tensor, not a view of it, not what autograd saved. Nobody's tensor is ever written over. When the block
-ends, the system gets everything back that is not in use.
+Inside `reused_buffers`, `reusable_tensor` uses its own memory mappings and reuses one only when nothing refers to it
+any more: no tensor, no view, nothing saved by autograd. So live tensors are never overwritten. At the end of the block,
+all unused memory is returned to the system.
 """
 
 from __future__ import annotations
@@ -29,35 +29,35 @@ import torch
 from torch import Tensor
 
 LARGE = 1 << 18
-"""Tensors smaller than this, in bytes, stay in the heap: other small ones fill the holes that they leave."""
+"""Smaller tensors, in bytes, stay in the heap: other small ones fill the holes they leave."""
 
 SLACK = 1.25
-"""A buffer is reused if it is at most this many times as large as requested; the number of Gaussians changes often."""
+"""A buffer is reused if it is at most this factor larger than requested; the number of Gaussians changes often."""
 
 HEAP_LIMIT = 1 << 22
-"""Bytes from which glibc maps a request separately and unmaps it when it is freed (M_MMAP_THRESHOLD)."""
+"""Request size in bytes from which glibc uses a separate mapping that is unmapped when freed (M_MMAP_THRESHOLD)."""
 
 M_MMAP_THRESHOLD = -3
-"""mallopt's number for it."""
+"""Number of this parameter in mallopt."""
 
 
 class _Pool:
-    """Mappings, those in use and those waiting for the next request.
+    """Memory mappings, in use or waiting for reuse.
 
-    It never holds more bytes than were in use at once within the last two spans of `SPAN` requests.
+    The pool never holds more bytes than the peak in use within the last two spans of `SPAN` requests.
     """
 
     SPAN = 1024
 
     def __init__(self) -> None:
         self._waiting: list[mmap.mmap] = []
-        # Finalizers append to it from any thread and at any moment; waiting for a lock, they could wait for themselves.
+        # Finalizers append to it from any thread at any time. They must not take a lock: that could deadlock.
         self._returned = deque[mmap.mmap]()
         self._used = self._peak = self._peak_before = self._requests = 0
         self._closed = False
 
     def take(self, nbytes: int) -> np.ndarray:
-        """Return an array of that many bytes, whose memory comes back when nothing refers to it any more."""
+        """Return an array of that many bytes; its memory returns to the pool when nothing refers to it any more."""
         self._collect()
         fitting = [block for block in self._waiting if nbytes <= len(block) <= SLACK * nbytes]
         if fitting:
@@ -72,7 +72,7 @@ class _Pool:
         return array
 
     def close(self) -> None:
-        """Unmap what is waiting now, and from now on whatever comes back."""
+        """Unmap the waiting memory, and from now on all returned memory."""
         self._closed = True
         self._waiting.clear()
         self._returned.clear()
@@ -96,7 +96,7 @@ class _Pool:
             self._shrink(0)
 
     def _shrink(self, wanted: int) -> None:
-        """Unmap those that have waited longest until what is wanted fits below the peak."""
+        """Unmap the memory that has waited longest until the request fits below the peak."""
         most = max(self._peak, self._peak_before)
         waiting = sum(map(len, self._waiting))
         while self._waiting and self._used + waiting + wanted > most:
@@ -104,7 +104,7 @@ class _Pool:
 
     @property
     def nbytes(self) -> int:
-        """Bytes mapped: in use and waiting."""
+        """Mapped bytes: in use and waiting."""
         self._collect()
         return self._used + sum(map(len, self._waiting))
 
@@ -122,10 +122,10 @@ _current = _Current()
 def reused_buffers() -> Iterator[None]:
     """Let `reusable_tensor` reuse memory inside the block, in this thread. Nested blocks share one pool.
 
-    From the first block on, glibc maps every other large request separately too, for as long as the process runs:
-    photos that are read again and the work of density control go back to the system when they are freed. By default
-    glibc raises its limit for that to the size of whatever was freed, up to 32 MiB. Other C libraries are left as
-    they are: musl's limit is fixed, and macOS keeps large requests out of its small regions.
+    From the first block on, for the rest of the process, glibc also maps every other large request separately, so that
+        photos that are read again and the temporaries of density control are returned to the system when freed. By
+        default glibc raises its threshold for that to the size of the freed memory, up to 32 MiB. Other C libraries are
+        left unchanged: musl's threshold is fixed, and macOS keeps large requests out of its small regions.
     """
     _limit_heap()
     before = _current.pool
@@ -139,11 +139,11 @@ def reused_buffers() -> Iterator[None]:
 
 
 def reusable_tensor(shape: Sequence[int], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """Return an uninitialised tensor of a shape, contiguous, on another's device.
+    """Return an uninitialised, contiguous tensor of a given shape on the device of another tensor.
 
     Args:
         shape: Its shape.
-        like: Decides the device, and the dtype where none is given.
+        like: Provides the device, and the dtype if none is given.
         dtype: Its dtype.
     """
     pool, dtype = _current.pool, dtype or like.dtype
@@ -154,7 +154,7 @@ def reusable_tensor(shape: Sequence[int], like: Tensor, dtype: torch.dtype | Non
 
 
 def _mapped(nbytes: int) -> mmap.mmap:
-    """Map fresh memory; a forked child gets a copy of it."""
+    """Map fresh memory; a forked child gets a copy."""
     if sys.platform == "win32":
         return mmap.mmap(-1, nbytes)
     return mmap.mmap(-1, nbytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)

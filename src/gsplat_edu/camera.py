@@ -1,4 +1,4 @@
-"""The pinhole camera: where it stands, where it looks, and what it does to points.
+"""The pinhole camera: position, orientation and projection.
 
 Axes are OpenCV's, for the world and the camera alike: +x right, +y down, +z forward. The world's up is
 (0, -1, 0). Pixels are sampled at integer coordinates.
@@ -16,31 +16,36 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.intrinsics import Intrinsics
 from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
 
 WORLD_UP = (0.0, -1.0, 0.0)
 """The world's up direction: +y points down."""
 
 ROTATION_TOLERANCE = 1e-4
-"""Largest entry of R R' - I that a rotation may have: room for rotations that went through float32 text."""
+"""Largest entry of R R' - I accepted for a rotation, to allow rotations stored as float32 text."""
+
+PARALLEL = 1e-3
+"""Smallest eigenvalue of mean(I - d d') at which the intersection of the optical axes d is well defined. Below it
+(about 1.8 degrees between axes) the intersection is noise."""
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Float64[np.ndarray, "3 3"]:
-    """Turn a camera towards a point.
+    """Return the rotation of a camera that looks at a point.
 
     forward = normalize(target - eye),  right = normalize(forward × up),  down = forward × right
 
     Args:
         eye: (3,) camera centre, world units.
         target: (3,) point the camera looks at, world units.
-        up: (3,) the direction that is up in the image; any length.
+        up: (3,) up direction in the image; any length.
 
     Returns:
         (3, 3) world-to-camera rotation with rows (right, down, forward).
 
     Raises:
         ShapeError: an argument is not of shape (3,).
-        ArgumentError: `target` is where `eye` is, or `up` is zero or along the viewing direction.
+        ArgumentError: `target` equals `eye`, or `up` is zero or parallel to the viewing direction.
     """
     eye = float64_array("eye", eye, (3,))
     target = float64_array("target", target, (3,))
@@ -48,13 +53,13 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Floa
     distance = np.linalg.norm(target - eye)
     if distance == 0.0:
         raise ArgumentError(
-            f"target: is where eye is, {tuple(eye.tolist())}; a camera has to look somewhere else"
+            f"target: equals eye, {tuple(eye.tolist())}; a camera needs another point to look at"
         )
     forward = (target - eye) / distance
     right = np.cross(forward, up)
     sine = np.linalg.norm(right)
     if sine <= 1e-9 * np.linalg.norm(up):
-        raise ArgumentError("up: is zero or along the viewing direction; give another up direction")
+        raise ArgumentError("up: is zero or parallel to the viewing direction; give another up direction")
     right = right / sine
     return np.stack([right, np.cross(forward, right), forward])
 
@@ -97,7 +102,7 @@ class Camera:
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
             raise ArgumentError(
-                "R: is not a rotation; rows have to be (right, down, forward), orthonormal, det +1"
+                "R: is not a rotation; its rows must be (right, down, forward), orthonormal, det +1"
             )
         centre = float64_array("eye", eye, (3,)).copy()
         rotation.flags.writeable = centre.flags.writeable = False
@@ -118,7 +123,7 @@ class Camera:
     def looking_at(
         cls, eye: ArrayLike, target: ArrayLike, fx: float, fy: float, H: int, W: int, up: ArrayLike = WORLD_UP
     ) -> Camera:
-        """Make a camera at `eye` that looks at `target`, its principal point at (W/2, H/2).
+        """Make a camera at `eye` that looks at `target`, with the principal point at (W/2, H/2).
 
         Args:
             eye: (3,) camera centre, world units.
@@ -127,7 +132,7 @@ class Camera:
             fy: Focal length along y, px.
             H: Image height, px.
             W: Image width, px.
-            up: (3,) the direction that is up in the image.
+            up: (3,) up direction in the image.
 
         Raises:
             ShapeError: an argument is not of shape (3,).
@@ -136,11 +141,32 @@ class Camera:
         H, W = whole_number("H", H, 1), whole_number("W", W, 1)
         return cls(look_at(eye, target, up), eye, fx, fy, W / 2, H / 2, H, W)
 
-    def jacobian_bounds(self, limit: float | None) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Bound x/z and y/z where the projection's Jacobian is taken.
+    @classmethod
+    def posed(cls, R: ArrayLike, eye: ArrayLike, intrinsics: Intrinsics) -> Camera:
+        """Make a camera from a pose and intrinsics.
 
-        Far outside the image the first-order ellipse of a Gaussian grows without bound and paints across it.
-        The bounds are the viewing directions of the image rectangle, enlarged by `limit` around its middle.
+        Args:
+            R: (3, 3) world-to-camera rotation.
+            eye: (3,) camera centre, world units.
+            intrinsics: Of a pinhole; `Intrinsics.undistorted` gives that of a lens.
+
+        Raises:
+            ShapeError: R is not (3, 3) or eye not (3,).
+            ArgumentError: as for the constructor.
+        """
+        i = intrinsics
+        return cls(R, eye, i.fx, i.fy, i.cx, i.cy, i.H, i.W)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Focal lengths, principal point and image size as one value."""
+        return Intrinsics(self.W, self.H, self.fx, self.fy, self.cx, self.cy)
+
+    def jacobian_bounds(self, limit: float | None) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the bounds of x/z and y/z for evaluating the projection's Jacobian.
+
+        Far outside the image, a Gaussian's first-order ellipse grows without bound and would cover the image. The
+        bounds are the viewing directions of the image rectangle, enlarged by `limit` about its centre.
 
         Args:
             limit: Factor, 1.3 in Kerbl et al.'s code; None for no bounds.
@@ -158,7 +184,7 @@ class Camera:
         return (x_low, x_high), (y_low, y_high)
 
     def world_to_cam(self, points: ArrayLike) -> Float64[np.ndarray, "*batch 3"]:
-        """Move points from world to camera coordinates: x_cam = R (x - eye).
+        """Transform points from world to camera coordinates: x_cam = R (x - eye).
 
         Args:
             points: (..., 3) world units.
@@ -184,8 +210,7 @@ class Camera:
             points_cam: (..., 3) camera coordinates, world units.
 
         Returns:
-            u, v: (...) column and row, px; NaN where z <= 0, because a point beside or behind the camera has
-            no image.
+            u, v: (...) column and row, px; NaN where z <= 0, because a point beside or behind the camera has no image.
             z: (...) depth, world units.
 
         Raises:
@@ -195,24 +220,24 @@ class Camera:
         x, y, z = np.moveaxis(float64_array("points_cam", points_cam, ("...", 3)), -1, 0)
         depth = np.where(z > 0, z, np.nan)
         u, v = self.fx * x / depth + self.cx, self.fy * y / depth + self.cy
-        return np.asarray(u), np.asarray(v), np.array(z)  # one point: arrays of no axes, not bare numbers
+        return np.asarray(u), np.asarray(v), np.array(z)  # for a single point: 0-d arrays, not scalars
 
 
 @runtime_checkable
 class CameraLike(Protocol):
-    """Any pinhole camera: what the renderers need to know of one, by the names of `Camera`.
+    """Any pinhole camera: the members that the renderers use, named as in `Camera`.
 
-    Arrays may be lists, and numbers NumPy scalars; `as_camera` reads and checks them. Other members, such as
-    the methods of a chapter's own camera, may be there and are not called.
+    Arrays may be lists, and numbers may be NumPy scalars; `as_camera` reads and checks them. Other members, such as the
+    methods of a chapter's own camera, are ignored.
     """
 
     @property
     def R(self) -> ArrayLike:
-        """(3, 3) world-to-camera rotation, rows (right, down, forward)."""
+        """World-to-camera rotation (3, 3), rows (right, down, forward)."""
 
     @property
     def eye(self) -> ArrayLike:
-        """(3,) camera centre, world units."""
+        """Camera centre (3,), world units."""
 
     @property
     def fx(self) -> SupportsFloat:
@@ -240,15 +265,15 @@ class CameraLike(Protocol):
 
 
 def as_camera(name: str, camera: CameraLike) -> Camera:
-    """Return a camera that is one of ours: the same object where it is, else one of the same eight numbers and arrays.
+    """Convert to a `Camera`; a `Camera` is returned unchanged.
 
     Args:
-        name: What the caller calls the argument.
-        camera: A `Camera`, or anything with its members R, eye, fx, fy, cx, cy, H and W.
+        name: The caller's name for the argument.
+        camera: A `Camera`, or any object with its members R, eye, fx, fy, cx, cy, H and W.
 
     Raises:
         ShapeError: its R is not (3, 3) or its eye not (3,).
-        ArgumentError: a member is missing, or has a value that no pinhole camera has.
+        ArgumentError: a member is missing or invalid.
     """
     if isinstance(camera, Camera):
         return camera
@@ -256,7 +281,7 @@ def as_camera(name: str, camera: CameraLike) -> Camera:
     missing = [member for member in members if not hasattr(camera, member)]
     if missing:
         raise ArgumentError(
-            f"{name}: is no camera, a {type(camera).__name__} has no {', '.join(missing)}; "
+            f"{name}: is not a camera, a {type(camera).__name__} has no {', '.join(missing)}; "
             "a camera has R, eye, fx, fy, cx, cy, H and W"
         )
     try:
@@ -266,7 +291,7 @@ def as_camera(name: str, camera: CameraLike) -> Camera:
 
 
 def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius: float = 3.0) -> Camera:
-    """Make a square camera on a sphere around the origin, looking at its centre.
+    """Make a square camera on a sphere around the origin, looking at the origin.
 
     eye = radius (cos e sin a, sin e, -cos e cos a)
 
@@ -278,8 +303,8 @@ def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius:
         radius: Distance of the camera from the origin, world units.
 
     Raises:
-        ArgumentError: the radius or focal length is not positive, the size is below 1, or the camera stands
-            straight above or below the origin, where up is not defined.
+        ArgumentError: the radius or focal length is not positive, the size is below 1, or the camera is straight above
+            or below the origin, where up is undefined.
     """
     radius = in_range("radius", radius, 0.0, open_low=True)
     azimuth, elevation = (
@@ -289,44 +314,22 @@ def orbit_camera(azimuth: float, elevation: float, size: int, fx: float, radius:
     return Camera.looking_at(radius * np.array(direction), (0.0, 0.0, 0.0), fx, fx, size, size)
 
 
-def point_nearest_axes(cameras: Sequence[Camera], parallel: float) -> Float64[np.ndarray, "3"] | None:
-    """Find the point closest to all optical axes, in the least-squares sense.
+def point_nearest_axes(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"] | None:
+    """Find the point nearest to all optical axes in the least-squares sense.
 
-    p minimises sum_i |(I - d_i d_i') (p - e_i)|²,  e_i: centre of camera i,  d_i: direction it looks in
+    p minimises sum_i |(I - d_i d_i') (p - e_i)|²,  e_i: centre of camera i,  d_i: its viewing direction
 
     Args:
         cameras: At least one.
-        parallel: Smallest eigenvalue of mean_i (I - d_i d_i') that fixes a point.
 
     Returns:
-        (3,) world units; None where the axes are so nearly parallel that where they cross is noise.
+        (3,) world units; None if the axes are so nearly parallel that their intersection is noise.
     """
     eyes = np.stack([camera.eye for camera in cameras])
     axes = np.stack([camera.R[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     A, mean = across.mean(axis=0), eyes.mean(axis=0)
-    if np.linalg.eigvalsh(A)[0] < parallel:
+    if np.linalg.eigvalsh(A)[0] < PARALLEL:
         return None
     b = (across @ (eyes - mean)[:, :, None]).mean(axis=0)[:, 0]
     return np.asarray(mean + np.linalg.solve(A, b))
-
-
-def scaled_intrinsics(
-    fx: float, fy: float, cx: float, cy: float, sx: float, sy: float
-) -> tuple[float, float, float, float]:
-    """Return the intrinsics of the same photo at another size.
-
-    f' = f s,  c' = (c + 1/2) s - 1/2: the image's edge, not the centre of its first pixel, stays in place.
-
-    Args:
-        fx: Focal length along x, px.
-        fy: Focal length along y, px.
-        cx: Column of the principal point, px.
-        cy: Row of the principal point, px.
-        sx: New width over old.
-        sy: New height over old.
-
-    Returns:
-        fx', fy', cx', cy', px.
-    """
-    return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5

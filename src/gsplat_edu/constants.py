@@ -1,4 +1,4 @@
-"""Every constant of the renderer, once: value, unit, why it is there, where it comes from.
+"""All constants of the renderer: value, unit, purpose, source.
 
 Kerbl et al. 2023 is "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (ACM TOG 42.4);
 "its code" is the rasteriser published with it.
@@ -12,62 +12,61 @@ import math
 from typing import Final
 
 DILATION: Final = 0.3
-"""px², added to both diagonal entries of every screen-space covariance, so that no splat is thinner than
-about a pixel and falls between the samples. Source: Kerbl et al. 2023, its code."""
+"""px², added to both diagonal entries of every screen-space covariance, so that every splat is at least about a pixel
+wide and cannot fall between the samples. Source: Kerbl et al. 2023, its code."""
 
 ALPHA_MIN: Final = 1.0 / 255.0
-"""Alpha below this is zero: one step of an 8-bit image. It is what gives a Gaussian a finite extent.
-Source: Kerbl et al. 2023, its code."""
+"""Alpha below this is zero: one step of an 8-bit image. This gives a Gaussian a finite extent. Source: Kerbl et al.
+2023, its code."""
 
 ALPHA_MAX: Final = 0.99
 """Alpha is clamped to this, so that 1 - alpha never reaches 0 and the transmittance behind a splat keeps a
 gradient. Source: Kerbl et al. 2023, appendix C."""
 
 Z_NEAR: Final = 0.05
-"""World units: a mean at this camera depth or nearer is culled; the projection divides by depth.
-Source: the course's convention (Kerbl et al. use 0.2)."""
+"""World units: means at this camera depth or nearer are culled, because the projection divides by depth. Source: the
+course's convention (Kerbl et al. use 0.2)."""
 
 T_STOP: Final = 1e-4
-"""Transmittance below which nothing behind can be seen, and compositing may stop.
-Source: Kerbl et al. 2023, appendix C."""
+"""Transmittance below which nothing behind is visible and compositing may stop. Source: Kerbl et al. 2023, appendix
+C."""
 
 TILE: Final = 16
-"""px: edge of the square tiles in which kernels composite and stop. Source: Kerbl et al. 2023, section 6."""
+"""px: edge of the square tiles in which kernels composite and terminate. Source: Kerbl et al. 2023, section 6."""
 
 RIM_SLACK: Final = 1e-3
-"""px, added around an ellipse where kernels work out its tiles and rows: rounding must not lose a pixel on the rim, and
-what lies within it costs a pair at most."""
+"""px, margin added around an ellipse when kernels determine its tiles and rows, so that rounding never loses a pixel at
+the rim; it costs at most one extra pair."""
 
 COLOR_LIMIT: Final = 1e6
-"""The kernels take a colour beyond this for one that is not finite and leave its Gaussian out. No photo comes near, and
-the gradients of the Gaussians around it would lose all their digits to it. Source: ours."""
+"""The kernels treat a colour beyond this as not finite and skip its Gaussian. No photo comes close, and the gradients
+of nearby Gaussians would lose all their digits to it. Source: ours."""
 
 SPLAT_LIMIT: Final = 1e15
-"""px: the native kernels leave out a Gaussian whose standard deviation on the screen is beyond this. float32 holds
-the squares of its inverse, a factor of the exponent. Source: ours."""
+"""px: the native kernels skip a Gaussian whose standard deviation on the screen exceeds this. float32 can hold the
+squares of its inverse, a factor of the exponent. Source: ours."""
 
 DET_FLOOR: Final = 1e-12
-"""px⁴: floor under the determinant of a screen-space covariance before its dilation, where antialiasing takes
-the root of its ratio to the one after. A Gaussian that is a line on the screen has determinant 0, where the
-root has no slope; below the floor the factor is constant. Source: ours."""
+"""px⁴: lower bound of the determinant of a screen-space covariance before dilation, used where antialiasing takes the
+root of its ratio to the dilated one. A Gaussian that degenerates to a line has determinant 0, where the root has no
+slope; below the bound the factor is constant. Source: ours."""
 
 LAMBDA_FLOOR: Final = 0.1
-"""px⁴: floor under the discriminant when the larger eigenvalue of a screen-space covariance is taken for
-the 3-sigma box, so that rounding cannot make it negative. Source: Kerbl et al. 2023, its code."""
+"""px⁴: lower bound of the discriminant when computing the larger eigenvalue of a screen-space covariance for the
+3-sigma box, so that rounding cannot make it negative. Source: Kerbl et al. 2023, its code."""
 
 SSIM_C1: Final = 0.01**2
-"""Keeps SSIM's ratio of means away from 0 / 0, for images of range 1. Source: Wang et al. 2004, K1 = 0.01."""
+"""Stabilises SSIM's ratio of means, for images of range 1. Source: Wang et al. 2004, K1 = 0.01."""
 
 SSIM_C2: Final = 0.03**2
-"""Keeps SSIM's ratio of variances away from 0 / 0, for images of range 1.
-Source: Wang et al. 2004, K2 = 0.03."""
+"""Stabilises SSIM's ratio of variances, for images of range 1. Source: Wang et al. 2004, K2 = 0.03."""
 
 SSIM_SIGMA: Final = 1.5
-"""px: standard deviation of SSIM's window, 11 taps wide, zero outside the image.
-Source: Wang et al. 2004; the padding is that of Kerbl et al. 2023's code."""
+"""px: standard deviation of SSIM's window, which has 11 taps and is zero outside the image. Source: Wang et al. 2004;
+the padding is that of Kerbl et al. 2023's code."""
 
-# Spherical harmonics: normalisations of the real basis, degree 0 to 3. Each is the number that makes its
-# polynomial's square integrate to 1 over the sphere. Source: Sloan 2008, "Stupid Spherical Harmonics Tricks".
+# Spherical harmonics: normalisation constants of the real basis, degrees 0 to 3. Each makes the square of its
+# polynomial integrate to 1 over the sphere. Source: Sloan 2008, "Stupid Spherical Harmonics Tricks".
 
 C0: Final = 0.28209479177387814
 """1 / (2 sqrt(pi)): the constant harmonic. colour = C0 * sh0 + 0.5 at degree 0."""
@@ -82,7 +81,7 @@ C2: Final = (
     -math.sqrt(15.0 / math.pi) / 2.0,
     math.sqrt(15.0 / math.pi) / 4.0,
 )
-"""Degree 2, one factor for each harmonic from m = -2 to 2, signs included: of xy, yz, 2z² - x² - y², xz, x² - y²."""
+"""Degree 2, one factor per harmonic from m = -2 to 2, signs included: of xy, yz, 2z² - x² - y², xz, x² - y²."""
 
 C3: Final = (
     -math.sqrt(35.0 / (2.0 * math.pi)) / 4.0,
@@ -93,12 +92,12 @@ C3: Final = (
     math.sqrt(105.0 / math.pi) / 4.0,
     -math.sqrt(35.0 / (2.0 * math.pi)) / 4.0,
 )
-"""Degree 3, one factor for each harmonic from m = -3 to 3, signs included: of y(3x² - y²), xyz, y(4z² - x² - y²),
-z(2z² - 3x² - 3y²), x(4z² - x² - y²), z(x² - y²), x(x² - 3y²)."""
+"""Degree 3, one factor per harmonic from m = -3 to 3, signs included: of y(3x² - y²), xyz, y(4z² - x² - y²), z(2z² -
+3x² - 3y²), x(4z² - x² - y²), z(x² - y²), x(x² - 3y²)."""
 
 SH_OFFSET: Final = 0.5
 """Added to every evaluated colour, so that all-zero coefficients are mid-grey.
 Source: Kerbl et al. 2023, its code."""
 
 SH_MAX_DEGREE: Final = 3
-"""Highest degree of spherical harmonics the system evaluates: 16 coefficients per channel."""
+"""Highest supported SH degree: 16 coefficients per channel."""

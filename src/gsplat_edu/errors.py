@@ -1,13 +1,15 @@
-"""What can go wrong, as one tree.
+"""The exception tree of this package.
 
     SplatError
-    ├── ArgumentError (also a ValueError)    an argument's value cannot be used
-    │   └── ShapeError                       an argument's shape is not the documented one
-    ├── BackendUnavailableError              this machine cannot run the backend that was asked for
-    ├── DatasetError                         a capture cannot be read, or not as it stands
-    ├── SceneFormatError                     a scene file is not what it says it is
-    ├── CheckpointError                      a run cannot be continued, or its state not be written
+    ├── ArgumentError (also a ValueError)    an argument has an invalid value
+    │   └── ShapeError                       an argument has the wrong shape
+    ├── BackendUnavailableError              the requested backend cannot run on this machine
+    ├── DatasetError                         a capture cannot be read or used
+    ├── SceneFormatError                     a scene file is damaged or of another format
+    ├── CheckpointError                      a run cannot be resumed or saved
     └── NotEnoughMemoryError                 work needs more memory than is free
+
+    BackendWarning                           "auto" takes another backend than the machine suggests
 
 Every message is one line that says what is wrong, where, and what to do next. The command line prints that
 line and exits with 2.
@@ -21,7 +23,7 @@ class SplatError(Exception):
 
 
 class ArgumentError(SplatError, ValueError):
-    """An argument has a value that cannot be used; the message names the argument."""
+    """An argument has an invalid value; the message names the argument."""
 
 
 class ShapeError(ArgumentError):
@@ -29,11 +31,24 @@ class ShapeError(ArgumentError):
 
 
 class BackendUnavailableError(SplatError):
-    """The rendering backend that was asked for does not run here; the message says why and what does."""
+    """The requested rendering backend is unavailable here; the message says why and which one to use."""
+
+
+class BackendWarning(UserWarning):
+    """The backend "auto" is not the one that this machine suggests; the message says why."""
 
 
 class DatasetError(SplatError):
-    """A capture cannot be read; the message names the file, and the line or image where there is one."""
+    """A capture cannot be read; the message names the file, and the line or image where there is one.
+
+    Args:
+        message: One line: what is wrong, where, and what to do next.
+        reason: What is wrong in a few words, for a list in which the file stands already; None for the message.
+    """
+
+    def __init__(self, message: str, reason: str | None = None) -> None:
+        super().__init__(message)
+        self.reason = message if reason is None else reason
 
 
 class SceneFormatError(SplatError):
@@ -41,8 +56,8 @@ class SceneFormatError(SplatError):
 
 
 class CheckpointError(SplatError):
-    """A run cannot be saved or continued; the message names the file and what stands unharmed."""
+    """A run cannot be saved or resumed; the message names the file and what remains intact."""
 
 
 class NotEnoughMemoryError(SplatError):
-    """Work needs more memory than is free; the message says what, how much, and what to do."""
+    """Work needs more memory than is free; the message says which work, how much, and what to do."""

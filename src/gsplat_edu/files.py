@@ -1,4 +1,4 @@
-"""Writing files so that an interrupted write never leaves half a file under the final name."""
+"""Write files so that an interrupted write never leaves a partial file under the final name."""
 
 from __future__ import annotations
 
@@ -15,20 +15,18 @@ from gsplat_edu.errors import ArgumentError
 
 @contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
-    """Write a file under a temporary name beside `path` and rename it when the block ends well.
+    """Write a file under a temporary name next to `path`, and rename it when the block succeeds.
 
     Args:
-        path: The final name. Missing parent folders are made. The temporary name keeps its suffix.
+        path: The final name. Missing parent folders are created. The temporary name has the same suffix.
 
     Yields:
-        The temporary path to write to, in the same folder, so that the rename is atomic.
+        The temporary path, in the same folder so that the rename is atomic.
 
     Raises:
-        OSError: the folder cannot be made or written to. What stood under `path` before is untouched.
+        OSError: the folder cannot be created or written to. An existing file at `path` stays unchanged.
     """
-    prefix = (
-        f".{path.stem}.{os.getpid()}-"  # the writer's process: remove_leftovers asks whether it still runs
-    )
+    prefix = f".{path.stem}.{os.getpid()}-"  # remove_leftovers checks whether this process is still running
     with named_failure(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
@@ -39,7 +37,7 @@ def written_aside(path: Path) -> Iterator[Path]:
             yield aside
             umask = os.umask(0)
             os.umask(umask)
-            aside.chmod(0o666 & ~umask)  # mkstemp makes files that only their owner can read
+            aside.chmod(0o666 & ~umask)  # mkstemp creates files that only their owner can read
             aside.replace(path)
     finally:
         aside.unlink(missing_ok=True)
@@ -47,11 +45,11 @@ def written_aside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def named_failure(path: Path, aside: Path | None = None) -> Iterator[None]:
-    """Let an OSError name the file that was to be written, not a temporary one beside it, or none at all.
+    """Make an OSError name the intended file instead of a temporary one or none.
 
     Args:
         path: The file.
-        aside: Its temporary name; None if an error inside of the block is always about the file, whatever it names.
+        aside: Its temporary name; None if every error inside the block concerns the file, whatever name it has.
     """
     try:
         yield
@@ -63,7 +61,7 @@ def named_failure(path: Path, aside: Path | None = None) -> Iterator[None]:
 
 
 def described(error: OSError) -> str:
-    """Say in words what an OSError says in numbers: the file that the user knows, and the reason."""
+    """Describe an OSError in words: the file as the user knows it, and the reason."""
     if error.strerror is None:
         return str(error)
     reason = error.strerror[:1].lower() + error.strerror[1:]
@@ -87,21 +85,21 @@ _ADVICE = {
     errno.EISDIR: "give the name of a file",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
-"""What to do about an error."""
+"""Advice by error number."""
 
 
 @contextmanager
 def named_in_utf8(path: Path) -> Iterator[Path]:
-    """Give a file a name in UTF-8 while the block runs: OpenCV crashes the process on any other.
+    """Give a file a UTF-8 name inside the block, because OpenCV crashes the process on any other name.
 
     Args:
-        path: A file that is there.
+        path: An existing file.
 
     Yields:
-        The path; a link to it in a temporary folder if its name, or that of a folder above, is not UTF-8.
+        The path; if its name or a parent folder's is not UTF-8, a link to it in a temporary folder.
 
     Raises:
-        OSError: the link cannot be made.
+        OSError: the link cannot be created.
     """
     if not _SURROGATE.search(str(path)):
         yield path
@@ -112,17 +110,17 @@ def named_in_utf8(path: Path) -> Iterator[Path]:
         yield link
 
 
-_SURROGATE = re.compile("[\ud800-\udfff]")  # stands for a byte that is not UTF-8 (PEP 383)
+_SURROGATE = re.compile("[\ud800-\udfff]")  # represents a byte that is not UTF-8 (PEP 383)
 
 _LEFTOVER = re.compile(r"\..*\.(\d+)-[a-z0-9_]{8}(?:\.[^.]+)?")  # temporary names of written_aside
 
 
 def remove_leftovers(folder: Path, *, below: bool = True) -> None:
-    """Remove temporary files of `written_aside` whose process was killed; those of a running process stay.
+    """Remove temporary files of `written_aside` whose process was killed; keep those of running processes.
 
     Args:
-        folder: Where to look; it need not exist.
-        below: Look in all folders below as well.
+        folder: The folder; it need not exist.
+        below: Include all subfolders.
     """
     for path in folder.rglob(".*") if below else folder.glob(".*"):
         match = _LEFTOVER.fullmatch(path.name)
@@ -131,7 +129,7 @@ def remove_leftovers(folder: Path, *, below: bool = True) -> None:
 
 
 def _runs(pid: int) -> bool:
-    """Say whether a process is running; on Windows, where asking with signal 0 would end it, always."""
+    """Return whether a process is running; always true on Windows, where signal 0 would terminate it."""
     if os.name == "nt" or pid == os.getpid():
         return True
     try:
@@ -144,18 +142,18 @@ def _runs(pid: int) -> bool:
 
 
 def check_folder(name: str, path: Path) -> None:
-    """Find out before hours of work whether files can be written into a folder. Nothing is made.
+    """Check, before hours of work, that files can be written to a folder. Creates nothing.
 
     Args:
-        name: What the user calls the folder, for the message.
-        path: The folder; it need not be there yet.
+        name: The user's name for the folder, for messages.
+        path: The folder; it need not exist.
 
     Raises:
-        ArgumentError: files cannot be written there, and why.
+        ArgumentError: files cannot be written there; the message says why.
     """
     nearest = next(place for place in (path, *path.absolute().parents) if place.exists())
     if not nearest.is_dir():
-        raise ArgumentError(f"{name}: {nearest} is a file; name a folder")
+        raise ArgumentError(f"{name}: {nearest} is a file; give a folder")
     try:
         with tempfile.TemporaryFile(dir=nearest):
             pass
@@ -166,14 +164,14 @@ def check_folder(name: str, path: Path) -> None:
 
 
 def check_writable(name: str, path: Path) -> None:
-    """Find out before hours of work whether a file can be written in the end. Parent folders are made.
+    """Check, before hours of work, that a file can be written. Parent folders are created.
 
     Args:
-        name: What the user calls the file, for the message.
+        name: The user's name for the file, for messages.
         path: The file.
 
     Raises:
-        ArgumentError: it cannot be written, and why.
+        ArgumentError: it cannot be written; the message says why.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -182,4 +180,4 @@ def check_writable(name: str, path: Path) -> None:
     except OSError as error:
         raise ArgumentError(f"{name}: cannot write {path} ({error.strerror}); choose another place") from None
     if path.is_dir():
-        raise ArgumentError(f"{name}: {path} is a folder; give the name of a file")
+        raise ArgumentError(f"{name}: {path} is a folder; give a file name")

@@ -1,7 +1,7 @@
-"""The mathematics of one Gaussian, in NumPy.
+"""The mathematics of a Gaussian, in NumPy.
 
-Quaternion to rotation, rotation and scales to covariance, covariance to screen space. The names ending in
-`_batch` do the same for N at once; the two are tested to agree.
+From quaternion to rotation, from rotation and scales to covariance, from covariance to screen space. Functions ending
+in `_batch` process N Gaussians at once; tests check that both agree.
 
 Chapters: 02_gaussians_in_2d, 03_gaussians_in_3d, 04_splatting.
 """
@@ -18,13 +18,13 @@ from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_a
 
 
 def quat_to_R(quat: ArrayLike) -> Float64[np.ndarray, "3 3"]:
-    """Turn one quaternion into a rotation matrix.
+    """Convert a quaternion to a rotation matrix.
 
     Args:
-        quat: (4,) quaternion (w, x, y, z), any length but zero; normalised here.
+        quat: (4,) quaternion (w, x, y, z) of nonzero length; normalised here.
 
     Returns:
-        (3, 3) rotation; q and -q give the same.
+        (3, 3) rotation; q and -q give the same one.
 
     Raises:
         ShapeError: not of shape (4,).
@@ -37,10 +37,10 @@ def quat_to_R(quat: ArrayLike) -> Float64[np.ndarray, "3 3"]:
 
 
 def quat_to_R_batch(quats: ArrayLike) -> Float64[np.ndarray, "N 3 3"]:
-    """Turn N quaternions into rotation matrices; see `quat_to_R`.
+    """Convert N quaternions to rotation matrices; see `quat_to_R`.
 
     Args:
-        quats: (N, 4) quaternions (w, x, y, z), any length but zero.
+        quats: (N, 4) quaternions (w, x, y, z) of nonzero length.
 
     Returns:
         (N, 3, 3) rotations.
@@ -54,16 +54,16 @@ def quat_to_R_batch(quats: ArrayLike) -> Float64[np.ndarray, "N 3 3"]:
 
 
 def build_cov3d(scale: ArrayLike, R: ArrayLike) -> Float64[np.ndarray, "3 3"]:
-    """Build the covariance of one Gaussian from its standard deviations and its rotation.
+    """Build the covariance of a Gaussian from its standard deviations and its rotation.
 
     Sigma = (R S)(R S)',  S = diag(scale)
 
-    A product of a matrix with its own transpose cannot have a negative eigenvalue, whatever its entries: so
-    gradient descent on scale and rotation never leaves the covariances.
+    The product of a matrix with its own transpose has no negative eigenvalues, so gradient descent on scale and
+    rotation always yields a valid covariance.
 
     Args:
         scale: (3,) standard deviations along the Gaussian's own axes, world units, >= 0.
-        R: (3, 3) rotation from the Gaussian's axes to the world's.
+        R: (3, 3) rotation from the Gaussian's axes to world axes.
 
     Returns:
         (3, 3) covariance, world units squared.
@@ -108,22 +108,22 @@ def project_cov3d(
 
     Sigma2d = J W Sigma W' J',  W = cam.R,  J = [[fx/z, 0, -fx x/z²], [0, fy/z, -fy y/z²]]
 
-    (J: Jacobian of the pinhole at the mean, x y z its camera coordinates.) The dilation is not added here.
+    (J: Jacobian of the pinhole at the mean, whose camera coordinates are x y z.) The dilation is not included.
 
     Args:
         cov3d: (..., 3, 3) covariances in world axes, world units squared.
         mean_cam: (..., 3) means in camera coordinates, world units; the same leading axes.
-        cam: The camera: a `Camera`, or anything with its members (`CameraLike`).
-        jacobian_limit: x/z and y/z inside J are clamped to this many half fields of view, see
-            `Camera.jacobian_bounds`; None clamps nothing.
+        cam: The camera: a `Camera` or any object with its members (`CameraLike`).
+        jacobian_limit: Clamp x/z and y/z inside J to this multiple of half the field of view, see
+            `Camera.jacobian_bounds`; None disables clamping.
 
     Returns:
         (..., 2, 2) screen-space covariances, px².
 
     Raises:
         ShapeError: a shape differs.
-        ArgumentError: a mean is not in front of the camera (z <= 0), anything is NaN or infinite, or `cam` is
-            no camera.
+        ArgumentError: a mean is not in front of the camera (z <= 0), anything is NaN or infinite, or `cam` is not a
+            camera.
 
     Source: Zwicker et al. 2002, "EWA Splatting", eq. 31; Kerbl et al. 2023, eq. 5.
     """
@@ -146,7 +146,7 @@ def project_cov3d(
 
 
 def opacity_compensation(cov2d: ArrayLike) -> Float64[np.ndarray, "*batch"]:
-    """Return the factor by which antialiasing lowers an opacity, so that the dilation adds no light.
+    """Return the factor by which antialiasing lowers an opacity to compensate for the dilation.
 
     sqrt(max(det Sigma2d, 1e-12) / det(Sigma2d + 0.3 I))
 
@@ -165,16 +165,18 @@ def opacity_compensation(cov2d: ArrayLike) -> Float64[np.ndarray, "*batch"]:
     cov2d = float64_array("cov2d", cov2d, ("...", 2, 2))
     a, b, c = cov2d[..., 0, 0], cov2d[..., 0, 1], cov2d[..., 1, 1]
     det = np.maximum(a * c - b * b, 0.0)
-    # det(Sigma2d + d I) = det Sigma2d + d (a + c) + d²: no term is negative, so that nothing cancels a second time.
+    # det(Sigma2d + d I) = det Sigma2d + d (a + c) + d²: no term is negative, so there is no further cancellation.
     dilated = det + DILATION * (a + c) + DILATION * DILATION
     return np.asarray(np.sqrt(np.maximum(det, DET_FLOOR) / dilated))
 
 
 def _rotations(name: str, quats: Float64[np.ndarray, "*batch 4"]) -> Float64[np.ndarray, "*batch 3 3"]:
-    # The largest entry is divided out first, so that the norm neither overflows nor underflows.
+    # Dividing by the largest entry first keeps the norm from overflowing or underflowing.
     largest = np.abs(quats).max(axis=-1, keepdims=True)
     if not np.all(largest > 0):
-        raise ArgumentError(f"{name}{first_index(largest[..., 0] == 0)}: has zero length and is no rotation")
+        raise ArgumentError(
+            f"{name}{first_index(largest[..., 0] == 0)}: has zero length and is not a rotation"
+        )
     unit = quats / largest
     w, x, y, z = np.moveaxis(unit / np.linalg.norm(unit, axis=-1, keepdims=True), -1, 0)
     rows = [

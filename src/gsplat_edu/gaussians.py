@@ -1,4 +1,4 @@
-"""The Gaussians that are learned: raw parameters, and the activations that turn them into what is drawn.
+"""The learned Gaussians: raw parameters, and the activations that map them to rendered quantities.
 
 Chapter: 07_a_trained_scene.
 """
@@ -18,7 +18,7 @@ from gsplat_edu.validation import Shape, check_shape, first_index
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians as raw parameters, which gradient descent may move anywhere.
+    """N Gaussians as raw parameters, which gradient descent may change freely.
 
     Args:
         means: (N, 3) centres, world units.
@@ -70,22 +70,22 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Highest degree of spherical harmonics that is stored."""
+        """Highest stored SH degree."""
         return {0: 0, 3: 1, 8: 2, 15: 3}[self.sh_rest.shape[1]]
 
     @property
     def scales(self) -> Float[Tensor, "N 3"]:
-        """(N, 3) standard deviations, world units: exp(log_scales)."""
+        """Standard deviations exp(log_scales), (N, 3), world units."""
         return torch.exp(self.log_scales)
 
     @property
     def opacities(self) -> Float[Tensor, " N"]:
-        """(N,) opacities in (0, 1): sigmoid(logit_opacities)."""
+        """Opacities sigmoid(logit_opacities) in (0, 1), (N,)."""
         return torch.sigmoid(self.logit_opacities)
 
     @property
     def sh(self) -> Float[Tensor, "N K 3"]:
-        """(N, K, 3) all coefficients, degree 0 first: K = 1, 4, 9 or 16."""
+        """All coefficients, degree 0 first, (N, K, 3): K = 1, 4, 9 or 16."""
         return torch.cat([self.sh0, self.sh_rest], dim=1)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -96,41 +96,41 @@ class Gaussians:
         """Check that no raw parameter is NaN or infinite.
 
         Raises:
-            ArgumentError: one is; the message names the parameter and the entry.
+            ArgumentError: one is NaN or infinite; the message names the parameter and the entry.
         """
         for name, tensor in self.tensors().items():
             check_tensor(name, tensor, ("...",), {})
 
     def finite_rows(self) -> Bool[Tensor, " N"]:
-        """Say of each Gaussian whether all its raw parameters are finite."""
+        """Return for each Gaussian whether all its raw parameters are finite."""
         finite = [torch.isfinite(t.detach()).flatten(1).all(dim=1) for t in (self.sh0, self.sh_rest)]
         flat = (self.means, self.quats, self.log_scales, self.logit_opacities[:, None])
         return torch.stack([*finite, *(torch.isfinite(t.detach()).all(dim=1) for t in flat)]).all(dim=0)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Gaussians:
-        """Return new Gaussians with the same change made to every raw parameter."""
+        """Apply a function to every raw parameter and return the new Gaussians."""
         return Gaussians(**{name: change(tensor) for name, tensor in self.tensors().items()})
 
     def to(self, device: torch.device) -> Gaussians:
-        """Return the same Gaussians with their parameters on a device."""
+        """Return the Gaussians with their parameters on a device."""
         return self.map(lambda tensor: tensor.to(device))
 
     def trainable(self) -> Gaussians:
-        """Return a copy whose parameters are leaves that collect gradients."""
+        """Return a copy whose parameters are leaves that accumulate gradients."""
         return self.map(lambda tensor: tensor.detach().clone().requires_grad_())
 
     @staticmethod
     def concatenated(parts: Sequence[Gaussians]) -> Gaussians:
-        """Join Gaussians in the order given; all must store the same SH degree."""
+        """Join Gaussians in the given order; all must have the same SH degree."""
         tensors = [part.tensors() for part in parts]
         return Gaussians(**{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]})
 
 
 def quat_to_R_t(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    """Turn N quaternions into rotation matrices, differentiably.
+    """Convert N quaternions to rotation matrices, differentiably.
 
     Args:
-        quats: (N, 4) quaternions (w, x, y, z), any length but zero.
+        quats: (N, 4) quaternions (w, x, y, z) of nonzero length.
 
     Returns:
         (N, 3, 3) rotations.
@@ -149,7 +149,7 @@ def quat_to_R_t(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
 
 
 def unchecked_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    """Turn quaternions into rotation matrices as `quat_to_R_t` does, unchecked: NaN where one has zero length.
+    """Convert quaternions to rotation matrices like `quat_to_R_t`, without checks: NaN for zero length.
 
     Args:
         quats: (N, 4) quaternions (w, x, y, z).
@@ -159,8 +159,8 @@ def unchecked_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
 
     Differentiable in: quats.
     """
-    # The largest entry is divided out first, so that the norm neither overflows nor underflows. It may be a
-    # constant to autograd: a rotation does not depend on the quaternion's length.
+    # Dividing by the largest entry first keeps the norm from overflowing or underflowing. Autograd may treat it as
+    # constant: a rotation does not depend on the quaternion's length.
     scaled = quats / quats.detach().abs().amax(dim=-1, keepdim=True)
     w, x, y, z = (scaled / scaled.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
@@ -178,7 +178,7 @@ def cov3d_t(log_scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Fl
 
     Args:
         log_scales: (N, 3) natural logarithm of the standard deviations in world units.
-        quats: (N, 4) quaternions (w, x, y, z), any length but zero.
+        quats: (N, 4) quaternions (w, x, y, z) of nonzero length.
 
     Returns:
         (N, 3, 3) covariances, world units squared.
@@ -197,7 +197,7 @@ def cov3d_t(log_scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Fl
 
 
 def check_tensor(name: str, value: Tensor, shape: Shape, sizes: dict[str, int]) -> None:
-    """Check an argument that is a tensor.
+    """Validate a tensor argument.
 
     Raises:
         ShapeError: the shape differs; see `gsplat_edu.validation.check_shape`.

@@ -1,7 +1,7 @@
-"""How much memory this process can still take; work that needs more is refused before it starts.
+"""Memory still available to this process; work that needs more is rejected before it starts.
 
-Linux grants memory that it does not have and later kills the process that touches it. So a photo, an image or a list
-whose size is known is compared with what is free first.
+Linux grants memory that it does not have and later kills the process that uses it. So large allocations of known size
+are compared with the free memory first.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from pathlib import Path
 from gsplat_edu.errors import NotEnoughMemoryError
 
 WORTH_ASKING = 64 * 2**20
-"""Smaller needs are granted without asking the system, which takes some 0.1 ms."""
+"""Smaller requests are granted without a query, which takes about 0.1 ms."""
 
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 UNLIMITED = 2**60
-"""Limits of this many bytes and more count as none."""
+"""Limits from this many bytes on count as none."""
 
 _SHORTAGES = (
     "can't allocate memory",
@@ -27,26 +27,26 @@ _SHORTAGES = (
     "out of memory",
     "can't start new thread",
 )
-"""What RuntimeErrors of torch and Python's threads say when memory ran out, in lower case."""
+"""Lower-case phrases by which RuntimeErrors of torch and of Python's threads report insufficient memory."""
 
 
 def available_memory() -> int | None:
-    """Return the bytes this process can still take: the least that the machine, its cgroups and its limits leave.
+    """Return the bytes this process can still use: the minimum over the machine, its cgroups and its limits.
 
     Returns:
-        None where the system does not say.
+        None if the system does not provide the information.
     """
     found = [*_machine(), *_cgroups(), *_address_space()]
     return max(0, min(found)) if found else None
 
 
 def require_memory(what: str, nbytes: int, advice: str) -> None:
-    """Refuse work that needs more memory than there is.
+    """Reject work that needs more memory than is free.
 
     Args:
         what: The work, as the subject of the message.
-        nbytes: Bytes it takes at its peak.
-        advice: What to do, for the message.
+        nbytes: Its peak memory in bytes.
+        advice: Advice for the message.
 
     Raises:
         NotEnoughMemoryError: fewer bytes are available.
@@ -56,12 +56,12 @@ def require_memory(what: str, nbytes: int, advice: str) -> None:
     available = available_memory()
     if available is not None and nbytes > available:
         raise NotEnoughMemoryError(
-            f"{what}: needs {_gib(nbytes)} of memory, but {_gib(available)} are free; {advice}"
+            f"{what}: needs {_gib(nbytes)} of memory, but only {_gib(available)} are free; {advice}"
         )
 
 
 def shortage(error: BaseException) -> str | None:
-    """Return what an error says if memory ran out; None if it is about something else.
+    """Return the message of an error caused by insufficient memory; None for other errors.
 
     Covers Python, NumPy and the native kernels (MemoryError), torch and threads (RuntimeError), OpenCV and the system.
     """
@@ -89,7 +89,7 @@ def _machine() -> list[int]:
 
 
 def _cgroups() -> list[int]:
-    """Return what each cgroup above this process leaves; pages of its file cache count as free."""
+    """Return the free memory of each enclosing cgroup; its file cache counts as free."""
     found = []
     for line in _lines(PROC / "self" / "cgroup"):
         _, controllers, place = [*line.split(":", 2), "", "/"][:3]

@@ -1,6 +1,7 @@
-"""The one door to image files: formats that cameras and programs write for photos, within a size and within memory.
+"""Open image files; no other module does. Formats of cameras and photo software, within limits on size and memory.
 
-Pillow knows some forty formats more. One of them starts Ghostscript on the file, others unpack what no photo holds.
+Pillow supports some forty more formats. One of them starts Ghostscript on the file, and others decode data that no
+photo contains.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from gsplat_edu.headroom import require_memory
 from gsplat_edu.reading import open_file
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
-"""Formats that are opened, by Pillow's names. JPEG opens MPO too, which some cameras and phones write as .jpg."""
+"""Accepted formats, by Pillow's names. JPEG includes MPO, which some cameras and phones write as .jpg."""
 
 SPELLED = "JPEG, PNG, WebP, TIFF, BMP or PPM"
-"""The same for people."""
+"""The accepted formats in messages."""
 
 MAX_PIXELS = 2**30
-"""Pixels of a photo that are believed; a header that says more is a corrupt file's or not a photo's."""
+"""Most pixels of a photo; a header that claims more belongs to a corrupt file or not to a photo."""
 
 BYTES_PER_PIXEL = 10
-"""Memory that decoding takes: 4 bytes in Pillow, as many after a conversion, and the array's. Measured: 8 to 11."""
+"""Memory needed for decoding: 4 bytes in Pillow, 4 after a conversion, and the array. Measured: 8 to 11."""
 
 UNDECODABLE = (
     OSError,
@@ -39,15 +40,16 @@ UNDECODABLE = (
     IndexError,
     TypeError,
     OverflowError,
+    RuntimeError,
     struct.error,
 )
-"""What Pillow raises on files that are cut short, corrupt, absurdly large or no images."""
+"""Exceptions of Pillow for files that are truncated, corrupt, absurdly large or not images."""
 
 
 class _PillowsLimit:
-    """Lifts Pillow's limit of 89 megapixels while images are open: `MAX_PIXELS` and free memory are the limits here.
+    """Lifts Pillow's limit of 89 megapixels while images are open; `MAX_PIXELS` and the free memory apply instead.
 
-    Pillow's limit belongs to the process, and some decoders check it again. It is back once no thread reads.
+    Pillow's limit is global to the process, and some decoders check it again. It is restored once no thread is reading.
     """
 
     def __init__(self) -> None:
@@ -73,17 +75,17 @@ _no_limit = _PillowsLimit()
 
 @contextmanager
 def opened_image(source: Path | bytes, formats: Sequence[str] = FORMATS) -> Iterator[Image.Image]:
-    """Open an image and read its header; nothing is decoded yet.
+    """Open an image and read its header, without decoding it.
 
     Args:
-        source: The file, or its contents.
-        formats: Pillow's names of those that are tried.
+        source: The file or its contents.
+        formats: Pillow's names of the accepted formats.
 
     Yields:
-        The image. Call `require_room` before its pixels are touched.
+        The image. Call `require_room` before accessing its pixels.
 
     Raises:
-        UNDECODABLE: it is no image of these formats, no regular file, damaged, or has more than `MAX_PIXELS`.
+        UNDECODABLE: not an image of these formats, not a regular file, damaged, or larger than `MAX_PIXELS`.
     """
     with (
         _no_limit,
@@ -91,15 +93,15 @@ def opened_image(source: Path | bytes, formats: Sequence[str] = FORMATS) -> Iter
         Image.open(file, formats=tuple(formats)) as image,
     ):
         if image.width * image.height > MAX_PIXELS:
-            raise ValueError(f"{image.width}x{image.height} px are more than a photo has")
+            raise ValueError(f"{image.width}x{image.height} px is too large for a photo")
         yield image
 
 
 def require_room(path: Path, image: Image.Image) -> None:
-    """Check that there is memory to decode an image, by the size in its header.
+    """Check that enough memory is free to decode an image, given the size in its header.
 
     Raises:
-        NotEnoughMemoryError: there is not.
+        NotEnoughMemoryError: too little memory is free.
     """
     require_memory(
         f"{path}: {image.width}x{image.height} px",
@@ -109,7 +111,7 @@ def require_room(path: Path, image: Image.Image) -> None:
 
 
 def is_image(path: Path) -> bool:
-    """Say whether a file is an image of one of `FORMATS`, by its header."""
+    """Return whether a file is an image in one of `FORMATS`, according to its header."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

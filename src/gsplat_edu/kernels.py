@@ -1,4 +1,4 @@
-"""The native module, or the reason why it is not there. Every call of a native kernel goes through here.
+"""Access to the native module, or the reason why it is missing. Every native kernel is called through this module.
 
 Chapter: 10_the_naive_kernel.
 """
@@ -11,14 +11,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.dlpack import to_dlpack  # type: ignore[attr-defined]  # documented, yet not in its __all__
+from torch.utils.dlpack import to_dlpack  # type: ignore[attr-defined]  # documented, but not in its __all__
 
 from gsplat_edu.errors import BackendUnavailableError
 from gsplat_edu.headroom import available_memory
 
 _native: ModuleType | None
 REASON: str | None
-"""Why the native module does not load, and what to do; None where it does."""
+"""Why the native module does not load, and what to do; None if it is loaded."""
 
 try:
     _native = importlib.import_module("gsplat_edu._native")
@@ -31,14 +31,14 @@ else:
     _native.ask_before_large_blocks(available_memory)
 
 SUFFIXES = {torch.float32: "32", torch.float64: "64"}
-"""How native names end by scalar type: float for speed, double for proof."""
+"""Suffixes of native names by scalar type: float for speed, double for gradient checks."""
 
 
 def native_array(tensor: Tensor) -> object:
-    """Hand a tensor to the native module, which checks it.
+    """Pass a tensor to the native module, which validates it.
 
-    The module is built against no torch. Tensors describe themselves to it through DLPack's C interface, at next to no
-    cost; those of older versions of torch, which lack it, become DLPack capsules.
+    The module is not built against torch. It reads tensors through DLPack's C interface at almost no cost; tensors of
+    older torch versions, which lack it, are converted to DLPack capsules.
     """
     return tensor if _DESCRIBE_THEMSELVES else to_dlpack(tensor)
 
@@ -50,7 +50,7 @@ def native() -> Any:  # noqa: ANN401
     """Return the native module, for its structures: Camera, Settings, Scene, Gradients and Images.
 
     Raises:
-        BackendUnavailableError: it is not there.
+        BackendUnavailableError: the native module is missing.
     """
     if _native is None:
         raise BackendUnavailableError(f"native kernels: {REASON}")
@@ -58,9 +58,9 @@ def native() -> Any:  # noqa: ANN401
 
 
 def kernel(name: str, dtype: torch.dtype) -> Any:  # noqa: ANN401
-    """Look up a native function or class by its name without the scalar type, "adam_f" for example.
+    """Look up a native function or class by its name without the scalar type, for example "adam_f".
 
     Raises:
-        BackendUnavailableError: the native module is not there.
+        BackendUnavailableError: the native module is missing.
     """
     return getattr(native(), name + SUFFIXES[dtype])

@@ -1,4 +1,4 @@
-"""One writer per folder: a lock that the operating system gives up when its process ends, however it ends."""
+"""One writer per folder: a lock that the operating system releases when its process ends, however it ends."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.files import check_folder, named_failure
 
 LOCK = ".lock"
-"""Name of the lock in its folder. It is removed at the end; one that a killed process left locks nothing."""
+"""Name of the lock file. It is removed at the end; a file left by a killed process locks nothing."""
 
 _FAR = 1 << 30
-"""Offset of the byte that is locked on Windows, far beyond the file's contents: a locked byte cannot be read."""
+"""Offset of the locked byte on Windows, far beyond the contents, because a locked byte cannot be read."""
 
 _held: set[int] = set()
 
 
 @contextmanager
 def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> Iterator[None]:
-    """Keep other processes from writing to a folder while the block runs. It is made where it is missing.
+    """Keep other processes from writing to a folder inside the block. The folder is created if missing.
 
-    The lock is `flock` on Linux and macOS, a locked byte on Windows. Both end with the process, even by kill -9;
-    processes it starts or forks do not keep it. Threads of one process exclude one another likewise.
+    The lock is `flock` on Linux and macOS and a locked byte on Windows. Both end with the process, even with kill -9;
+    child processes do not inherit them. Threads of one process exclude one another as well.
 
     Args:
-        name: What the user calls the folder, for messages.
-        folder: The folder. If the block leaves it empty and it was made here, it is removed again.
-        what: What this process does, for the message that the next one prints.
-        say: Receives a sentence if the file system has no locks: the block then runs without.
+        name: The user's name for the folder, for messages.
+        folder: The folder. It is removed again if it was created here and the block leaves it empty.
+        what: The activity of this process, for the message shown to another process.
+        say: Receives a sentence if the file system has no locks; the block then runs without one.
 
     Raises:
-        ArgumentError: another process holds the lock; the message says which. Or the folder cannot be written to.
+        ArgumentError: another process holds the lock (the message names it), or the folder is not writable.
     """
     check_folder(name, folder)
     made = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
@@ -48,7 +48,9 @@ def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> It
     try:
         handle = _acquired(name, path)
         if handle is None:
-            say(f"{folder}: its file system has no locks; do not let two commands write to it at once")
+            say(
+                f"{folder}: its file system has no locks; do not let two commands write to it at the same time"
+            )
             yield
             return
         try:
@@ -61,21 +63,21 @@ def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> It
             _release(handle, path)
     finally:
         for place in made:
-            with contextlib.suppress(OSError):  # it holds what the block wrote
+            with contextlib.suppress(OSError):  # not empty: it holds the block's output
                 place.rmdir()
 
 
 def _acquired(name: str, path: Path) -> int | None:
     """Return an open, locked file; None if the file system has no locks."""
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)  # programs that are started do not inherit it
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)  # child processes do not inherit it
         try:
             _lock(handle)
         except (BlockingIOError, PermissionError):
             holder = _holder(handle)
             os.close(handle)
             raise ArgumentError(
-                f"{name}: {path.parent} is in use by {holder}; wait until that ends, or name another folder"
+                f"{name}: {path.parent} is in use by {holder}; wait until it ends, or choose another folder"
             ) from None
         except OSError:
             os.close(handle)
@@ -86,16 +88,16 @@ def _acquired(name: str, path: Path) -> int | None:
             return handle
         os.close(
             handle
-        )  # its last holder removed it between our two calls: another file is there now, or none
+        )  # the previous holder removed it between our two calls: another file, or none, is there now
 
 
 def _release(handle: int, path: Path) -> None:
     _held.discard(handle)
     if sys.platform != "win32":
-        path.unlink(missing_ok=True)  # before it is released: afterwards it may be another process's
+        path.unlink(missing_ok=True)  # before the release: afterwards it may belong to another process
     os.close(handle)
     if sys.platform == "win32":
-        with contextlib.suppress(OSError):  # another process has opened it meanwhile
+        with contextlib.suppress(OSError):  # another process has opened it in the meantime
             path.unlink()
 
 
@@ -120,7 +122,7 @@ def _is_at(path: Path, handle: int) -> bool:
 
 
 def _holder(handle: int) -> str:
-    """Say who wrote the lock, in words that cannot do anything to a terminal."""
+    """Describe the lock's owner, with control characters removed."""
     try:
         facts = json.loads(os.read(handle, 1000))
         words = [re.sub(r"[^ -~]", "?", str(facts[key]))[:80] for key in ("what", "pid", "host", "since")]
@@ -134,7 +136,7 @@ def _now() -> str:
 
 
 def _drop_in_child() -> None:
-    """Close a forked child's copies: with one of them open, the lock would outlive its process."""
+    """Close a forked child's copies; an open copy would keep the lock after its process ended."""
     for handle in _held:
         with contextlib.suppress(OSError):
             os.close(handle)

@@ -1,4 +1,4 @@
-"""What training minimises."""
+"""Training losses."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def photo_loss(
     mask: Bool[np.ndarray, "H W"] | Bool[Tensor, "H W"] | None = None,
     ssim_weight: float = 0.2,
 ) -> Float[Tensor, ""]:
-    """Return the loss a trainer steps down: `l1_ssim`, or `l1` where SSIM has no weight, of what a mask leaves.
+    """Return the photometric loss of the unmasked pixels: `l1_ssim`, or `l1` if SSIM has no weight.
 
-    Where a pixel does not count, image and photo are both black; the mean is over all pixels all the same.
+    Masked pixels are black in both image and photo; the mean covers all pixels.
 
     Args:
-        image: (H, W, 3) rendered.
+        image: (H, W, 3) render.
         target: (H, W, 3) photo, uint8 or float from 0 to 1.
-        mask: (H, W) true where a pixel counts; None where all do.
+        mask: (H, W) true for pixels that count; None if all count.
         ssim_weight: k, 0 to 1.
 
     Returns:
@@ -43,7 +43,7 @@ def photo_loss(
         target = target.to(image.dtype)
     if mask is not None:
         counts = torch.as_tensor(mask, device=image.device)[..., None]
-        # Times 0 or 1: exact, on any number of threads.
+        # Multiplication by 0 or 1 is exact, for any number of threads.
         check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
         image = _Masked.apply(image, counts)  # type: ignore[no-untyped-call]
         target = torch.mul(target.detach(), counts, out=reusable_tensor(target.shape, target))
@@ -60,18 +60,18 @@ def l1(
 ) -> Float[Tensor, ""]:
     """Return the mean absolute difference of two images: mean |image - target|.
 
-    On the CPU it is one native pass (where the native module is there): torch would wake its own threads for it,
-    and they would spin against ours.
+    On the CPU this is one native pass (if the native module is available): torch would wake its own threads for it,
+    which would compete with the native ones.
 
     Args:
-        image: (H, W, 3) rendered.
-        target: (H, W, 3) photo, 0 to 1, or uint8, 0 to 255; no gradient reaches it.
+        image: (H, W, 3) render.
+        target: (H, W, 3) photo, 0 to 1, or uint8, 0 to 255; receives no gradient.
 
     Returns:
         () scalar, differentiable in the image.
 
     Raises:
-        ShapeError: the two are not of one size.
+        ShapeError: the sizes differ.
     """
     check_shape("target", target.shape, image.shape, {})
     native = REASON is None and image.device.type == "cpu" and image.dtype in SUFFIXES
@@ -87,22 +87,22 @@ def l1_ssim(
     target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
     ssim_weight: float = 0.2,
 ) -> Float[Tensor, ""]:
-    """Return the loss of captures, (1 - k) L1 + k (1 - SSIM), in one native pass with its gradient.
+    """Return the loss (1 - k) L1 + k (1 - SSIM) used for captures, in one native pass with its gradient.
 
     SSIM is the mean over pixels and channels, with a Gaussian window of 11 taps (sigma 1.5), zero outside the
     image.
 
     Args:
-        image: (H, W, 3) rendered, float32 or float64, on the CPU.
+        image: (H, W, 3) render, float32 or float64, on the CPU.
         target: (H, W, 3) photo, 0 to 1, of the image's dtype; or uint8, 0 to 255.
         ssim_weight: k, 0 to 1.
 
     Returns:
-        () scalar, differentiable in the image, the same to the bit on any number of threads.
+        () scalar, differentiable in the image, identical to the bit for any number of threads.
 
     Raises:
-        ShapeError: the image is not (H, W, 3), or the target of another size.
-        ArgumentError: a dtype or device is another one, or the weight is outside 0 to 1.
+        ShapeError: the image is not (H, W, 3), or the target's size differs.
+        ArgumentError: a dtype or device is unsupported, or the weight is outside 0 to 1.
 
     Source: Kerbl et al. 2023, eq. 7; Wang et al. 2004.
     """
@@ -122,7 +122,7 @@ def l1_ssim(
 
 
 class _Masked(torch.autograd.Function):
-    """An image times a mask of 0 and 1, in reused buffers."""
+    """Multiply an image by a mask of 0 and 1, in reused buffers."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, counts: Tensor) -> Tensor:  # noqa: ANN401
@@ -137,7 +137,7 @@ class _Masked(torch.autograd.Function):
 
 
 class _L1Ssim(torch.autograd.Function):
-    """Loss and gradient in one pass; backward only scales."""
+    """Compute loss and gradient in one pass; backward only scales."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:  # noqa: ANN401

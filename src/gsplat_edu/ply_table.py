@@ -1,4 +1,4 @@
-"""PLY as tables: the header's elements, and the rows of one of them. It knows nothing of splats."""
+"""PLY files as tables: the elements of the header and the rows of one element. Independent of splats."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsplat_edu.headroom import require_memory
 from gsplat_edu.reading import TOO_LARGE
 
 FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-"""Formats and their byte order as NumPy writes it."""
+"""Formats and their byte order in NumPy's notation."""
 
 NUMBERS = {
     "char": "i1",
@@ -37,19 +37,19 @@ NUMBERS = {
     "double": "f8",
     "float64": "f8",
 }
-"""Number types of PLY, in both spellings, as NumPy's."""
+"""PLY's number types, in both spellings, as NumPy types."""
 
 LINE_LIMIT = 4096
-"""Bytes of a header line: longer ones are not a header's."""
+"""Most bytes of a header line."""
 
 HEADER_LIMIT = 10_000
-"""Lines of a header: a file that goes on longer is not a PLY, whatever its first line says."""
+"""Most lines of a header; a file with more is not a PLY, whatever its first line says."""
 
 MOST_ROWS = 10**12
-"""Rows of an element that are believed: more are a damaged header's, or one made to break readers."""
+"""Most rows of an element; more indicate a damaged header or a malicious file."""
 
 COPIES = 3
-"""Copies of its rows that reading a scene takes at its peak: the table, its columns and the tensors."""
+"""Peak number of copies of the rows when a scene is read: the table, its columns and the tensors."""
 
 LFS_POINTER = b"version https://git-lfs"
 
@@ -59,9 +59,9 @@ class Element:
     """An element of a PLY.
 
     Args:
-        name: Its name, "vertex" for example.
-        count: Rows that the header promises.
-        properties: Name and NumPy type without byte order of each; the type is None for a list.
+        name: Its name, for example "vertex".
+        count: Number of rows declared in the header.
+        properties: Name and NumPy type (without byte order) of each; the type of a list is None.
     """
 
     name: str
@@ -70,21 +70,21 @@ class Element:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the properties, in the order of the file."""
+        """Names of the properties, in file order."""
         return tuple(name for name, _ in self.properties)
 
     def dtype(self, path: Path, order: str) -> np.dtype[Any]:
         """Return the type of a row.
 
         Raises:
-            SceneFormatError: a property is a list, so that rows have no one size.
+            SceneFormatError: a property is a list, so the rows have no fixed size.
         """
         fields = []
         for name, kind in self.properties:
             if kind is None:
                 raise SceneFormatError(
                     f"{path}: element {self.name} has the list {name}, so its rows cannot be read as a table;"
-                    " export it without"
+                    " export it without the list"
                 )
             fields.append((name, order + kind))
         return np.dtype(fields)
@@ -92,12 +92,12 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What the lines up to end_header say.
+    """The contents of the header.
 
     Args:
         format: "ascii", "binary_little_endian" or "binary_big_endian".
-        elements: In the order of the file.
-        comments: Words of each comment, in the order of the file.
+        elements: The elements, in file order.
+        comments: Words of each comment, in file order.
     """
 
     format: str
@@ -106,10 +106,10 @@ class Header:
 
 
 def read_elements(path: Path, file: BinaryIO) -> Header:
-    """Read the header and leave the file at the first byte after it.
+    """Read the header, leaving the file at the first byte after it.
 
     Raises:
-        SceneFormatError: not a PLY, or its header is damaged; the message names the line.
+        SceneFormatError: not a PLY, or the header is damaged; the message names the line.
     """
     first = file.readline(LINE_LIMIT)
     if first.startswith(LFS_POINTER):
@@ -136,7 +136,7 @@ def read_elements(path: Path, file: BinaryIO) -> Header:
 
 
 class _HeaderLines:
-    """Collects the lines of a header; each answer is what is wrong with the line, or None."""
+    """Collects the lines of a header; `add` returns an error in the line, or None."""
 
     def __init__(self) -> None:
         self.format: str | None = None
@@ -160,7 +160,7 @@ class _HeaderLines:
             case ["property", number, name] if number in NUMBERS:
                 return self._property(name, NUMBERS[number])
             case _:
-                return f"{' '.join(words)[:60]!r} is no line of a PLY header"
+                return f"{' '.join(words)[:60]!r} is not a line of a PLY header"
         return None
 
     def _property(self, name: str, kind: str | None) -> str | None:
@@ -168,7 +168,7 @@ class _HeaderLines:
             return f"property {name} belongs to no element"
         _, properties = next(reversed(self.elements.values()))
         if name in properties:
-            return f"property {name} stands twice"
+            return f"property {name} appears twice"
         properties[name] = kind
         return None
 
@@ -176,25 +176,25 @@ class _HeaderLines:
 def read_rows(path: Path, file: BinaryIO, header: Header, wanted: Element) -> np.ndarray[Any, np.dtype[Any]]:
     """Read the rows of one element.
 
-    Nothing is allocated for rows that the file is too small to hold.
+    Nothing is allocated for rows that do not fit into the file.
 
     Args:
         path: The file's name, for messages.
         file: The open file, just after its header.
-        header: What the header says.
+        header: The header.
         wanted: The element, one of the header's.
 
     Returns:
-        (count,) structured array with the element's properties by name; every one float64 where the file is ASCII.
+        (count,) structured array with the element's properties by name; all are float64 if the file is ASCII.
 
     Raises:
-        SceneFormatError: rows are missing or cannot be read; the message says how many are there.
+        SceneFormatError: rows are missing or malformed; the message gives the number present.
     """
     order = FORMATS[header.format]
     before = header.elements[: header.elements.index(wanted)]
     dtype = wanted.dtype(path, order)
     if header.format == "ascii":
-        # rows of an element without properties are blank lines, which are passed over
+        # rows of an element without properties are blank lines, which are skipped
         skipped = sum(element.count for element in before if element.properties)
         return _ascii_rows(path, file, skipped, wanted)
     left = os.fstat(file.fileno()).st_size - file.tell()
@@ -202,7 +202,7 @@ def read_rows(path: Path, file: BinaryIO, header: Header, wanted: Element) -> np
     there = max(0, left - skipped) // dtype.itemsize if dtype.itemsize else 0
     if there < wanted.count:
         raise _truncated(path, wanted, there)
-    if not wanted.count:  # what stands before it may be longer than a file can be
+    if not wanted.count:  # the declared rows before it may exceed any file size
         return np.empty(0, dtype)
     require_memory(str(path), COPIES * wanted.count * dtype.itemsize, TOO_LARGE)
     file.seek(skipped, os.SEEK_CUR)
@@ -212,18 +212,18 @@ def read_rows(path: Path, file: BinaryIO, header: Header, wanted: Element) -> np
 def _ascii_rows(path: Path, file: BinaryIO, skipped: int, wanted: Element) -> np.ndarray[Any, np.dtype[Any]]:
     names = wanted.names
     lines = itertools.islice(
-        (line for line in file if line.strip()),  # blank lines are no rows
+        (line for line in file if line.strip()),  # blank lines are not rows
         min(skipped, sys.maxsize),
         min(skipped + wanted.count, sys.maxsize),
     )
     rows = np.empty((0, len(names)))
-    # a number takes two bytes at least in the file, and eight in the table
+    # a number needs at least two bytes in the file, and eight in the table
     lines_left = os.fstat(file.fileno()).st_size - file.tell()
     require_memory(str(path), min(4 * lines_left, 8 * wanted.count * len(names)), TOO_LARGE)
     if wanted.count:
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # no line at all: told of below
+                warnings.simplefilter("ignore", UserWarning)  # no lines at all; reported below
                 rows = np.loadtxt(lines, comments=None, ndmin=2, encoding="latin-1")
         except ValueError as error:
             reason = str(error).split(";")[0].rstrip(".")
@@ -242,5 +242,5 @@ def _ascii_rows(path: Path, file: BinaryIO, skipped: int, wanted: Element) -> np
 
 def _truncated(path: Path, element: Element, there: int) -> SceneFormatError:
     return SceneFormatError(
-        f"{path}: is truncated: {there} of {element.count} rows of {element.name} are there; get the file again"
+        f"{path}: is truncated: {there} of {element.count} rows of {element.name} are present; get the file again"
     )

@@ -1,4 +1,4 @@
-"""Procedural scenes: Gaussians from a formula, so that their truth is known exactly.
+"""Procedural scenes: Gaussians from a formula, with exactly known ground truth.
 
 Chapter: 05_sort_and_composite.
 """
@@ -19,12 +19,12 @@ def sphere_shell(
     Float64[np.ndarray, "n 3"],
     Float64[np.ndarray, " n"],
 ]:
-    """Cover the unit sphere with flat disks, coloured by where they are.
+    """Cover the unit sphere with flat disks, coloured by their positions.
 
     Sigma = B diag(s_t², s_t², s_n²) B',  B = (t1, t2, normal);  colour = (P + 1) / 2
 
-    t1 is the normalised cross product of the normal with the coordinate axis on which the normal is
-    smallest (so never with one it is parallel to), and t2 = normal × t1.
+    t1 is the normalised cross product of the normal with the coordinate axis along which the normal is smallest (so the
+    two are never parallel), and t2 = normal × t1.
 
     Args:
         n: Number of disks.

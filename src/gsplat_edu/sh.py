@@ -18,7 +18,7 @@ from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.validation import ArrayLike, first_index, float64_array, whole_number
 
 UNIT_TOLERANCE = 1e-3
-"""How far from 1 the length of a viewing direction may be."""
+"""Largest deviation of a viewing direction's length from 1."""
 
 
 def sh_basis(dirs: ArrayLike) -> Float64[np.ndarray, "*batch 16"]:
@@ -50,15 +50,15 @@ def eval_sh(degree: int, sh: ArrayLike, dirs: ArrayLike) -> Float64[np.ndarray, 
 
     Args:
         degree: Highest degree to use, 0 to 3.
-        sh: (N, K, 3) coefficients, K >= (degree + 1)²; those of higher degrees are not used.
+        sh: (N, K, 3) coefficients, K >= (degree + 1)²; coefficients of higher degrees are ignored.
         dirs: (N, 3) unit vectors from the camera to each Gaussian.
 
     Returns:
-        (N, 3) colours, 0 and up, not limited to 1.
+        (N, 3) colours, at least 0, without an upper bound.
 
     Raises:
         ShapeError: a shape differs, N differs, or K is too small for the degree.
-        ArgumentError: the degree is not 0, 1, 2 or 3; a number is NaN or infinite; a direction is not unit.
+        ArgumentError: the degree is not 0, 1, 2 or 3; a number is NaN or infinite; a direction is not a unit vector.
 
     Source: Kerbl et al. 2023, section 4 and its code.
     """
@@ -83,10 +83,10 @@ def num_coefficients(degree: int) -> int:
 
 
 def basis_terms(degree: int, x: Any, y: Any, z: Any) -> list[Any]:  # noqa: ANN401
-    """Write the harmonics up to `degree` as polynomials in x, y and z.
+    """Return the harmonics up to `degree` as polynomials in x, y and z.
 
-    Only +, - and * are used, so that the same line serves NumPy arrays and torch tensors; the first term is
-    the plain number C0. Values are those of a spherical harmonic where x² + y² + z² = 1.
+    Only +, - and * are used, so that the same code works for NumPy arrays and torch tensors; the first term is the
+    number C0. The values are spherical harmonics where x² + y² + z² = 1.
     """
     terms = [C0]
     if degree >= 1:
@@ -114,12 +114,12 @@ def basis_terms(degree: int, x: Any, y: Any, z: Any) -> list[Any]:  # noqa: ANN4
 
 
 def sh_rotation(degree: int, R: ArrayLike) -> Float64[np.ndarray, "K K"]:
-    """Return what a rotation does to the coefficients of degrees 1 and up: a block per degree.
+    """Return the effect of a rotation on the coefficients of degrees 1 and up: one block per degree.
 
-    sum_k b_k(d) (M c)_k = sum_k b_k(R' d) c_k  for every direction d: the colours turn with the scene.
+    sum_k b_k(d) (M c)_k = sum_k b_k(R' d) c_k  for every direction d: the colours rotate with the scene.
 
-    A rotated harmonic is a sum of harmonics of its own degree, so that each block is found exactly from as many
-    directions as there are unknowns and some more.
+    A rotated harmonic is a combination of harmonics of its own degree. So each block follows exactly from a
+    least-squares fit over more directions than unknowns.
 
     Args:
         degree: Highest degree, 0 to 3.
@@ -134,7 +134,7 @@ def sh_rotation(degree: int, R: ArrayLike) -> Float64[np.ndarray, "K K"]:
     """
     R = float64_array("R", R, (3, 3))
     count = num_coefficients(degree)
-    dirs = np.random.default_rng(0).normal(size=(64, 3))  # any that span the harmonics; the same every time
+    dirs = np.random.default_rng(0).normal(size=(64, 3))  # any directions that span the harmonics; fixed seed
     dirs /= np.linalg.norm(dirs, axis=1, keepdims=True)
     still, turned = sh_basis(dirs), sh_basis(dirs @ R)
     matrix = np.zeros((count - 1, count - 1))

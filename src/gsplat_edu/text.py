@@ -1,7 +1,7 @@
-"""Text that quotes names from files: how it is shown on a terminal, written to a file, and turned into a file name.
+"""Text that quotes names from files: safe forms for terminals, files and file names.
 
-A name on Linux is bytes, and the text of a JSON file may hold halves of a surrogate pair. Python keeps a byte that it
-could not decode as a lone surrogate (PEP 383). No encoding takes these, so a report could fail on its title.
+File names on Linux are bytes, and JSON text may contain unpaired surrogates. Python represents a byte that it cannot
+decode as a lone surrogate (PEP 383). No encoding accepts these, so a report could fail because of its title.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066
 """Characters that move the cursor, change colours, break a line or reverse the direction of text."""
 
 RAW_BYTES = 0xDC80, 0xDCFF
-"""Lone surrogates that stand for the bytes 0x80 to 0xFF."""
+"""Lone surrogates that represent the bytes 0x80 to 0xFF."""
 
 
 def legible(text: str) -> str:
-    """Return text without lone surrogates, which every UTF-8 encoder takes.
+    """Replace lone surrogates, so that every UTF-8 encoder accepts the text.
 
     Args:
-        text: Any text. Raw bytes in it that are valid UTF-8 together, as in names read under LC_ALL=C, are decoded;
-            other raw bytes and lone surrogates become backslash escapes.
+        text: Any text. Raw bytes that form valid UTF-8, as in names read under LC_ALL=C, are decoded; other raw bytes
+            and lone surrogates become backslash escapes.
     """
     if not _SURROGATES.search(text):
         return text
@@ -36,7 +36,7 @@ def legible(text: str) -> str:
 def printable(text: str) -> str:
     """Return one line that is safe to print: control characters become backslash escapes.
 
-    Without this a file name could clear the screen, hide a warning or write its own line.
+    Otherwise a file name could clear the screen, hide a warning or fake a line of output.
     """
     return _CONTROLS.sub(_escaped, legible(text))
 
@@ -49,7 +49,7 @@ def _escaped(match: re.Match[str]) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file as UTF-8; `legible` spells what has no UTF-8.
+    """Write a text file as UTF-8; `legible` replaces characters without an encoding.
 
     Raises:
         OSError: the file cannot be written.
@@ -58,11 +58,11 @@ def write_text(path: Path, text: str) -> None:
 
 
 def as_file_name(name: str) -> str:
-    """Return a path from a file's text as the system's functions take it, whatever the locale.
+    """Convert a file's text to a path for the system's functions, independent of the locale.
 
-    File names are bytes, in UTF-8 on every system in use. Under LC_ALL=C Python would refuse to encode "ü".
+    File names are UTF-8 bytes on every system in use, but under LC_ALL=C Python would refuse to encode "ü".
     """
     try:
         return os.fsdecode(name.encode("utf-8", "surrogateescape"))
-    except UnicodeError:  # half of a pair: no file has this name
+    except UnicodeError:  # an unpaired surrogate: no file has this name
         return name

@@ -1,7 +1,7 @@
-"""Checks of public arguments: each failure is one line that names the argument.
+"""Validate public arguments; each error is one line that names the argument.
 
-Public functions take whatever NumPy can read as an array, so their parameters are annotated `ArrayLike` and
-checked here; what they return, and what they pass on inside, carries its shape in the annotation.
+Public functions accept anything that NumPy can read as an array, so their parameters are annotated `ArrayLike` and
+checked here. Return values and internal arguments carry their shapes in their annotations.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ if TYPE_CHECKING:
 
     ArrayLike: TypeAlias = _NumPyArrayLike
 else:
-    # NumPy's alias asks for methods that a tuple has in its stub file alone, so it cannot be checked at run
+    # NumPy's alias requires methods that tuples have only in its stub file, so it cannot be checked at run
     # time; float64_array does that.
     ArrayLike = Any
 
 Shape = Sequence[int | str]
-"""An expected shape: a number is that size; a letter is any size, the same wherever the letter stands;
-"..." in the first place is any number of leading axes."""
+"""An expected shape. A number requires that size; a letter allows any size, but the same one at each occurrence; "..."
+in first place allows any number of leading axes."""
 
 
 def float64_array(
     name: str, value: ArrayLike, shape: Shape, sizes: dict[str, int] | None = None
 ) -> Float64[np.ndarray, "..."]:
-    """Read an argument as a finite float64 array of the given shape.
+    """Convert an argument to a finite float64 array of the given shape.
 
     Args:
-        name: What the caller calls the argument.
+        name: The caller's name for the argument.
         value: The argument.
-        shape: Expected shape; letters already in `sizes` must have that size.
-        sizes: Sizes of the letters met so far; new ones are added.
+        shape: Expected shape; letters already in `sizes` must match.
+        sizes: Sizes of the letters so far; new ones are added.
 
     Returns:
-        The argument as float64; not a copy when it already was one.
+        The argument as float64; not copied if it already was.
 
     Raises:
         ShapeError: the shape differs.
-        ArgumentError: not numbers, or NaN or infinite somewhere.
+        ArgumentError: not numeric, or some entry is NaN or infinite.
     """
     try:
         given = np.asarray(value)
@@ -70,10 +70,10 @@ def float64_array(
 
 
 def check_shape(name: str, actual: Sequence[int], expected: Shape, sizes: dict[str, int]) -> None:
-    """Compare a shape with the expected one and remember the sizes its letters stand for.
+    """Compare a shape with the expected one, and record the sizes of its letters.
 
     Raises:
-        ShapeError: naming the argument, the expected and the actual shape.
+        ShapeError: names the argument, the expected and the actual shape.
     """
     leading = len(expected) > 0 and expected[0] == "..."
     tail = list(expected[1:] if leading else expected)
@@ -88,16 +88,16 @@ def check_shape(name: str, actual: Sequence[int], expected: Shape, sizes: dict[s
 
 
 def first_index(mask: np.ndarray[Any, np.dtype[np.bool_]]) -> str:
-    """Name the first true entry of a mask the way Python indexes it: "[3, 1]"; "" for a scalar."""
+    """Return the index of a mask's first true entry in Python's notation: "[3, 1]"; "" for a scalar."""
     index = np.argwhere(mask)[0]
     return f"[{', '.join(str(i) for i in index)}]" if len(index) else ""
 
 
 def in_range(name: str, value: float, low: float, high: float = np.inf, *, open_low: bool = False) -> float:
-    """Check low <= value <= high (low < value where `open_low`).
+    """Check low <= value <= high (low < value if `open_low`).
 
     Raises:
-        ArgumentError: outside, or NaN.
+        ArgumentError: out of range, or NaN.
     """
     number = float(float64_array(name, value, ()))
     if not (low < number if open_low else low <= number) or number > high:
@@ -115,7 +115,7 @@ def whole_number(name: str, value: object, low: int, high: int | None = None) ->
         The number as an int.
 
     Raises:
-        ArgumentError: it is not. True is not a number, and 3.0 is not a whole one.
+        ArgumentError: it is not. Booleans and floats such as 3.0 are rejected.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
@@ -128,7 +128,7 @@ def whole_number(name: str, value: object, low: int, high: int | None = None) ->
 
 
 def one_of(name: str, value: str, choices: Sequence[str]) -> None:
-    """Check that a word is one of those allowed.
+    """Check that a word is one of the allowed choices.
 
     Raises:
         ArgumentError: it is not; the message lists the choices.

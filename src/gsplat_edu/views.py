@@ -1,4 +1,4 @@
-"""A view: a camera and the photo it took. It is what a trainer is fed; where it came from does not matter."""
+"""A view: a camera and its photo, independent of their source. The trainer consumes views."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Pixels = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
 
 
 AT_ONCE = 8192
-"""Pixels that are put over a background at a time."""
+"""Pixels composited over a background at a time."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -24,13 +24,13 @@ class Photo:
     """The pixels of a view.
 
     Args:
-        image: (H, W, 3) RGB: uint8, not copied; or float from 0 to 1, kept as float32.
-        alpha: (H, W) uint8, 255 where the photo is opaque; None where it is everywhere.
-        mask: (H, W) true where a pixel counts; None where all do.
+        image: (H, W, 3) RGB: uint8, not copied; or float from 0 to 1, stored as float32.
+        alpha: (H, W) uint8, 255 for opaque pixels; None if the photo is opaque.
+        mask: (H, W) true for pixels that count; None if all count.
 
     Raises:
-        ShapeError: the three are not of one size.
-        ArgumentError: a pixel is NaN or outside 0 to 1, or alpha or mask is of another type.
+        ShapeError: the sizes differ.
+        ArgumentError: a pixel is NaN or outside 0 to 1, or alpha or mask has another dtype.
     """
 
     image: Pixels
@@ -63,17 +63,17 @@ class Photo:
 
     @property
     def nbytes(self) -> int:
-        """Bytes the pixels take."""
+        """Size of the pixels in bytes."""
         return sum(a.nbytes for a in (self.image, self.alpha, self.mask) if a is not None)
 
     def over(self, background: ArrayLike) -> Pixels:
-        """Put the photo over a background: rgb alpha + background (1 - alpha).
+        """Composite the photo over a background: rgb alpha + background (1 - alpha).
 
         Args:
             background: (3,) colour, 0 to 1.
 
         Returns:
-            (H, W, 3) the photo itself where it is opaque; else uint8, rounded.
+            (H, W, 3) the photo itself if it is opaque; else uint8, rounded.
         """
         if self.alpha is None:
             return self.image
@@ -82,7 +82,7 @@ class Photo:
         rows = max(1, AT_ONCE // max(self.image.shape[1], 1))
         for top in range(
             0, len(flat), rows
-        ):  # the floats of a few rows stay in the cache, and out of the heap
+        ):  # in blocks: the floats of a few rows stay in the cache and out of the heap
             band = slice(top, top + rows)
             share = self.alpha[band, :, None].astype(np.float32) / 255.0
             image = self.image[band].astype(np.float32) / (255.0 if self.image.dtype == np.uint8 else 1.0)
@@ -97,18 +97,18 @@ class View:
 
     Args:
         camera: The camera.
-        image: (H, W, 3) the photo, of the camera's size; see `Photo`.
-        alpha: (H, W) opacity of the photo, uint8; None where it is opaque.
-        mask: (H, W) true where a pixel counts; None where all do.
-        name: What the capture calls it.
+        image: (H, W, 3) photo, of the camera's size; see `Photo`.
+        alpha: (H, W) opacity of the photo, uint8; None if it is opaque.
+        mask: (H, W) true for pixels that count; None if all count.
+        name: The view's name in the capture.
 
     Raises:
-        ShapeError: the photo is not of the camera's size.
+        ShapeError: the sizes of photo and camera differ.
         ArgumentError: as for `Photo`.
 
     Attributes:
-        read: Gives the photo, from memory or from disk; it may be called from another thread.
-        on_disk: Reading may take time, so that it pays to begin early.
+        read: Returns the photo, from memory or from disk; may be called from another thread.
+        on_disk: Whether reading takes time, so that prefetching pays off.
     """
 
     camera: Camera
@@ -131,12 +131,12 @@ class View:
 
     @classmethod
     def stored(cls, camera: Camera, read: Callable[[], Photo], name: str = "") -> View:
-        """Make a view whose photo is read when it is asked for.
+        """Make a view whose photo is read on demand.
 
         Args:
             camera: The camera.
-            read: Gives the photo, of the camera's size.
-            name: What the capture calls it.
+            read: Returns the photo, of the camera's size.
+            name: The view's name in the capture.
         """
         view = cls.__new__(cls)
         view._set(camera, name, read, on_disk=True)
@@ -148,5 +148,5 @@ class View:
 
     @property
     def image(self) -> Pixels:
-        """(H, W, 3) the photo's RGB."""
+        """RGB of the photo, (H, W, 3)."""
         return self.read().image

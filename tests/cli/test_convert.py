@@ -68,8 +68,8 @@ def test_what_a_format_cannot_hold_is_said(convert, tmp_path):
     folder, *_ = make_run(tmp_path / "run")
     said = convert(folder.path, tmp_path / "a.splat")
     assert "30 splats, SH degree 0" in said
-    assert "holds harmonics up to degree 0; those up to 3 are left out" in said
-    assert "cannot say that the scene is to be rendered with antialiasing" in said
+    assert "stores SH up to degree 0; degrees up to 3 are dropped" in said
+    assert "cannot store that the scene needs antialiased rendering" in said
     assert "left out" not in convert(folder.path, tmp_path / "a.ply")
 
 
@@ -106,11 +106,11 @@ def test_scenes_are_joined_on_request(convert, plain, tmp_path):
     [
         (["gone.ply", "out.ply"], "gone.ply: is not there"),
         (["IN", "out.obj"], "known are .compressed.ply, .ply, .splat, .spz, .sog, .glb, .html"),
-        (["IN", "."], "ends like no scene format"),
-        (["IN", "IN/out.ply"], "is a file; name a folder"),
+        (["IN", "."], "unknown scene format"),
+        (["IN", "IN/out.ply"], "is a file; give a folder"),
         (["IN", "out.ply", "--crop", "1,2,3"], "is not 6 numbers"),
         (["IN", "out.ply", "--crop", "0,0,0,1,1,nan"], "is not 6 numbers"),
-        (["IN", "out.ply", "--crop", "0,0,0,1,1,-1"], "have to be below"),
+        (["IN", "out.ply", "--crop", "0,0,0,1,1,-1"], "must be below"),
         (["IN", "out.ply", "--crop", "90,90,90,91,91,91"], "no splat is left (300 before)"),
         (["IN", "out.ply", "--min-opacity", "2"], "min_opacity"),
         (["IN", "out.ply", "--sh-degree", "4"], "sh_degree"),

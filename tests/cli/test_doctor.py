@@ -53,6 +53,16 @@ def test_a_clean_capture_fits_on_a_screen_and_ends_with_advice(doctor, capture):
     )
 
 
+def test_the_recommended_training_is_the_one_that_was_asked_about(doctor, capture):
+    """A forecast for 800 iterations at half size used to end with the command for 30,000 at full size."""
+    folder, *_ = capture
+    code, said = doctor(folder, "--no-forecast", "--iterations", "800", "--resolution", "2")
+    words = next(line for line in said.splitlines() if "train: " in line).partition("train: ")[2]
+    assert code == 0
+    assert words == f"gsplat-edu train {folder} --iterations 800 --resolution 2 --out out/capture"
+    assert "--iterations 3000" not in said
+
+
 def test_faults_are_named_and_the_exit_code_stays_0(doctor, capture, tmp_path):
     _, views, points, colors = capture
     write_colmap(tmp_path, views, points, colors)
@@ -64,7 +74,7 @@ def test_faults_are_named_and_the_exit_code_stays_0(doctor, capture, tmp_path):
     assert "1 missing image of 24 listed, first view_005.png" in said
     # a forecast reads the capture as training would, and that refuses it
     assert (
-        "forecast   none, for training would end here" in said and "view_003.png: cannot be decoded" in said
+        "forecast   none, because training would fail" in said and "view_003.png: cannot be decoded" in said
     )
 
 
@@ -85,8 +95,8 @@ def test_hopeless_captures_end_with_1(doctor, capture, tmp_path):
 def test_bad_input_is_one_line_and_2(doctor, capture, tmp_path):
     (tmp_path / "empty").mkdir()
     for words, text in (
-        ([tmp_path / "gone"], "is not there; give a dataset folder or a run folder"),
-        ([tmp_path / "empty"], "is no capture"),
+        ([tmp_path / "gone"], "does not exist; give a dataset folder or a run folder"),
+        ([tmp_path / "empty"], "is not a capture"),
         ([capture[0], "--resolution", "0.5"], "resolution"),
         ([capture[0], "--backend", "abacus"], "abacus"),
         ([capture[0], "--backend", "torch"], "--no-forecast"),

@@ -125,7 +125,7 @@ def test_another_dataset_is_scored_apart_or_not_at_all(run, other, cli, capsys, 
     (tmp_path / "apart" / LOCK).touch()  # an evaluation was killed here
     for _ in range(2):  # an evaluation may be done again
         assert cli(words) == 0
-        assert "it is scored apart" in capsys.readouterr().out.replace("\n", " ")
+        assert "the scores are written to" in capsys.readouterr().out.replace("\n", " ")
     assert contents(run.path) == before
     apart = RunFolder(tmp_path / "apart")
     assert apart.read_metrics()["evaluated"] == {"run": str(run.path), "dataset": str(other)}

@@ -53,7 +53,7 @@ OUT_OF_RANGE = [
 @pytest.mark.own_process
 def test_mistakes_and_help_import_nothing_heavy(tmp_path):
     assert set(NEEDED) == set(COMMANDS)
-    lines = ["--version", "--help", "--verison", "trian"]
+    lines = ["--version", "--help", "--verison", "trian", "train --help-all"]
     for name, words in NEEDED.items():
         lines += [f"{name} --help", f"{name} {words} --backendd cpu", f"{name} {words} --iteration 10"]
     lines += OUT_OF_RANGE
@@ -67,7 +67,7 @@ def test_mistakes_and_help_import_nothing_heavy(tmp_path):
     answers = done.stdout.splitlines()
     assert len(answers) == len(lines)
     for line, answer in zip(lines, answers, strict=True):
-        wanted = "0" if line.endswith(("--help", "--version")) else "2"
+        wanted = "0" if line.endswith(("--help", "--help-all", "--version")) else "2"
         assert answer.startswith(f"{wanted} |"), (line, answer)
     assert not (tmp_path / "run").exists()
     said = dict(zip(lines, answers, strict=True))

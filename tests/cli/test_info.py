@@ -64,7 +64,7 @@ def test_a_run_says_how_far_it_got(info, tmp_path):
         {"version": "9.9", "train": {"iterations": 7000}, "backend": "cpu", "data": {"path": "x"}}
     )
     said = info(folder.path)
-    assert "nothing yet of 7,000" in said and "holds no scene" in said and "not judged yet" in said
+    assert "not started of 7,000" in said and "holds no scene" in said and "not evaluated yet" in said
 
     folder.log_file.write_text(json.dumps({"iteration": 6999}) + "\n")
     folder.write_metrics({"test": {"psnr": 23.456, "ssim": 0.8, "num_images": 3}, "seconds": 61.0})
@@ -96,10 +96,10 @@ def test_a_dataset_is_described_and_no_photo_is_decoded(info, tmp_path, monkeypa
 
 
 def test_what_is_none_of_them_is_one_line(info, tmp_path):
-    assert "is not there; give a dataset folder" in info(tmp_path / "gone", code=2)
-    assert "is no capture" in info(tmp_path, code=2)
+    assert "does not exist; give a dataset folder" in info(tmp_path / "gone", code=2)
+    assert "is not a capture" in info(tmp_path, code=2)
     (tmp_path / "a.txt").write_text("hello")
-    assert "a.txt: its name ends like no scene format" in info(tmp_path / "a.txt", code=2)
+    assert "a.txt: unknown scene format" in info(tmp_path / "a.txt", code=2)
 
 
 def test_help_shows_an_example(info, capsys):

@@ -54,7 +54,7 @@ def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
             ["--backend", "abacus"],
             "backend 'abacus': not in this version of gsplat_edu; use auto or one of: cuda, cpu, torch",
         ),
-        (["--out", "sphere.jpg"], "--out: 'sphere.jpg' has to end in .png"),
+        (["--out", "sphere.jpg"], "--out: 'sphere.jpg' must end in .png"),
         (["--out", "taken/sphere.png"], "--out: cannot write taken/sphere.png"),
         (["--out", "folder.png"], "--out: folder.png is a folder"),
         (["--itres", "3"], "unrecognized argument --itres: did you mean --iters?"),

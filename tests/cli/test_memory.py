@@ -89,19 +89,19 @@ def test_a_process_that_may_take_little_more(tmp_path):
     assert codes == ["2", "2", "2"], ended.stderr
     first, second, third = ended.stderr.splitlines()
     assert re.fullmatch(
-        r"photo: .*large\.png: 24000x18000 px: needs 4\.02 GiB of memory, but 0\.\d\d GiB are free; "
+        r"photo: .*large\.png: 24000x18000 px: needs 4\.02 GiB of memory, but only 0\.\d\d GiB are free; "
         r"close other programs, or make the photo smaller",
         first,
     )
     assert re.fullmatch(
-        r"gsplat-edu render: an image of 200000x200000 px: needs [\d,.]+ GiB of memory, but 0\.\d\d GiB are free; "
+        r"gsplat-edu render: an image of 200000x200000 px: needs [\d,.]+ GiB of memory, but only 0\.\d\d GiB are free; "
         r"close other programs, or render fewer pixels \(--size\)",
         second,
     )
     assert re.fullmatch(
         r"gsplat-edu render: ran out of memory \(the renderer needs a block of 0\.\d\d GiB, but 0\.\d\d GiB are "
         r"free\); "
-        r"close other programs, or give a smaller --size",
+        r"close other programs, or reduce --size",
         third,
     )
     assert not out.exists() or not list(out.iterdir()), "nothing half done is left"

@@ -56,7 +56,7 @@ def test_a_run_is_rendered_as_an_orbit_into_its_folder(made, cli, capsys):
     printed = capsys.readouterr().out
     path = folder.renders / "orbit.mp4"
     assert printed.splitlines()[-1].startswith(f"wrote {path}: 3 images of ") and "32x24" in printed
-    assert printed.startswith("the cameras stand all round: a full circle\n")
+    assert printed.startswith("the cameras surround the scene: using a full circle\n")
     video = cv2.VideoCapture(str(path))
     frames = [video.read() for _ in range(4)]
     assert [read for read, _ in frames] == [True] * 3 + [False]
@@ -98,7 +98,7 @@ def test_a_datasets_cameras_a_size_and_a_background_can_be_asked_for(made, cli, 
 def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, capsys):
     bare = made[2]
     assert cli(["render", str(bare), "--frames", "2", "--size", "40", "--out", "frames"]) == 0
-    assert "does not say from where it was photographed: a full circle" in capsys.readouterr().out
+    assert "has no cameras: using a full circle" in capsys.readouterr().out
     image = pixels(tmp_path / "frames" / "frame_0001.png").astype(int).sum(axis=2)
     assert image.shape == (40, 40) and image[15:25, 15:25].min() > 0
     assert cli(["render", str(bare), "--frames", "2", "--size", "40"]) == 0
@@ -108,17 +108,17 @@ def test_a_bare_scene_turns_in_the_middle_of_the_picture(made, cli, tmp_path, ca
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["gone"], "gone: is not there; give the folder of a run, or a scene file"),
-        (["."], "is no run (it has no config.json)"),
-        (["BARE", "--dataset"], "--dataset: a scene file comes without cameras"),
+        (["gone"], "gone: does not exist; give a run folder or a scene file"),
+        (["."], "is not a run (config.json is missing)"),
+        (["BARE", "--dataset"], "--dataset: a scene file has no cameras"),
         (["BARE", "--frames", "0"], "--frames: is 0"),
         (["BARE", "--size", "0"], "--size: is 0"),
         (["BARE", "--fps", "-1"], "--fps: is -1"),
         (["BARE", "--backend", "abacus"], "backend 'abacus'"),
-        (["BARE", "--dataset", "."], "is no capture"),
+        (["BARE", "--dataset", "."], "is not a capture"),
         (
             ["BARE", "--out", "x.gif"],
-            "x.gif: GIF is not written here; give a video (.mp4) or a folder of PNGs",
+            "x.gif: GIF is not supported; give a video (.mp4) or a folder of PNGs",
         ),
     ],
 )
@@ -139,7 +139,7 @@ def test_cameras_of_one_side_get_no_full_circle(made, cli, capsys, tmp_path):
     run.write_cameras(views[:3], [])
     assert cli(["render", str(run.path), "--frames", "4", "--out", "frames"]) == 0
     assert "the cameras cover 1" in (said := capsys.readouterr().out), said
-    assert "degrees: the path swings over those, no farther\n" in said
+    assert "degrees: the path stays within them\n" in said
 
 
 def test_help_shows_an_example(cli, capsys):

@@ -85,10 +85,10 @@ def _unreadable(folder):
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda folder: None, "photos: is not there; name a folder of photos, or a video"),
-        (lambda folder: folder.mkdir(), "photos: holds no photos; name a folder of photos, or a video"),
-        (_texts, "photos: holds no photos; name a folder"),
-        (_video_inside, "photos: holds no photos; it holds a video, name that: "),
+        (lambda folder: None, "photos: does not exist; give a folder of photos, or a video"),
+        (lambda folder: folder.mkdir(), "photos: holds no photos; give a folder of photos, or a video"),
+        (_texts, "photos: holds no photos; give a folder"),
+        (_video_inside, "photos: holds no photos; it holds a video; give that: "),
         (lambda folder: save(folder, box_orbit(1)), "photos: holds one photo; poses need at least 3"),
         (
             _unreadable,
@@ -99,7 +99,7 @@ def _unreadable(folder):
         (lambda folder: folder.write_text("hello"), "photos: is neither a photo nor a video"),
         (
             lambda file: Image.fromarray(photograph_box(box_camera(0.0))).save(file, format="PNG"),
-            "photos: is a single photo; name a folder",
+            "photos: is a single photo; give a folder",
         ),
     ],
 )
@@ -117,16 +117,16 @@ def test_an_empty_video_is_one_line(tmp_path, capsys):
     (tmp_path / "walk.mp4").write_bytes(b"")
     assert main(["sfm", str(tmp_path / "walk.mp4"), str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
-    assert "walk.mp4: is no video that OpenCV can decode" in said and said.count("\n") == 1
+    assert "walk.mp4: is not a video that OpenCV can decode" in said and said.count("\n") == 1
 
 
 @pytest.mark.parametrize(
     ("out", "says"),
     [
-        ("photos", "is where the photos themselves are"),
-        (".", "is where the photos themselves are"),
-        ("posed", "holds photos or poses already"),
-        ("photos/0.jpg", "0.jpg is a file; name a folder"),
+        ("photos", "is the folder of the photos"),
+        (".", "is the folder of the photos"),
+        ("posed", "already holds photos or poses"),
+        ("photos/0.jpg", "0.jpg is a file; give a folder"),
     ],
 )
 @pytest.mark.usefixtures("colmap", "as_shipped")
@@ -137,7 +137,7 @@ def test_the_users_photos_are_not_written_over(tmp_path, capsys, out, says):
 @pytest.mark.parametrize("place", ["sfm/photos", "sfm/frames", "masks", "sparse/0", "images/day 1"])
 @pytest.mark.usefixtures("colmap", "as_shipped")
 def test_photos_where_a_run_puts_things_are_not_removed(tmp_path, capsys, place):
-    _refused(tmp_path, capsys, tmp_path / "out" / place, "out", "is where the photos themselves are")
+    _refused(tmp_path, capsys, tmp_path / "out" / place, "out", "is the folder of the photos")
 
 
 @pytest.mark.usefixtures("colmap", "as_shipped")
@@ -146,7 +146,7 @@ def test_a_video_where_a_run_puts_things_is_not_removed(tmp_path, capsys):
     video = tmp_path / "out" / "sfm" / "frames" / "walk.mp4"
     video.write_bytes(b"")
     assert main(["sfm", str(video), str(tmp_path / "out")]) == 2
-    assert "is where the photos themselves are" in capsys.readouterr().err
+    assert "is the folder of the photos" in capsys.readouterr().err
     assert video.is_file()
 
 
@@ -158,7 +158,7 @@ def test_what_no_run_put_there_stays(tmp_path, capsys, mine):
     (tmp_path / "out" / mine).parent.mkdir(parents=True)
     (tmp_path / "out" / mine).write_text("mine")
     _refused(
-        tmp_path, capsys, tmp_path / "photos", "out", "holds photos or poses already; name another folder"
+        tmp_path, capsys, tmp_path / "photos", "out", "already holds photos or poses; choose another folder"
     )
 
 
@@ -213,7 +213,7 @@ def test_ctrl_c_says_that_it_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gsplat_edu.sfm.reconstruct.copy_photos", press)
     before = signal.getsignal(signal.SIGTERM)
     assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 130
-    assert "the same command resumes after the last finished stage" in capsys.readouterr().err
+    assert "the same command resumes after the last completed stage" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGTERM) is before
 
 
@@ -243,7 +243,7 @@ def test_a_finished_run_is_asked_for_before_its_capture_is_replaced(tmp_path, ca
     (tmp_path / "run" / "config.json").write_text("{}")
     assert main(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run")]) != 0
     said = capsys.readouterr().err
-    assert "holds a run already; add --resume" in said and said.count("\n") == 1
+    assert "already holds a run; add --resume" in said and said.count("\n") == 1
 
 
 @pytest.mark.usefixtures("never")
@@ -257,7 +257,7 @@ def test_a_run_that_goes_on_keeps_its_poses(tmp_path):
     options = train_options_from(build_parser(["train"]).parse_args(words))
     said = []
     assert _with_poses(options, Console(file=io.StringIO()), said.append).data == found
-    assert len(said) == 1 and "holds the poses that this run began with" in said[0]
+    assert len(said) == 1 and "using the poses that this run started with" in said[0]
 
 
 @pytest.mark.usefixtures("as_shipped", "never")

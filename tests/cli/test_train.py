@@ -57,7 +57,7 @@ def test_the_other_strategies_and_colours():
 
 def test_every_field_of_the_recipe_has_an_option(capsys):
     with pytest.raises(SystemExit):
-        main(["train", "--help"])
+        main(["train", "--help-all"])
     said = capsys.readouterr().out
     for field in dataclasses.fields(TrainConfig):
         assert f"--{field.name.replace('_', '-')}" in said, field.name
@@ -160,7 +160,7 @@ def _syntax_error(folder):
 
 CAPTURE = procedural_capture(16, 3, splats=20)
 FAULTS = {
-    _nothing: "holds no photos, it is empty",
+    _nothing: "is empty",
     _photos_only: "poses",
     _no_images: "view_000.png",
     _corrupt_jpeg: "view_002.png",

@@ -18,9 +18,13 @@ def run(*arguments, **options):
     return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 
 
+@pytest.mark.sliced(0)
 @pytest.mark.slow
 def test_the_default_budget_trains_end_to_end(tmp_path):
-    """The dense backend's reduced budget: at least threefold on the camera that was held out."""
+    """The dense backend's reduced budget: at least threefold on the camera that was held out.
+
+    Minutes: it waits for `make soak`. Every run follows the first hundred iterations of that backend (tests/golden).
+    """
     out = tmp_path / "new" / "folder" / "sphere.png"
     # One thread: torch's wait for one another, for minutes where other programs run.
     done = run("--backend", "torch", "--out", out, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "1"})

@@ -59,7 +59,7 @@ def viewing(*words, ends_with=signal.SIGINT):
     try:
         printed = ""
         deadline = time.monotonic() + PATIENCE
-        while not (found := re.search(r"(http://\S+/)   \(Ctrl-C ends it\)\n", printed)):
+        while not (found := re.search(r"(http://\S+/)   \(press Ctrl-C to stop\)\n", printed)):
             assert select.select([process.stdout], [], [], deadline - time.monotonic())[0], (
                 f"only {printed!r}"
             )
@@ -109,7 +109,9 @@ def test_a_scene_of_another_format_has_no_cameras(made):
         assert fetched(url) == page.html(source.scene, (), source.settings, "bare.splat")
     first, warning, _ = printed.splitlines()
     assert "200 Gaussians, " in first and "cameras" not in first
-    assert warning.startswith("warning: listening at 0.0.0.0: whoever can reach this computer sees the scene")
+    assert warning.startswith(
+        "warning: listening on 0.0.0.0: anyone who can reach this computer sees the scene"
+    )
 
 
 @pytest.mark.skipif(shutil.which("sh") is None or sys.platform == "win32", reason="needs sh and a terminal")
@@ -135,7 +137,7 @@ def test_a_person_at_a_screen_has_the_browser_opened(made, tmp_path):
         os.close(theirs)
         try:
             printed, deadline = b"", time.monotonic() + PATIENCE
-            while b"Ctrl-C ends it" not in printed:
+            while b"press Ctrl-C to stop" not in printed:
                 assert select.select([ours], [], [], deadline - time.monotonic())[0], printed
                 printed += os.read(ours, 1 << 16)
             until = time.monotonic() + (PATIENCE if not words and not environment else 1.0)
@@ -160,14 +162,14 @@ def test_a_person_at_a_screen_has_the_browser_opened(made, tmp_path):
     [
         (["nowhere"], "nowhere: is not there; give a scene file or the folder of a run"),
         (["empty"], "empty: is no run (it has no config.json)"),
-        (["notes.txt"], "notes.txt: its name ends like no scene format"),
+        (["notes.txt"], "notes.txt: unknown scene format"),
         (["cut.ply"], "cut.ply: "),
-        (["desk.html"], "desk.html: is a page already; open it in a browser: file://"),
+        (["desk.html"], "desk.html: is already a page; open it in a browser: file://"),
         (["gone.html"], "gone.html: is not there"),
         (["unfinished"], "unfinished: holds no scene"),
         (["nowhere", "--port", "70000"], "--port: is 70000"),
         (["nowhere", "--port", "many"], "argument --port: 'many' is not a whole number"),
-        (["nowhere", "--host", "no such host"], "--host: 'no such host' is no address"),
+        (["nowhere", "--host", "no such host"], "--host: 'no such host' is not an address"),
     ],
 )
 @pytest.mark.usefixtures("as_shipped")
@@ -195,5 +197,5 @@ def test_a_port_that_is_taken_costs_one_line_before_the_scene_is_read(capsys):
         taken.listen(1)
         port = taken.getsockname()[1]
         assert command_line.main(["view", "nowhere", "--port", str(port)]) == 2
-    says = f"gsplat-edu view: --port: {port} is taken on 127.0.0.1; give another, or 0 for any that is free\n"
+    says = f"gsplat-edu view: --port: {port} is in use on 127.0.0.1; choose another port, or 0 for any free one\n"
     assert capsys.readouterr().err == says

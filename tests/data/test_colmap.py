@@ -200,7 +200,7 @@ def test_a_model_of_no_images(capture):
 @pytest.mark.parametrize("lost", ["cameras", "images"])
 def test_half_a_model(capture, lost):
     (capture / "sparse" / "0" / f"{lost}.bin").unlink()
-    with pytest.raises(DatasetError, match="not both of cameras and images"):
+    with pytest.raises(DatasetError, match="needs both cameras and images"):
         load_dataset(capture)
 
 
@@ -267,7 +267,7 @@ def test_a_count_beyond_the_file_allocates_nothing(capture):
         path = capture / "sparse" / "0" / f"{file}.bin"
         whole = path.read_bytes()
         path.write_bytes(struct.pack("<Q", 2**63) + whole[8:])
-        with pytest.raises(DatasetError, match="more than it has room for"):
+        with pytest.raises(DatasetError, match="more than the file can contain"):
             load_dataset(capture)
         path.write_bytes(whole)
 
@@ -357,7 +357,7 @@ def test_a_bare_mask_that_two_images_share_is_not_used_and_told(text):
     dataset = load_dataset(text, EVERYTHING)
     masked = [view.name for view in dataset.train if view.read().mask is not None]
     assert masked == ["view_000.png"]
-    assert any("a mask only by a bare name" in n and "first a/view_000.png" in n for n in dataset.notes)
+    assert any("mask whose bare name several photos share" in n and "first a/view_000.png" in n for n in dataset.notes)
 
 
 @pytest.mark.parametrize("number", [7, 10, 11, 12, 13, 16, 17])

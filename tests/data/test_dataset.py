@@ -99,9 +99,9 @@ def test_one_photo_is_trained_on(tmp_path, small):
     dataset = load_dataset(tmp_path)
     assert len(dataset.train) == 1 and dataset.test == ()
     assert any("one photo" in note for note in dataset.notes)
-    assert any("no points: 100,000 random ones" in note for note in dataset.notes)
+    assert any("no points: starting from 100,000 random points" in note for note in dataset.notes)
     assert np.isfinite(dataset.points).all()
-    with pytest.raises(DatasetError, match="to train on"):
+    with pytest.raises(DatasetError, match="for training"):
         load_dataset(tmp_path, DataSettings(test_every=8))
 
 
@@ -116,7 +116,7 @@ def test_the_captures_own_split(tmp_path, small):
     write_transforms(tmp_path, views, extra={"val_filenames": names[:2]})
     assert [v.name for v in load_dataset(tmp_path).train] == names[2:]
     write_transforms(tmp_path, views, extra={"test_filenames": names})
-    with pytest.raises(DatasetError, match="none of its 9 photos to train on"):
+    with pytest.raises(DatasetError, match="none of its 9 photos for training"):
         load_dataset(tmp_path)
 
 
@@ -150,7 +150,7 @@ def test_points_of_another_file(written, tmp_path, small):
     dataset = load_dataset(written("colmap"), points=tmp_path / "p.ply")
     np.testing.assert_array_equal(dataset.points, [[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(dataset.colors, [[0.2, 0.4, 0.6]], atol=1e-12)
-    assert any("1 of 2 points are NaN" in note for note in dataset.notes)
+    assert any("1 of 2 points that are NaN" in note for note in dataset.notes)
     with pytest.raises(DatasetError, match=r"none\.ply"):
         load_dataset(written("colmap"), points=tmp_path / "none.ply")
 
@@ -289,9 +289,9 @@ def test_ready_made_sizes_are_the_photos_where_there_are_no_others(written, reso
 
 @pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + ".json", "a\0b"])
 def test_names_that_nothing_can_have(tmp_path, name):
-    with pytest.raises(DatasetError, match="is no folder and no"):
+    with pytest.raises(DatasetError, match="is neither a folder nor"):
         load_dataset(tmp_path / name)
-    with pytest.raises(DatasetError, match="name a point cloud"):
+    with pytest.raises(DatasetError, match="give a point cloud"):
         read_points_ply(tmp_path / name)
 
 

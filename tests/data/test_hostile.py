@@ -171,7 +171,7 @@ def test_thousands_of_elements_and_properties_are_looked_up_in_tables(tmp_path, 
         assert lines.add(["element", Name(f"e{i}"), "0"]) is None
     for i in range(count):
         assert lines.add(["property", "float", Name(f"p{i}")]) is None
-    assert lines.add(["property", "float", Name("p7")]) == "property p7 stands twice"
+    assert lines.add(["property", "float", Name("p7")]) == "property p7 appears twice"
     assert compared < 4 * count
 
 
@@ -244,7 +244,7 @@ def test_json_made_to_break_parsers(tmp_path, text):
     with pytest.raises(DatasetError, match=r"transforms\.json: is not JSON"):
         load_dataset(tmp_path)
     (tmp_path / "meta.json").write_text(text)
-    with pytest.raises(SceneFormatError, match="its metadata is no JSON"):
+    with pytest.raises(SceneFormatError, match="its metadata is not JSON"):
         read_scene(tmp_path / "meta.json")
 
 

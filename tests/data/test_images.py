@@ -161,7 +161,7 @@ def test_a_photo_of_another_size_rescales_its_camera(one_photo):
     assert (camera.W, camera.H) == (33, 25)
     np.testing.assert_allclose((camera.fx, camera.fy), (60 * 33 / 64, 58 * 25 / 48))
     np.testing.assert_allclose((camera.cx, camera.cy), (30 * 33 / 64 - 0.5, 22 * 25 / 48 - 0.5))
-    assert any("1 of 1 photos have another size" in note and "rescaled" in note for note in dataset.notes)
+    assert any("1 of 1 photos differ in size" in note and "rescaled" in note for note in dataset.notes)
     folder = one_photo(np.zeros((64, 48, 3), np.uint8), w=64, h=48)
     with pytest.raises(
         DatasetError, match=r"images/a\.png is 48x64 but its camera 64x48, another aspect ratio"
@@ -218,7 +218,7 @@ def test_large_photos_are_photos(tmp_path, name, limit, monkeypatch):
 
 def test_an_absurd_size_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("gsplat_edu.image_files.MAX_PIXELS", 100)
-    with pytest.raises(DatasetError, match=r"a\.png: .*16x12 px are more than a photo has"):
+    with pytest.raises(DatasetError, match=r"a\.png: .*16x12 px is too large for a photo"):
         image_size(saved(tmp_path, Image.fromarray(NOISE)))
 
 

@@ -74,7 +74,7 @@ def test_intrinsics_that_differ_and_are_off_centre(tmp_path):
         for view, expected in zip(dataset.train, views, strict=True):
             assert_same_camera(view.camera, expected.camera)
             np.testing.assert_array_equal(view.image, expected.image)
-    with pytest.raises(ArgumentError, match="principal point in the middle"):
+    with pytest.raises(ArgumentError, match="centred principal point"):
         write_blender(tmp_path / "x", views, [])
 
 

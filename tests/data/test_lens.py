@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.lens import BAND, PERSPECTIVE, Lens, bands, lens_of, straightened, undistortion
+from gsplat_edu.data.lens import BAND, PERSPECTIVE, Lens, bands, lens_of, undistortion
 from gsplat_edu.errors import DatasetError
 
 W, H, FX, FY, CX, CY = 160, 120, 140.0, 133.0, 83.0, 57.0  # corner convention: what a file says
@@ -86,13 +86,13 @@ def test_rays_lie_where_the_pinhole_puts_them(one_photo, model, coefficients, re
     [
         ({"k1": -0.25, "p1": 0.02}, False, False),
         ({"k1": 0.3, "p1": 0.02}, False, False),
-        ({"k1": 1.0}, True, True),  # bulges so that the corners of the straightened photo lie outside
+        ({"k1": 1.0}, True, True),  # bulges so that the corners of the undistorted photo lie outside
     ],
 )
 def test_the_mask_is_what_lies_outside_of_the_photo(values, is_fisheye, some_outside):
     """A pixel counts exactly where the formula leads inside the edges; maps are float32, good to 1e-4 px here."""
     lens = lens_of({"fx": FX, "fy": FY, "cx": CX, "cy": CY, **values}, W, H, fisheye=is_fisheye)
-    (columns, rows, valid), pinhole = whole(lens), straightened(lens)
+    (columns, rows, valid), pinhole = whole(lens), lens.undistorted()
     y, x = np.mgrid[:H, :W]
     distort = fisheye if is_fisheye else perspective
     u, v = distort((x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy, **values)
@@ -111,7 +111,7 @@ def test_where_the_image_is_folded_no_pixel_counts():
     Slopes are differences between neighbours, so within 5 % of that radius either answer will do.
     """
     lens = Lens(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.6,))
-    pinhole, (_, _, valid) = straightened(lens), whole(lens)
+    pinhole, (_, _, valid) = lens.undistorted(), whole(lens)
     y, x = np.mgrid[:48, :64]
     radius = np.hypot((x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy) * np.sqrt(1.8)
     assert (radius > 1.05).sum() > 200 and not valid[radius > 1.05].any()
@@ -146,7 +146,7 @@ def test_pinholes_have_no_maps(one_photo):
 )
 def test_what_no_pinhole_shows_is_refused(lens, check):
     with pytest.raises(DatasetError, match=check) as caught:
-        straightened(lens)
+        lens.undistorted()
         undistortion(lens, slice(0, lens.H))
     assert "image_undistorter" in str(caught.value)
 
@@ -157,7 +157,7 @@ def test_what_no_pinhole_shows_is_refused(lens, check):
 def test_pixels_keep_their_shape_and_stay_inside(coefficients):
     """OpenCV's own matrix fills the image with each axis by itself: it would squeeze these pixels by up to 20 %."""
     lens = Lens(640, 480, 560.0, 550.0, 325.0, 230.0, coefficients)
-    pinhole = straightened(lens)
+    pinhole = lens.undistorted()
     assert pinhole.fx / pinhole.fy == pytest.approx(lens.fx / lens.fy, rel=1e-12)
     columns, rows, valid = whole(lens)
     assert valid.all()
@@ -180,8 +180,8 @@ def test_bands_are_the_rows_of_the_whole():
 def test_the_statues_strong_distortion_gives_a_sane_camera():
     """k = -0.684 of real internet photos, at the calibrated size and at a quarter of it."""
     lens = lens_of({"fx": 2395.65, "fy": 2395.65, "cx": 400, "cy": 600, "k1": -0.684122}, 800, 1200)
-    for one in (lens, lens.resized(200, 300)):
-        pinhole = straightened(one)
+    for one in (lens, lens.scaled(200, 300)):
+        pinhole = one.undistorted()
         assert 0.9 < pinhole.fx / one.fx <= 1.1 and 0.9 < pinhole.fy / one.fy <= 1.1
         assert whole(one)[2].mean() > 0.98
 
@@ -189,7 +189,7 @@ def test_the_statues_strong_distortion_gives_a_sane_camera():
 def test_sizes_scale_about_the_corner():
     """The middle of the image stays the middle, and the principal point's share of the width stays the same."""
     lens = lens_of({"fx": 100, "fy": 90, "cx": 20, "cy": 15}, 40, 30)
-    half = lens.resized(20, 15)
+    half = lens.scaled(20, 15)
     assert (half.fx, half.fy, half.cx, half.cy) == (50, 45, 9.5, 7.0)
-    uneven = lens.resized(10, 15)
+    uneven = lens.scaled(10, 15)
     assert (uneven.fx, uneven.fy, uneven.cx, uneven.cy) == (25, 45, 4.5, 7.0)

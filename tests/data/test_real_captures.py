@@ -71,7 +71,7 @@ def test_fox(real):
     dataset = load_dataset(real("fox"))
     assert dataset.layout == "transforms.json" and len(dataset.train) == 43 and len(dataset.test) == 7
     notes = " | ".join(dataset.notes)
-    assert "17 of 67 photos have no file" in notes and "50 of 50 photos come from a lens" in notes
+    assert "17 of 67 photos have no file" in notes and "50 of 50 photos have lens distortion" in notes
     assert "no points: 100,000 random" in notes
     photo = dataset.train[0].read()
     assert photo.image.shape == (1920, 1080, 3)

@@ -58,7 +58,7 @@ def test_fields_of_view(one_photo):
     assert camera_of(path).fx == camera_of(path).fy == 40.0
     del contents["camera_angle_x"]
     path.write_text(json.dumps(contents))
-    with pytest.raises(DatasetError, match=r"frame images/a\.png: has neither fl_x nor camera_angle_x"):
+    with pytest.raises(DatasetError, match=r"frame images/a\.png: neither it nor the file has fl_x"):
         load_dataset(path)
 
 
@@ -111,9 +111,9 @@ def test_what_is_no_transforms_json(tmp_path, content):
         ("file_path", None, "frame 4: has no file_path"),
         ("file_path", 7, "frame 4: has no file_path"),
         ("transform_matrix", None, r"view_004\.png: has no transform_matrix"),
-        ("transform_matrix", [[1, 2], [3, 4]], r"view_004\.png: transform_matrix is not 3x4 or 4x4"),
-        ("transform_matrix", [[1], [3, 4]], r"view_004\.png: transform_matrix is not 3x4 or 4x4"),
-        ("transform_matrix", "x", r"view_004\.png: transform_matrix is not 3x4 or 4x4"),
+        ("transform_matrix", [[1, 2], [3, 4]], r"view_004\.png: transform_matrix is not a 3x4 or 4x4"),
+        ("transform_matrix", [[1], [3, 4]], r"view_004\.png: transform_matrix is not a 3x4 or 4x4"),
+        ("transform_matrix", "x", r"view_004\.png: transform_matrix is not a 3x4 or 4x4"),
         ("fl_x", -3.0, r"view_004\.png: focal length fx is -3"),
         ("fl_x", "abc", r"view_004\.png: fl_x is abc"),
         ("fl_x", float("nan"), r"view_004\.png: fl_x is nan"),
@@ -272,7 +272,7 @@ def test_val_is_not_trained_on(tmp_path, small):
     dataset = load_dataset(tmp_path)
     assert [v.name for v in dataset.train] == names[2:6] and [v.name for v in dataset.test] == names[6:]
     assert any(
-        "2 of 9 photos are in none of the capture's lists to train or test on" in n for n in dataset.notes
+        "2 of 9 photos are in none of the capture's training and test lists" in n for n in dataset.notes
     )
 
 
@@ -282,13 +282,13 @@ def test_blenders_val_is_left_out_and_told(tmp_path, small):
     shutil.copy(tmp_path / "transforms_test.json", tmp_path / "transforms_val.json")
     dataset = load_dataset(tmp_path)
     assert len(dataset.train) == 6 and len(dataset.test) == 3
-    assert any(note.startswith("transforms_val.json: its photos are left out") for note in dataset.notes)
+    assert any(note.startswith("transforms_val.json: its photos are ignored") for note in dataset.notes)
 
 
 @pytest.mark.parametrize(
     ("extra", "why"),
     [
-        ({}, "does not say by applied_transform"),
+        ({}, "does not give applied_transform"),
         ({"applied_transform": np.eye(4).tolist(), "applied_scale": 0.5}, "has poses scaled by 0.5"),
     ],
 )
@@ -298,7 +298,7 @@ def test_why_colmaps_points_are_not_used(tmp_path, small, extra, why):
     write_transforms(tmp_path, views, extra=extra)
     dataset = load_dataset(tmp_path)
     assert len(dataset.points) == 100_000
-    (note,) = [note for note in dataset.notes if "random ones" in note]
+    (note,) = [note for note in dataset.notes if "random points" in note]
     assert "points of the COLMAP model in" in note and why in note and "has no points" not in note
     write_transforms(tmp_path, views, extra={"applied_transform": np.eye(4).tolist(), "applied_scale": 1.0})
     np.testing.assert_array_equal(load_dataset(tmp_path).points, points)

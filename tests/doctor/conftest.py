@@ -30,10 +30,10 @@ def diagnosed(tmp_path) -> Callable[..., Diagnosis]:
 
 @pytest.fixture
 def named(diagnosed) -> Callable[..., dict]:
-    """The same, as the images of each finding that is no note, by the finding's name."""
+    """The same, as the labelled images of each finding that is no note, by the finding's name."""
 
     def warnings(views, points=None, spoil=None) -> dict:
         findings = diagnosed(views, points, spoil).findings
-        return {f.name: f.images for f in findings if f.severity > Severity.NOTE}
+        return {f.name: f.labels for f in findings if f.severity > Severity.NOTE}
 
     return warnings

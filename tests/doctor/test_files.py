@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from doctor.rooms import room
+from gsplat_edu.data.notes import MissingPhotos
 from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Severity, advice_lines
@@ -64,8 +65,8 @@ def test_a_jpeg_cut_short_is_named_too(tmp_path, orbit):
     (tmp_path / "transforms.json").write_text(json.dumps(contents))
     cut(tmp_path / "images" / "view_004.jpg", 0.8)
     survey = prepare(tmp_path)
-    assert [name for name, _ in survey.refused] == ["images/view_004.jpg"]
-    assert "truncated" in survey.refused[0][1]
+    (refused,) = survey.refused
+    assert refused.name == "images/view_004.jpg" and refused.reason.startswith("image file is truncated")
     assert {max(shot.look.thumbnail.shape) for shot in survey.shots} == {128}
     assert {shot.size for shot in survey.shots} == {(2400, 1800)}, "the size is the file's"
 
@@ -127,6 +128,29 @@ def test_a_photo_of_another_shape_than_its_camera_is_named(diagnosed, orbit):
 
     (found,) = [f for f in diagnosed(views, points, spoil).findings if f.name == "unusable"]
     assert found.images == (views[5].name,) and "another aspect ratio" in found.sentence
+
+
+def test_names_that_read_like_messages_do_not_change_what_is_found(tmp_path, orbit):
+    """Reasons and numbers come from fields. In a sentence, a name with these signs would be taken for a part of it."""
+    views, _ = orbit
+    odd = "cannot be decoded (x); 1 of 2 photos have no file: skipped, first"
+    write_transforms(tmp_path, views)
+    contents = json.loads((tmp_path / "transforms.json").read_text())
+    for view, frame, name in zip(views, contents["frames"], (f"{odd} a.png", f"{odd} b.png"), strict=False):
+        frame["file_path"] = f"images/{name}"
+        (tmp_path / "images" / view.name).rename(tmp_path / "images" / name)
+    (tmp_path / "transforms.json").write_text(json.dumps(contents))
+    path = str(tmp_path / "images" / f"{odd} a.png")
+    cv2.imwrite(path, cv2.imread(path)[:40])
+    (tmp_path / "images" / f"{odd} b.png").unlink()
+    survey = prepare(tmp_path)
+    assert survey.notes == (MissingPhotos(1, 24, f"images/{odd} b.png"),)
+    found = {finding.name: finding for finding in examine(survey).findings}
+    assert found["missing"].sentence == f"1 missing image of 24 listed, first images/{odd} b.png"
+    assert (
+        found["unusable"].sentence
+        == "1 of 23 photos (the photo is 96x40 but its camera 96x72, another aspect ratio)"
+    )
 
 
 def test_one_reason_is_told_once(diagnosed, orbit):

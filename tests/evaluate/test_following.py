@@ -66,7 +66,7 @@ def check_smooth(cameras, depth=1.0):
 def test_cameras_all_round_get_a_full_circle(frame, count):
     cameras = around(np.arange(count) * 360 / count, [20] * count, frame=frame)
     path = path_along(cameras, 40)
-    assert "full circle" in path.says and len(path.cameras) == 40
+    assert "full circle" in path.description and len(path.cameras) == 40
     azimuths, elevations, distances = seen_from(path, frame)
     np.testing.assert_allclose(
         np.sort(np.diff(np.unwrap(np.radians(azimuths)))),
@@ -87,12 +87,12 @@ def test_an_arc_is_never_left(frame, extent, count):
     azimuths = np.linspace(-extent / 2, extent / 2, count)
     cameras = around(azimuths, [10, 30] * (count // 2), frame=frame, jitter=1)
     path = path_along(cameras, 60)
-    assert "full circle" not in path.says
+    assert "full circle" not in path.description
     if extent > 20:
         assert (
-            f"cover {extent} degrees" in path.says
-            or f"cover {extent - 1} degrees" in path.says
-            or (f"cover {extent + 1} degrees" in path.says)
+            f"cover {extent} degrees" in path.description
+            or f"cover {extent - 1} degrees" in path.description
+            or (f"cover {extent + 1} degrees" in path.description)
         )
     seen, elevations, distances = seen_from(path, frame)
     # the centre is that of jittered axes: 1 degree each, less in the mean
@@ -158,7 +158,7 @@ def test_cameras_that_look_one_way_get_a_loop_between_them(frame, turns, jitter)
     cameras = grid(frame, turns, jitter)
     for depth in (1.0, 4.0, 100.0):
         path = path_along(cameras, 40, depth)
-        assert "look one way" in path.says
+        assert "one viewing direction" in path.description
         eyes = np.stack([camera.eye for camera in path.cameras]) @ frame
         assert np.abs(eyes[:, :2]).max() <= 3 + 1e-9
         assert np.abs(eyes[:, 2]).max() < 0.5 and np.ptp(eyes[:, 0]) > 2
@@ -171,7 +171,7 @@ def test_aerial_photos_that_look_down_on_one_place():
     cameras = around(np.arange(20) * 130.0, np.linspace(80, 89, 20))
     path = path_along(cameras, 30)
     _, elevations, _ = seen_from(path)
-    assert elevations.min() > 79 and "loop" in path.says
+    assert elevations.min() > 79 and "loop" in path.description
     assert off(path, cameras) < 5
     check_smooth(cameras)
 
@@ -183,7 +183,7 @@ def test_a_panorama_turns_on_the_spot(radius, extent, closed):
     ahead = [np.array([math.sin(a), 0.0, math.cos(a)]) for a in angles]
     cameras = [placed(SUBJECT + radius * f, SUBJECT + (radius + 1) * f) for f in ahead]
     path = path_along(cameras, 36, 3.0)
-    assert ("round and round" in path.says) is closed
+    assert ("closed loop" in path.description) is closed
     assert max(np.linalg.norm(camera.eye - SUBJECT) for camera in path.cameras) <= radius + 1e-9
     assert off(path, cameras) <= 5 + 1e-6, "half of the angle between neighbours"
     turned = np.degrees(np.arccos(np.clip([c.R[2] @ ahead[0] for c in path.cameras], -1, 1)))
@@ -236,7 +236,7 @@ def test_cameras_too_far_apart_for_a_path_get_a_loop_at_one_of_them(azimuths):
     path = path_along(cameras, 12, 2.0)
     eyes, real = (np.stack([camera.eye for camera in each]) for each in (path.cameras, cameras))
     nearest = np.linalg.norm(eyes[:, None] - real, axis=2).min(axis=0)
-    assert np.sort(nearest)[0] < 0.1 and "too far apart" in path.says
+    assert np.sort(nearest)[0] < 0.1 and "too far apart" in path.description
     # half axes are 0.03 of the distance, 2.5; the view turns with the place: 0.075 / 2.5 rad, 1.7 degrees
     assert 0.07 < np.ptp(eyes, axis=0).max() < 0.16 and off(path, cameras) < 1.8
     check_smooth(cameras, 2.0)

@@ -76,7 +76,7 @@ def test_a_file_is_no_folder(tmp_path):
 def test_other_formats_are_refused_by_name(tmp_path, suffix):
     """`--out x.gif` was taken for a folder."""
     with pytest.raises(
-        ArgumentError, match=rf"x\{suffix}: {suffix[1:].upper()} is not written here; give a video"
+        ArgumentError, match=rf"x\{suffix}: {suffix[1:].upper()} is not supported; give a video"
     ):
         write_frames(tmp_path / f"x{suffix}", [colour(4, 4, (0, 0, 0))])
     assert list(tmp_path.iterdir()) == []
@@ -126,5 +126,5 @@ def test_an_encoder_that_does_not_open_is_said(tmp_path, monkeypatch):
             pass
 
     monkeypatch.setattr(cv2, "VideoWriter", Closed)
-    with pytest.raises(ArgumentError, match="OpenCV cannot encode VP9 at 4x4, 30 fps, here; write a folder"):
+    with pytest.raises(ArgumentError, match="OpenCV cannot encode VP9 at 4x4, 30 fps here; write a folder"):
         write_frames(tmp_path / "v.mp4", [colour(4, 4, (0, 0, 0))])

@@ -127,7 +127,7 @@ def test_differences_are_bright_enough_to_see_and_say_by_how_much(step, times):
     title, data = Picture.of(
         "a", np.full((30, 40, 3), step, np.uint8), np.zeros((30, 40, 3), np.uint8)
     ).panels[2]
-    assert title == ("difference" if times == 1 else f"difference, {times} times as bright")
+    assert title == ("difference" if times == 1 else f"difference, {times}x amplified")
     assert np.array(Image.open(io.BytesIO(data))).mean() == pytest.approx(step * times, abs=1)
 
 
@@ -151,15 +151,15 @@ def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
             32.0,
             [
                 "renders of the held-out photos reach 31.0 dB",
-                "look very close to them",
+                "(very close)",
                 "1.0 dB below the training photos;",
             ],
         ),
-        (26.0, 25.5, ["26.0 dB", "look close to them", "0.5 dB above the training photos"]),
-        (21.0, 29.5, ["soft or partly wrong", "8.5 dB below", "so the scene has overfitted to those"]),
-        (15.0, None, ["15.0 dB", "look wrong in places"]),
+        (26.0, 25.5, ["26.0 dB", "(close)", "0.5 dB above the training photos"]),
+        (21.0, 29.5, ["soft or partly wrong", "8.5 dB below", "so the scene has overfitted to them"]),
+        (15.0, None, ["15.0 dB", "(wrong in places)"]),
         (None, 30.0, ["renders of the training photos reach 30.0 dB", "no photo was held out"]),
-        (None, None, ["Nothing was judged"]),
+        (None, None, ["was not evaluated"]),
     ],
 )
 def test_the_verdict_is_a_sentence_from_the_numbers(tmp_path, test, train, says):
@@ -172,7 +172,7 @@ def test_the_verdict_is_a_sentence_from_the_numbers(tmp_path, test, train, says)
     assert all(words in sentence for words in says), sentence
     assert sentence.count(". ") == 0 and sentence.endswith(".") and sentence[0].isupper()
     if scores:
-        assert "the worst is <i>low</i> at 12.5 dB" in sentence and sentence.startswith(
+        assert "the worst view is <i>low</i> at 12.5 dB" in sentence and sentence.startswith(
             "After 1,500 iterations, "
         )
     write_report(tmp_path / "r.html", Report("t", metrics, scores=scores))
@@ -202,7 +202,7 @@ def test_the_machine_is_stated_once_and_the_configuration_is_folded(tmp_path):
     assert text.index("<details>") < text.index("train.seed") < text.index("</details>")
     write_report(tmp_path / "r.html", Report("t", {}, config={"machine": {"processor": "<another>"}}))
     text = Page(tmp_path / "r.html").text
-    assert "Machine of the training processor <another>" in text and "Machine of this report" in text
+    assert "Training machine processor <another>" in text and "Evaluation machine" in text
 
 
 @pytest.mark.parametrize("width", [1440, 390])
@@ -258,13 +258,28 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
 def test_nothing_to_show_is_a_page_too(tmp_path):
     write_report(tmp_path / "r.html", Report("empty", {"test": summarize([])}))
     page = Page(tmp_path / "r.html")
-    assert "No view was held out" in page.text and "svg" not in page.tags
+    assert "No view was held out for testing" in page.text and "svg" not in page.tags
 
 
 @pytest.mark.parametrize("count", [1, 5, 8, 9])
 def test_few_views_are_all_shown(tmp_path, count):
     write_report(tmp_path / "r.html", full_report(count))
     assert Page(tmp_path / "r.html").tags.count("img") == 3 * min(count, 8)
+
+
+def test_every_kind_of_number_has_its_own_curve():
+    log = [
+        {"iteration": i, "loss": 1.0 + i, "psnr": 20.0 + i, "num_gaussians": 300 + i, "ms": 4.0 + i}
+        for i in (1, 2)
+    ]
+    panels = run_curves_figure(log).axes
+    assert [axes.get_title() for axes in panels] == [
+        "training loss",
+        "held-out views",
+        "density control",
+        "speed",
+    ]
+    assert [axes.lines[0].get_ydata()[0] for axes in panels] == [2.0, 21.0, 301.0, 5.0]
 
 
 def test_curves_are_of_what_the_log_has():

@@ -74,7 +74,7 @@ def test_adam_does_what_its_equations_say():
     ("options", "match"),
     [
         ({"rates": {"means": 1.0}}, "'angles' is missing"),
-        ({"rates": dict(RATES_2D) | {"depths": 1.0}}, "'depths' is no parameter"),
+        ({"rates": dict(RATES_2D) | {"depths": 1.0}}, "'depths' is not a parameter"),
         ({"rates": dict(RATES_2D) | {"means": -1.0}}, r"rates\['means'\]: is -1"),
         ({"betas": (0.9, 1.0)}, "betas: is 1"),
         ({"eps": 0.0}, "eps: is 0"),
@@ -99,7 +99,7 @@ def test_settings_and_targets_are_checked(as_shipped):
 
 def test_splats_of_another_count_cannot_follow(as_shipped):
     few, many = (random_splats_2d(n, 4, 4, np.random.default_rng(0)) for n in (2, 3))
-    with pytest.raises(ShapeError, match="gradients: are of 3 splats, but there are 2"):
+    with pytest.raises(ShapeError, match="gradients: has 3 splats, but there are 2"):
         adam_step_2d(few, many, AdamState.fresh(few), AdamSettings())
 
 

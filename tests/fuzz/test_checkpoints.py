@@ -4,20 +4,19 @@ Also run on the build with sanitizers (tools/sanitize.sh): a step follows every 
 """
 
 import json
-import os
 
 import numpy as np
 import pytest
 
+import slices
 from checkpoints import Maker, mutate, step
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.train.checkpoint import load_checkpoint, read_seconds, save_checkpoint
 
-MUTATIONS = int(os.environ.get("GSPLAT_EDU_FUZZ_CHECKPOINTS", "100"))
-"""Damaged checkpoints per strategy; tools/sanitize.sh has more of them."""
+MUTATIONS = slices.count("GSPLAT_EDU_FUZZ_CHECKPOINTS", 50, 2_000)
+"""Damaged checkpoints per strategy."""
 
-FIRST = int(os.environ.get("GSPLAT_EDU_FUZZ_FIRST", "0"))
-"""Seed of the first."""
+SEEDS = range(slices.SEED, slices.SEED + MUTATIONS)
 
 
 def as_it_stands(trainer):
@@ -27,6 +26,7 @@ def as_it_stands(trainer):
     return kept, tensors["density.generator"].tolist(), json.dumps(numbers), id(trainer.gaussians)
 
 
+@pytest.mark.sliced
 @pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
 def test_damaged_checkpoints(tmp_path, strategy):
@@ -37,7 +37,7 @@ def test_damaged_checkpoints(tmp_path, strategy):
     path = tmp_path / "iteration_3.safetensors"
     fresh, taken = make(), 0
     before = as_it_stands(fresh)
-    for seed in range(FIRST, FIRST + MUTATIONS):
+    for seed in SEEDS:
         mutate(data, path, np.random.default_rng(seed))
         try:
             load_checkpoint(path, fresh)

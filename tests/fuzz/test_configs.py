@@ -3,11 +3,11 @@
 import contextlib
 import io
 import json
-import os
 
 import numpy as np
 import pytest
 
+import slices
 from checkpoints import changed_json, spelled
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
@@ -16,11 +16,10 @@ from gsplat_edu.errors import SplatError
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.source import open_source
 
-MUTATIONS = int(os.environ.get("GSPLAT_EDU_FUZZ_CONFIGS", "50"))
+MUTATIONS = slices.count("GSPLAT_EDU_FUZZ_CONFIGS", 25, 1_000)
 """Damaged files."""
 
-FIRST = int(os.environ.get("GSPLAT_EDU_FUZZ_FIRST", "0"))
-"""Seed of the first."""
+SEEDS = range(slices.SEED, slices.SEED + MUTATIONS)
 
 
 def damaged(data, rng):
@@ -40,6 +39,7 @@ def resumed(words):
     return code, stream.buffer.getvalue().decode()
 
 
+@pytest.mark.sliced
 @pytest.mark.usefixtures("as_shipped")
 def test_damaged_configs(tmp_path):
     write_colmap(tmp_path / "egg", *procedural_capture(12, 4, splats=30))
@@ -47,7 +47,7 @@ def test_damaged_configs(tmp_path):
     words = ["train", str(tmp_path / "egg"), "--out", str(out), "--iterations", "3", "--resume"]
     assert main(words) == 0
     whole = (out / "config.json").read_bytes()
-    for seed in range(FIRST, FIRST + MUTATIONS):
+    for seed in SEEDS:
         (out / "config.json").write_bytes(damaged(whole, np.random.default_rng(seed)))
         code, said = resumed(words)
         assert code in (0, 2), seed

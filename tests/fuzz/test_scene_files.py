@@ -1,18 +1,20 @@
 """Damaged scene files: whatever the damage, a scene of finite numbers or one line, and memory stays small."""
 
-import os
 import tracemalloc
 import zipfile
 
 import numpy as np
 import pytest
 
+import slices
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.io.formats import FORMATS, read_scene
 from scene_files import small_file
 
-FILES = int(os.environ.get("GSPLAT_EDU_FUZZ", "200"))
+FILES = slices.count("GSPLAT_EDU_FUZZ", 100, 20_000)
 """Mutated files per reader."""
+
+SEEDS = range(slices.SEED, slices.SEED + FILES)
 
 MOST_MEMORY = 24 << 20
 """Bytes: files here have at most 32 KiB; their allowance is 1 MiB of contents, and float32 copies of those."""
@@ -48,30 +50,32 @@ def mutated(data, rng):
     return bytes(damaged)
 
 
-def check(path):
+def check(path, seed):
     tracemalloc.start()
     try:
         scene = read_scene(path)
     except SceneFormatError as error:
         message = str(error)
-        assert str(path) in message and "\n" not in message
+        assert str(path) in message and "\n" not in message, seed
     else:
-        assert bool(scene.gaussians.finite_rows().all())
+        assert bool(scene.gaussians.finite_rows().all()), seed
     finally:
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-    assert peak < MOST_MEMORY, f"{peak:,} bytes"
+    assert peak < MOST_MEMORY, f"seed {seed}: {peak:,} bytes"
 
 
+@pytest.mark.sliced
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 def test_damaged_files(tmp_path, suffix):
     data = small_file(tmp_path, suffix).read_bytes()
     path = tmp_path / f"damaged{suffix}"
-    for seed in range(FILES):
+    for seed in SEEDS:
         path.write_bytes(mutated(data, np.random.default_rng(seed)))
-        check(path)
+        check(path, seed)
 
 
+@pytest.mark.sliced
 def test_damage_inside_a_sog(tmp_path):
     """A zip has checksums: damage to its parts is put in before they are zipped."""
     parts = {}
@@ -80,10 +84,10 @@ def test_damage_inside_a_sog(tmp_path):
             parts[name] = bundle.read(name)
     path = tmp_path / "damaged.sog"
     names = sorted(parts)
-    for seed in range(FILES):
+    for seed in SEEDS:
         rng = np.random.default_rng(seed)
         victim = names[int(rng.integers(0, len(names)))] if rng.random() < 0.5 else "meta.json"
         with zipfile.ZipFile(path, "w") as bundle:
             for name, content in parts.items():
                 bundle.writestr(name, mutated(content, rng) if name == victim else content)
-        check(path)
+        check(path, seed)

@@ -6,8 +6,8 @@ from gsplat_edu import ArgumentError, kernels
 # Not `triton`: without its wheel that name is this folder.
 pytest.importorskip("triton.language", reason="triton is not installed")
 
+from gsplat_edu.adam import AdamNumbers
 from gsplat_edu.render.triton.adam import adam_triton
-from gsplat_edu.train.optimizer import NUMBERS
 
 U = 2.0**-24
 """Half a unit in the last place of float32: the largest relative error of one rounding."""
@@ -17,7 +17,7 @@ STEPS = 20
 
 
 def numbers(t):
-    return RATE, B1, B2, EPS, 1 - B1**t, 1 - B2**t
+    return AdamNumbers(RATE, B1, B2, EPS, 1 - B1**t, 1 - B2**t)
 
 
 def gradients(shape, seed=0):
@@ -60,8 +60,7 @@ def walk(step, start, all_gradients):
 def natively(parameter, m, v, gradient, numbers):
     names = ("parameter", "first", "second", "gradient")
     arrays = dict(zip(names, map(kernels.native_array, (parameter, m, v, gradient)), strict=True))
-    named = dict(zip(NUMBERS, numbers, strict=True))
-    kernels.kernel("adam_f", parameter.dtype)(**arrays, **named, threads=1)
+    kernels.kernel("adam_f", parameter.dtype)(**arrays, **numbers._asdict(), threads=1)
 
 
 @pytest.mark.parametrize("shape", [(1,), (7, 3), (1500, 3), (2, 1024)])

@@ -113,6 +113,7 @@ def value_and_gradient(loss, image, target, weight):
     return value.detach().cpu().double(), image.grad.cpu().double()
 
 
+@pytest.mark.sliced(4)
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (19, 23), (33, 48)])
 @pytest.mark.parametrize("kind", ["floats", "bytes", "flat"])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
@@ -141,6 +142,7 @@ def test_the_bound_would_notice_another_window(monkeypatch):
     assert ((truth[1] - other[1]).abs() > e_gradient).double().mean() > 0.9
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("weight", [0.0, 0.2])
 def test_two_runs_give_the_same_bits_whatever_stood_in_memory(device, weight):
     image, target = (t.to(device) for t in images((19, 23), "bytes"))

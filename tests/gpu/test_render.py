@@ -68,6 +68,7 @@ def sensitivity(scene) -> np.ndarray:
     return worst
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", [name for name in SMALLER if name != "ties in depth"])
 def test_images_are_the_references(device, name):
     scene = SMALLER[name]
@@ -80,6 +81,7 @@ def test_images_are_the_references(device, name):
     assert np.abs(values["depth"] - truth_depth).max() < 1.1 * max(1.0, truth_depth.max()) / 255
 
 
+@pytest.mark.sliced(3)
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("name", SMALLER)
 def test_gradients_are_those_of_the_native_kernels_in_double(device, name, antialiased):
@@ -95,6 +97,7 @@ def test_gradients_are_those_of_the_native_kernels_in_double(device, name, antia
         assert np.abs(gradients[key] - truth).max() <= bound * np.abs(truth).max(), key
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_lower_degrees(device, degree):
     settings = dataclasses.replace(SETTINGS, sh_degree=degree)
@@ -120,6 +123,7 @@ def test_several_cameras_and_no_depth(device):
     assert torch.equal(stack.image[0], stack.image[1])
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize("kind", ["empty", "behind", "faint", "one"])
 def test_scenes_of_almost_nothing(device, kind):
     scene = random(0 if kind == "empty" else 1 if kind == "one" else 9, (17, 33), seed=2)
@@ -148,6 +152,7 @@ POISON = (
 )
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # NumPy's, in the interpreter
 @pytest.mark.parametrize(("name", "value"), POISON)
 def test_one_bad_gaussian_spoils_nothing(device, name, value):

@@ -350,25 +350,25 @@ def test_cut_anywhere_it_is_refused(tmp_path, rest):
         ({b"uint packed_color": b"list uchar uint packed_color"}, "packed_color is not of type uint"),
         ({b"element chunk 2": b"element chunk 3"}, "has 3 chunks of 256 for 300 splats"),
         ({b"element vertex 300": b"element vertex 200"}, "has 2 chunks of 256 for 200 splats"),
-        ({b"element sh 300": b"element sh 299"}, "has SH coefficients of 299 splats, but 300 splats"),
+        ({b"element sh 300": b"element sh 299"}, "has SH coefficients for 299 of 300 splats"),
         ({b"f_rest_8": b"f_rest_9"}, "sh has 9 properties f_rest_*, but SH degrees 1-3 have 9, 24, 45"),
         ({b"f_rest_8": b"rest_8"}, "sh has 8 properties f_rest_*, but"),
         ({b"uchar f_rest_8": b"char f_rest_8"}, "sh has properties f_rest_* that are not uchar"),
-        ({b"element sh 300": b"element vertex 300"}, "is no line of a PLY header"),
+        ({b"element sh 300": b"element vertex 300"}, "is not a line of a PLY header"),
         (
             {
                 b"vertex 300": b"vertex 25600000000",
                 b"sh 300": b"sh 25600000000",
                 b"chunk 2": b"chunk 100000000",
             },
-            "of 100000000 rows of chunk are there",
+            "of 100000000 rows of chunk are present",
         ),
         (
             {b"element chunk": b"element a %d\nproperty int b\nelement chunk" % 10**30},
             "more than any file holds",
         ),
         ({b"element chunk": b"element a 1\nproperty list uchar int b\nelement chunk"}, "has the list b"),
-        ({b"gsplat_edu up 0.0": b"gsplat_edu up x"}, "is no direction"),
+        ({b"gsplat_edu up 0.0": b"gsplat_edu up x"}, "is not a direction"),
     ],
 )
 def test_damage_is_named(tmp_path, changes, says):
@@ -401,7 +401,7 @@ def test_bounds_beyond_float32_are_named(tmp_path):
     assert "chunk 0: max_y is 1e+300; " in refused(path)
     # within it, but coefficients of such colours are not
     by_hand(path, {"chunk": chunk_element(BOUNDS | COLORS | {"max_r": 3e38}), "vertex": vertex})
-    with pytest.raises(SceneFormatError, match="1 splats have a NaN or infinite number"):
+    with pytest.raises(SceneFormatError, match="1 splats have NaN or infinite values"):
         read_scene(path)
 
 

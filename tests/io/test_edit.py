@@ -87,7 +87,7 @@ def test_what_gaussians_cannot_do_is_refused(A, says):
 
 
 def test_a_matrix_of_columns_or_another_shape_is_refused():
-    with pytest.raises(ArgumentError, match="rows come first"):
+    with pytest.raises(ArgumentError, match="give it row by row"):
         Similarity.of_matrix(np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [5, 6, 7, 1]]))
     with pytest.raises(ShapeError):
         Similarity.of_matrix(np.eye(3))

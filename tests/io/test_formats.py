@@ -44,7 +44,7 @@ def test_reading_what_was_written_and_writing_it_again_gives_the_same_scene(tmp_
 def test_what_a_format_leaves_out_is_said(tmp_path):
     scene = random_scene(3)
     assert losses("a.ply", scene) == []
-    assert "up to degree 0; those up to 3 are left out" in losses("a.splat", scene)[0]
+    assert "up to degree 0; degrees up to 3 are dropped" in losses("a.splat", scene)[0]
 
 
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
@@ -53,7 +53,7 @@ def test_antialiasing_is_kept_or_said_to_be_lost(tmp_path, suffix, antialiased):
     scene = replace(random_scene(3, 0), antialiased=antialiased)
     write_scene(tmp_path / f"a{suffix}", scene)
     kept = read_scene(tmp_path / f"a{suffix}").antialiased
-    said = [note for note in losses(f"a{suffix}", scene) if "antialiasing" in note]
+    said = [note for note in losses(f"a{suffix}", scene) if "antialiased" in note]
     assert len(said) == (0 if bool(kept) == antialiased else 1)
 
 

@@ -219,13 +219,13 @@ def edited(path, change):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda d: d["nodes"][0].update(rotation=[1, 0, 0, 0]), "a node's transform"),
-        (lambda d: d["accessors"][1].update(componentType=5121), "other numbers than float32"),
-        (lambda d: d["accessors"][1].update(count=10**15), "beyond its end"),
-        (lambda d: d["accessors"][1].update(count=7.0), "beyond its end"),
+        (lambda d: d["nodes"][0].update(rotation=[1, 0, 0, 0]), "by a node"),
+        (lambda d: d["accessors"][1].update(componentType=5121), "not float32"),
+        (lambda d: d["accessors"][1].update(count=10**15), "beyond the file's end"),
+        (lambda d: d["accessors"][1].update(count=7.0), "beyond the file's end"),
         (lambda d: d["accessors"][1].update(count=4), "different numbers of splats"),
-        (lambda d: d["bufferViews"][1].update(byteStride=32), "interleaves"),
-        (lambda d: d["bufferViews"][1].update(byteOffset=-4), "beyond its end"),
+        (lambda d: d["bufferViews"][1].update(byteStride=32), "interleaved"),
+        (lambda d: d["bufferViews"][1].update(byteOffset=-4), "beyond the file's end"),
         (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SCALE"), "without KHR"),
         (
             lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(PREFIX + "SH_DEGREE_0_COEF_0"),
@@ -238,7 +238,7 @@ def edited(path, change):
         (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no splats"),
         (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives"),
         (lambda d: d["asset"].update(extras={"antialiased": "yes"}), "antialiased is"),
-        (lambda d: d["asset"].update(extras={"up": [0, 0, 0]}), "no direction"),
+        (lambda d: d["asset"].update(extras={"up": [0, 0, 0]}), "not a direction"),
         (lambda d: d["asset"].update(extras={"up": [0, 0]}), "does not describe"),
         (lambda d: d.pop("asset"), "does not describe"),
         (lambda d: d.update(accessors="none"), "does not describe"),

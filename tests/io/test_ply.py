@@ -198,7 +198,7 @@ def test_every_cut_is_told(tmp_path, form):
         refused(path)
     if form == "binary_little_endian":
         path.write_bytes(whole[: end + 2 * row + 5])
-        assert "is truncated: 2 of 4 rows of vertex are there; get the file again" in refused(path)
+        assert "is truncated: 2 of 4 rows of vertex are present; get the file again" in refused(path)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
@@ -232,14 +232,14 @@ def test_what_is_not_finite_is_named(tmp_path, form, value, text):
         ((b"ply\n", b"version https://git-lfs.github.com/spec/v1\n"), "is a Git LFS pointer"),
         (
             (b"format binary_little_endian", b"format text"),
-            "line 2: 'format text 1.0' is no line of a PLY header",
+            "line 2: 'format text 1.0' is not a line of a PLY header",
         ),
         ((b"format binary_little_endian 1.0", b"comment"), "its header names no format"),
-        ((b"element vertex 3", b"element vertex -3"), "'element vertex -3' is no line"),
+        ((b"element vertex 3", b"element vertex -3"), "'element vertex -3' is not a line"),
         ((b"element vertex 3", b"element point 3"), "is a PLY without vertices"),
         ((b"element vertex 3", b"comment"), "belongs to no element"),
-        ((b"property float x\n", b"property real x\n"), "'property real x' is no line"),
-        ((b"property float x\n", b"property float y\n"), "property y stands twice"),
+        ((b"property float x\n", b"property real x\n"), "'property real x' is not a line"),
+        ((b"property float x\n", b"property float y\n"), "property y appears twice"),
         ((b"property float x\n", b"property list uchar int x\n"), "has the list x"),
         (
             (b"property float opacity", b"property float transparency"),
@@ -253,7 +253,7 @@ def test_what_is_not_finite_is_named(tmp_path, form, value, text):
             (b"property float f_rest_8", b"property float rest"),
             "has 8 properties f_rest_*, but SH",
         ),
-        ((b"end_header", b"comment" + b" long" * 2000), "is no line of a PLY header"),
+        ((b"end_header", b"comment" + b" long" * 2000), "is not a line of a PLY header"),
         ((b"end_header\n", b"comment\n" * 11000), "no end_header in 10000 lines"),
     ],
 )
@@ -362,7 +362,7 @@ def test_a_comment_of_ours_that_is_none_is_refused(tmp_path, said):
     save_ply(path, random_gaussians(1, 0))
     data = path.read_bytes().replace(b"element", f"comment gsplat_edu {said}\nelement".encode(), 1)
     path.write_bytes(data)
-    with pytest.raises(SceneFormatError, match="is no direction"):
+    with pytest.raises(SceneFormatError, match="is not a direction"):
         read(path)
     path.write_bytes(data.replace(b"comment gsplat_edu", b"comment another"))
     assert read(path).up is None

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.io import sog
+from gsplat_edu.io.sog import codec as sog
 from scene_files import random_scene
 
 COUNT = 40
@@ -136,7 +136,7 @@ def test_bombs_do_not_go_off(tmp_path, contents):
 
     messages = []
     assert peak_of(said, path) < 16 << 20
-    assert "says it holds 314,572,800 bytes in a file of" in messages[0]
+    assert "claims to hold 314,572,800 bytes in a file of" in messages[0]
 
     path.write_bytes(bomb.replace((300 << 20).to_bytes(4, "little"), (100).to_bytes(4, "little")))
     assert peak_of(said, path) < 16 << 20
@@ -180,7 +180,7 @@ def test_what_is_no_sog_is_called_so(tmp_path, contents):
     path = tmp_path / "a.sog"
     for data in (b"", b"ply\nformat", bytes(100), contents["sh0.webp"]):
         path.write_bytes(data)
-        assert "is no zip" in refused(path)
+        assert "it is not a zip" in refused(path)
     pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
     path.write_bytes(pointer)
     assert "git lfs pull" in refused(path)
@@ -217,7 +217,7 @@ NUMBERS = ["scales.codebook", "sh0.codebook", "shN.codebook", "means.mins", "mea
         ),
         (_set("means.mins.0", 88.8), "in means.mins[0]"),  # e^88.8 is more than float32 has
         (_set("means", [1, 2]), "numbers in means.mins"),
-        (_set("version", 3), "is SOG of version 3, but version 2 is read"),
+        (_set("version", 3), "is SOG of version 3, but only version 2 is supported"),
         (_set("version", "2"), "is SOG of no version"),
         (_set("version", True), "is SOG of no version"),
         (_set("version", 10**4000), "is SOG of no version"),
@@ -226,11 +226,11 @@ NUMBERS = ["scales.codebook", "sh0.codebook", "shN.codebook", "means.mins", "mea
             (_set("count", value), "number from 0 to 67108864 in count")
             for value in (-1, 1.5, True, None, 2**26 + 1, 10**99)
         ),
-        (_set("count", 2**26), "says it holds 6,174,015,488 bytes in a file of"),
+        (_set("count", 2**26), "claims to hold 6,174,015,488 bytes in a file of"),
         (_set("count", COUNT * 10), "has 8x8 pixels for 400 splats"),
         (_set("shN.count", 0), "number from 1 to 65536 in shN.count"),
         (_set("shN.count", 65537), "number from 1 to 65536 in shN.count"),
-        (_set("shN.count", COUNT - 1), "its harmonics are number 39 of 39"),
+        (_set("shN.count", COUNT - 1), "its label 39 exceeds the palette of 39"),
         (_set("shN.count", 65), "has 192x1 pixels, but 65 entries of degree 1 take 192x2"),
         (_set("shN.bands", 4), "number from 1 to 3 in shN.bands"),
         (_set("shN.bands", 2), "has 192x1 pixels, but 40 entries of degree 2 take 512x1"),
@@ -238,7 +238,7 @@ NUMBERS = ["scales.codebook", "sh0.codebook", "shN.codebook", "means.mins", "mea
         (_set("antialias", "yes"), "antialias, which is neither"),
         (_set("quats.files", []), "no 1 file names in quats.files"),
         (_set("means.files", "means_l.webp"), "no 2 file names in means.files"),
-        (_set("quats.files.0", "meta.json"), "meta.json is no WebP image"),
+        (_set("quats.files.0", "meta.json"), "meta.json is not a WebP image"),
     ],
 )
 def test_what_metadata_cannot_say_is_named(tmp_path, contents, change, says):
@@ -265,18 +265,18 @@ def test_what_metadata_cannot_say_is_named(tmp_path, contents, change, says):
 def test_names_that_lead_elsewhere_are_refused(tmp_path, contents, name):
     changed = with_meta(contents, _set("quats.files.0", name))
     for path in (zipped(tmp_path / "a.sog", changed), in_folder(tmp_path / "a", changed)):
-        assert "in quats.files something that is no plain file name" in refused(path)
+        assert "an entry in quats.files that is not a plain file name" in refused(path)
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (b"", "is no JSON"),
-        (b"\xff\xfe\x00", "is no JSON"),
-        (b'{"count": NaN}', "is no JSON (NaN is no number of JSON)"),
-        (b'{"count": -Infinity}', "is no JSON (-Infinity is no number of JSON)"),
-        (b'{"a":' * 200_000, "is no JSON (nested too deep)"),
-        (b"9" * 5000, "is no JSON"),
+        (b"", "is not JSON"),
+        (b"\xff\xfe\x00", "is not JSON"),
+        (b'{"count": NaN}', "is not JSON (NaN is not a JSON number)"),
+        (b'{"count": -Infinity}', "is not JSON (-Infinity is not a JSON number)"),
+        (b'{"a":' * 200_000, "is not JSON (nested too deeply)"),
+        (b"9" * 5000, "is not JSON"),
         (b"[]", "has no object"),
         (b"{}", "is SOG of no version"),
         (b'{"version": 2}', "means.mins"),
@@ -320,7 +320,7 @@ def test_rotations_of_no_kind_are_refused(tmp_path, contents):
     assert (pixels.reshape(-1, 4)[COUNT:] == 0).all(), "beyond the splats it does not matter"
     pixels[1, 2, 3] = 251
     said = refused(zipped(tmp_path / "a.sog", contents | {"quats.webp": webp(pixels)}))
-    assert f"splat {pixels.shape[1] + 2}: its rotation is of a kind that SOG has not" in said
+    assert f"splat {pixels.shape[1] + 2}: its rotation has an unknown encoding" in said
 
 
 def test_images_of_other_sizes_are_refused(tmp_path, contents):
@@ -367,7 +367,7 @@ def test_other_images_are_refused(tmp_path, contents):
     png = io.BytesIO()
     Image.fromarray(pixels_of(contents["scales.webp"])).save(png, "PNG")
     said = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": png.getvalue()}))
-    assert "scales.webp is no WebP image" in said
+    assert "scales.webp is not a WebP image" in said
     broken = contents["scales.webp"][:30] + bytes(len(contents["scales.webp"]) - 30)
     said = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": broken}))
     assert "scales.webp is a damaged WebP image" in said

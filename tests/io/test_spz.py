@@ -316,7 +316,7 @@ def test_extensions_are_skipped_save_the_one_for_axes(tmp_path, version):
         write(stored, *([] if axes is None else [record(0xADBE0003, struct.pack("<I", axes))]))
         assert_close(spz.read(path).gaussians, g, 2.0**-12)
     write(g, record(0xADBE0003, struct.pack("<I", 9)))
-    assert "its axes, number 9 of the extension for them, are not read" in refused(path)
+    assert "its axes (number 9 in the axes extension) are not supported" in refused(path)
     write(half_turned(g), record(0x12340001, b"cut")[:-1])
     assert_close(spz.read(path).gaussians, g, 2.0**-12)
 
@@ -348,7 +348,7 @@ def test_every_cut_and_every_byte_too_many_is_told(tmp_path, files, kind):
         refused(path)
     for more in (b"\0", b"garbage", whole):
         path.write_bytes(whole + more)
-        assert "follow its last stream" in refused(path) or "more than its header says" in refused(path)
+        assert "follow its last stream" in refused(path) or "more than its header declares" in refused(path)
     path.write_bytes(whole)
     spz.read(path)
 
@@ -372,20 +372,20 @@ def test_damage_anywhere_is_told_or_harmless(tmp_path, files, kind):
     [
         (0, b"PK\x03\x04", "is not an SPZ file: it begins with neither NGSP nor gzip"),
         (0, b"version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer"),
-        (4, b"\0", "is SPZ of version 0, but 1 to 4 are read"),
-        (4, b"\x05", "is SPZ of version 5"),
-        (8, b"\xff\xff\xff\xff", "says it holds 279,172,874,175 bytes in a file of"),
-        (8, b"\0\0\0\0", "has 6 streams, but its header asks for 0"),
-        (8, b"\x79", "its positions are not as many as its header says"),
-        (12, b"\x05", "says that its harmonics are of degree 5"),
-        (12, b"\x02", "its coefficients are not as many"),
-        (12, b"\0", "has 6 streams, but its header asks for 5"),
-        (13, b"\x19", "says that positions have 25 fractional bits"),
+        (4, b"\0", "has SPZ version 0, but 1 to 4 are supported"),
+        (4, b"\x05", "has SPZ version 5"),
+        (8, b"\xff\xff\xff\xff", "claims to hold 279,172,874,175 bytes in a file of"),
+        (8, b"\0\0\0\0", "has 6 streams, but its header requires 0"),
+        (8, b"\x79", "the number of its positions differs from its header"),
+        (12, b"\x05", "its header gives SH degree 5"),
+        (12, b"\x02", "the number of its coefficients differs"),
+        (12, b"\0", "has 6 streams, but its header requires 5"),
+        (13, b"\x19", "its header gives 25 fractional bits"),
         (14, b"\x80", "holds levels of detail"),
         (15, b"\x05", "has 5 streams"),
-        (16, b"\x10", "its table of contents does not fit"),
-        (16, b"\0\0\0\xff", "its table of contents does not fit"),
-        (32, b"\xff\xff\xff\xff\xff\xff\xff\xff", "ends early: within its positions"),
+        (16, b"\x10", "its table of contents extends beyond its end"),
+        (16, b"\0\0\0\xff", "its table of contents extends beyond its end"),
+        (32, b"\xff\xff\xff\xff\xff\xff\xff\xff", "is truncated within its positions"),
         (128, b"\0\0\0\0", "its positions cannot be unpacked"),
     ],
 )
@@ -412,14 +412,14 @@ def test_damage_of_older_versions_is_named(tmp_path, files):
     for data, says in (
         (gzip.compress(body.replace(b"NGSP", b"PSGN", 1)), "is not an SPZ file"),
         (gzip.compress(body.replace(b"\x03", b"\x04", 1)), "is of version 4, but in one gzip"),
-        (gzip.compress(body + b"!"), "holds more than its header says"),
-        (gzip.compress(body[:-1]), "ends early: 7,799 of 7,800 bytes are there"),
+        (gzip.compress(body + b"!"), "holds more than its header declares"),
+        (gzip.compress(body[:-1]), "is truncated: 7,799 of 7,800 bytes are present"),
         (gzip.compress(b""), "is not an SPZ file"),
         (files["gzip"][:-8] + bytes(8), "its gzip cannot be unpacked"),  # checksum
-        (body.replace(b"x\0\0\0", b"\xff\xff\xff\xff", 1), "ends early"),
+        (body.replace(b"x\0\0\0", b"\xff\xff\xff\xff", 1), "is truncated"),
         (
             gzip.compress(body.replace(b"x\0\0\0", b"\xff\xff\xff\xff", 1)),
-            "says it holds 279,172,874,175 bytes",
+            "claims to hold 279,172,874,175 bytes",
         ),
     ):
         path.write_bytes(data)

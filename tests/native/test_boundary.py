@@ -238,10 +238,10 @@ def test_capsules_of_older_torch_give_the_same_bits(monkeypatch, degree):
         monkeypatch.setattr(kernels, "_DESCRIBE_THEMSELVES", describes)
         raw = parameters() | {"sh_rest": torch.zeros(N, (degree + 1) ** 2 - 1, 3)}
         gaussians = Gaussians(**raw).trainable()
-        optimizer = Adam(gaussians, dict.fromkeys(raw, 0.01))
+        optimizer = Adam(gaussians.tensors(), dict.fromkeys(raw, 0.01))
         for _ in range(2):
             photo_loss(render(gaussians, cam, backend="cpu").image, target).backward()
-            optimizer.step(gaussians)
+            optimizer.step(gaussians.tensors())
         found.append(gaussians.tensors())
     for name, tensor in found[0].items():
         assert torch.equal(tensor, found[1][name]), name

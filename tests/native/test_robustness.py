@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu import ArgumentError, Camera, _native
+from gsplat_edu import ArgumentError, Camera, _native, orbit_camera
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.headroom import available_memory
 from gsplat_edu.render.api import render
 from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.settings import RenderSettings
@@ -263,3 +264,40 @@ def test_the_dense_backend_trains_without_the_native_module(tmp_path):
     budget = ["--iters", "2", "--size", "8", "--k0", "5", "--out", str(tmp_path / "x.png")]
     done = python(MAIN, "demo", "--backend", "torch", *budget, GSPLAT_EDU_ISA="v9")
     assert done.returncode == 0, done.stderr
+
+
+def test_an_interrupt_while_the_renderer_asks_for_memory_ends_it():
+    """7,000 splats that fill 64 x 64 tiles are pairs of 229 MB and a quarter more: Python is asked before 256 MiB.
+
+    Ctrl-C comes as a KeyboardInterrupt in whatever Python code runs. That there is too little memory to ask, or no
+    module left to import, only means that nobody knows.
+    """
+    count = 7_000
+    screens = Gaussians(
+        means=torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) * 0.1,
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        log_scales=torch.full((count, 3), 3.0),
+        sh0=torch.zeros(count, 1, 3),
+        sh_rest=torch.zeros(count, 0, 3),
+        logit_opacities=torch.zeros(count),
+    )
+    view, asked = orbit_camera(0.0, 0.0, 1024, 1000.0), []
+
+    def failing(error):
+        def ask():
+            asked.append(error)
+            raise error
+
+        return ask
+
+    try:
+        for error in (KeyboardInterrupt("stop"), ZeroDivisionError("a fault of ours")):
+            _native.ask_before_large_blocks(failing(error))
+            with pytest.raises(type(error), match=str(error)):
+                render(screens, view, backend="cpu")
+        for error in (MemoryError(), ImportError("the interpreter ends")):
+            _native.ask_before_large_blocks(failing(error))
+            assert torch.isfinite(render(screens, view, backend="cpu").image).all()
+    finally:
+        _native.ask_before_large_blocks(available_memory)
+    assert [type(error) for error in asked[:3]] == [KeyboardInterrupt, ZeroDivisionError, MemoryError]

@@ -42,6 +42,8 @@ def test_the_contracts_hold(copy):
         ("train/trainer.py", "import gsplat_edu.data.synthetic"),
         ("train/trainer.py", "import gsplat_edu.cli.main"),
         ("train/density/surgery.py", "import gsplat_edu.render.torch_reference"),
+        ("train/optimizer.py", "from gsplat_edu.render.triton.adam import adam_triton"),
+        ("train/optimizer.py", "import gsplat_edu.kernels"),
         ("render/torch_reference.py", "import gsplat_edu.render.numpy_reference"),
         ("sh.py", "import torch"),
         ("losses.py", "import gsplat_edu.data"),

@@ -6,7 +6,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 NATIVE = ROOT / "native"
-ISA_FREE = {"arguments.h", "bindings.cpp", "dispatch.cpp", "frame.cpp", "frame.h", "threads.cpp", "threads.h"}
+ISA_FREE = {
+    *("arguments.h", "bindings.cpp"),
+    *(
+        f"{name}.{end}"
+        for name in ("buffers", "dispatch", "frame", "loss", "sort", "threads")
+        for end in ("cpp", "h")
+    ),
+}
 """Compiled once, for the oldest machine; all others are compiled once per instruction set."""
 
 

@@ -316,6 +316,7 @@ def test_what_ships_comes_from_the_source_and_was_executed(source):
     assert not any("(reduced)" in output.get("text", "") for output in outputs), "ships on the full budget"
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.slow
 @CHAPTERS
 def test_chapters_execute_on_a_reduced_budget(source, tmp_path):

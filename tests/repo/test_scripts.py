@@ -1,7 +1,6 @@
 """Every script runs: at a tiny size, to the end, with results that can be read."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -10,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
+
+from processes import Program
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py")) + sorted((ROOT / "benchmarks").glob("*/__main__.py"))
@@ -22,6 +23,7 @@ TRAININGS = {
 }
 
 ELSEWHERE = {
+    "build_cli_reference.py": "tests/repo/test_cli_reference.py",
     "build_notebooks.py": "tests/repo/test_notebooks.py",
     "build_site.py": "tests/repo/test_site.py",
     "chapter_figures.py": "tests/repo/test_notebooks.py",
@@ -33,13 +35,23 @@ ELSEWHERE = {
 """Tools, and where each is run."""
 
 
+SCRIPT = """
+import os, runpy, sys
+os.environ.pop("GSPLAT_EDU_DATA", None)
+sys.argv.pop(0)
+if os.path.isfile(sys.argv[0]):
+    sys.path.insert(0, os.path.dirname(sys.argv[0]))
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
 def run(*words, cwd=ROOT):
-    environment = {key: value for key, value in os.environ.items() if key != "GSPLAT_EDU_DATA"}
-    return subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
 
 
-def script(*words):
-    return run(sys.executable, *map(str, words))
+def script(path, *words, folder):
+    """Run a Python script in a process of its own, on no captures but those it makes itself."""
+    return Program(SCRIPT, [path, *words], folder).ended(patience=600)
 
 
 @pytest.mark.own_process
@@ -48,14 +60,15 @@ def script(*words):
 )
 def test_a_benchmark_runs(path, tmp_path):
     out = tmp_path / "deep" / "figures.json"
-    done = script(path.parent if path.name == "__main__.py" else path, "--smoke", "--out", out)
+    path = path.parent if path.name == "__main__.py" else path
+    code, said, complained = script(path, "--smoke", "--out", out, folder=tmp_path)
     if path.name == "gpu.py" and not torch.cuda.is_available():
-        assert (done.returncode, done.stderr.count("\n")) == (2, 1) and "no GPU" in done.stderr
+        assert (code, complained.count("\n")) == (2, 1) and "no GPU" in complained
         return
-    if path.parent.name == "ladder" and "compiler" in done.stderr:
-        pytest.skip(done.stderr.strip())
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip()
+    if path.name == "ladder" and "compiler" in complained:
+        pytest.skip(complained.strip())
+    assert code == 0, complained
+    assert said.strip()
     assert json.loads(out.read_text())["hardware"]["cores"] > 0
 
 
@@ -63,8 +76,8 @@ def test_a_benchmark_runs(path, tmp_path):
 @pytest.mark.parametrize("path", sorted((ROOT / "train").glob("*.py")), ids=lambda p: p.name)
 def test_a_training_runs(path, tmp_path):
     out = tmp_path / "x.png"
-    done = script(path, *TRAININGS[path.name], "--out", out)
-    assert done.returncode == 0, done.stderr
+    code, _, complained = script(path, *TRAININGS[path.name], "--out", out, folder=tmp_path)
+    assert code == 0, complained
     assert out.stat().st_size > 0
 
 
@@ -90,10 +103,10 @@ def targets():
 
 
 def test_every_target_is_explained_and_run():
-    """By .ci/run, by this file, or with the same tool by another test."""
+    """By .ci/run, by this file, or with the same tool by another test; what takes hours, by hand."""
     told = run("make", "help").stdout
     ci = (ROOT / ".ci" / "run").read_text()
-    elsewhere = {"help", "clean", "notebooks", "site"}
+    elsewhere = {"help", "clean", "notebooks", "site", "bench", "soak"}
     for name in targets():
         assert name == "help" or re.search(rf"^make {name} ", told, re.M), name
         assert name in elsewhere or re.search(rf"^make {name}\b", ci, re.M), name
@@ -104,6 +117,23 @@ def test_make_bench_smoke_passes_the_option_to_every_script():
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if "benchmarks/" in line]
     assert len(lines) >= 5 and all("--smoke" in line for line in lines)
+
+
+def test_make_soak_runs_every_case_and_the_whole_budget():
+    done = run("make", "-n", "soak")
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if not line.startswith("echo")]
+    assert any("GSPLAT_EDU_SOAK=1" in line and "-m sliced" in line for line in lines)
+    assert any("GSPLAT_EDU_SOAK=1 tools/sanitize.sh" in line for line in lines)
+    (chapters,) = (line for line in lines if "build_notebooks.py" in line)
+    assert "reduced" not in chapters
+    assert re.search(r"^\*\*\d{4}-\d{2}-\d{2}\*\*", soak_results(), re.M), "the last soak is dated"
+
+
+def soak_results():
+    """Return the section of RESULTS.md that `make soak` is written into."""
+    results = (ROOT / "benchmarks" / "RESULTS.md").read_text()
+    return re.split(r"^## ", re.split(r"^## .*make soak.*$", results, flags=re.M)[1], flags=re.M)[0]
 
 
 def test_make_clean_leaves_the_source(tmp_path):

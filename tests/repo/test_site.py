@@ -1,6 +1,7 @@
 """The site: built without a warning, opened from disk, and every link on it leads somewhere."""
 
 import re
+import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -50,6 +51,18 @@ def site(tmp_path_factory):
     return {path: Page(path.read_text()) for path in sorted(out.rglob("*.html"))}, out
 
 
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed")
+    with playwright.sync_playwright() as driver:
+        launched = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield launched
+        launched.close()
+
+
 def broken(pages, out):
     """Find links within the site that lead nowhere, or to a place that the page does not have."""
     found = []
@@ -81,10 +94,64 @@ def test_every_chapter_document_and_module_has_a_page(site):
     assert {f"notebooks/{path.stem}" for path in (ROOT / "notebooks").glob("*.ipynb")} <= names
     assert {"README", "ARCHITECTURE", "docs/DECISIONS", "reference/gsplat_edu.camera"} <= names
     modules = list((ROOT / "src" / "gsplat_edu").rglob("*.py"))
-    assert len([name for name in names if name.startswith("reference/")]) == len(modules)
+    assert len([name for name in names if name.startswith("reference/gsplat_edu")]) == len(modules)
     course = [page for path, page in pages.items() if path.parent.name == "notebooks"]
     assert all("img" in page.tags for page in course), "figures"
     assert sum("math" in page.tags for page in course) > 5, "equations"
+
+
+@pytest.mark.slow
+def test_the_landing_page_shows_pictures_and_three_ways_in(site):
+    pages, out = site
+    text = (out / "index.html").read_text()
+    assert re.findall(r"<h2>(.*?)</h2>", text)[:3] == ["Learn", "Use", "Build on"]
+    assert len([picture for picture in pages[out / "index.html"].loaded if "_static" in picture]) > 3
+    captions = re.findall(r'class="caption-text">(.*?)<', text.split("sidebar-tree")[1])
+    assert captions[:3] == ["Learn", "Use", "Build on"]
+    # Modules and records fold away behind their indices.
+    shown = re.findall(r'class="toctree-l1[^"]*"><a class="reference internal" href="(.*?)"', text)
+    assert not [link for link in shown if "gsplat_edu." in link or re.search(r"decisions/\d", link)]
+    assert "docs/decisions/index.html" in shown and "reference/index.html" in shown
+
+
+@pytest.mark.slow
+def test_the_reference_begins_with_the_public_api_and_links_every_name(site):
+    _, out = site
+    text = (out / "reference" / "index.html").read_text()
+    public, _, rest = text.partition(">Packages<")
+    rows = re.findall(
+        r"<tr class=\"row-(?:odd|even)\"><td>(.*?)</td>\s*<td>(.*?)</td>", public, flags=re.DOTALL
+    )
+    assert len(rows) > 30
+    assert [row for row in rows if "href=" not in row[0] or len(row[1]) < 10] == []
+    assert "gsplat_edu.render.html" in rest and "gsplat_edu.render.cpu.html" not in rest
+
+
+@pytest.mark.slow
+def test_set_up_cells_are_folded_and_others_are_not(site):
+    _, out = site
+    for path in (out / "notebooks").glob("*.html"):
+        text = path.read_text()
+        folded = re.findall(r'<details class="hide above-input">', text)
+        assert 1 <= len(folded) < text.count("cell_input"), path.name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1440, 390])
+def test_no_line_of_code_is_cut_off(site, width, browser):
+    """Code in the pages wraps or fits; only printed output may scroll."""
+    _, out = site
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    for name in ("notebooks/10_the_naive_kernel.html", "README.html", "docs/PYTHON.html", "docs/CLI.html"):
+        page.goto((out / name).as_uri())
+        cut = page.evaluate(
+            """() => [...document.querySelectorAll("article pre")]
+                .filter(pre => !pre.closest(".cell_output") && pre.offsetParent)
+                .filter(pre => pre.scrollWidth > pre.clientWidth + 1).map(pre => pre.innerText.slice(0, 80))"""
+        )
+        assert cut == [], name
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+    page.close()
 
 
 @pytest.mark.slow

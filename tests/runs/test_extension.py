@@ -124,7 +124,7 @@ def test_an_unfinished_run_is_extended_and_no_run_is_shortened(capture, whole, t
 
 
 def _taken_up(capture, out, *words):
-    from gsplat_edu.doctor.plan import taken_up
+    from gsplat_edu.budget.plan import taken_up
 
     given = [
         name for name in ("iterations", "densify_start") if f"--{name.replace('_', '-')}" in (*BASE, *words)

@@ -102,7 +102,7 @@ def test_the_message_names_the_field(run):
     ):
         folder.read_metrics()
     folder.metrics.write_text('{"iterations": ' + 100_000 * "[" + "}")
-    with pytest.raises(CheckpointError, match=r"is not JSON \(nested too deep\)"):
+    with pytest.raises(CheckpointError, match=r"is not JSON \(nested too deeply\)"):
         folder.read_metrics()
     folder.metrics.write_bytes(before)
     log = folder.log_file.read_bytes() if folder.log_file.exists() else b""

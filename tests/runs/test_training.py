@@ -4,11 +4,7 @@ import dataclasses
 import errno
 import json
 import math
-import os
-import resource
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 
@@ -26,6 +22,7 @@ from gsplat_edu.io.ply import load_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.training import CaptureRun
+from processes import Program
 
 SHORT = ["--iterations", "40", "--eval-every", "20", "--save-every", "10", "--densify-start", "5"]
 SHORT += ["--densify-every", "10", "--densify-stop", "35", "--grad-threshold", "5e-5"]
@@ -38,7 +35,7 @@ STRATEGIES = {
     "adc": [*ADC, "--reset-every", "100", "--max-gaussians", "1500", "--random-background"],
     "mcmc": ["--strategy", "mcmc", "--max-gaussians", "1200", "--mcmc-stop", "500"],
 }
-COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"]
+TRAIN = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
 
 @pytest.fixture(scope="module")
@@ -104,24 +101,35 @@ def test_the_saved_scene_gives_the_same_images_to_the_bit(capture, tmp_path):
 
 
 def start(capture, out, *options, threads=2):
-    environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
-    words = [*COMMAND, "train", str(capture), "--out", str(out), *options]
-    return subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return Program(TRAIN, ["train", capture, "--out", out, *options], capture.parent, threads)
 
 
 def completed(capture, out, *options, threads=2):
-    process = start(capture, out, *options, threads=threads)
-    said, complained = process.communicate(timeout=120)
-    assert process.returncode == 0, complained
+    code, said, complained = start(capture, out, *options, threads=threads).ended()
+    assert code == 0, complained
     return said
 
 
-def wait_for(condition, process, patience=60.0):
+@pytest.fixture(scope="module")
+def whole(capture, tmp_path_factory):
+    """Runs that nobody interrupts, one for each strategy, on two threads."""
+    made = {}
+
+    def run(strategy):
+        if strategy not in made:
+            made[strategy] = tmp_path_factory.mktemp("whole") / strategy
+            completed(capture, made[strategy], *LONG, *STRATEGIES[strategy], threads=2)
+        return made[strategy]
+
+    return run
+
+
+def wait_for(condition, program, patience=60.0):
     end = time.monotonic() + patience
     while not condition():
-        assert process.poll() is None, "the run ended before it could be killed"
+        assert program.runs, "the run ended before it could be killed"
         assert time.monotonic() < end
-        time.sleep(0.0005)
+        time.sleep(0.001)
 
 
 def checkpoints(out):
@@ -138,29 +146,24 @@ def newest(out):
 @pytest.mark.slow
 @pytest.mark.own_process
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_killed_at_any_moment_and_resumed_gives_the_same_bytes(capture, tmp_path, strategy):
-    """kill -9 before the first checkpoint and at two moments on the way, on one thread and two."""
-    options = [*LONG, *STRATEGIES[strategy]]
-    whole = tmp_path / "whole"
-    completed(capture, whole, *options, threads=2)
-    assert RunFolder(whole).read_metrics()["num_gaussians"] > 320
-    for threads in (1, 2):
-        out = tmp_path / f"killed{threads}"
-        moments = [
-            lambda out=out: (out / "log.jsonl").exists(),
-            lambda out=out: newest(out) >= 80,
-            lambda out=out: newest(out) >= 400,
-        ]
-        for k, moment in enumerate(moments):
-            process = start(capture, out, *options, *(["--resume"] if k else []), threads=threads)
-            wait_for(moment, process)
-            process.kill()
-            process.communicate()
-            assert process.returncode == -signal.SIGKILL
-        completed(capture, out, *options, "--resume", threads=threads)
-        assert ply(out, 600) == ply(whole, 600), f"{threads} threads"
-        iterations = [line["iteration"] for line in RunFolder(out).log() if "loss" in line]
-        assert iterations == list(range(10, 601, 10)), "the log has every step once"
+def test_killed_at_any_moment_and_resumed_gives_the_same_bytes(capture, whole, tmp_path, strategy):
+    """kill -9 before the first checkpoint and at two moments on the way; on one thread and two by turns."""
+    options, uninterrupted, out = [*LONG, *STRATEGIES[strategy]], whole(strategy), tmp_path / "killed"
+    assert RunFolder(uninterrupted).read_metrics()["num_gaussians"] > 320
+    moments = (
+        (out / "log.jsonl").exists,
+        lambda: newest(out) >= 80,
+        lambda: newest(out) >= 400,
+    )
+    for k, moment in enumerate(moments):
+        program = start(capture, out, *options, *(["--resume"] if k else []), threads=1 + k % 2)
+        wait_for(moment, program)
+        program.send(signal.SIGKILL)
+        assert program.ended()[0] == -signal.SIGKILL
+    completed(capture, out, *options, "--resume", threads=2)
+    assert ply(out, 600) == ply(uninterrupted, 600)
+    iterations = [line["iteration"] for line in RunFolder(out).log() if "loss" in line]
+    assert iterations == list(range(10, 601, 10)), "the log has every step once"
 
 
 DIES = """
@@ -179,6 +182,14 @@ def dying(path, target):
 
 Path.replace = dying
 sys.exit(main(sys.argv[3:]))
+"""
+
+FILES_END = """
+import resource, signal, sys
+from gsplat_edu.cli.main import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
+sys.exit(main(sys.argv[2:]))
 """
 
 DEATHS = (
@@ -206,9 +217,8 @@ def test_killed_around_the_renaming_of_every_file(capture, finished, tmp_path):
     words = ["train", str(capture), "--out", str(out), *SHORT]
     for name, moment in DEATHS:
         resume = ["--resume"] if (out / "config.json").exists() else []
-        command = [sys.executable, "-c", DIES, name, moment, *words, *resume]
-        done = subprocess.run(command, check=False, capture_output=True, timeout=120)
-        assert done.returncode == -signal.SIGKILL, (name, moment, done.stderr)
+        code, _, complained = Program(DIES, [name, moment, *words, *resume], tmp_path).ended()
+        assert code == -signal.SIGKILL, (name, moment, complained)
     assert train(capture, out, *SHORT, "--resume") == 0
     assert ply(out, 40) == ply(finished, 40)
     names = {path.relative_to(out) for path in out.rglob("*")}
@@ -295,17 +305,17 @@ def test_gaussians_that_are_not_finite_are_left_out(capture, tmp_path):
 
 @pytest.mark.own_process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interruption_saves_and_exits_with_130(capture, tmp_path, number):
-    process = start(capture, tmp_path / "run", *LONG, "--save-every", "0")
-    wait_for((tmp_path / "run" / "log.jsonl").exists, process)
-    process.send_signal(number)
-    _, complained = process.communicate(timeout=60)
-    assert process.returncode == 130
+def test_an_interruption_saves_and_exits_with_130(capture, whole, tmp_path, number):
+    out, options = tmp_path / "run", [*LONG, *STRATEGIES["adc"], "--save-every", "0"]
+    program = start(capture, out, *options)
+    wait_for((out / "log.jsonl").exists, program)
+    program.send(number)
+    code, _, complained = program.ended()
+    assert code == 130
     assert "--resume" in complained and complained.count("\n") == 1
-    assert len(checkpoints(tmp_path / "run")) == 1
-    completed(capture, tmp_path / "run", *LONG, "--save-every", "0", "--resume")
-    completed(capture, tmp_path / "whole", *LONG)
-    assert ply(tmp_path / "run", 600) == ply(tmp_path / "whole", 600)
+    assert len(checkpoints(out)) == 1
+    completed(capture, out, *options, "--resume")
+    assert ply(out, 600) == ply(whole("adc"), 600)
 
 
 def test_a_finished_run_has_nothing_to_do(capture, finished, capsys):
@@ -373,18 +383,13 @@ def test_a_time_limit_leaves_a_scene_and_metrics_and_can_be_lifted(capture, fini
 def test_a_full_disk_leaves_the_last_checkpoint(capture, tmp_path):
     """A limit on the size of files stands for the disk: the log still fits, the checkpoint that grew does not."""
     out = tmp_path / "run"
-    completed(capture, out, *LONG, "--time-limit", "0.001s")
+    assert train(capture, out, *LONG, "--time-limit", "0.001s") == 0
     good = checkpoints(out)[-1]
     before = good.read_bytes()
-    words = [*COMMAND, "train", str(capture), "--out", str(out), *LONG, "--resume"]
-
-    def limit():
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) - 1000,) * 2)
-
-    done = subprocess.run(words, check=False, preexec_fn=limit, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2, done.stderr
-    assert "cannot be written" in done.stderr and done.stderr.count("\n") == 1
+    words = [len(before) - 1000, "train", capture, "--out", out, *LONG, "--resume"]
+    code, _, complained = Program(FILES_END, words, tmp_path).ended()
+    assert code == 2, complained
+    assert "cannot be written" in complained and complained.count("\n") == 1
     assert good.read_bytes() == before and checkpoints(out) == [good]
 
 
@@ -411,7 +416,7 @@ def test_a_file_in_the_place_of_the_folder(capture, tmp_path, capsys):
 @pytest.mark.parametrize(("strategy", "cap"), [("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 320)])
 def test_the_cap_holds_from_the_first_iteration_to_the_last(capture, tmp_path, strategy, cap):
     """The start cloud has more points than the lower cap."""
-    options = [*LONG[2:], "--iterations", "300", "--strategy", strategy, "--max-gaussians", str(cap)]
+    options = [*LONG[2:], "--iterations", "150", "--strategy", strategy, "--max-gaussians", str(cap)]
     options += ADC if strategy == "adc" else []
     assert train(capture, tmp_path / "run", *options, "--eval-every", "0", "--save-every", "0") == 0
     counts = [line["num_gaussians"] for line in RunFolder(tmp_path / "run").log() if "num_gaussians" in line]

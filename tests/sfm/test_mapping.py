@@ -7,7 +7,7 @@ from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm import mapping
 from gsplat_edu.sfm.mapping import MANY_PHOTOS, Attempt, attempts, best_model, shared_cameras
 from gsplat_edu.sfm.photos import PhotoFacts
-from gsplat_edu.sfm.result import QUARTER, output_names, turned
+from gsplat_edu.sfm.result import QUARTER, output_names
 
 
 def test_another_mapper_lens_thresholds_and_a_camera_per_photo_are_tried_in_turn():
@@ -58,9 +58,9 @@ def test_a_turned_photo_has_a_turned_camera(turns):
     lens = Lens(40, 30, 50.0, 55.0, 18.0, 16.5)
     point = np.array([0.11, -0.07, 0.9])
     u, v, _ = Camera(np.eye(3), np.zeros(3), 50.0, 55.0, 18.0, 16.5, 30, 40).project(point)
-    after = turned(lens, turns)
+    after = lens.turned(turns)
     R = np.linalg.matrix_power(QUARTER, turns)
-    camera = Camera(R, np.zeros(3), after.fx, after.fy, after.cx, after.cy, after.H, after.W)
+    camera = Camera.posed(R, np.zeros(3), after)
     photo = np.zeros((30, 40))
     rows, columns = np.mgrid[:30, :40]
     photo = np.rot90(np.hypot(columns - u, rows - v), -turns)  # smallest where the point is

@@ -3,9 +3,9 @@ import numpy as np
 from gsplat_edu.sfm.pairs import (
     all_pairs,
     largest_part,
-    looks,
     nearest_pairs,
     on_the_ground,
+    photo_descriptors,
     sequential_pairs,
 )
 
@@ -48,9 +48,9 @@ def test_places_on_the_ground_are_metres_apart():
 
 def test_photos_that_look_alike_were_taken_side_by_side(done):
     names = [f"{i:06d}.jpg" for i in range(14)]
-    described = looks(done.out / "sfm" / "database.db", names, 0)
+    described = photo_descriptors(done.out / "sfm" / "database.db", names, 0)
     np.testing.assert_allclose(np.linalg.norm(described, axis=1), 1.0, rtol=1e-5)
-    np.testing.assert_array_equal(described, looks(done.out / "sfm" / "database.db", names, 0))
+    np.testing.assert_array_equal(described, photo_descriptors(done.out / "sfm" / "database.db", names, 0))
     nearest = nearest_pairs(described, 2)
     # Photos are sorted by folder, so their places on the circle are not those in the list.
     place = {name: i for i, name in enumerate(sorted(done.truth))}
@@ -63,7 +63,7 @@ def test_photos_that_look_alike_were_taken_side_by_side(done):
 
 def test_a_photo_without_features_looks_like_nothing(done):
     names = ["000000.jpg", "not there.jpg"]
-    described = looks(done.out / "sfm" / "database.db", names, 0)
+    described = photo_descriptors(done.out / "sfm" / "database.db", names, 0)
     assert described[0].any() and not described[1].any()
 
 

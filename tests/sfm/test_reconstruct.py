@@ -1,9 +1,11 @@
+import itertools
 import json
 import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import asdict, replace
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -42,14 +44,30 @@ def test_every_photo_gets_its_pose(done):
 
 
 def test_photos_are_upright_and_undistorted(done):
+    """A photo shows what it showed, where it showed it: in no quarter moved by a pixel.
+
+    The cameras have no distortion, so all that undistortion may move is the bend of the lens that was found, and
+    photos explain that lens to less than a pixel. What moves by d px keeps a correlation of exp(-d²/4s²) with itself
+    even in a texture without any structure, once it is blurred by s px: 0.94 at d = 1 and s = 2.
+    """
     for view in load_dataset(done.out, DataSettings(test_every=0)).train:
-        taken = photograph_box(done.truth[view.name]).astype(float)
-        written = view.read().image.astype(float)
+        taken, written = (
+            cv2.GaussianBlur(image.astype(np.float32).mean(axis=2), (0, 0), 2)
+            for image in (photograph_box(done.truth[view.name]), view.read().image)
+        )
+        H, W = taken.shape
         assert written.shape == taken.shape
-        # The lens that was found bends the photo by less than two pixels: apart from that it is the one taken.
-        inner = (slice(20, -20), slice(20, -20))
-        small = [image[inner][::8, ::8].mean(axis=2).ravel() for image in (taken, written)]
-        assert np.corrcoef(*small)[0, 1] > 0.5, view.name
+        for quarter in itertools.product(
+            (slice(20, H // 2), slice(H // 2, -20)), (slice(20, W // 2), slice(W // 2, -20))
+        ):
+            shift, _ = cv2.phaseCorrelate(
+                np.ascontiguousarray(taken[quarter]), np.ascontiguousarray(written[quarter])
+            )
+            assert np.hypot(*shift) < 1, (view.name, quarter)
+            assert np.corrcoef(taken[quarter].ravel(), written[quarter].ravel())[0, 1] > 0.94, (
+                view.name,
+                quarter,
+            )
 
 
 def test_points_lie_on_the_box_and_the_floor(done):
@@ -127,7 +145,7 @@ def test_an_interrupted_run_goes_on(done, phone, tmp_path):
     # Other options begin again from the stage that they concern, and the old result goes when the new one is there.
     said = []
     reconstruct(replace(options, camera_model="SIMPLE_RADIAL"), said.append)
-    assert said[3] == "mapping: camera_model differ from those before; again from here"
+    assert said[3] == "mapping: camera_model changed; repeating this stage and the later ones"
     assert [sentence.endswith("(done before)") for sentence in said] == [True] * 3 + [False] * 3
     assert set(cameras_of(options.out)) == set(whole)
 
@@ -186,7 +204,7 @@ def test_photos_put_there_before_a_run_was_finished_stay(phone, tmp_path):
     with pytest.raises(StoppedError):
         reconstruct(options, progress=stop)  # goes on: its own work is no reason not to
     (options.out / "images").mkdir()
-    with pytest.raises(ArgumentError, match="holds photos or poses already"):
+    with pytest.raises(ArgumentError, match="already holds photos or poses"):
         reconstruct(options)
 
 
@@ -244,7 +262,7 @@ def test_what_cannot_be_used_is_named_and_left_out(phone, tmp_path):
 
 def test_a_job_that_fails_names_its_log(tmp_path):
     with pytest.raises(
-        DatasetError, match=r"failed with code 1: the last lines of .*log\.txt say why"
+        DatasetError, match=r"failed with code 1: see the last lines of .*log\.txt"
     ) as failure:
         call(
             "finish",

@@ -34,15 +34,15 @@ def test_a_run_is_no_folder_of_photos(run, tmp_path, capsys, command):
     out = ["--out"] if command == "train" else []
     assert main([command, str(run), *out, str(tmp_path / "out")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "is a run, and its pictures are renders, not photos" in line
-    assert line.endswith("name the capture it was trained on, captures/desk")
+    assert "is a run, whose pictures are renders, not photos" in line
+    assert line.endswith("give the capture it was trained on, captures/desk")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("contents", ["{", "[" * 100_000, '{"data": {"path": 7}}'])
 def test_a_run_whose_configuration_is_damaged_is_still_one(run, contents):
     (run / "config.json").write_text(contents)
-    with pytest.raises(DatasetError, match="name the capture it was trained on$"):
+    with pytest.raises(DatasetError, match="give the capture it was trained on$"):
         needs_poses(run)
 
 

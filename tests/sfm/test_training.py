@@ -33,7 +33,7 @@ def test_a_dozen_photos_train_as_well_as_with_their_true_poses(tmp_path, capsys)
     for name, camera in truth.items():
         Image.fromarray(photograph_box(camera)).save(photos / name)
     reached, fitted = trained(photos, tmp_path / "found")
-    assert "comes without poses; finding them first" in capsys.readouterr().out
+    assert "has no poses; finding them first" in capsys.readouterr().out
     dataset = load_dataset(tmp_path / "found" / "capture", DataSettings(test_every=0))
     cameras = {view.name: view.camera for view in dataset.train}
     assert cameras.keys() == truth.keys()

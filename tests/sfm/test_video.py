@@ -161,7 +161,7 @@ def test_names_of_videos(tmp_path):
 def test_what_is_no_video_is_one_line(tmp_path, contents):
     path = tmp_path / "broken.mp4"
     path.write_bytes(contents)
-    with pytest.raises(DatasetError, match=r"broken.mp4: is no video that OpenCV can decode") as failure:
+    with pytest.raises(DatasetError, match=r"broken.mp4: is not a video that OpenCV can decode") as failure:
         choose_frames(path, 10, silent)
     assert "\n" not in str(failure.value)
 
@@ -181,4 +181,6 @@ sys.exit(main(["sfm", "broken.mp4", "out"]))
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert ran.returncode == 2
-    assert re.fullmatch(r"gsplat-edu sfm: broken\.mp4: is no video that OpenCV can decode; .*\n", ran.stderr)
+    assert re.fullmatch(
+        r"gsplat-edu sfm: broken\.mp4: is not a video that OpenCV can decode; .*\n", ran.stderr
+    )

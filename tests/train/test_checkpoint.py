@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -61,6 +62,22 @@ def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, name, at):
     for key, tensor in tensors.items():
         assert torch.equal(tensor, resumed[key]), key
     assert len(whole.gaussians) != len(capture[1]), "density control took part"
+
+
+@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+def test_a_checkpoint_of_the_version_before_parameter_groups_is_resumed(strategy):
+    """The files were written after 5 steps by the code before Adam had named groups, from the same trainers."""
+    path = Path(__file__).parent / "old_checkpoints" / f"{strategy}.safetensors"
+    stored, metadata = read(path)
+    run = Maker(strategy)()
+    load_checkpoint(path, run)
+    tensors, numbers = run.state()
+    assert run.iteration == 5 and numbers == json.loads(metadata["state"])
+    assert tensors.keys() == stored.keys()
+    for name, tensor in stored.items():
+        assert torch.equal(tensors[name], tensor), name
+    steps(run, 3)
+    assert not torch.equal(run.state()[0]["first.means"], stored["first.means"])
 
 
 def test_the_last_two_are_kept_and_the_time_comes_back(capture, tmp_path):

@@ -37,7 +37,7 @@ def four(dtype=torch.float64) -> Gaussians:
 def controlled(hot, config=CONFIG):
     """Set up density control that has seen the gradients `hot` asks for in two renders."""
     gaussians = four()
-    optimizer = Adam(gaussians, {"means": 1e-3})
+    optimizer = Adam(gaussians.tensors(), {"means": 1e-3})
     optimizer.first["means"] = torch.arange(12.0, dtype=torch.float64).reshape(4, 3) + 1
     control = AdaptiveDensityControl(config, EXTENT, torch.Generator().manual_seed(0), gaussians)
     control.norm_sums = torch.tensor(hot, dtype=torch.float64) * 2 * 1.01 * config.grad_threshold
@@ -92,7 +92,7 @@ def test_the_cap_cuts_from_the_end(cap):
 
 def test_all_may_be_pruned():
     gaussians = four().map(lambda t: t.detach()[3:]).trainable()
-    optimizer = Adam(gaussians, {"means": 1e-3})
+    optimizer = Adam(gaussians.tensors(), {"means": 1e-3})
     control = AdaptiveDensityControl(CONFIG, EXTENT, torch.Generator(), gaussians)
     changed, (event,) = control.update(100, gaussians, optimizer)
     assert len(changed) == 0 and event.num_pruned == 1
@@ -127,7 +127,7 @@ def test_children_are_drawn_from_the_parents_distribution():
 
 def test_replace_without_change_is_the_identity():
     gaussians = four()
-    optimizer = Adam(gaussians, {"means": 1e-3})
+    optimizer = Adam(gaussians.tensors(), {"means": 1e-3})
     same = replace(gaussians, optimizer, torch.ones(4, dtype=torch.bool), [], cap=10)
     for name, tensor in same.tensors().items():
         torch.testing.assert_close(tensor, gaussians.tensors()[name], rtol=0, atol=0)

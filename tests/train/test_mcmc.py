@@ -22,7 +22,7 @@ def scene(count=60, dtype=torch.float64):
 
 
 def made(gaussians, config=CONFIG, seed=0):
-    return MCMC(config, torch.Generator().manual_seed(seed)), Adam(gaussians, config.learning_rates)
+    return MCMC(config, torch.Generator().manual_seed(seed)), Adam(gaussians.tensors(), config.learning_rates)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7, MOST_SHARERS])

@@ -16,6 +16,7 @@ IMAGE = 320 * 240 * 3 * 4
 """Bytes of a float image of the smaller kind; the photos of mixed sizes have as many pixels or more, on average."""
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.own_process
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc")
 @pytest.mark.parametrize("case", soak.CASES)

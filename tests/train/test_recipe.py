@@ -102,7 +102,10 @@ def scene(count=50, scale=0.05):
 def due(config, iterations):
     """Which events come after which iterations, for a scene that nothing pulls at."""
     gaussians = scene()
-    control, optimizer = make_strategy(config, 1.0, gaussians), Adam(gaussians, config.learning_rates)
+    control, optimizer = (
+        make_strategy(config, 1.0, gaussians),
+        Adam(gaussians.tensors(), config.learning_rates),
+    )
     found = []
     for iteration in iterations:
         gaussians, events = control.update(iteration, gaussians, optimizer)
@@ -129,7 +132,7 @@ def test_white_resets_early_too():
 
 def test_a_reset_lowers_opacities_and_forgets_their_moments_only():
     config, gaussians = TrainConfig(prune_scale=0.0), scene()
-    optimizer = Adam(gaussians, config.learning_rates)
+    optimizer = Adam(gaussians.tensors(), config.learning_rates)
     for moments in (optimizer.first, optimizer.second):
         for tensor in moments.values():
             tensor.fill_(1.0)
@@ -152,7 +155,9 @@ def test_large_gaussians_are_pruned_once_opacities_have_been_reset():
         with torch.no_grad():
             gaussians.log_scales[7] = math.log(0.11 * 2.0)
         control = AdaptiveDensityControl(config, 2.0, torch.Generator(), gaussians)
-        changed, events = control.update(iteration, gaussians, Adam(gaussians, config.learning_rates))
+        changed, events = control.update(
+            iteration, gaussians, Adam(gaussians.tensors(), config.learning_rates)
+        )
         assert len(changed) == left and events[0].num_pruned == 50 - left
 
 
@@ -161,7 +166,7 @@ def test_screen_size_prunes_only_on_request():
         config, gaussians = TrainConfig(prune_scale=0.0, prune_screen_size=limit), scene()
         control = AdaptiveDensityControl(config, 1.0, torch.Generator(), gaussians)
         control.largest_radii[3] = 21.0
-        changed, _ = control.update(3_100, gaussians, Adam(gaussians, config.learning_rates))
+        changed, _ = control.update(3_100, gaussians, Adam(gaussians.tensors(), config.learning_rates))
         assert len(changed) == left
 
 
@@ -174,7 +179,7 @@ def test_the_strongest_come_first_where_room_is_scarce(cap):
     control = AdaptiveDensityControl(config, 1.0, torch.Generator().manual_seed(0), gaussians)
     control.times_visible[:] = 1
     control.norm_sums[:20] = 1.0 + torch.arange(20.0)
-    changed, (event,) = control.update(600, gaussians, Adam(gaussians, config.learning_rates))
+    changed, (event,) = control.update(600, gaussians, Adam(gaussians.tensors(), config.learning_rates))
     assert len(changed) == cap
     # Numbers 19, 18 ... are pulled hardest, and those are the large ones.
     assert event.num_split_children == 2 * min(cap - 50, 10) and event.num_cloned == 0

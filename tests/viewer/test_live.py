@@ -22,7 +22,7 @@ from gsplat_edu import quat_to_R
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.errors import ArgumentError, NotEnoughMemoryError
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.train.checkpoint import list_checkpoints
@@ -123,6 +123,25 @@ def test_while_the_camera_moves_pictures_are_smaller(capture, tmp_path):
         assert len(client.listened().pictures) == 2, "paused and at rest, there is nothing to draw"
 
 
+def test_the_panel_says_why_a_picture_is_missing(capture, tmp_path, monkeypatch):
+    with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
+        client.move()
+        client.press("Pause")
+        client.paused_at()
+        right = made.view._render
+
+        def fail(gaussians, camera):
+            raise NotEnoughMemoryError("an image of 120x80 px: needs 9.0 GiB of memory, but 1.0 GiB are free")
+
+        monkeypatch.setattr(made.view, "_render", fail)
+        client.move(position=(0.0, 0.1, -4.0))
+        client.says("`not drawn: an image of 120x80 px: needs 9.0 GiB of memory, but 1.0 GiB are free`")
+        monkeypatch.setattr(made.view, "_render", right)
+        client.move(position=(0.0, 0.2, -4.0))
+        until(lambda: "not drawn" not in client.listened().text, "a panel without the failure")
+        assert "**paused**" in client.text
+
+
 def test_pause_step_and_resume(capture, tmp_path):
     with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
         client.move()
@@ -173,27 +192,29 @@ def test_the_end_of_the_program_ends_a_pause(capture, tmp_path):
         assert checkpoint.stem == f"iteration_{held}", "what was trained is saved"
 
 
-def test_a_pause_is_not_counted_as_training(capture, tmp_path):
+def test_a_pause_is_not_counted_as_training(capture, tmp_path, monkeypatch):
+    """The clock goes forward by an hour during the pause: the run takes less than that."""
+    clock, ahead = time.perf_counter, []
+    monkeypatch.setattr(time, "perf_counter", lambda: clock() + sum(ahead))
     with training(capture, tmp_path / "run", "--iterations", "200") as made, Client(made.view) as client:
-        began = time.perf_counter()
         client.move()
         client.press("Step")
         client.paused_at()
-        time.sleep(2.0)
+        ahead.append(3600.0)
         client.press("Resume")
         made.ended()
-        assert made.run.seconds < time.perf_counter() - began - 1.9
+    assert 0 < made.run.seconds < 3600
 
 
 def trained(out, capture, *words, watch=None):
     """Return all of a checkpoint but its clock, and the scene's bytes, of a training that `watch` was let at."""
-    with training(capture, out, "--iterations", "400", "--random-background", *words) as made:
+    with training(capture, out, "--iterations", "200", "--random-background", *words) as made:
         if watch is not None:
             watch(made)
         made.ended()
         tensors, numbers = made.run.trainer.state()
-        made.run.finish(lambda split, score: made.view.look("judging"))
-    scene = out / "point_cloud" / "iteration_400" / "point_cloud.ply"
+        made.run.finish(lambda split, score: made.view.update("evaluating"))
+    scene = out / "point_cloud" / "iteration_200" / "point_cloud.ply"
     bits = {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
     return bits, repr(numbers), scene.read_bytes()
 
@@ -222,7 +243,7 @@ def test_a_training_has_the_same_bits_whoever_watches_it(capture, tmp_path, stra
     words = STRATEGIES[strategy]
     alone = trained(tmp_path / "alone", capture, *words)
     assert trained(tmp_path / "watched", capture, *words, watch=watch) == alone
-    assert len(seen) > 20, "it was watched"
+    assert len(seen) > 10, "it was watched"
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -391,7 +412,7 @@ def test_the_camera_list_and_the_way_back(capture, tmp_path):
             ahead = np.subtract(client.moved["SetCameraLookAtMessage"]["look_at"], position)
             np.testing.assert_allclose(ahead / np.linalg.norm(ahead), camera.R[2], atol=1e-6)
         client.moved.clear()
-        client.press("Back to the start")
+        client.press("Reset view")
         until(lambda: "SetCameraPositionMessage" in client.listened().moved, "the start")
         start = dataset.train[0].camera
         np.testing.assert_allclose(client.moved["SetCameraPositionMessage"]["position"], start.eye, atol=1e-6)
@@ -429,11 +450,11 @@ def test_everything_is_closed_after_an_error(capture, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--view-port", "8080"], "--view-port: is looked at with --view only"),
-        (["--view-host", "0.0.0.0"], "--view-host: is looked at with --view only"),
+        (["--view-port", "8080"], "--view-port: has an effect only with --view"),
+        (["--view-host", "0.0.0.0"], "--view-host: has an effect only with --view"),
         (
             ["--view", "--view-port", "TAKEN"],
-            "--view-port: TAKEN is taken on 127.0.0.1; give another, or 0 for",
+            "--view-port: TAKEN is in use on 127.0.0.1; choose another port, or 0 for",
         ),
         (
             ["--view", "--view-port", "70000"],
@@ -441,11 +462,11 @@ def test_everything_is_closed_after_an_error(capture, tmp_path):
         ),
         (
             ["--view", "--view-port", "0", "--view-host", "no such host"],
-            "--view-host: 'no such host' is no address",
+            "--view-host: 'no such host' is not an address",
         ),
         (
             ["--view", "--view-port", "0", "--view-host", "203.0.113.1"],
-            "--view-host: cannot listen at 203.0.113.1",
+            "--view-host: cannot listen on 203.0.113.1",
         ),
     ],
 )
@@ -489,6 +510,7 @@ def test_the_finished_scene_is_shown_until_the_last_browser_goes(capture, tmp_pa
             assert staying.is_alive()
         staying.join(PATIENCE)
         assert not staying.is_alive() and not made.view.watched
-        began = time.monotonic()
-        made.view.stay()
-        assert time.monotonic() - began < 5, "nobody is there: it does not stay"
+        again = threading.Thread(target=made.view.stay)
+        again.start()
+        again.join(PATIENCE)
+        assert not again.is_alive(), "nobody is there: it does not stay"

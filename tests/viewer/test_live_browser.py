@@ -211,9 +211,9 @@ def test_after_the_training_the_view_stays_until_ctrl_c_and_all_is_well(capture,
             printed, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, complaints) == (0, "")
         assert printed.startswith(
-            "warning: listening at 0.0.0.0: whoever can reach this computer and has the URL sees the training"
+            "warning: listening on 0.0.0.0: anyone who can reach this computer and has the URL sees the training"
         )
-        assert printed.endswith("the live view stays until its last browser is closed, or Ctrl-C\n")
+        assert printed.endswith("the live view stays open until its last browser is closed, or Ctrl-C\n")
 
 
 @pytest.mark.own_process

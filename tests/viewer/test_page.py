@@ -226,23 +226,23 @@ def test_every_changed_byte_of_the_splats_is_told(tmp_path, whole):
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        (b'<script type="application/json" id="facts">', b"<p>", "is no page of this package"),
-        (b'"format":"gsplat-edu page"', b'"format":"another page"', "its facts are damaged"),
-        (b'"format":"gsplat-edu page"', b'"format"', "its facts are damaged"),
-        (b'{"format"', b"[" * 100_000, "its facts are damaged"),
-        (b'"version":1', b'"version":7', "is a page of version 7"),
-        (b'"count":9', b'"count":-9', "its fact 'count' is missing or wrong"),
-        (b'"count":9', b'"count":true', "its fact 'count' is missing or wrong"),
-        (b'"count":9', b'"number":9', "its fact 'count' is missing or wrong"),
-        (b'"count":9', b'"count":8', "splats are cut off or damaged"),
-        (b'"count":9', b'"count":10', "splats are cut off or damaged"),
-        (b'"count":9', b'"count":9000000000', "says it holds"),
-        (b'"count":9', b'"count":' + b"9" * 5000, "its facts are damaged"),
-        (b'"sh_degree":3', b'"sh_degree":4', "its fact 'sh_degree' is missing or wrong"),
-        (b'"antialiased":null', b'"antialiased":1', "its fact 'antialiased' is missing or wrong"),
-        (b'"up":null', b'"up":[0,0,0]', "its fact 'up' is missing or wrong"),
-        (b'"up":null', b'"up":[0,0,NaN]', "its fact 'up' is missing or wrong"),
-        (b'"up":null', b'"up":[0,0,1' + b"0" * 400 + b"]", "its fact 'up' is missing or wrong"),
+        (b'<script type="application/json" id="facts">', b"<p>", "is not a page of this package"),
+        (b'"format":"gsplat-edu page"', b'"format":"another page"', "the metadata is damaged"),
+        (b'"format":"gsplat-edu page"', b'"format"', "the metadata is damaged"),
+        (b'{"format"', b"[" * 100_000, "the metadata is damaged"),
+        (b'"version":1', b'"version":7', "has page version 7"),
+        (b'"count":9', b'"count":-9', "metadata 'count' is missing or invalid"),
+        (b'"count":9', b'"count":true', "metadata 'count' is missing or invalid"),
+        (b'"count":9', b'"number":9', "metadata 'count' is missing or invalid"),
+        (b'"count":9', b'"count":8', "splats are truncated or damaged"),
+        (b'"count":9', b'"count":10', "splats are truncated or damaged"),
+        (b'"count":9', b'"count":9000000000', "claims to hold"),
+        (b'"count":9', b'"count":' + b"9" * 5000, "the metadata is damaged"),
+        (b'"sh_degree":3', b'"sh_degree":4', "metadata 'sh_degree' is missing or invalid"),
+        (b'"antialiased":null', b'"antialiased":1', "metadata 'antialiased' is missing or invalid"),
+        (b'"up":null', b'"up":[0,0,0]', "metadata 'up' is missing or invalid"),
+        (b'"up":null', b'"up":[0,0,NaN]', "metadata 'up' is missing or invalid"),
+        (b'"up":null', b'"up":[0,0,1' + b"0" * 400 + b"]", "metadata 'up' is missing or invalid"),
     ],
 )
 def test_damage_is_named(tmp_path, whole, old, new, says):
@@ -256,7 +256,7 @@ def test_what_is_no_page(tmp_path):
     path = tmp_path / "a.html"
     for content in (b"", b"<!DOCTYPE html><p>hello</p>", bytes(range(256)) * 40):
         path.write_bytes(content)
-        assert "is no page of this package" in refused(path)
+        assert "is not a page of this package" in refused(path)
     path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
     assert "is a Git LFS pointer" in refused(path)
     with pytest.raises(FileNotFoundError):
@@ -270,7 +270,7 @@ def test_numbers_that_are_not_finite_are_counted(tmp_path, whole):
     data[12:16] = np.float32(np.nan).tobytes()
     path = tmp_path / "a.html"
     path.write_bytes(whole[:begin] + base64.b64encode(gzip.compress(data)) + whole[end:])
-    assert "1 splats have a NaN or infinite number" in refused(path)
+    assert "1 splats have NaN or infinite values" in refused(path)
 
 
 def test_a_bomb_is_not_inflated(tmp_path, whole):
@@ -278,7 +278,7 @@ def test_a_bomb_is_not_inflated(tmp_path, whole):
     end = whole.index(page.CLOSE, begin)
     path = tmp_path / "a.html"
     path.write_bytes(whole[:begin] + base64.b64encode(gzip.compress(bytes(50_000_000))) + whole[end:])
-    assert "splats are cut off or damaged" in refused(path)
+    assert "splats are truncated or damaged" in refused(path)
 
 
 @pytest.mark.parametrize("gaussians", [0, 1, 40])

@@ -297,5 +297,5 @@ def test_damaged_splats_are_told(visit, tmp_path, random_gaussians, damage):
 def test_a_lost_context_is_told(show, random_gaussians):
     visit = show(random_gaussians(3))
     visit.tab.evaluate("viewer.renderer.gl.getExtension('WEBGL_lose_context').loseContext()")
-    visit.message("The graphics processor dropped this page")
+    visit.message("The graphics processor stopped drawing this page")
     visit.complaints[:] = [one for one in visit.complaints if not re.search("WebGL: CONTEXT_LOST", one)]

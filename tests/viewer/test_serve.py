@@ -287,7 +287,7 @@ def test_by_default_only_this_computer_can_connect():
 def test_a_port_that_is_taken_is_named():
     with PageServer(PAGE) as first:
         port = first.server_port
-        says = f"^--port: {port} is taken on 127.0.0.1; give another, or 0 for any that is free$"
+        says = f"^--port: {port} is in use on 127.0.0.1; choose another port, or 0 for any free one$"
         with pytest.raises(ArgumentError, match=says):
             PageServer(PAGE, port=port)
         with pytest.raises(ArgumentError, match=says):
@@ -300,10 +300,10 @@ def test_a_port_that_is_taken_is_named():
     [
         ("127.0.0.1", 70_000, "--port: is 70000, but has to be a whole number from 0 to 65535"),
         ("127.0.0.1", -1, "--port: is -1"),
-        ("no such host", 0, "--host: 'no such host' is no address"),
+        ("no such host", 0, "--host: 'no such host' is not an address"),
         ("a" * 300, 0, "--host: '"),
-        ("", 0, "--host: '' is no address"),
-        ("203.0.113.1", 0, "--host: cannot listen at 203.0.113.1"),  # documentation's: nobody has it
+        ("", 0, "--host: '' is not an address"),
+        ("203.0.113.1", 0, "--host: cannot listen on 203.0.113.1"),  # documentation's: nobody has it
     ],
 )
 def test_an_address_that_cannot_be_had_costs_one_line(host, port, says):
@@ -324,7 +324,7 @@ def test_who_is_warned():
         assert is_loopback(host) and exposure(host, "sees it") is None
     for host in ("0.0.0.0", "::", "192.168.0.7", "example.org"):
         said = exposure(host, "sees it")
-        assert said.startswith(f"warning: listening at {host}: whoever can reach") and "\n" not in said
+        assert said.startswith(f"warning: listening on {host}: anyone who can reach") and "\n" not in said
 
 
 def test_urls():

@@ -1,4 +1,4 @@
-"""Command lines whose mistakes cost one line, not a page."""
+"""Command-line parsing; a mistake is reported in one line instead of a page."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
-from gsplat_edu.cli.printing import complain, spell_what_cannot_be_encoded
-from gsplat_edu.errors import SplatError
+from gsplat_edu.cli.printing import complain, escape_unencodable_characters
+from gsplat_edu.errors import BackendWarning, SplatError
 from gsplat_edu.files import described
 from gsplat_edu.headroom import shortage
 from gsplat_edu.render.settings import BACKENDS
@@ -26,25 +27,54 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 LESS_MEMORY = {
-    "train": "close other programs, or train with a smaller --resolution, --max-gaussians or --image-memory; what was "
-    "saved is unharmed",
-    "render": "close other programs, or give a smaller --size",
-    "sfm": "close other programs, or give a smaller --max-image-size or --max-features",
-    "train_2d.py": "close other programs, or give a smaller --size or --splats",
-    "train_3d.py": "close other programs, or give a smaller --size or --cap",
-    "demo": "close other programs, or give a smaller --size or --cap",
+    "train": "close other programs, or reduce --resolution, --max-gaussians or --image-memory; saved checkpoints are "
+    "intact",
+    "render": "close other programs, or reduce --size",
+    "sfm": "close other programs, or reduce --max-image-size or --max-features",
+    "train_2d.py": "close other programs, or reduce --size or --splats",
+    "train_3d.py": "close other programs, or reduce --size or --cap",
+    "demo": "close other programs, or reduce --size or --cap",
 }
-"""What to do where a command ran out of memory; the others have no option that takes less."""
+"""Advice for commands that run out of memory; the other commands have no option that needs less."""
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser that answers a mistake with one line: what is wrong and where help is.
+    """A parser that reports a mistake in one line: the error and where to find help.
 
-    Options are not abbreviated: what a script relies on keeps its meaning when options are added.
+    Options cannot be abbreviated, so that new options never change the meaning of a script's options.
     """
 
     def __init__(self, **options: Any) -> None:  # noqa: ANN401
         super().__init__(allow_abbrev=False, **options)
+        self._common: frozenset[str] | None = None
+
+    def show_in_help(self, names: Iterable[str]) -> None:
+        """Make --help show only these options, and add --help-all, which shows every option.
+
+        Args:
+            names: Destinations of the options, for example "max_gaussians".
+        """
+        self.add_argument("--help-all", action=_HelpAll, nargs=0, help="show every option and exit")
+        self._common = frozenset({"help", "help_all", *names})
+
+    def format_help(self) -> str:
+        """Return the text of --help; see `show_in_help`."""
+        common = self._common
+        if common is None:
+            return super().format_help()
+        hidden = [action for action in self._actions if action.option_strings and action.dest not in common]
+        texts = [action.help for action in hidden]
+        for action in hidden:
+            action.help = argparse.SUPPRESS
+        try:
+            return super().format_help()
+        finally:
+            for action, text in zip(hidden, texts, strict=True):
+                action.help = text
+
+    def format_help_all(self) -> str:
+        """Return the text of --help-all: every option."""
+        return super().format_help()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
         """Refuse an unknown option before argparse misses others, and say which one is spelled alike."""
@@ -68,14 +98,25 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(EXIT_BAD_INPUT, printable(f"{self.prog}: {message}{end} see {self.prog} --help") + "\n")
 
 
+class _HelpAll(argparse.Action):
+    """Print the help of every option and exit."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        """Print and exit."""
+        assert isinstance(parser, OneLineParser)
+        print(parser.format_help_all(), end="")
+        parser.exit()
+
+
 def add_backend(parser: argparse._ActionsContainer) -> None:
     """Add the option --backend."""
     names = ", ".join(("auto", *BACKENDS))
-    parser.add_argument("--backend", default="auto", metavar="NAME", help=f"one of {names} (default: auto)")
+    text = f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu (default: auto)"
+    parser.add_argument("--backend", default="auto", metavar="NAME", help=text)
 
 
 def whole_number_text(text: str) -> int:
-    """Read a whole number from the command line."""
+    """Parse a whole number."""
     try:
         return int(text)
     except ValueError:
@@ -83,7 +124,7 @@ def whole_number_text(text: str) -> int:
 
 
 def numbers_text(count: int) -> Callable[[str], tuple[float, ...]]:
-    """Return a reader of so many finite numbers with commas between them."""
+    """Return a parser of `count` finite numbers separated by commas."""
 
     def read(text: str) -> tuple[float, ...]:
         try:
@@ -91,14 +132,14 @@ def numbers_text(count: int) -> Callable[[str], tuple[float, ...]]:
         except ValueError:
             numbers = ()
         if len(numbers) != count or not all(map(math.isfinite, numbers)):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {count} numbers with commas between them")
+            raise argparse.ArgumentTypeError(f"{text!r} is not {count} numbers separated by commas")
         return numbers
 
     return read
 
 
 def seconds_text(text: str) -> float:
-    """Read a duration from the command line: 90, 90s, 1.5m, 2h, 1h30m; in seconds."""
+    """Parse a duration such as 90, 90s, 1.5m, 2h or 1h30m; return seconds."""
     match = re.fullmatch(r"(?:([\d.]+)h)?(?:([\d.]+)m)?(?:([\d.]+)s?)?", text.strip())
     try:
         hours, minutes, seconds = (float(part or 0) for part in match.groups()) if match else (0.0, 0.0, 0.0)
@@ -106,36 +147,36 @@ def seconds_text(text: str) -> float:
         hours = minutes = seconds = 0.0
     total = 3600 * hours + 60 * minutes + seconds
     if total <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is no duration; give, for example, 90s, 20m or 1h30m")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a duration; examples: 90s, 20m, 1h30m")
     return total
 
 
 def bytes_text(text: str) -> int:
-    """Read a size from the command line: 4GiB, 500MB, 1e9; in bytes."""
+    """Parse a size such as 4GiB, 500MB or 1e9; return bytes."""
     match = re.fullmatch(r"([\d.]+(?:e\d+)?)\s*([kmgt]?)(i?)b?", text.strip().lower())
     try:
         number = float(match[1]) if match else -1.0
     except ValueError:
         number = -1.0
     if match is None or not 0 <= number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size; give, for example, 4GiB or 500MB")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; examples: 4GiB, 500MB")
     return int(number * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " "))
 
 
 def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
-    """Run a command and turn what can go wrong into one line on stderr.
+    """Run a command and report a failure in one line on stderr.
 
     Args:
-        program: Name in front of the line.
-        command: What to run.
-        debug: Print the traceback too.
+        program: Name at the start of the line.
+        command: The command to run.
+        debug: Also print the traceback.
 
     Returns:
-        Exit code: 0; 2 for bad input, a file that cannot be written, or too little memory; 130 when interrupted.
+        Exit code: 0; 2 for bad input, a file that cannot be written, or insufficient memory; 130 if interrupted.
     """
-    spell_what_cannot_be_encoded()
+    escape_unencodable_characters()
     try:
-        with _terminable():
+        with _terminable(), _one_line_warnings(program):
             command()
     except KeyboardInterrupt as interruption:
         complain(f"{program}: {str(interruption) or 'interrupted'}")
@@ -152,8 +193,10 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Let SIGTERM end a command as Ctrl-C does, so that it removes its temporary files."""
-    if threading.current_thread() is not threading.main_thread():  # only the main one may set handlers
+    """Make SIGTERM end a command like Ctrl-C, so that it removes its temporary files."""
+    if (
+        threading.current_thread() is not threading.main_thread()
+    ):  # only the main thread may set signal handlers
         yield
         return
 
@@ -164,11 +207,36 @@ def _terminable() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        # None stands for a handler that Python did not install and cannot put back
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+@contextmanager
+def _one_line_warnings(program: str) -> Iterator[None]:
+    """Print our own warnings as a line without file and line number; others as Python does."""
+    before = warnings.showwarning
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if issubclass(category, BackendWarning):
+            complain(f"{program}: {message}")
+        else:
+            before(message, category, filename, lineno, file, line)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        warnings.simplefilter("always", BackendWarning)
+        yield
 
 
 def _line(program: str, error: Exception) -> str | None:
-    """Say what went wrong in one line; None for what is a fault of the program."""
+    """Describe an error in one line; return None for bugs in this program."""
     if isinstance(error, SplatError):
         return str(error)
     if (said := shortage(error)) is not None:

@@ -1,4 +1,4 @@
-"""`gsplat-edu convert`: a scene in another format, filtered, moved or joined, and checked."""
+"""`gsplat-edu convert`: write a scene in another format; filter, transform, merge and verify it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gsplat_edu.viewer import export
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Convert, say what was written, and check it where that was asked for."""
+    """Convert, report the written file, and verify it if requested."""
     keep = Filter(arguments.min_opacity, arguments.crop, arguments.sh_degree)
     move = IDENTITY
     for text in arguments.transform:
@@ -33,9 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
     backend = resolve_backend(arguments.backend) if arguments.verify else ""
     export.check_target("OUT", arguments.out)
     if len(arguments.sources) > 1 and not arguments.merge:
-        raise ArgumentError(
-            "IN: are several; add --merge to join them into one scene, or convert one at a time"
-        )
+        raise ArgumentError("IN: several scenes given; add --merge to join them, or convert one at a time")
     console = Terminal()
     columns = (
         Field("{task.description}"),
@@ -68,7 +66,7 @@ def _edited(source: Source, keep: Filter, move: Similarity) -> Source:
     kept = replace(source.scene, gaussians=keep.apply(source.scene.gaussians))
     if not len(kept.gaussians):
         raise ArgumentError(
-            f"{source.path}: no splat is left ({len(source.scene.gaussians):,} before); filter less"
+            f"{source.path}: no splat is left ({len(source.scene.gaussians):,} before); relax the filters"
         )
     if move is IDENTITY:
         return replace(source, scene=kept)
@@ -86,19 +84,19 @@ def _joined(sources: Sequence[Source]) -> Source:
 
 
 def _origins(sources: Sequence[Source]) -> list[str]:
-    """Say which coordinates are not those of the capture; refuse to join what stands in different frames."""
+    """Report an offset between the written coordinates and the capture's; reject scenes with different origins."""
     origins = {source.origin for source in sources}
     if len(origins) > 1:
-        raise ArgumentError("IN: were trained around different origins; convert and place them one at a time")
+        raise ArgumentError("IN: the scenes have different origins; convert and place them one at a time")
     origin = origins.pop()
     if not any(origin):
         return []
     where = ", ".join(f"{x:.6g}" for x in origin)
-    return [f"coordinates are written relative to ({where}), the run's origin: float32 holds them better"]
+    return [f"coordinates are relative to the run's origin ({where}), which keeps them precise in float32"]
 
 
 def _similarity(text: str) -> Similarity:
-    """Read one --transform."""
+    """Parse one --transform."""
     kind, _, value = text.partition("=")
     try:
         match kind:
@@ -123,4 +121,4 @@ def _similarity(text: str) -> Similarity:
         raise ArgumentError(f"--transform: {text}: {error}") from None
     except (ValueError, argparse.ArgumentTypeError):
         pass
-    raise ArgumentError(f"--transform: {text!r} cannot be read; give {MOVES}")
+    raise ArgumentError(f"--transform: cannot parse {text!r}; give {MOVES}")

@@ -1,4 +1,4 @@
-"""`gsplat-edu demo`: the course's run with a progress bar."""
+"""`gsplat-edu demo`: the course's training with a progress bar."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
 LOSS_EVERY = 20
-"""Iterations between two looks at the loss, each of which waits for a GPU."""
+"""Iterations between two updates of the loss; each update waits for the GPU."""
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Train, showing a bar with the loss and the number of Gaussians."""
+    """Train with a progress bar that shows the loss and the number of Gaussians."""
     console = Terminal()
     options, notice = options_from(arguments)
     if notice:

@@ -1,4 +1,4 @@
-"""`gsplat-edu doctor`: what is wrong with a capture before training, or with a run after it, and what to do."""
+"""`gsplat-edu doctor`: diagnose a capture before training or a run after it, and give advice."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.train.config import recipe
+from gsplat_edu.train.config import RECIPE_ITERATIONS, recipe
 
 EXIT_HOPELESS = 1
-"""Exit code where training would be pointless."""
+"""Exit code if training would be pointless."""
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Examine, and print one screen that ends with what to do.
+    """Print a diagnosis on one screen that ends with advice.
 
     Raises:
-        SystemExit: with 1, where training would be pointless.
+        SystemExit: with 1, if training would be pointless.
     """
     path: Path = arguments.path
     if not path.exists():
-        raise ArgumentError(f"{path}: is not there; give a dataset folder or a run folder")
+        raise ArgumentError(f"{path}: does not exist; give a dataset folder or a run folder")
     console = Terminal()
     if RunFolder(path).exists():
         diagnosis, lines = _after(arguments, console)
@@ -56,22 +56,32 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
     backend = resolve_backend(arguments.backend)
     if backend == "torch" and not arguments.no_forecast:
         raise ArgumentError(
-            "--backend torch: is too slow to be forecast; take cpu or cuda, or add --no-forecast"
+            "--backend torch: is too slow for a forecast; choose cpu or cuda, or add --no-forecast"
         )
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
         survey = prepare(arguments.path, lambda done, total: bar.update(task, completed=done, total=total))
         bar.add_task("comparing", total=None)
-        diagnosis = examine(survey)
+        diagnosis = examine(survey, _forecast_options(arguments))
     if arguments.no_forecast or diagnosis.hopeless:
         return diagnosis, ()
-    from gsplat_edu.doctor.forecast import forecast  # it measures this machine, which takes a moment
+    from gsplat_edu.budget.forecast import forecast  # it measures this machine, which takes a moment
 
     try:
         said = forecast(load_dataset(arguments.path, settings), config, backend=backend).lines()
     except DatasetError as error:
-        said = [f"none, for training would end here: {error}"]
+        said = [f"none, because training would fail: {error}"]
     return diagnosis, table_lines(zip(("forecast", *[""] * len(said)), said, strict=False))
+
+
+def _forecast_options(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return the options of the training that is forecast where they are not the defaults."""
+    words: tuple[str, ...] = ()
+    if arguments.iterations != RECIPE_ITERATIONS:
+        words += ("--iterations", str(arguments.iterations))
+    if arguments.resolution is not None:
+        words += ("--resolution", f"{arguments.resolution:g}")
+    return words
 
 
 def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
@@ -81,7 +91,9 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     settings = dataclasses.replace(render_settings(config), depth=True)
     scene, reached = folder.latest_scene()
     dataset = run_dataset(config, arguments.dataset)
-    gaussians = load_ply(scene, dataset.origin).to(device_of(backend))  # the frame its cameras stand in
+    gaussians = load_ply(scene, dataset.origin).to(
+        device_of(backend)
+    )  # in the coordinate frame of the cameras
     renderer = functools.partial(render, settings=settings, backend=backend)
     with _bar(console) as bar:
         task = bar.add_task("views", total=len(dataset.train) + len(dataset.test))
@@ -111,7 +123,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
 
 
 def _options(config: dict[str, Any]) -> tuple[str, ...]:
-    """Return the options that a longer run should have too: what it reads, its background, how much it may hold."""
+    """Return the options to repeat in a longer run: input, background, limits."""
     section, data = config.get("train"), config["data"]
     train = section if isinstance(section, dict) else {}
     background = train.get("background") or ()
@@ -133,7 +145,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _exposure_beforehand(capture: Path, console: Console) -> list[Finding]:
-    """Look at the photos' exposure as before training; where they cannot be compared there is nothing to say."""
+    """Check the photos' exposure as before training; report nothing if they cannot be compared."""
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
         try:

@@ -1,4 +1,4 @@
-"""`gsplat-edu eval`: judge a run by its test and training views."""
+"""`gsplat-edu eval`: evaluate a run on its test and training views."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gsplat_edu.runs.identity import capture_difference
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Score every view, print a line per split, and say what was written."""
+    """Score every view, print one line per split, and report the written files."""
     console = Terminal()
 
     def say(sentence: str) -> None:
@@ -40,12 +40,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _check_apart(out: RunFolder) -> None:
-    """Refuse to write over anything but an earlier evaluation of the same kind."""
+    """Allow overwriting only an earlier evaluation of the same kind."""
     if out.exists():
-        raise ArgumentError(f"--out: {out.path} holds a run; name a folder for this evaluation alone")
+        raise ArgumentError(f"--out: {out.path} holds a run; choose another folder for this evaluation")
     others = out.path.is_dir() and any(path.name != LOCK for path in out.path.iterdir())
     if others and EVALUATED not in out.read_metrics():
-        raise ArgumentError(f"--out: {out.path} holds other files; name a new folder")
+        raise ArgumentError(f"--out: {out.path} holds other files; choose a new folder")
 
 
 def _evaluate(
@@ -66,10 +66,12 @@ def _evaluate(
         what = f"{dataset.path} is not the capture of {folder.path}: {found}"
         if into is None:
             raise ArgumentError(
-                f"{what}; name its own with --dataset, or add --out FOLDER to score this one apart"
+                f"{what}; give the run's capture with --dataset, or add --out FOLDER to write the scores elsewhere"
             )
-        say(f"{what}; it is scored apart, in {into.path}")
-    gaussians = load_ply(scene, dataset.origin).to(device_of(backend))  # the frame its cameras stand in
+        say(f"{what}; the scores are written to {into.path}")
+    gaussians = load_ply(scene, dataset.origin).to(
+        device_of(backend)
+    )  # in the coordinate frame of the cameras
     judged = Judged(dataset.test, dataset.train, settings.background, dataset.notes)
     with Progress(
         TextColumn("{task.description}"),
@@ -99,8 +101,8 @@ def _evaluate(
 
 
 def score_lines(test: Sequence[ImageScore], train: Sequence[ImageScore]) -> list[str]:
-    """Return the table of the scores, a line per split."""
-    lines = [f"{'':5} {'images':>6} {'PSNR':>7} {'8 bit':>7} {'SSIM':>7} {'L1':>7}  worst view"]
+    """Return the table of scores, one line per split."""
+    lines = [f"{'':5} {'images':>6} {'PSNR':>7} {'8-bit':>7} {'SSIM':>7} {'L1':>7}  worst view"]
     for name, scores in (("test", test), ("train", train)):
         if not scores:
             lines.append(f"{name:5} {0:6}  no views")

@@ -1,4 +1,4 @@
-"""What `convert` and `train` share: writing scenes in other formats, and saying what the files show."""
+"""Shared by `convert` and `train`: write scenes in other formats and report the quality of the files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsplat_edu.viewer import export
 def check_and_say(
     path: Path, source: Source, backend: str, bar: Progress, say: Callable[[str], None]
 ) -> export.Exported:
-    """Check a file against what was written to it, and say what came out in a line."""
+    """Compare a written file with its source and report the result in one line."""
     task = bar.add_task(f"checking {path}", total=len(source.probes(export.VIEWS, export.SIDE)))
     found = export.check(path, source, backend, functools.partial(_advance, bar, task))
     bar.remove_task(task)
@@ -28,7 +28,7 @@ def check_and_say(
 def export_all(
     paths: Sequence[Path], bar: Progress, backend: str, say: Callable[[str], None], source: Source
 ) -> list[dict[str, Any]]:
-    """Write a scene to every path, check each, and return what metrics.json holds of them."""
+    """Write a scene to every path, check each file, and return the entries for metrics.json."""
     written = []
     for path in paths:
         for note in export.losses(path, source.scene):

@@ -1,4 +1,4 @@
-"""`gsplat-edu info`: what a dataset, a run or a scene file holds, on one screen."""
+"""`gsplat-edu info`: summarise a dataset, a run or a scene file on one screen."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from gsplat_edu.runs.folder import RunFolder
 PERCENTILES = (1, 25, 50, 75, 99)
 
 BINS = 40
-"""Bins of a histogram: one character each."""
+"""Bins of a histogram, one character each."""
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
-"""Heights of a bin: the first is for an empty one only."""
+"""Bar characters by height; the first marks an empty bin."""
 
 PLAIN_BLOCKS = " .:-=+*#@"
-"""The same for terminals that have ASCII only."""
+"""The same for ASCII-only terminals."""
 
 HIGHLIGHTS = {
     "data": ("path", "resolution", "test_every", "points"),
     "train": ("strategy", "max_gaussians", "ssim_weight", "seed"),
     "render": ("sh_degree", "background", "antialiased", "jacobian_limit"),
 }
-"""Settings of a run that are shown, by the section of config.json; what is None is not. report.html has them all."""
+"""Settings of a run to show, by section of config.json; None values are skipped. report.html shows all settings."""
 
 Fact = tuple[str, str]
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Print one line per fact."""
+    """Print one fact per line."""
     path: Path = arguments.path
     if not path.exists():
-        raise ArgumentError(f"{path}: is not there; give a dataset folder, a run folder or a scene file")
+        raise ArgumentError(f"{path}: does not exist; give a dataset folder, a run folder or a scene file")
     if (path / SOG_META).is_file():
         path = path / SOG_META
-    # any other .json may be the transforms.json of a dataset
+    # any other .json may be a dataset's transforms.json
     if path.is_file() and (path.suffix.lower() != ".json" or path.name.lower() == SOG_META):
         facts = _scene_facts(path)
     elif RunFolder(path).exists():
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _scene_facts(path: Path) -> list[Fact]:
     found = format_of(path)
-    # what is NaN is told of here; other commands refuse it
+    # NaN is reported here; other commands reject it
     scene = ply.read(path, finite=False) if found.suffix == ".ply" else read_scene(path)
     gaussians = scene.gaussians
     count, size = len(gaussians), stored_bytes(path)
@@ -80,7 +80,7 @@ def _scene_facts(path: Path) -> list[Fact]:
     finite = gaussians.finite_rows()
     if broken := int((~finite).sum()):
         facts.append(
-            ("warning", f"{broken:,} of {count:,} splats have a NaN or infinite number: cannot be drawn")
+            ("warning", f"{broken:,} of {count:,} splats have NaN or infinite values and cannot be drawn")
         )
         gaussians = gaussians.map(lambda tensor: tensor[finite])
     return facts + _splat_facts(gaussians) if len(gaussians) else facts
@@ -93,7 +93,7 @@ def _splat_facts(gaussians: Gaussians) -> list[Fact]:
     header = "percentiles " + ", ".join(str(p) for p in PERCENTILES)
     facts = [
         ("bounds", _bounds(means)),
-        ("", f"of the middle 98 %: {_bounds(inner)}"),
+        ("", f"middle 98 %: {_bounds(inner)}"),
         ("opacity", f"{_percentiles(opacities)}   ({header})"),
         ("", _histogram(opacities, np.linspace(0.0, 1.0, BINS + 1), "0", "1")),
         ("scale", f"{_percentiles(scales)}   world units"),
@@ -101,12 +101,15 @@ def _splat_facts(gaussians: Gaussians) -> list[Fact]:
     ]
     diagonal = float(np.linalg.norm(inner[1] - inner[0]))
     for number, what in (
-        (int((gaussians.quats.detach() == 0).all(dim=1).sum()), "a quaternion of length zero: never drawn"),
+        (
+            int((gaussians.quats.detach() == 0).all(dim=1).sum()),
+            "a quaternion of length zero and are never drawn",
+        ),
         (
             int((scales > diagonal).any(axis=1).sum()) if diagonal else 0,
-            "a scale beyond the middle 98 %'s diagonal",
+            "a scale larger than the diagonal of the middle 98 %",
         ),
-        (int((opacities < ALPHA_MIN).sum()), "an opacity below 1/255: cannot be seen"),
+        (int((opacities < ALPHA_MIN).sum()), "an opacity below 1/255 and are invisible"),
     ):
         if number:
             facts.append(("warning", f"{number:,} of {len(gaussians):,} splats have {what}"))
@@ -116,9 +119,9 @@ def _splat_facts(gaussians: Gaussians) -> list[Fact]:
 def _run_facts(folder: RunFolder) -> list[Fact]:
     config, metrics, log = folder.read_config(), folder.read_metrics(), folder.log()
     planned = _section(config, "train").get("iterations")
-    reached = f"iteration {log[-1].get('iteration')}" if log else "nothing yet"
+    reached = f"iteration {log[-1].get('iteration')}" if log else "not started"
     facts = [
-        ("run", f"{folder.path}, by gsplat_edu {config.get('version', '?')}"),
+        ("run", f"{folder.path}, gsplat_edu {config.get('version', '?')}"),
         ("progress", f"{reached}" + (f" of {planned:,}" if isinstance(planned, int) else "")),
     ]
     for split in ("test", "train"):
@@ -131,7 +134,7 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
                 )
             )
     if not metrics:
-        facts.append(("test", f"not judged yet: gsplat-edu eval {folder.path}"))
+        facts.append(("test", f"not evaluated yet; run: gsplat-edu eval {folder.path}"))
     if isinstance(seconds := metrics.get("seconds"), int | float):
         facts.append(("time", f"{seconds:.1f} s"))
     for key, names in HIGHLIGHTS.items():
@@ -148,7 +151,7 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
 
 
 def _scores(scores: Mapping[str, Any]) -> list[str]:
-    """Say what metrics.json has of a split; another program's may lack some."""
+    """Format a split's metrics; files of other programs may lack some."""
     ssim, images = scores.get("ssim"), scores.get("num_images")
     said = [f"PSNR {scores['psnr']:.2f} dB"]
     said += [] if ssim is None else [f"SSIM {ssim:.4f}"]
@@ -174,9 +177,9 @@ def _dataset_facts(path: Path) -> list[Fact]:
     ]
     if len(dataset.points):
         inner = np.percentile(dataset.points, (1, 99), axis=0)
-        facts.append(("", f"of the middle 98 %: {_bounds(inner)}"))
+        facts.append(("", f"middle 98 %: {_bounds(inner)}"))
     if np.any(dataset.origin):
-        facts.append(("origin", f"moved to {', '.join(f'{x:.6g}' for x in dataset.origin)}"))
+        facts.append(("origin", f"shifted to {', '.join(f'{x:.6g}' for x in dataset.origin)}"))
     return facts + [("note", note) for note in dataset.notes]
 
 
@@ -198,7 +201,7 @@ def _bounds(points: Float[np.ndarray, "N 3"]) -> str:
 
 
 def _log_histogram(values: Float[np.ndarray, "..."]) -> str:
-    """Draw a histogram over the powers of ten that hold the middle 99.8 %; what is beyond counts at the ends."""
+    """Draw a histogram over the decades of the middle 99.8 %; values beyond count in the end bins."""
     logs = np.log10(np.maximum(values, np.finfo(np.float64).tiny))
     low, high = np.percentile(logs, (0.1, 99.9))
     edges = np.linspace(low, high if high > low else low + 1.0, BINS + 1)
@@ -208,7 +211,7 @@ def _log_histogram(values: Float[np.ndarray, "..."]) -> str:
 
 
 def _histogram(values: Float[np.ndarray, "..."], edges: Float[np.ndarray, " B"], low: str, high: str) -> str:
-    """Draw a histogram as one line of blocks, the highest bin as the full one."""
+    """Draw a histogram as one line of bar characters, scaled to the highest bin."""
     counts, _ = np.histogram(values, edges)
     heights = np.ceil(counts / max(int(counts.max()), 1) * (len(BLOCKS) - 1)).astype(int)
     return f"{low} |{''.join(BLOCKS[height] for height in heights)}| {high}"

@@ -10,21 +10,21 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
-from gsplat_edu.cli.printing import complain, spell_what_cannot_be_encoded
+from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.render.settings import check_backend
 
 COMMANDS = {
-    "demo": "learn a sphere from 24 renders of it and judge the result with a held-out camera",
-    "sfm": "find the poses of photos, or of a video's frames, and write a capture that train reads",
-    "train": "turn a folder of posed photos into a scene",
-    "eval": "score a run's latest scene on its test and training views, and write metrics, renders and a report",
-    "render": "render a run or a scene file: an orbit as a video, or what the dataset's cameras see",
-    "convert": "write a scene in another format, or as a page that draws it; filter, move, join, and check it",
+    "demo": "train a sphere from 24 renders of it and evaluate the result with a held-out camera",
+    "sfm": "estimate the camera poses of photos or a video, and write a capture that train reads",
+    "train": "train a scene from a capture, photos or a video",
+    "eval": "score a run's latest scene on its test and training views; write metrics, renders and a report",
+    "render": "render images or a video of a run or a scene file, along a path or from a capture's cameras",
+    "convert": "write a scene in another format, or as a web page; filter, transform, merge and verify it",
     "view": "show a scene or a run in the browser",
-    "doctor": "say what is wrong with a capture before training or with a run after it, and what to do",
-    "info": "say what a dataset, a run or a scene file holds, on one screen",
+    "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",
+    "info": "summarise a capture, a run or a scene file on one screen",
 }
-"""Commands and what they do; each is a module `gsplat_edu.cli.NAME` with `run`, and one in `gsplat_edu.cli.options`."""
+"""Commands and their summaries. Each has a module in `gsplat_edu.cli`, with `run`, and one in `cli.options`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0; 2 for bad input; 130 when interrupted.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
-    spell_what_cannot_be_encoded()
+    escape_unencodable_characters()
     try:
         parser = build_parser(words)
         parsed = parser.parse_args(words)
@@ -63,6 +63,8 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
         command.epilog = options.EXAMPLE
         options.add_arguments(command)
         command.add_argument("--debug", action="store_true", help="print the traceback of an error")
+        if hasattr(options, "COMMON"):
+            command.show_in_help(options.COMMON)
         command.set_defaults(run=functools.partial(_run, name))
     return parser
 

@@ -1,4 +1,4 @@
-"""Lines on a terminal, without rich: errors come before it is imported, and scripts do without it."""
+"""Terminal output without rich, for errors raised before rich is imported and for scripts."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def complain(sentence: str) -> None:
     print(printable(sentence), file=sys.stderr)
 
 
-def spell_what_cannot_be_encoded() -> None:
-    """Let standard output and error spell characters that the locale lacks, instead of raising UnicodeEncodeError."""
+def escape_unencodable_characters() -> None:
+    """Escape characters that the locale cannot encode, on standard output and error, to avoid UnicodeEncodeError."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

@@ -1,4 +1,4 @@
-"""`gsplat-edu render`: pictures or a video of a trained scene."""
+"""`gsplat-edu render`: images or a video of a trained scene."""
 
 from __future__ import annotations
 
@@ -36,25 +36,25 @@ from gsplat_edu.validation import whole_number
 
 @dataclass(frozen=True)
 class Shot:
-    """What is rendered.
+    """The images to render.
 
     Args:
         gaussians: The scene.
         cameras: One per image.
         names: File names of the images in a folder; None numbers them.
-        settings: How to render.
-        says: What path the cameras take, and why; "" where they are the dataset's.
+        settings: Render settings.
+        path: The kind of camera path and the reason for it; "" for the dataset's cameras.
     """
 
     gaussians: Gaussians
     cameras: Sequence[Camera]
     names: Sequence[str] | None
     settings: RenderSettings
-    says: str = ""
+    path: str = ""
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Render and say what was written."""
+    """Render and report the written files."""
     backend = resolve_backend(arguments.backend)
     for name in ("frames", "fps"):
         whole_number(f"--{name}", getattr(arguments, name), 1)
@@ -72,13 +72,13 @@ def run(arguments: argparse.Namespace) -> None:
         out = arguments.out or Path("out") / f"{arguments.source.stem}_{'orbit.mp4' if orbit else 'views'}"
     elif arguments.source.exists():
         raise ArgumentError(
-            f"{arguments.source}: is no run (it has no config.json); give a run or a scene file"
+            f"{arguments.source}: is not a run (config.json is missing); give a run folder or a scene file"
         )
     else:
-        raise ArgumentError(f"{arguments.source}: is not there; give the folder of a run, or a scene file")
+        raise ArgumentError(f"{arguments.source}: does not exist; give a run folder or a scene file")
     console = Terminal()
-    if shot.says:
-        console.print(shot.says, soft_wrap=True)
+    if shot.path:
+        console.print(shot.path, soft_wrap=True)
     started = time.perf_counter()
     frames = track(
         _frames(replace(shot, gaussians=shot.gaussians.to(device_of(backend))), backend),
@@ -106,15 +106,13 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> 
     cameras = folder.read_cameras(origin)
     named = [(name, camera) for name, _, camera in cameras]
     if not named:
-        raise ArgumentError(f"{folder.cameras}: lists no camera; name a dataset's folder with --dataset PATH")
+        raise ArgumentError(f"{folder.cameras}: lists no cameras; give a dataset folder with --dataset PATH")
     return _shot(arguments, gaussians, named, settings, orbit)
 
 
 def _file_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
     if arguments.dataset == RUNS_CAMERAS:
-        raise ArgumentError(
-            "--dataset: a scene file comes without cameras; give the dataset's folder: --dataset PATH"
-        )
+        raise ArgumentError("--dataset: a scene file has no cameras; give the dataset folder: --dataset PATH")
     scene = read_scene(arguments.source)
     settings = _settings(file_settings(scene), arguments)
     if arguments.dataset is not None:
@@ -122,8 +120,10 @@ def _file_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
     cameras = orbit_of_scene(
         scene.gaussians, arguments.frames, arguments.size or SCENE_SIZE, scene.up or WORLD_UP
     )
-    says = "a scene file does not say from where it was photographed: a full circle; --dataset PATH follows the photos"
-    return Shot(scene.gaussians, cameras, None, settings, says)
+    description = (
+        "a scene file has no cameras: using a full circle; --dataset PATH follows a capture's cameras"
+    )
+    return Shot(scene.gaussians, cameras, None, settings, description)
 
 
 def _dataset_shot(
@@ -134,7 +134,7 @@ def _dataset_shot(
     orbit: bool,
 ) -> Shot:
     dataset = load_dataset(arguments.dataset, data)
-    gaussians = relative_to(gaussians, dataset.origin)  # the frame its cameras stand in
+    gaussians = relative_to(gaussians, dataset.origin)  # in the coordinate frame of the cameras
     named = [(view.name, view.camera) for view in (*dataset.train, *dataset.test)]
     return _shot(arguments, gaussians, named, settings, orbit)
 
@@ -147,15 +147,15 @@ def _shot(
     orbit: bool,
 ) -> Shot:
     cameras = [camera for _, camera in named]
-    names, says = None, ""
+    names, description = None, ""
     if orbit:
         path = path_along(cameras, arguments.frames, _depth(gaussians, cameras[0]))
-        cameras, says = path.cameras, path.says
+        cameras, description = path.cameras, path.description
     else:
         names = image_file_names([name for name, _ in named])
     if arguments.size is not None:
         cameras = [resized(camera, arguments.size) for camera in cameras]
-    return Shot(gaussians, cameras, names, settings, says)
+    return Shot(gaussians, cameras, names, settings, description)
 
 
 def _settings(settings: RenderSettings, arguments: argparse.Namespace) -> RenderSettings:
@@ -164,7 +164,7 @@ def _settings(settings: RenderSettings, arguments: argparse.Namespace) -> Render
 
 
 def _depth(gaussians: Gaussians, camera: Camera) -> float:
-    """Return the median depth of the Gaussians in front of a camera: where a single photo's subject may be."""
+    """Return the median depth of the Gaussians in front of a camera, an estimate of its subject's distance."""
     depths = camera.world_to_cam(gaussians.means.numpy(force=True))[:, 2]
     ahead = depths[depths > 0]
     return float(np.median(ahead)) if ahead.size else 1.0

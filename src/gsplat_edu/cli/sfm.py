@@ -1,4 +1,4 @@
-"""`gsplat-edu sfm`: photos or a video without poses become a capture."""
+"""`gsplat-edu sfm`: turn photos or a video without poses into a capture."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsplat_edu.sfm.reconstruct import reconstruct
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Find the poses, showing how it goes."""
+    """Find the poses with progress output."""
     options = options_from(arguments)
     console = Terminal()
 
@@ -29,20 +29,20 @@ def run(arguments: argparse.Namespace) -> None:
             reconstruct(options, say, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                "interrupted; the same command resumes after the last finished stage"
+                "interrupted; the same command resumes after the last completed stage"
             ) from None
     say(f"wrote {options.out}; next: gsplat-edu train {shlex.quote(str(options.out))} --out RUN")
 
 
 @contextmanager
 def stage_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar per stage while the block runs, on a terminal.
+    """Show a progress bar per stage, on a terminal.
 
     Args:
-        console: Where to.
+        console: Console to draw on.
 
     Yields:
-        The progress that `reconstruct` tells.
+        The progress callback for `reconstruct`.
     """
     columns = (
         TextColumn("{task.description}"),

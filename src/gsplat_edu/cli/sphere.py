@@ -1,6 +1,6 @@
-"""The course's run: a sphere learned from 24 of its own renders, judged by a camera that was held out.
+"""The course's training: learn a sphere from 24 of its own renders, evaluated with a held-out camera.
 
-`gsplat-edu demo` and `train/train_3d.py` are two faces of `run_sphere`.
+`gsplat-edu demo` and `train/train_3d.py` both call `run_sphere`.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ from gsplat_edu.train.trainer import Callback, Renderer, Trainer, TrainResult
 from gsplat_edu.validation import whole_number
 
 MAX_SEED = 2**63 - 1
-"""What torch's generators take."""
+"""Largest seed of torch's generators."""
 
 
 @dataclass(frozen=True)
 class SphereOptions:
-    """Options of the run.
+    """Options of the training.
 
     Args:
         budget: Iterations, cap and image size.
-        k0: Gaussians at the start.
-        seed: Seed of the start, the splits and the view order.
-        backend: Rendering backend, by its own name.
-        out: The held-out figure, a .png; the curves and the scene go beside it.
+        k0: Initial number of Gaussians.
+        seed: Seed of the initialisation, the splits and the view order.
+        backend: Name of the rendering backend.
+        out: The held-out figure, a .png file; the curves and the scene are written next to it.
 
     Raises:
-        ArgumentError: an option is out of range, or `out` is no place for a .png; the message names the flag.
+        ArgumentError: an option is out of range, or `out` is not a .png path; the message names the flag.
     """
 
     budget: Budget
@@ -67,11 +67,11 @@ class SphereOptions:
         whole_number("--seed", self.seed, 0, MAX_SEED)
         if self.k0 > self.budget.cap:
             raise ArgumentError(
-                f"--k0: is {self.k0}, more than --cap {self.budget.cap}; start with fewer or raise it"
+                f"--k0: is {self.k0}, more than --cap {self.budget.cap}; lower --k0 or raise --cap"
             )
         if self.out.suffix.lower() != ".png":
             raise ArgumentError(
-                f"--out: {str(self.out)!r} has to end in .png; the other files are named after it"
+                f"--out: {str(self.out)!r} must end in .png; the other files are named after it"
             )
 
     @property
@@ -81,7 +81,7 @@ class SphereOptions:
 
 
 class Summary(NamedTuple):
-    """What a run comes to."""
+    """Result of a training."""
 
     result: TrainResult
     initial_l1: float
@@ -89,16 +89,16 @@ class Summary(NamedTuple):
 
 
 def options_from(arguments: argparse.Namespace) -> tuple[SphereOptions, str | None]:
-    """Turn parsed options into those of a run, with the budget of the backend that will run.
+    """Convert parsed arguments to options, with the default budget of the selected backend.
 
-    That the files can be written is found out here, before anything is trained. Their folder is made.
+    Also check, before training, that the files can be written, and create their folder.
 
     Returns:
-        The options, and a sentence where the budget is not the chapter's by default.
+        The options, and a sentence if the default budget differs from the chapter's.
 
     Raises:
         ArgumentError: an option is out of range, or the files cannot be written.
-        BackendUnavailableError: the backend does not run here.
+        BackendUnavailableError: the backend is not available here.
     """
     backend = resolve_backend(arguments.backend)
     default = REDUCED if backend == "torch" else CHAPTER
@@ -114,7 +114,7 @@ def options_from(arguments: argparse.Namespace) -> tuple[SphereOptions, str | No
     chosen, full = (" ".join(f"--{name} {getattr(b, name)}" for name in reduced) for b in (default, CHAPTER))
     return (
         options,
-        f"backend torch is dense and slow, so the budget is reduced: {chosen} (the chapter's: {full})",
+        f"backend torch is slow, so the budget is reduced to {chosen} (the chapter uses {full})",
     )
 
 
@@ -125,8 +125,8 @@ def run_sphere(
 
     Args:
         options: The options.
-        callbacks: Told of every step and every densification.
-        say: Prints the lines that close the run.
+        callbacks: Called after every step and every densification.
+        say: Prints the closing lines.
     """
     capture = sphere_capture(options.budget.size)
     renderer = functools.partial(render, backend=options.backend)
@@ -140,7 +140,9 @@ def run_sphere(
     snapshots = {}
 
     def take_snapshot(trainer: Trainer, event: Event) -> None:
-        if event.iteration == middle:  # told of the step first, then of its densification, which shows
+        if (
+            event.iteration == middle
+        ):  # called after the step and again after its densification, which is kept
             snapshots["middle"] = held_out(trainer.gaussians)
 
     trainer = _trainer(options, capture, renderer, (take_snapshot, *callbacks))

@@ -1,4 +1,4 @@
-"""The one way to the terminal: sentences may quote names from files, so what could command a terminal is escaped."""
+"""The console for all regular output. It escapes control characters, since messages may quote names from files."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from gsplat_edu.text import printable
 
 
 class Terminal(Console):
-    """Standard output. Text is printed as it is: no markup, no emoji codes, and control characters are escaped."""
+    """Standard output. Text is printed literally: no markup, no emoji codes, control characters escaped."""
 
     def __init__(self) -> None:
         super().__init__(highlight=False, markup=False, emoji=False)
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: ANN401
-        """Print as rich does, each piece of text on its one line."""
+        """Print like rich, each text on one line."""
         super().print(*(printable(o) if isinstance(o, str) else o for o in objects), **options)
 
     def shows(self, characters: str) -> bool:
-        """Say whether the terminal's encoding has all of these characters."""
+        """Return whether the terminal's encoding has all of these characters."""
         try:
             characters.encode(self.encoding)
         except (UnicodeError, LookupError):
@@ -31,7 +31,7 @@ class Terminal(Console):
 
 
 class Field(TextColumn):
-    """A column of a progress bar whose text may quote names.
+    """A progress bar column whose text may quote names from files.
 
     Args:
         text: As for rich's `TextColumn`: "{task.description}", for example.
@@ -41,5 +41,5 @@ class Field(TextColumn):
         super().__init__(text, markup=False)
 
     def render(self, task: Task) -> Text:
-        """Return the text of a task, escaped."""
+        """Return a task's text, escaped."""
         return Text(printable(self.text_format.format(task=task)))

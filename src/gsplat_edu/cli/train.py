@@ -1,4 +1,4 @@
-"""`gsplat-edu train`: a capture becomes a scene."""
+"""`gsplat-edu train`: train a scene from a capture."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from types import ModuleType
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
+from gsplat_edu.budget.deadline import Deadline, stopwatch
+from gsplat_edu.budget.pace import Pace
+from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.train import options_from
+from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.points import read_points_ply
-from gsplat_edu.doctor.pace import Pace
-from gsplat_edu.doctor.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
@@ -37,17 +39,17 @@ from gsplat_edu.viewer.export import check_target
 from gsplat_edu.viewer.serve import exposure
 
 LINES = 20
-"""Lines that tell of the training where there is no terminal to draw a bar on."""
+"""Number of progress lines if there is no terminal for a progress bar."""
 
 NAME_WIDTH = 20
-"""Characters of a view's name on the progress line."""
+"""Characters of a view's name in the progress bar."""
 
 PSNR_EVERY = 20
-"""Iterations between two looks at the last view's loss and PSNR, which cost a few milliseconds each."""
+"""Iterations between two updates of the last view's loss and PSNR, which cost a few milliseconds each."""
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Train, showing how it goes; write the scene, the metrics and the report."""
+    """Train with progress output; write the scene, the metrics and the report."""
     console = Terminal()
 
     def say(sentence: str) -> None:
@@ -63,15 +65,17 @@ def run(arguments: argparse.Namespace) -> None:
 def _run(
     arguments: argparse.Namespace, console: Console, say: Callable[[str], None], live: ModuleType | None
 ) -> None:
-    chosen = _planned(arguments, console, say)
+    seconds = arguments.time_limit
+    deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
+    chosen = _planned(arguments, deadline, console, say)
     with interruptible() as interrupted, ExitStack() as closing:
         capture = CaptureRun(chosen.options, say)
         if capture.finished:
             return
         callbacks: list[Callback] = []
         ends = interrupted
-        if arguments.time_limit is not None:
-            pace = Pace(capture, arguments.time_limit, extend=chosen.by_time, say=say)
+        if deadline is not None:
+            pace = Pace(capture, deadline, extend=chosen.by_time, say=say)
             callbacks.append(pace)
             ends = functools.partial(_either, interrupted, pace.over)
         view = None
@@ -87,19 +91,19 @@ def _run(
         if interrupted():
             raise KeyboardInterrupt(
                 f"interrupted after {capture.trainer.iteration} iterations;"
-                " the same command with --resume goes on from there"
+                " add --resume to the same command to continue"
             )
         with _bar(console, "") as bar:
-            task = bar.add_task("judging", total=len(capture.dataset.test) + len(capture.dataset.train))
+            task = bar.add_task("evaluating", total=len(capture.dataset.test) + len(capture.dataset.train))
 
             def scored(split: str, score: ImageScore) -> None:
                 if interrupted():
                     raise KeyboardInterrupt(
-                        "interrupted while judging; the scene is written, --resume judges it again"
+                        "interrupted during the evaluation; the scene is saved, and --resume repeats the evaluation"
                     )
                 bar.advance(task)
                 if view is not None:
-                    view.look("judging")
+                    view.update("evaluating")
 
             backend = capture.options.backend
             result = capture.finish(
@@ -110,41 +114,43 @@ def _run(
             )
         _report(capture, result, say)
         if view is not None and view.watched:
-            say("the live view stays until its last browser is closed, or Ctrl-C")
+            say("the live view stays open until its last browser is closed, or Ctrl-C")
             view.stay()
 
 
 def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None]) -> RunOptions:
-    """Find the poses of plain photos or a video first; the capture is kept in the run's folder."""
+    """Find the poses first if the input is plain photos or a video; keep the capture in the run's folder."""
     if not needs_poses(options.data):
         return options
     if options.points is not None:
-        read_points_ply(options.points)  # what is wrong with them is said before the long work
+        read_points_ply(options.points)  # report errors in the file before the long computation
     found = options.folder.path / "capture"
     if options.folder.exists():
         if not options.resume:
             raise CheckpointError(
-                f"--out: {options.folder.path} holds a run already; add --resume to continue it, "
-                "or name another folder"
+                f"--out: {options.folder.path} already holds a run; add --resume to continue it, "
+                "or choose another folder"
             )
         if find_model(found) is not None:
-            say(f"{found}: holds the poses that this run began with; {options.data} is not looked at again")
+            say(f"{found}: using the poses that this run started with; {options.data} is not read again")
             return replace(options, data=found)
-    say(f"{options.data}: comes without poses; finding them first, into {found}")
+    say(f"{options.data}: has no poses; finding them first and writing them to {found}")
     with stage_bars(console) as progress:
         try:
             reconstruct(SfmOptions(options.data, found), say, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                "interrupted while finding poses; the same command resumes after the last finished stage"
+                "interrupted while finding poses; the same command resumes after the last completed stage"
             ) from None
     return replace(options, data=found)
 
 
-def _planned(arguments: argparse.Namespace, console: Console, say: Callable[[str], None]) -> Plan:
-    """Find poses where there are none, and choose what the limits leave open."""
+def _planned(
+    arguments: argparse.Namespace, deadline: Deadline | None, console: Console, say: Callable[[str], None]
+) -> Plan:
+    """Find poses if necessary, and choose the options that the limits leave open."""
     options = _with_poses(options_from(arguments), console, say)
-    limits = Limits(arguments.max_memory, arguments.time_limit)
+    limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
     chosen = plan(options, limits, given, rescale=not arguments.no_rescale)
     for sentence in chosen.sentences:
@@ -167,15 +173,17 @@ def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None])
     say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
     if (planned := trainer.config.iterations) > trainer.iteration:
         folder = capture.folder.path
-        say(f"the time limit ended it before {planned}; --resume with a longer one goes on: {folder}")
+        say(
+            f"the time limit ended training before {planned}; use --resume with a longer limit to continue: {folder}"
+        )
 
 
 def _live(arguments: argparse.Namespace) -> ModuleType | None:
-    """Import the live view where it is asked for: it needs viser, which is optional."""
+    """Import the live view if requested; it needs viser, which is optional."""
     if not arguments.view:
         for flag, value in (("--view-host", arguments.view_host), ("--view-port", arguments.view_port)):
             if value is not None:
-                raise ArgumentError(f"{flag}: is looked at with --view only; add that, or leave it out")
+                raise ArgumentError(f"{flag}: has an effect only with --view; add --view, or omit {flag}")
         return None
     try:
         return importlib.import_module("gsplat_edu.viewer.live")
@@ -183,7 +191,7 @@ def _live(arguments: argparse.Namespace) -> ModuleType | None:
         if (error.name or "").startswith("gsplat_edu"):
             raise
         how = "pip install -c constraints.txt 'gsplat-edu[viewer]'"
-        raise ArgumentError(f"--view: {error.name} is not installed; {how}, or leave it out") from None
+        raise ArgumentError(f"--view: {error.name} is not installed; {how}, or omit --view") from None
 
 
 def _train(
@@ -200,7 +208,7 @@ def _train(
     def show(trainer: Trainer, event: Event) -> None:
         if not isinstance(event, StepEvent):
             return
-        iterations = trainer.config.iterations  # a limit of time may have made them more
+        iterations = trainer.config.iterations  # a time limit may have raised it
         if event.iteration % PSNR_EVERY == 0 or trainer.iteration == iterations:
             speed = bar.tasks[-1].speed or 0.0
             state = f"loss {event.loss:.3f}  PSNR {_psnr(trainer):.1f} of {_short(trainer.last_name)}"
@@ -213,7 +221,7 @@ def _train(
 
     def loaded(done: int, total: int) -> None:
         if interrupted():
-            raise KeyboardInterrupt("interrupted while reading photos; nothing was begun")
+            raise KeyboardInterrupt("interrupted while loading photos; nothing was written")
         bar.update(photos, completed=done, total=total)
 
     trainer = capture.start(loaded, [show, *callbacks])
@@ -223,7 +231,7 @@ def _train(
 
 
 def _short(name: str) -> str:
-    """Return the end of a view's name, which tells views apart."""
+    """Return the end of a view's name, which distinguishes views."""
     return name if len(name) <= NAME_WIDTH else f"...{name[3 - NAME_WIDTH :]}"
 
 
@@ -246,10 +254,10 @@ def _bar(console: Console, state: str) -> Progress:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C and SIGTERM end a training between two iterations; a second one ends it at once.
+    """Let Ctrl-C and SIGTERM end a training between two iterations; a second signal ends it at once.
 
     Yields:
-        Says whether one came. A loop that asks it is expected to end soon.
+        A function that returns whether a signal arrived. A loop that polls it should end soon after.
     """
     came = False
 
@@ -257,7 +265,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
         nonlocal came
         if came:
             raise KeyboardInterrupt(
-                "interrupted; what was saved before is unharmed, --resume goes on from it"
+                "interrupted; saved checkpoints are intact, --resume continues from the last one"
             )
         came = True
 

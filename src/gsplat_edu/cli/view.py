@@ -1,4 +1,4 @@
-"""`gsplat-edu view`: a scene in the browser."""
+"""`gsplat-edu view`: show a scene in the browser."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from gsplat_edu.viewer.serve import PageServer, exposure
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Serve the page until Ctrl-C, which is how it ends."""
+    """Serve the page until Ctrl-C."""
     console = Terminal()
     _check_is_no_page(arguments.source)
-    # first of all: a port that is taken is no reason to wait for the scene
+    # first: report a port in use before loading the scene
     with PageServer(b"", arguments.host, arguments.port, policy=page.policy()) as server:
         source = open_source(arguments.source)
         title = _title(arguments.source)
@@ -32,9 +32,9 @@ def run(arguments: argparse.Namespace) -> None:
         )
         if warning := exposure(arguments.host, "sees the scene"):
             console.print(warning, soft_wrap=True)
-        console.print(f"{server.url}   (Ctrl-C ends it)", soft_wrap=True)
+        console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
         if not arguments.no_open and _has_screen():
-            # a thread: some browsers are programs that have to end before webbrowser goes on
+            # in a thread: some browsers have to exit before webbrowser returns
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         try:
             server.serve_forever()
@@ -43,9 +43,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _check_is_no_page(path: Path) -> None:
-    """Refuse a page, which needs no program but a browser."""
+    """Reject a page, which a browser opens without this program."""
     if path.suffix.lower() == export.PAGE and path.is_file():
-        raise ArgumentError(f"{path}: is a page already; open it in a browser: {path.resolve().as_uri()}")
+        raise ArgumentError(f"{path}: is already a page; open it in a browser: {path.resolve().as_uri()}")
 
 
 def _title(path: Path) -> str:
@@ -53,7 +53,7 @@ def _title(path: Path) -> str:
 
 
 def _has_screen() -> bool:
-    """Say whether a person sits here whose screen can show a browser's window."""
+    """Return whether a user at this computer could see a browser window."""
     windows = sys.platform in ("win32", "darwin") or any(
         os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
     )

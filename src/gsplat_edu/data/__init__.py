@@ -1,1 +1,1 @@
-"""Where views come from: a folder on disk, or a scene we render ourselves."""
+"""Sources of views: captures on disk, and procedural scenes."""

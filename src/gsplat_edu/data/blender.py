@@ -1,13 +1,14 @@
 """Blender's synthetic scenes: transforms_train.json, transforms_val.json and transforms_test.json.
 
-The frames are those of transforms.json. Source: the scenes of Mildenhall et al. 2020, "NeRF".
+The frames are as in transforms.json. Source: the scenes of Mildenhall et al. 2020, "NeRF".
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from gsplat_edu.data.capture import Capture, Frame, is_file, missing_note, outside_note
+from gsplat_edu.data.capture import Capture, Frame, is_file
+from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, UnusedSplit
 from gsplat_edu.data.points import BLENDER_CUBE
 from gsplat_edu.data.transforms import nothing_found, read_frames, read_json
 
@@ -15,7 +16,7 @@ TRAIN_FILE = "transforms_train.json"
 
 
 def read_blender(folder: Path) -> Capture:
-    """Read a Blender scene: its training views, and to test with those of test, or of val where there is no test.
+    """Read a Blender scene: its training views, and the test views from test, or from val if there is no test.
 
     Args:
         folder: The folder with transforms_train.json.
@@ -36,9 +37,9 @@ def read_blender(folder: Path) -> Capture:
         missing += found.missing
         outside += found.outside
     val = folder / "transforms_val.json"
-    notes = list[str]()
+    notes = list[Note]()
     if held_out is not None and held_out != val and is_file(val):
-        notes.append(f"{val.name}: its photos are left out; {held_out.name} is there to test with")
-    notes += [missing_note(missing, len(frames) + len(missing))] if missing else []
-    notes += [outside_note(outside, folder)] if outside else []
+        notes.append(UnusedSplit(val.name, held_out.name))
+    notes += [MissingPhotos(len(missing), len(frames) + len(missing), missing[0])] if missing else []
+    notes += [FilesOutside(outside[0], len(outside), folder)] if outside else []
     return Capture("Blender", tuple(frames), None, tuple(notes), cube=BLENDER_CUBE)

@@ -1,10 +1,10 @@
-"""What every layout is read into: frames, points, and what the user should know about them."""
+"""The common form of all layouts: frames, points, and notes for the user."""
 
 from __future__ import annotations
 
 import os
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -14,40 +14,42 @@ from jaxtyping import Float64
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.images import PhotoFile, image_size
-from gsplat_edu.data.lens import Lens, straightened
+from gsplat_edu.data.lens import Lens
+from gsplat_edu.data.notes import Note
 from gsplat_edu.errors import DatasetError
 
 ROTATION_SLACK = 1e-2
-"""Largest entry of R R' - I in a file that is still taken for a rotation written with few digits."""
+"""Largest entry of R R' - I that is accepted as a rotation written with few digits."""
 
 MAX_COORDINATE = 1e12
-"""Largest coordinate that is believed, world units."""
+"""Largest plausible coordinate, world units."""
 
 FACTOR_BELOW = 32
-"""A resolution below this divides the size; from here on it is the longest side, px."""
+"""A resolution below this is a divisor of the size; from here on it is the longest side, px."""
 
 READY_MADE = (2, 4, 8)
-"""Factors for which a folder images_2, images_4 or images_8 is looked for."""
+"""Factors of the folders images_2, images_4 and images_8 that are searched."""
 
 PHOTO_FOLDERS = ("images", *(f"images_{factor}" for factor in READY_MADE))
-"""Folders that hold the same photos in several sizes."""
+"""Folders with the same photos in several sizes."""
 
 PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic")
-"""What names of photos end in, in any case."""
+"""Suffixes of photos, in any case."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One photo with its camera, as the capture states them.
+    """One photo with its camera, as given by the capture.
 
     Args:
-        name: What the capture calls it.
+        name: The photo's name in the capture.
         image: The image file, which exists.
-        lens: The camera's intrinsics; its size may not be the file's.
+        lens: The camera's intrinsics; their size may differ from the file's.
         R: (3, 3) world-to-camera rotation, OpenCV axes.
         eye: (3,) camera centre, world units.
-        mask: Image file that is zero where a pixel does not count.
-        part: "train" or "test" where the capture says so, "left out" where it lists others only, else "".
+        mask: Image file that is zero for pixels that do not count.
+        part: "train" or "test" if the capture assigns it, "left out" if it is missing from the capture's lists, else
+            "".
     """
 
     name: str
@@ -61,7 +63,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points to start from.
+    """Initial points.
 
     Args:
         points: (N, 3) world units.
@@ -74,27 +76,27 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """What a folder holds.
+    """The contents of a capture folder.
 
     Args:
         layout: "COLMAP", "transforms.json" or "Blender".
         frames: In any order; at least one.
-        cloud: The capture's points; None where it has none.
-        notes: Sentences for the user.
-        no_cloud: Why there are no points, where there are none.
-        cube: Half the edge of the cube around the origin that holds the scene, where the layout fixes it.
+        cloud: The capture's points; None if it has none.
+        notes: Facts that the user should know.
+        no_cloud: The reason for missing points.
+        cube: Half the edge of the cube around the origin that contains the scene, if the layout defines it.
     """
 
     layout: str
     frames: tuple[Frame, ...]
     cloud: Cloud | None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     no_cloud: str = "the capture has no points"
     cube: float | None = None
 
 
 def is_file(path: Path) -> bool:
-    """Say whether a file is there; names that no file can have are not."""
+    """Return whether a file exists; false for invalid names."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -102,7 +104,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Say whether a folder is there; names that no folder can have are not."""
+    """Return whether a folder exists; false for invalid names."""
     try:
         return path.is_dir()
     except (OSError, ValueError):
@@ -110,21 +112,21 @@ def is_folder(path: Path) -> bool:
 
 
 class Listings:
-    """The names in the folders of photos, each folder listed once.
+    """Names in the photo folders, each folder listed once.
 
-    A capture may name hundreds of thousands of photos that are not there, each of which could have twenty-two endings
-    in four folders. Asking the system about every spelling takes minutes.
+    A capture may name hundreds of thousands of missing photos, each with twenty-two possible suffixes in four folders.
+    Asking the system about every spelling would take minutes.
     """
 
     def __init__(self) -> None:
         self._known: dict[str, frozenset[str] | None] = {}
 
     def may_hold(self, path: str) -> bool:
-        """Say whether a photo of that name can be there; the system then has to say that it is.
+        """Return whether a photo of that name may exist; if so, the system has to confirm it.
 
         Args:
-            path: Path of the photo, with or without its ending. Case does not matter, nor how accents are composed, as
-                on file systems that ignore both.
+            path: Path of the photo, with or without suffix. Case and the composition of accents are ignored, as on file
+                systems that ignore both.
         """
         parent, name = os.path.split(path)
         if parent not in self._known:
@@ -138,11 +140,11 @@ def _folded(name: str) -> str:
 
 
 def _folded_names(folder: Path) -> frozenset[str] | None:
-    """List a folder and those with smaller copies of its photos; None where one cannot be listed."""
+    """List a folder and its counterparts with smaller copies of the photos; None if one cannot be listed."""
     names = set[str]()
     for place in (folder, *(copy for name in PHOTO_FOLDERS[1:] if (copy := _copy_place(folder, name)))):
         try:
-            for name in os.listdir(place):  # noqa: PTH208 - names are enough
+            for name in os.listdir(place):  # noqa: PTH208 - only names are needed
                 stem, dot, ending = name.rpartition(".")
                 names.add(_folded(name))
                 if f"{dot}{ending}".lower() in PHOTO_ENDINGS:
@@ -155,7 +157,7 @@ def _folded_names(folder: Path) -> frozenset[str] | None:
 
 
 def is_outside(folder: Path, name: str) -> bool:
-    """Say whether a path that a capture names leads out of its folder; links are not followed.
+    """Return whether a path in a capture leads out of its folder; links are not followed.
 
     Args:
         folder: The capture.
@@ -163,22 +165,15 @@ def is_outside(folder: Path, name: str) -> bool:
     """
     if ".." not in name and not PurePosixPath(name).is_absolute() and not PureWindowsPath(name).drive:
         return False
-    place, top = os.path.abspath(folder / name), os.path.abspath(folder)  # noqa: PTH100 - it folds ".." lexically
+    place, top = os.path.abspath(folder / name), os.path.abspath(folder)  # noqa: PTH100 - resolves ".." lexically
     return not Path(place).is_relative_to(top)
-
-
-def outside_note(outside: Sequence[Path], folder: Path) -> str:
-    """Say which files are read from elsewhere because the capture says so."""
-    more = f" and {len(outside) - 1} more files" if len(outside) > 1 else ""
-    verb = "lie" if more else "lies"
-    return f"{outside[0]}{more} {verb} outside of {folder}; the capture names {'them' if more else 'it'}"
 
 
 def entries(folder: Path) -> list[Path]:
     """List a folder.
 
     Raises:
-        DatasetError: it cannot be read.
+        DatasetError: the folder cannot be read.
     """
     try:
         return sorted(folder.iterdir())
@@ -187,10 +182,10 @@ def entries(folder: Path) -> list[Path]:
 
 
 def find_photo(path: Path) -> Path | None:
-    """Find a photo; where it is not in images/, the smaller one of images_2, images_4 or images_8.
+    """Find a photo: in images/, else its smaller copy in images_2, images_4 or images_8.
 
     Args:
-        path: Where the capture says it is.
+        path: The path given by the capture.
     """
     if is_file(path):
         return path
@@ -198,26 +193,21 @@ def find_photo(path: Path) -> Path | None:
     return next((copy for copy in copies if copy is not None), None)
 
 
-def missing_note(missing: Sequence[str], total: int) -> str:
-    """Say how many photos have no file."""
-    return f"{len(missing)} of {total} photos have no file: skipped, first {missing[0]}"
-
-
 def checked_frame(where: str, frame: Frame) -> Frame:
-    """Check a pose, and make a rotation that lost digits one again.
+    """Check a pose, and restore the orthogonality of a rotation written with few digits.
 
-    The nearest rotation in the least-squares sense is U V' of the singular value decomposition U S V' = R.
+    The nearest rotation in the least-squares sense is U V', with the singular value decomposition R = U S V'.
 
     Args:
-        where: File and image, for the message.
-        frame: As read.
+        where: File and image, for messages.
+        frame: The frame as read.
 
     Raises:
         DatasetError: a number is NaN, infinite or absurd, or R is not a rotation.
     """
     if not (np.all(np.abs(frame.eye) < MAX_COORDINATE) and np.all(np.isfinite(frame.R))):
         raise DatasetError(
-            f"{where}: its pose is NaN, infinite or absurdly far; take the image out of the capture"
+            f"{where}: its pose is NaN, infinite or absurdly far away; remove the image from the capture"
         )
     if np.abs(frame.R).max() > 1e3:
         raise DatasetError(f"{where}: its pose is not a rotation; entries up to {np.abs(frame.R).max():g}")
@@ -227,7 +217,9 @@ def checked_frame(where: str, frame: Frame) -> Frame:
         scale = abs(det) ** (1 / 3)
         uniform = scale > 0 and np.abs(frame.R @ frame.R.T / scale**2 - np.eye(3)).max() < ROTATION_SLACK
         what = "mirrors" if det < 0 else f"is scaled by {scale:.4g}" if uniform else "is not orthonormal"
-        raise DatasetError(f"{where}: its rotation {what}; poses have to be a rotation and a translation")
+        raise DatasetError(
+            f"{where}: its rotation {what}; poses must consist of a rotation and a translation"
+        )
     if error < 1e-12:
         return frame
     U, _, Vt = np.linalg.svd(frame.R)
@@ -240,62 +232,62 @@ def photo_file(
     background: tuple[float, float, float] | None,
     size_of: Callable[[Path], tuple[int, int]] = image_size,
 ) -> tuple[PhotoFile, Camera, bool]:
-    """Work out which file a view is read from, how, and the camera that goes with the result.
+    """Determine a view's image file, how to load it, and the resulting camera.
 
     Args:
         frame: The frame.
-        resolution: Below `FACTOR_BELOW` what to divide the size by, else the longest side, px; None: as it is.
+        resolution: Below `FACTOR_BELOW`, the divisor of the size; else the longest side, px; None keeps the size.
         background: As for `PhotoFile`.
-        size_of: Reads the size of an image file; one that remembers saves time where frames share files.
+        size_of: Reads the size of an image file; a caching one saves time if frames share files.
 
     Returns:
-        The photo; its camera, a pinhole of the final size; whether the file has another size than the frame
-        says, so that the intrinsics were rescaled.
+        The photo; its camera, a pinhole of the final size; and whether the file's size differs from the frame's, in
+        which case the intrinsics were rescaled.
 
     Raises:
-        DatasetError: a file is no image, the sizes of photo, mask and camera do not fit, or the distortion
-            cannot be undone.
+        DatasetError: a file is not an image, the sizes of photo, mask and camera are inconsistent, or the photo cannot
+            be undistorted.
     """
     path = frame.image
     size = size_of(path)
     rescaled = size != (frame.lens.W, frame.lens.H)
     lens = _fitted(frame, path, size)
     if frame.mask is not None and (mask_size := size_of(frame.mask)) != size:
-        raise DatasetError(
-            f"{frame.mask}: the mask is {_spelled(mask_size)} but its photo {_spelled(size)}; make them one size"
-        )
+        reason = f"the mask is {_spelled(mask_size)} but its photo {_spelled(size)}"
+        raise DatasetError(f"{frame.mask}: {reason}; make them one size", reason)
     W, H = _target(*size, resolution)
-    # A mask has the size of the full photo, so a photo that has one is always downscaled here.
+    # A mask has the size of the full photo, so a photo with a mask is always downscaled here.
     smaller = _smaller_copy(path, resolution) if frame.mask is None else None
     if smaller is not None:
         path = smaller
         W, H = size_of(path)
         lens = _fitted(frame, path, (W, H))
     try:
-        pinhole = _resized(straightened(lens), W, H)
+        pinhole = lens.undistorted().scaled(W, H)
     except DatasetError as error:
-        raise DatasetError(f"{frame.name}: {error}") from None
-    camera = Camera(frame.R, frame.eye, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, H, W)
+        raise DatasetError(f"{frame.name}: {error}", error.reason) from None
+    camera = Camera.posed(frame.R, frame.eye, pinhole)
     return PhotoFile(path, frame.mask, lens, W, H, background), camera, rescaled
 
 
 def _fitted(frame: Frame, path: Path, size: tuple[int, int]) -> Lens:
-    """Return the lens at the size the file has."""
+    """Return the lens scaled to the file's size."""
     (W, H), lens = size, frame.lens
-    # Both sizes may have been rounded by up to a pixel, of the smaller of photo and camera.
+    # Both sizes may have been rounded by up to a pixel of the smaller one of photo and camera.
     slack = max(1.0, W / lens.W) * (1.0 + lens.H / lens.W)
     if abs(H - lens.H * W / lens.W) > slack:
+        what = f"is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect ratio"
         raise DatasetError(
-            f"{path}: the photo of {frame.name} is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect "
-            "ratio; was the photo cropped or turned after the poses were found?"
+            f"{path}: the photo of {frame.name} {what}; was the photo cropped or turned after the poses were found?",
+            f"the photo {what}",
         )
-    return _resized(lens, W, H)
+    return _scaled(lens, W, H)
 
 
 @lru_cache(maxsize=4096)
-def _resized(lens: Lens, W: int, H: int) -> Lens:
-    """Resize a lens; the frames of a capture share a few."""
-    return lens.resized(W, H)
+def _scaled(lens: Lens, W: int, H: int) -> Lens:
+    """Scale a lens, with a cache: the frames of a capture share a few lenses."""
+    return lens.scaled(W, H)
 
 
 def _target(W: int, H: int, resolution: float | None) -> tuple[int, int]:
@@ -306,18 +298,18 @@ def _target(W: int, H: int, resolution: float | None) -> tuple[int, int]:
 
 
 def _smaller_copy(path: Path, resolution: float | None) -> Path | None:
-    """Find images_4/NAME beside images/NAME for resolution 4."""
+    """Find images_4/NAME next to images/NAME for resolution 4."""
     return _copy(path, f"images_{resolution:.0f}") if resolution in READY_MADE else None
 
 
 def _copy(path: Path, name: str) -> Path | None:
-    """Find the same photo in another of the folders."""
+    """Find the same photo in another of these folders."""
     place = _copy_place(path.parent, name)
     return copy if place is not None and is_file(copy := place / path.name) else None
 
 
 def _copy_place(parent: Path, name: str) -> Path | None:
-    """Return the folder that corresponds to a folder of photos among their smaller copies."""
+    """Return the counterpart of a photo folder that holds smaller copies."""
     for folder in (parent, *parent.parents):
         if folder.name in PHOTO_FOLDERS:
             return folder.with_name(name) / parent.relative_to(folder)
@@ -325,7 +317,7 @@ def _copy_place(parent: Path, name: str) -> Path | None:
 
 
 def unit_colors(colors: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-    """Bring colours to the range 0 to 1; what is NaN becomes mid-gray."""
+    """Clamp colours to 0..1; NaN becomes mid-grey."""
     return np.asarray(np.clip(np.nan_to_num(colors, nan=0.5), 0.0, 1.0))
 
 

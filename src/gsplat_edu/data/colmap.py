@@ -1,8 +1,8 @@
 """COLMAP's sparse models: cameras, images and points3D, as .bin or .txt.
 
-World and camera axes are those of this project. Quaternions are (w, x, y, z) and turn world into camera
-coordinates, x_cam = R x + t; so the camera stands at -R' t. What rigs.bin and frames.bin of newer versions say is
-in images.bin too, so they are not read.
+World and camera axes match this project's. Quaternions are (w, x, y, z) and rotate world into camera coordinates, x_cam
+= R x + t, so the camera centre is -R' t. The contents of rigs.bin and frames.bin of newer versions are also in
+images.bin, so those files are not read.
 
 Source: COLMAP's documentation, "Output Format" and "Camera Models".
 """
@@ -30,11 +30,10 @@ from gsplat_edu.data.capture import (
     is_file,
     is_folder,
     is_outside,
-    missing_note,
-    outside_note,
     unit_colors,
 )
 from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels, UnclearMasks
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.gaussian_math import quat_to_R
 from gsplat_edu.reading import read_bytes, read_text
@@ -60,7 +59,7 @@ MODELS: tuple[tuple[str, str], ...] = (
     ("EUCM", "fx fy cx cy alpha beta"),
     ("EQUIRECTANGULAR", "w h"),
 )
-"""COLMAP's camera models by their number, with their parameters."""
+"""COLMAP's camera models by number, with their parameters."""
 
 REFUSED = (
     "FOV",
@@ -71,11 +70,11 @@ REFUSED = (
     "EUCM",
     "EQUIRECTANGULAR",
 )
-"""Those that are not undistorted here."""
+"""Models that are not supported."""
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-"""Where a model is looked for in a capture, in this order; then in folders with a number in sparse, colmap/sparse and
-the capture itself."""
+"""Locations of a model in a capture, in search order; after these, numbered folders in sparse, colmap/sparse and the
+capture itself are searched."""
 
 SUFFIXES = (".bin", ".txt")
 
@@ -90,10 +89,10 @@ class Pose(NamedTuple):
 
 
 def find_model(folder: Path) -> Path | None:
-    """Find the folder that holds a model, by its cameras file or its images file.
+    """Find the folder of a model, by its cameras or images file.
 
     Args:
-        folder: The capture, or its folder of models, or the model.
+        folder: The capture, its folder of models, or the model.
     """
     places = [folder / place for place in PLACES]
     for parent in (folder / "sparse", folder / "colmap" / "sparse", folder):
@@ -103,27 +102,27 @@ def find_model(folder: Path) -> Path | None:
 
 
 def read_colmap(folder: Path, model: Path) -> Capture:
-    """Read a capture whose poses COLMAP found.
+    """Read a capture with poses from COLMAP.
 
     Args:
-        folder: The capture, with the photos in images/ or beside.
-        model: The folder with cameras, images and perhaps points3D.
+        folder: The capture, with the photos in images/ or next to the model.
+        model: The folder with cameras, images and optionally points3D.
 
     Raises:
-        DatasetError: a file is missing, cut short or malformed; a camera model is not undistorted here; a pose is
-            none; two images are one file; or no image has a file.
+        DatasetError: a file is missing, truncated or malformed; a camera model is unsupported; a pose is invalid; two
+            images share one file; or no image has a file.
     """
     suffix = _suffix(model)
     listed = model / f"images{suffix}"
     poses = read_images(listed)
     if not poses:
-        raise DatasetError(f"{listed}: lists no images; run COLMAP's mapper, or name another model")
+        raise DatasetError(f"{listed}: lists no images; run COLMAP's mapper, or choose another model")
     photos, masks, notes = _files(folder, model, [pose.name for pose in poses])
     there = [pose for pose in poses if pose.name in photos]
     missing = [legible(pose.name) for pose in poses if pose.name not in photos]
     if not there:
         raise DatasetError(
-            f"{folder}: none of the {len(poses)} photos that {listed.name} lists has a file, first {missing[0]}; put "
+            f"{folder}: none of the {len(poses)} photos listed in {listed.name} has a file, first {missing[0]}; put "
             "them into images/"
         )
     lenses = read_cameras(model / f"cameras{suffix}", {pose.camera for pose in there})
@@ -133,35 +132,33 @@ def read_colmap(folder: Path, model: Path) -> Capture:
         where = f"{listed}, image {name}"
         if pose.camera not in lenses:
             raise DatasetError(
-                f"{where}: its camera {pose.camera} is not in cameras{suffix}; the two do not belong together"
+                f"{where}: its camera {pose.camera} is not in cameras{suffix}; the two files do not belong together"
             )
         R, eye = _placed(where, pose)
         frame = Frame(name, photos[pose.name], lenses[pose.camera], R, eye, masks.get(pose.name))
         frames.append(checked_frame(where, frame))
     if missing:
-        notes.append(missing_note(missing, len(poses)))
+        notes.append(MissingPhotos(len(missing), len(poses), missing[0]))
     others = [place.name for place in _numbered(model.parent) if place != model]
     if model.name.isdecimal() and others and (model.parent == folder or model.parent.name == "sparse"):
-        notes.append(
-            f"{model.parent} holds {len(others) + 1} models: {model.name} is read, {', '.join(others)} not"
-        )
+        notes.append(OtherModels(model.parent, model.name, tuple(others)))
     return Capture("COLMAP", tuple(frames), read_points(model), tuple(notes))
 
 
 def points_file(model: Path) -> Path | None:
-    """Find the file with the points of a model, as .bin or as .txt, whatever its other files are."""
+    """Find a model's file of points, .bin or .txt, independent of the suffix of its other files."""
     paths = (model / f"points3D{suffix}" for suffix in SUFFIXES)
     return next((path for path in paths if is_file(path)), None)
 
 
 def read_points(model: Path) -> Cloud | None:
-    """Read the points of a model, or nothing where there is no such file or it is empty.
+    """Read a model's points; return None if the file is missing or empty.
 
     Args:
         model: The folder with points3D.bin or points3D.txt.
 
     Raises:
-        DatasetError: the file is cut short or malformed.
+        DatasetError: the file is truncated or malformed.
     """
     path = points_file(model)
     if path is None:
@@ -178,10 +175,10 @@ def read_cameras(path: Path, used: Container[int] | None = None) -> dict[int, Le
 
     Args:
         path: cameras.bin or cameras.txt.
-        used: Numbers of the cameras that are wanted; None for all. What the others are does not matter.
+        used: Numbers of the required cameras; None for all. Other cameras may be unsupported.
 
     Raises:
-        DatasetError: the file is cut short or malformed, or a camera model is not undistorted here.
+        DatasetError: the file is truncated or malformed, or a required camera model is unsupported.
     """
     lenses = {}
     for where, camera, model, W, H, values in (
@@ -203,7 +200,7 @@ def read_images(path: Path) -> list[Pose]:
         path: images.bin or images.txt.
 
     Raises:
-        DatasetError: the file is cut short or malformed.
+        DatasetError: the file is truncated or malformed.
     """
     return _images_bin(path) if path.suffix == ".bin" else _images_txt(path)
 
@@ -212,13 +209,11 @@ def _suffix(model: Path) -> str:
     for suffix in SUFFIXES:
         if is_file(model / f"cameras{suffix}") and is_file(model / f"images{suffix}"):
             return suffix
-    raise DatasetError(
-        f"{model}: holds not both of cameras and images, as .bin or as .txt; copy the whole model"
-    )
+    raise DatasetError(f"{model}: needs both cameras and images, as .bin or as .txt; copy the whole model")
 
 
 def _numbered(folder: Path) -> list[Path]:
-    """List the folders whose names are numbers, in their order."""
+    """List the folders whose names are numbers, in ascending order."""
     if not is_folder(folder):
         return []
     return sorted(
@@ -227,10 +222,10 @@ def _numbered(folder: Path) -> list[Path]:
 
 
 def _photo_folders(folder: Path, model: Path) -> tuple[list[Path], list[Path]]:
-    """Return where photos may lie, and where masks may."""
+    """Return the possible folders of photos, and of masks."""
     photos, masks = [folder / "images", folder], [folder / "masks"]
     if model == folder or (model.parent == folder and model.name.isdecimal()):
-        # The model or its folder was named; its photos lie where they would for the capture.
+        # The model or its parent folder was given; its photos are where they would be for the capture.
         above = folder.absolute().parents[:2]
         photos += [parent / "images" for parent in above]
         masks += [parent / "masks" for parent in above]
@@ -239,13 +234,13 @@ def _photo_folders(folder: Path, model: Path) -> tuple[list[Path], list[Path]]:
 
 def _files(
     folder: Path, model: Path, names: Sequence[str]
-) -> tuple[dict[str, Path], dict[str, Path], list[str]]:
-    """Find photos and masks, by the names of the images, and say what was not used.
+) -> tuple[dict[str, Path], dict[str, Path], list[Note]]:
+    """Find photos and masks by the names of the images, and report unused files.
 
-    A file that lies there without the folders of its name is used where no other image has that bare name.
+    A file outside the folders of its image's name is used if no other image has the same bare name.
 
     Raises:
-        DatasetError: two images lead to one file.
+        DatasetError: two images share one file.
     """
     photo_folders, mask_folders = _photo_folders(folder, model)
     mask_folders = [place for place in mask_folders if is_folder(place)]
@@ -256,7 +251,7 @@ def _files(
         last = Path(name).name
         alone = [last] if bare[last] == 1 else []
         places = [p for p in _candidates(photo_folders, name, alone) if listings.may_hold(str(p))]
-        # Photos of full size first, wherever they are; then those of images_2, images_4 and images_8.
+        # Photos of full size first, in any folder; then those of images_2, images_4 and images_8.
         photo = next((p for find in (_present, find_photo) for p in map(find, places) if p), None)
         mask = next((p for p in _masks(mask_folders, [name, *alone]) if is_file(p)), None)
         if photo is not None:
@@ -267,15 +262,12 @@ def _files(
             unclear.append(legible(name))
     _check_single(model, names, photos)
     _check_single(model, names, masks)
-    notes = list[str]()
+    notes = list[Note]()
     outside = [photos[name] for name in names if name in photos and is_outside(folder, name)]
     if outside:
-        notes.append(outside_note(outside, folder))
+        notes.append(FilesOutside(outside[0], len(outside), folder))
     if unclear:
-        notes.append(
-            f"{len(unclear)} of {len(names)} photos have a mask only by a bare name that several share: not used, "
-            f"first {unclear[0]}; put masks into folders as the photos are"
-        )
+        notes.append(UnclearMasks(len(unclear), len(names), unclear[0]))
     return photos, masks, notes
 
 
@@ -284,7 +276,7 @@ def _present(path: Path) -> Path | None:
 
 
 def _check_single(model: Path, names: Sequence[str], files: Mapping[str, Path]) -> None:
-    """Refuse two images with one name, or with one file."""
+    """Reject two images with one name or one file."""
     owners: dict[Path, str] = {}
     for name in names:
         if name not in files:
@@ -296,7 +288,7 @@ def _check_single(model: Path, names: Sequence[str], files: Mapping[str, Path]) 
         else:
             raise DatasetError(
                 f"{files[name]}: is the file of two images, {legible(other)} and {legible(name)}; put each "
-                "where its whole name says"
+                "at the path given by its full name"
             )
 
 
@@ -314,17 +306,17 @@ def _masks(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Path]:
 
 
 def _name(raw: bytes) -> str:
-    """Return the name of a file as the system's functions take it, with slashes."""
+    """Decode a file name for the system's functions, with slashes."""
     return os.fsdecode(raw).replace("\\", "/")
 
 
 def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
     shift = np.array(pose.shift)
-    if not np.all(np.abs(shift) < 1e100):  # what is left is for checked_frame
-        raise DatasetError(f"{where}: its pose is NaN or infinite; take the image out of the model")
+    if not np.all(np.abs(shift) < 1e100):  # the rest is checked by checked_frame
+        raise DatasetError(f"{where}: its pose is NaN or infinite; remove the image from the model")
     if not np.all(np.isfinite(pose.quat)) or not np.any(pose.quat):
         raise DatasetError(
-            f"{where}: its quaternion {pose.quat} is no rotation; take the image out of the model"
+            f"{where}: its quaternion {pose.quat} is not a rotation; remove the image from the model"
         )
     R = quat_to_R(pose.quat)
     return R, -R.T @ shift
@@ -334,7 +326,7 @@ def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
     names = dict(MODELS).get(model, "").split()
     if not names or model in REFUSED:
         raise DatasetError(
-            f"camera model {model} is not undistorted here; run `colmap image_undistorter` and load its output"
+            f"camera model {model} is not supported; run `colmap image_undistorter` and load its output"
         )
     if len(values) != len(names):
         raise DatasetError(f"{model} has {len(names)} parameters ({', '.join(names)}), got {len(values)}")
@@ -345,7 +337,7 @@ def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
 
 
 class _Binary:
-    """Little-endian numbers from a file that may be cut short."""
+    """Reads little-endian numbers from a file that may be truncated."""
 
     def __init__(self, path: Path, smallest: int) -> None:
         self.path, self.at, self.where = path, 0, "its header"
@@ -355,23 +347,23 @@ class _Binary:
             raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
         (self.count,) = self.take(struct.Struct("<Q"))
         if self.count * smallest > len(self.data) - self.at:
-            raise self.corrupt(f"its header says {self.count} entries, more than it has room for")
+            raise self.corrupt(f"its header declares {self.count} entries, more than the file can contain")
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
-        """Read the numbers of a layout."""
+        """Read the numbers of a struct layout."""
         if self.at + layout.size > len(self.data):
             raise self.corrupt(f"it ends inside {self.where}")
         self.at += layout.size
         return layout.unpack_from(self.data, self.at - layout.size)
 
     def skip(self, count: int, size: int) -> None:
-        """Leave out so many entries of so many bytes."""
+        """Skip `count` entries of `size` bytes."""
         if count * size > len(self.data) - self.at:
             raise self.corrupt(f"it ends inside {self.where}")
         self.at += count * size
 
     def word(self) -> str:
-        """Read a name, up to a zero byte."""
+        """Read a zero-terminated name."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise self.corrupt(f"it ends inside {self.where}")
@@ -379,8 +371,8 @@ class _Binary:
         return _name(raw)
 
     def corrupt(self, what: str) -> DatasetError:
-        """Make the error that names the file."""
-        return DatasetError(f"{self.path}: {what}; the file is cut short or corrupt, copy it again")
+        """Return the error for a damaged file."""
+        return DatasetError(f"{self.path}: {what}; the file is truncated or corrupt, copy it again")
 
 
 _CAMERA = struct.Struct("<IiQQ")
@@ -472,7 +464,7 @@ def _images_txt(path: Path) -> list[Pose]:
             poses.append(Pose(file, int(camera), tuple(values[:4]), tuple(values[4:])))
         except ValueError:
             raise _malformed(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
-        # The image's 2D points follow on a line of their own, which may be empty but is never left out.
+        # The image's 2D points follow on their own line, which may be empty but is always present.
         _, observed = next(lines, (number + 1, ""))
         if len(observed.split()) % 3:
             raise _malformed(path, number + 1, "the image's points as X Y POINT3D_ID, or an empty line")

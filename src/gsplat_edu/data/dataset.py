@@ -1,4 +1,4 @@
-"""The door to captures: a folder on disk in, views with cameras, photos and start points out."""
+"""Load captures: from a folder on disk to views with cameras and photos, and an initial point cloud."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from gsplat_edu.data.capture import (
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import ImageStore, PhotoFile, image_size
+from gsplat_edu.data.notes import TwoLayouts
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
@@ -34,35 +35,29 @@ from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.views import View
 
 TEST_EVERY = 8
-"""Every how manieth view is for testing where the capture does not say: the habit of the field."""
+"""Hold out every 8th view if the capture defines no split (the usual convention)."""
 
 FAR = 1e4
-"""Camera coordinates beyond which the origin is moved, world units: float32 then keeps less than 1e-3 of them."""
+"""Camera coordinates beyond which the origin is moved, world units; float32 would resolve them only to 1e-3."""
 
 EXTENT_MARGIN = 1.1
-"""The extent is this much larger than the cameras' spread (the code of Kerbl et al. 2023)."""
-
-PARALLEL = 1e-4
-"""Smallest mean squared sine between optical axes at which they are said to meet: about half a degree."""
-
-UNEVEN = 1.5
-"""Ratio of the two focal lengths beyond which the user is told: pixels of real cameras are all but square."""
+"""Factor between the cameras' spread and the extent (the code of Kerbl et al. 2023)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A capture, ready to train on.
+    """A capture, ready for training.
 
     Args:
-        path: What was loaded.
+        path: The loaded path.
         layout: "COLMAP", "transforms.json" or "Blender".
-        train: Views to train on, sorted by name; at least one.
-        test: Views to judge with, sorted by name.
-        points: (N, 3) where to start, in the frame of the cameras, world units.
+        train: Training views, sorted by name; at least one.
+        test: Test views, sorted by name.
+        points: (N, 3) initial point cloud, in the cameras' coordinate frame, world units.
         colors: (N, 3) their colours, 0 to 1.
-        origin: (3,) what was subtracted from all coordinates; zero unless they were beyond 1e4.
-        notes: Sentences the user wants to read: what was skipped, rescaled, undistorted or made up.
-        images: Where the photos are kept.
+        origin: (3,) offset that was subtracted from all coordinates; zero unless they exceeded 1e4.
+        notes: Notes for the user: skipped, rescaled, undistorted or generated data.
+        images: The photo cache.
         files: Name and files of each photo, sorted by name.
     """
 
@@ -78,18 +73,18 @@ class Dataset:
     files: tuple[tuple[str, PhotoFile], ...] = ()
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
-        """Decode every photo once, several at a time, and keep those within the budget.
+        """Decode every photo once, several in parallel, and keep those within the budget.
 
         Args:
-            progress: Called with the photos done and their total after each, from the calling thread.
+            progress: Called after each photo with the number done and the total, in the calling thread.
 
         Raises:
-            DatasetError: names the first photo, by name, that cannot be decoded.
+            DatasetError: a photo cannot be decoded; names the first one by name.
         """
         views = (*self.train, *self.test)
 
         def decode(view: View) -> None:
-            view.read()  # the photo is not returned: the futures would keep what is over the budget
+            view.read()  # not returned: the futures would keep photos beyond the budget
 
         with ThreadPoolExecutor(self.images.workers) as pool:
             futures = [pool.submit(decode, view) for view in views]
@@ -109,19 +104,19 @@ def load_dataset(
     *,
     points: Path | None = None,
 ) -> Dataset:
-    """Load a capture. Photos are opened for their sizes only; their pixels are read when asked for.
+    """Load a capture. Only the photos' headers are read; pixels are decoded when needed.
 
     Args:
-        path: The folder of a capture of COLMAP, nerfstudio, instant-ngp or Blender; or a transforms.json.
+        path: A capture folder of COLMAP, nerfstudio, instant-ngp or Blender; or a transforms.json.
         settings: Resolution, split, background and memory.
-        points: A PLY to start from instead of the capture's points, in the capture's coordinates.
+        points: A PLY that replaces the capture's initial points, in the capture's coordinates.
 
     Raises:
-        DatasetError: nothing of that kind is there, or it cannot be used; names the file and what to do.
+        DatasetError: the path holds no capture, or it cannot be used; names the file and what to do.
     """
     path = Path(path)
     capture = read_capture(path)
-    notes = list(capture.notes)
+    notes = [str(note) for note in capture.notes]
     frames = sorted(capture.frames, key=lambda frame: frame.name)
     frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
     size_of = functools.cache(image_size)
@@ -134,8 +129,8 @@ def load_dataset(
     notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
     if store.needed > store.budget:
         notes.append(
-            f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} of them are kept: "
-            "the others are read again whenever they are used; raise --image-memory, or read them smaller with "
+            f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} are kept: the "
+            "others are decoded again whenever they are used; raise --image-memory, or load smaller photos with "
             "--resolution"
         )
     train, test = _split(path, views, [frame.part for frame in frames], settings.test_every, notes)
@@ -147,7 +142,7 @@ def load_dataset(
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
-    """Measure how large a scene is by where its cameras stand.
+    """Measure the scale of a scene by the spread of its cameras.
 
     1.1 max_i |e_i - mean e|,  e_i: centre of camera i
 
@@ -155,7 +150,7 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
         cameras: At least one.
 
     Returns:
-        World units; 1 where all cameras stand at one place, since that says nothing about the scene.
+        World units; 1 if all cameras are at the same place, which says nothing about the scene.
 
     Raises:
         ArgumentError: there is no camera.
@@ -163,15 +158,15 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     Source: the code of Kerbl et al. 2023.
     """
     if not cameras:
-        raise ArgumentError("cameras: is empty; the extent of a scene needs at least one")
+        raise ArgumentError("cameras: is empty; the extent of a scene needs at least one camera")
     eyes = np.stack([camera.eye for camera in cameras])
     spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
-    # Cameras that differ by rounding alone stand at one place too.
+    # Differences within rounding count as the same place.
     return EXTENT_MARGIN * spread if spread > 1e-9 * max(1.0, float(np.abs(eyes).max())) else 1.0
 
 
 def read_capture(path: Path) -> Capture:
-    """Find out which layout a path holds, and read it: poses and names, no photo.
+    """Detect the layout of a path and read its poses and names, without photos.
 
     Raises:
         DatasetError: it holds no capture, or a damaged one.
@@ -179,14 +174,13 @@ def read_capture(path: Path) -> Capture:
     if path.suffix.lower() == ".json" and is_file(path):
         return read_blender(path.parent) if path.name == TRAIN_FILE else read_transforms(path)
     if not is_folder(path):
-        raise DatasetError(f"{path}: is no folder and no .json file; name the folder of a capture")
+        raise DatasetError(f"{path}: is neither a folder nor a .json file; give the folder of a capture")
     if is_file(path / TRAIN_FILE):
         return read_blender(path)
     model = find_model(path)
     if is_file(path / "transforms.json"):
         capture = read_transforms(path / "transforms.json")
-        note = f"{path} holds transforms.json and a COLMAP model: the poses are those of transforms.json"
-        return capture if model is None else replace(capture, notes=(note, *capture.notes))
+        return capture if model is None else replace(capture, notes=(TwoLayouts(path), *capture.notes))
     if model is not None:
         return read_colmap(path, model)
     places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
@@ -194,16 +188,16 @@ def read_capture(path: Path) -> Capture:
     folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]
     if any(file.suffix.lower() in PHOTO_ENDINGS for folder in folders for file in entries(folder)):
         raise DatasetError(
-            f"{path}: holds photos but no camera poses; find them with "
+            f"{path}: holds photos but no camera poses; find the poses with "
             f"`gsplat-edu sfm {path} OUT` (looked for {looked})"
         )
-    raise DatasetError(f"{path}: is no capture; looked for {looked}")
+    raise DatasetError(f"{path}: is not a capture; looked for {looked}")
 
 
 def _near_origin(
     frames: list[Frame], cloud: Cloud | None, notes: list[str]
 ) -> tuple[list[Frame], Cloud | None, Float64[np.ndarray, "3"]]:
-    """Move a scene whose coordinates float32 cannot hold, such as map coordinates, to the origin."""
+    """Move a scene with coordinates too large for float32, such as map coordinates, to the origin."""
     eyes = np.stack([frame.eye for frame in frames])
     if cloud is not None:
         cloud, note = finite_cloud(cloud)
@@ -222,22 +216,22 @@ def _spelled(nbytes: int) -> str:
 
 
 def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
-    """Say what was done to the intrinsics."""
+    """Report changes of the intrinsics."""
     notes, distorted = [], [frame for frame in frames if frame.lens.distorts]
     if distorted:
         notes.append(
-            f"{len(distorted)} of {len(frames)} photos come from a lens that distorts: undistorted when read"
+            f"{len(distorted)} of {len(frames)} photos have lens distortion and are undistorted on loading"
         )
     if others := [frame for frame, is_it in zip(frames, rescaled, strict=True) if is_it]:
         notes.append(
-            f"{len(others)} of {len(frames)} photos have another size than their camera, first {others[0].name}: "
+            f"{len(others)} of {len(frames)} photos differ in size from their camera, first {others[0].name}: "
             "intrinsics rescaled"
         )
-    uneven = [frame for frame in frames if not 1 / UNEVEN < frame.lens.fx / frame.lens.fy < UNEVEN]
+    uneven = [frame for frame in frames if frame.lens.uneven]
     if uneven:
         lens = uneven[0].lens
         notes.append(
-            f"{len(uneven)} of {len(frames)} cameras have focal lengths far apart, first {lens.fx:.4g} and "
+            f"{len(uneven)} of {len(frames)} cameras have very different focal lengths, first {lens.fx:.4g} and "
             f"{lens.fy:.4g} px: the calibration may be wrong"
         )
     return notes
@@ -246,26 +240,26 @@ def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
 def _split(
     path: Path, views: Sequence[View], parts: Sequence[str], test_every: int | None, notes: list[str]
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """Divide views, sorted by name, into those to train on and those to test with."""
+    """Divide views, sorted by name, into training and test views."""
     if test_every is None and any(parts):
         train, test = (
             tuple(v for v, p in zip(views, parts, strict=True) if p == part) for part in ("train", "test")
         )
         if left_out := len(views) - len(train) - len(test):
             notes.append(
-                f"{left_out} of {len(views)} photos are in none of the capture's lists to train or test on: left out"
+                f"{left_out} of {len(views)} photos are in none of the capture's training and test lists: left out"
             )
     elif test_every == 0 or (test_every is None and len(views) == 1):
         train, test = tuple(views), ()
         if test_every is None:
-            notes.append("the capture has one photo: it is trained on, and there is none to test with")
+            notes.append("the capture has only one photo: it is used for training, and none is held out")
     else:
         every = test_every or TEST_EVERY
         train = tuple(view for i, view in enumerate(views) if i % every)
         test = tuple(view for i, view in enumerate(views) if i % every == 0)
     if not train:
         raise DatasetError(
-            f"{path}: the split leaves none of its {len(views)} photos to train on; set test_every to 0"
+            f"{path}: the split leaves none of its {len(views)} photos for training; set test_every to 0"
         )
     return train, test
 
@@ -273,16 +267,16 @@ def _split(
 def _random_start(
     capture: Capture, cameras: Sequence[Camera], notes: list[str], origin: Float64[np.ndarray, "3"]
 ) -> Cloud:
-    """Make up points to start from, and say so."""
+    """Generate random initial points and report it."""
     if capture.cube is not None:
         made = random_cloud(-origin, capture.cube)
         where = f"in the cube +-{capture.cube:g}"
     else:
         half_edge = scene_extent(cameras)
-        centre = point_nearest_axes(cameras, PARALLEL)
+        centre = point_nearest_axes(cameras)
         if centre is None:
             centre = np.mean([camera.eye for camera in cameras], axis=0)
         made = random_cloud(centre, half_edge)
         where = f"within {half_edge:.4g} of ({', '.join(f'{c:.4g}' for c in centre)})"
-    notes.append(f"{capture.no_cloud}: {len(made.points):,} random ones {where} are the start")
+    notes.append(f"{capture.no_cloud}: starting from {len(made.points):,} random points {where}")
     return made

@@ -1,4 +1,4 @@
-"""From an image file to the pixels of a view: decode, undistort, downscale, mask, and keep what memory allows."""
+"""Load the pixels of a view: decode, undistort, downscale and mask image files, and cache them within a budget."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from gsplat_edu.image_files import SPELLED, UNDECODABLE, opened_image, require_r
 from gsplat_edu.views import Photo
 
 ALL_OF_IT = 0.9999
-"""Share of a pixel's sources that have to count for it to count: all, up to float32 rounding."""
+"""A downscaled pixel counts if at least this fraction of its sources does: all, up to float32 rounding."""
 
 AT_ONCE = 64_000_000
-"""Pixels to decode at once: decoding takes about 10 bytes for each, and 25 more where alpha is resampled."""
+"""Pixels to decode at once; decoding takes about 10 bytes per pixel, and 25 more if alpha is resampled."""
 
 
 @dataclass(frozen=True)
 class PhotoFile:
-    """All that the pixels of a view depend on.
+    """Everything that determines a view's pixels.
 
     Args:
         path: The image file.
-        mask: An image of the same size, zero where a pixel does not count; None where all do.
-        lens: The camera that took it, at the file's size.
-        W: Width to downscale to, px.
-        H: Height to downscale to, px.
-        background: (r, g, b), 0 to 1, behind what is transparent; None keeps the alpha.
+        mask: An image of the same size, zero for pixels that do not count; None if all count.
+        lens: Its camera, at the file's size.
+        W: Width after downscaling, px.
+        H: Height after downscaling, px.
+        background: (r, g, b), 0 to 1, behind transparent pixels; None keeps the alpha.
     """
 
     path: Path
@@ -47,10 +47,10 @@ class PhotoFile:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Read width and height from a file's header, px. EXIF orientation is ignored, as COLMAP ignores it.
+    """Read width and height from a file's header, px. EXIF orientation is ignored, as in COLMAP.
 
     Raises:
-        DatasetError: the file is no image.
+        DatasetError: the file is not an image.
     """
     try:
         with opened_image(path) as file:
@@ -60,14 +60,14 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def decode(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
-    """Decode an image file of one of `gsplat_edu.image_files.FORMATS` to 8 bits.
+    """Decode an image file in one of `gsplat_edu.image_files.FORMATS` to 8 bits.
 
     Returns:
-        RGB, and the alpha: None where the photo is opaque.
+        RGB and alpha; alpha is None if the photo is opaque.
 
     Raises:
-        DatasetError: the file is cut short, corrupt or no image.
-        NotEnoughMemoryError: its pixels need more memory than is free.
+        DatasetError: the file is truncated, corrupt or not an image.
+        NotEnoughMemoryError: the pixels need more memory than is free.
     """
     try:
         with opened_image(path) as file:
@@ -87,11 +87,11 @@ def decode(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H
 
 
 def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """Decode a mask: true where it is not zero.
+    """Decode a mask: true for nonzero pixels.
 
     Raises:
-        DatasetError: the file is cut short, corrupt or no image.
-        NotEnoughMemoryError: its pixels need more memory than is free.
+        DatasetError: the file is truncated, corrupt or not an image.
+        NotEnoughMemoryError: the pixels need more memory than is free.
     """
     try:
         with opened_image(path) as file:
@@ -103,11 +103,11 @@ def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
         raise _undecodable(path, error) from None
 
 
-def develop(source: PhotoFile) -> Photo:
-    """Decode a photo and bring it to the view's camera: over the background, undistorted, downscaled.
+def load_photo(source: PhotoFile) -> Photo:
+    """Decode a photo and convert it to the view's camera: composite, undistort, downscale.
 
     Raises:
-        DatasetError: the photo or its mask cannot be decoded, or is not of the size its header said before.
+        DatasetError: the photo or its mask cannot be decoded, or its size differs from the header read before.
     """
     image, alpha = decode(source.path)
     mask = None if source.mask is None else decode_mask(source.mask)
@@ -118,7 +118,7 @@ def develop(source: PhotoFile) -> Photo:
         image, alpha = np.asarray(Photo(image, alpha).over(source.background)), None
     if not source.lens.distorts and (source.W, source.H) == (source.lens.W, source.lens.H):
         return Photo(image, alpha, mask)
-    if alpha is not None:  # colour weighted by alpha, as float32: a transparent pixel has no colour to mix in
+    if alpha is not None:  # premultiplied float32, since transparent pixels have no colour to interpolate
         share = alpha[..., None].astype(np.float32) / 255.0
         image = np.concatenate([image * share, 255.0 * share], axis=2)
     if source.lens.distorts:
@@ -134,9 +134,9 @@ def develop(source: PhotoFile) -> Photo:
 
 
 class ImageStore:
-    """The photos of a dataset: those within a budget of memory are kept, the others read again each time.
+    """The photos of a dataset: a cache within a memory budget; other photos are decoded again on each use.
 
-    The pixels are the same either way. Any number of threads may read.
+    The pixels are the same either way. Thread-safe.
 
     Args:
         budget: Bytes of decoded photos to keep.
@@ -146,10 +146,10 @@ class ImageStore:
     def __init__(self, budget: int, sources: Sequence[PhotoFile]) -> None:
         self.budget = budget
         self.needed = sum(source.W * source.H * (3 if source.mask is None else 4) for source in sources)
-        """Bytes that all photos take, by their sizes and masks; alpha is not known before they are decoded."""
+        """Bytes needed for all photos, from their sizes and masks; alpha is known only after decoding."""
         largest = max((source.lens.W * source.lens.H for source in sources), default=1)
         self.workers = max(1, min(os.cpu_count() or 1, AT_ONCE // largest))
-        """How many photos to decode at once."""
+        """Number of photos to decode at once."""
         self.watch = FileWatch()
         self._kept: dict[PhotoFile, Photo] = {}
         self._nbytes = 0
@@ -157,25 +157,25 @@ class ImageStore:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the photos kept."""
+        """Bytes of the cached photos."""
         return self._nbytes
 
     def __len__(self) -> int:
-        """Count the photos kept."""
+        """Return the number of cached photos."""
         return len(self._kept)
 
     def read(self, source: PhotoFile) -> Photo:
-        """Return a photo, from memory where it was kept.
+        """Return a photo, from the cache if possible.
 
         Raises:
-            DatasetError: as for `develop`, or a file has changed since it was first read.
+            DatasetError: as for `load_photo`, or a file has changed since it was first read.
         """
         with self._lock:
             kept = self._kept.get(source)
         if kept is not None:
             return kept
         with self.watch.unchanged(source.path, source.mask):
-            photo = develop(source)  # outside the lock: this is what takes long
+            photo = load_photo(source)  # outside the lock because it is slow
         with self._lock:
             if source not in self._kept and self._nbytes + photo.nbytes <= self.budget:
                 self._kept[source] = photo
@@ -188,7 +188,7 @@ def _undistorted(
     mask: Bool[np.ndarray, "H W"] | None,
     lens: Lens,
 ) -> tuple[UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"], Bool[np.ndarray, "H W"] | None]:
-    """Undistort a photo and its mask, band by band: the maps cost less than decoding, so none are kept.
+    """Undistort a photo and its mask band by band. The maps cost less than decoding, so they are not cached.
 
     Raises:
         DatasetError: as for `undistortion`.
@@ -207,7 +207,7 @@ def _undistorted(
 def _unweighted(
     weighted: Float32[np.ndarray, "h w 4"],
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    """Turn colour weighted by alpha, and alpha, into bytes of the two."""
+    """Convert premultiplied colour and alpha to 8-bit colour and alpha."""
     color = weighted[..., :3] / np.maximum(weighted[..., 3:] / 255.0, 1e-6)
     return (
         np.clip(np.round(color), 0, 255).astype(np.uint8),
@@ -226,9 +226,9 @@ def _smaller_mask(mask: Bool[np.ndarray, "H W"], W: int, H: int) -> Bool[np.ndar
 def _undecodable(path: Path, error: BaseException) -> SplatError:
     reason = getattr(error, "strerror", None) or str(error).split("\n")[0] or type(error).__name__
     if "out of memory" in reason:  # Pillow's decoders say so in an OSError
-        return NotEnoughMemoryError(f"{path}: memory ran out while it was decoded; close other programs")
+        return NotEnoughMemoryError(f"{path}: ran out of memory while decoding; close other programs")
     if "cannot identify" in reason:
         reason = f"it is not a {SPELLED} image"
     return DatasetError(
-        f"{path}: cannot be decoded ({reason}); replace the file, or take it out of the capture"
+        f"{path}: cannot be decoded ({reason}); replace the file, or take it out of the capture", reason
     )

@@ -1,4 +1,4 @@
-"""Start clouds: read from a point-cloud PLY, or drawn at random where a capture has none."""
+"""Initial point clouds: read from a PLY, or random where a capture has none."""
 
 from __future__ import annotations
 
@@ -15,43 +15,45 @@ from gsplat_edu.ply_table import read_elements, read_rows
 from gsplat_edu.reading import open_file
 
 RANDOM_POINTS = 100_000
-"""Points of a random start cloud, the number Inria's code draws for Blender scenes."""
+"""Size of a random initial cloud, as in Inria's code for Blender scenes."""
 
 BLENDER_CUBE = 1.3
-"""Half the edge of the cube that holds a Blender scene, world units: that of Kerbl et al. 2023's code."""
+"""Half the edge of the cube that contains a Blender scene, world units, as in the code of Kerbl et al. 2023."""
 
 RGB = ("red", "green", "blue")
 SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 
 FULL_SCALE = {"u1": 255.0, "u2": 65535.0}
-"""What full brightness is in an integer colour; that of a float is 1."""
+"""Full brightness of integer colours; 1 for floats."""
 
 
 def read_points_ply(path: Path) -> Cloud:
-    """Read a point cloud: x y z, and colours as red green blue or as the f_dc of a scene of Gaussians.
+    """Read a point cloud: x y z, with colours as red green blue or as the f_dc of a Gaussian scene.
 
     Args:
-        path: A PLY, ASCII or binary. Points without colour become gray.
+        path: A PLY, ASCII or binary. Points without colour become grey.
 
     Returns:
-        The points, in the file's units, NaN and infinity included.
+        The points, in the file's units, including NaN and infinity.
 
     Raises:
-        DatasetError: the file is not that, or is cut short.
+        DatasetError: the file is not a point cloud in PLY, or is truncated.
     """
     try:
         with open_file(path) as file:
             header = read_elements(path, file)
             vertex = next((e for e in header.elements if {"x", "y", "z"} <= set(e.names)), None)
             if vertex is None:
-                raise DatasetError(f"{path}: has no vertices with x, y and z; a start cloud needs them")
+                raise DatasetError(
+                    f"{path}: has no vertices with x, y and z; an initial point cloud needs them"
+                )
             table = read_rows(path, file, header, vertex)
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: invalid file name
         reason = getattr(error, "strerror", None) or str(error)
-        raise DatasetError(f"{path}: cannot be read ({reason}); name a point cloud in PLY") from None
+        raise DatasetError(f"{path}: cannot be read ({reason}); give a point cloud in PLY format") from None
     except SceneFormatError as error:
         raise DatasetError(str(error)) from None
-    with np.errstate(invalid="ignore"):  # a signalling NaN says so when it is converted
+    with np.errstate(invalid="ignore"):  # converting a signalling NaN raises this flag
         return Cloud(_columns(table, ("x", "y", "z")), _colors(table, dict(vertex.properties)))
 
 
@@ -73,20 +75,22 @@ def write_points_ply(path: Path, cloud: Cloud) -> None:
 
 
 def finite_cloud(cloud: Cloud) -> tuple[Cloud, str]:
-    """Leave out points that are NaN, infinite or absurdly far.
+    """Remove points that are NaN, infinite or absurdly far away.
 
     Returns:
-        The others, and a sentence that says how many there were; "" where there were none.
+        The remaining points, and a sentence with the number removed; "" if none was.
     """
     good = np.all(np.abs(cloud.points) < MAX_COORDINATE, axis=1)
     if good.all():
         return cloud, ""
-    note = f"{np.count_nonzero(~good)} of {len(good)} points are NaN, infinite or absurdly far: left out"
+    note = (
+        f"ignored {np.count_nonzero(~good)} of {len(good)} points that are NaN, infinite or absurdly far away"
+    )
     return Cloud(cloud.points[good], cloud.colors[good]), note
 
 
 def random_cloud(centre: Float64[np.ndarray, "3"], half_edge: float) -> Cloud:
-    """Draw points and colours evenly from a cube, the same in every run.
+    """Draw points and colours uniformly from a cube; every run draws the same ones.
 
     Args:
         centre: (3,) centre of the cube, world units.
@@ -102,7 +106,7 @@ def _columns(table: np.ndarray, names: Sequence[str]) -> Float64[np.ndarray, "N 
 
 
 def _colors(table: np.ndarray, kinds: Mapping[str, str | None]) -> Float64[np.ndarray, "N 3"]:
-    """Return colours from 0 to 1; the kinds are the file's, which ASCII rows do not have any more."""
+    """Return colours from 0 to 1. `kinds` are the file's property types, which ASCII rows have lost."""
     if set(RGB) <= kinds.keys():
         return unit_colors(_columns(table, RGB) / [FULL_SCALE.get(kinds[name] or "", 1.0) for name in RGB])
     if set(SH0) <= kinds.keys():

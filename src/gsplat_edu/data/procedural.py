@@ -1,6 +1,6 @@
-"""A capture whose truth is known: a lopsided, textured scene, photographed all round by the reference renderer.
+"""A capture with known ground truth: an asymmetric, textured scene, photographed with the reference renderer.
 
-Nothing in it is symmetric, so that an axis turned round, a matrix transposed or a photo mirrored shows.
+The asymmetry reveals flipped axes, transposed matrices and mirrored photos.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gsplat_edu.validation import whole_number
 from gsplat_edu.views import View
 
 TARGET = (0.1, -0.05, 0.15)
-"""What the cameras look at: not the origin, so that a camera which forgets its own centre shows."""
+"""Target of the cameras; not the origin, so that errors in the camera centre become visible."""
 
 RADIUS = 3.2
 """Distance of the cameras, world units."""
@@ -29,25 +29,25 @@ START_NOISE = 0.03
 def procedural_capture(
     size: int = 64, count: int = 24, *, height: int | None = None, splats: int = 300, seed: int = 0
 ) -> tuple[list[View], Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
-    """Photograph the scene from a full turn of cameras, on black.
+    """Photograph the scene with a full ring of cameras, on black.
 
-    Cameras have square pixels and their principal point in the middle, ((W - 1)/2, (H - 1)/2), which every format
-    can say; photos are uint8.
+    Cameras have square pixels and a centred principal point, ((W - 1)/2, (H - 1)/2), which every format can represent;
+    photos are uint8.
 
     Args:
         size: Width of the photos, px.
         count: Number of views, named view_000.png and so on.
-        height: Height of the photos, px; three quarters of the width where None.
+        height: Height of the photos, px; None means three quarters of the width.
         splats: Number of Gaussians in the scene.
         seed: Seed of the scene and of the start points.
 
     Returns:
-        views: One per camera, by name.
-        points: (N, 3) near the means of two thirds of the Gaussians, world units.
-        colors: (N, 3) theirs, 0 to 1.
+        views: One per camera, sorted by name.
+        points: (N, 3) noisy means of two thirds of the Gaussians, world units.
+        colors: (N, 3) their colours, 0 to 1.
 
     Raises:
-        ArgumentError: a number is not whole or below 1.
+        ArgumentError: a number is not a whole number of at least 1.
     """
     W, count = whole_number("size", size, 1), whole_number("count", count, 1)
     H = max(1, round(0.75 * W)) if height is None else whole_number("height", height, 1)
@@ -65,7 +65,7 @@ def procedural_capture(
 
 
 def _camera(i: int, count: int, W: int, H: int) -> Camera:
-    """Make camera i of a turn; its elevation swings twice a turn, below and above the horizon."""
+    """Make camera i of the ring; its elevation oscillates twice per turn, below and above the horizon."""
     azimuth = 2.0 * math.pi * i / count
     elevation = -0.15 + 0.4 * math.sin(2.0 * azimuth + 0.7)
     direction = (
@@ -86,7 +86,7 @@ def _scene(
     Float64[np.ndarray, "n 3"],
     Float64[np.ndarray, " n"],
 ]:
-    """Make a bumpy egg with a horn to its right and a bright cap on one side only."""
+    """Make a bumpy egg with a horn on its right and a bright cap on one side."""
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     x, y, z = direction.T

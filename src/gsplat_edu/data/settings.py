@@ -1,4 +1,4 @@
-"""How a capture is read. It imports nothing heavy: the command line checks its options first."""
+"""Settings for loading a capture. Imports nothing heavy, because the command line checks its options first."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from gsplat_edu.validation import float64_array, in_range, whole_number
 
 @dataclass(frozen=True)
 class DataSettings:
-    """How a capture is read.
+    """Settings for loading a capture.
 
     Args:
-        resolution: None: as the photos are. Below 32: a factor to divide both sizes by, 2 for half. From 32 on:
-            the longest side in px; nothing is enlarged.
-        test_every: Every n-th view by sorted name is for testing, 0 for none; a split that the capture has of
-            its own is then dissolved. None: the capture's own split if it has one, else every 8th.
-        background: (r, g, b), 0 to 1: photos with alpha are put over it when read. None keeps the alpha, for a
-            background that is chosen later.
-        image_memory: Bytes of decoded photos kept in memory; the others are read again when they are needed.
+        resolution: None keeps the photos' size. Below 32, a factor that divides both sizes (2 for half). From 32 on,
+            the longest side in px; photos are never enlarged.
+        test_every: Hold out every n-th view by sorted name; 0 for none. This overrides the capture's own split. None
+            uses the capture's split if it defines one, else every 8th view.
+        background: (r, g, b), 0 to 1, composited behind photos with alpha on loading. None keeps the alpha for a
+            background chosen later.
+        image_memory: Bytes of decoded photos to keep in memory; other photos are decoded again on each use.
 
     Raises:
-        ArgumentError: a value is not one of these, or the split would leave no view to train on.
+        ArgumentError: a value is out of range, or the split would leave no training view.
     """
 
     resolution: float | None = None
@@ -32,10 +32,10 @@ class DataSettings:
 
     def __post_init__(self) -> None:
         if self.resolution is not None and (in_range("resolution", self.resolution, 1.0) > 1e6):
-            raise ArgumentError("resolution: is above 1e6; give a factor below 32, or the longest side in px")
+            raise ArgumentError("resolution: is above 1e6; give a factor below 32 or the longest side in px")
         if self.test_every is not None and whole_number("test_every", self.test_every, 0) == 1:
             raise ArgumentError(
-                "test_every: is 1, which leaves no view to train on; give 0 for none, or 2 and more"
+                "test_every: is 1, which leaves no training view; give 0 for none, or at least 2"
             )
         if self.background is not None:
             r, g, b = (

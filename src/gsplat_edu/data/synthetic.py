@@ -1,4 +1,4 @@
-"""Views of a procedural scene, taken by the NumPy reference renderer: a capture with known truth."""
+"""Views of a procedural scene, rendered with the NumPy reference: a capture with known ground truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsplat_edu.scenes import sphere_shell
 from gsplat_edu.views import View
 
 ORBIT_RADIUS = 3.0
-"""Distance of the course's cameras from the centre of the sphere, world units."""
+"""Distance of the course's cameras to the sphere's centre, world units."""
 
 ELEVATIONS = (-0.35, 0.0, 0.35)
 """Elevations of the three rings of training cameras, radians."""
@@ -21,10 +21,10 @@ ELEVATIONS = (-0.35, 0.0, 0.35)
 CAMERAS_PER_RING = 8
 
 HELD_OUT = (math.radians(202.5), 0.18)
-"""Azimuth and elevation of the camera that judges, between the rings and between their cameras, radians."""
+"""Azimuth and elevation of the held-out camera, radians: between the rings and between their cameras."""
 
 FX_PER_PX = 150.0 / 128.0
-"""Focal length per pixel of image size: 150 px at 128 px, so that every size shows the same."""
+"""Focal length per pixel of image size: 150 px at 128 px. So every size has the same field of view."""
 
 
 class SphereCapture(NamedTuple):
@@ -35,7 +35,7 @@ class SphereCapture(NamedTuple):
 
 
 def sphere_cameras(size: int) -> list[Camera]:
-    """Make the 24 training cameras, ring by ring, each ring by azimuth.
+    """Make the 24 training cameras, ring by ring and by azimuth within a ring.
 
     Args:
         size: Height and width of the images, px.
@@ -47,7 +47,7 @@ def sphere_cameras(size: int) -> list[Camera]:
 
 
 def sphere_capture(size: int) -> SphereCapture:
-    """Photograph `sphere_shell()` with 24 cameras to train on and one to judge with, on black.
+    """Photograph `sphere_shell()` with 24 training cameras and a held-out camera, on black.
 
     Args:
         size: Height and width of the images, px.

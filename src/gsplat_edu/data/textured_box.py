@@ -1,7 +1,7 @@
-"""Photos whose cameras are known, of something with enough texture for features: a box on a floor.
+"""Photos with known cameras of a textured box on a floor, with enough texture for feature matching.
 
-Six textured rectangles are drawn by OpenCV's homographies, not by this package's renderer: what trains on these photos
-is shown nothing of its own making. Structure from motion is tested on them, and chapter 13 begins with them.
+Six textured rectangles are drawn with OpenCV homographies instead of this package's renderer, so training on them is an
+independent test. Structure from motion is tested on these photos, and chapter 13 starts with them.
 
 Chapter: 13_photos_to_scene.
 """
@@ -21,7 +21,7 @@ from gsplat_edu.camera import Camera, look_at
 
 BOX_FACES = np.array(
     [
-        # corner, and the two edges that leave it; y points down, the floor is y = 0
+        # corner and the two edges from it; y points down, the floor is y = 0
         [(-4.0, 0.0, -4.0), (8.0, 0.0, 0.0), (0.0, 0.0, 8.0)],
         [(-0.7, -1.0, -0.5), (1.4, 0.0, 0.0), (0.0, 0.0, 1.0)],
         [(-0.7, -1.0, -0.5), (1.4, 0.0, 0.0), (0.0, 1.0, 0.0)],
@@ -30,44 +30,44 @@ BOX_FACES = np.array(
         [(-0.7, -1.0, 0.5), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)],
     ]
 )
-"""The floor, then the box's top and sides, world units: what comes later hides what came before."""
+"""The floor, then the box's top and sides, world units, in drawing order: later faces cover earlier ones."""
 
 BOX_INSIDE = np.array([0.0, -0.5, 0.0])
-"""A point in the box."""
+"""A point inside the box."""
 
 BOX_TARGET = np.array([0.1, -0.4, 0.0])
-"""What the cameras look at."""
+"""Target of the cameras."""
 
 BOX_DISTANCE = 4.0
-"""From there to a camera, world units."""
+"""Distance from the target to a camera, world units."""
 
 BOX_FOCAL = 1.1
-"""Focal length as a share of the photo's longer side: 352 px at 320."""
+"""Focal length as a fraction of the photo's longer side: 352 px at 320."""
 
 BOX_SHARPER = 2
-"""Photos are drawn this much larger and made smaller, so that edges are smooth."""
+"""Supersampling factor of the photos, for smooth edges."""
 
 BEHIND = 90
-"""Grey behind floor and box."""
+"""Grey value behind the floor and the box."""
 
 
 class Alignment(NamedTuple):
-    """The similarity x' = s R x + t, and how far it leaves cameras from their truth."""
+    """The similarity x' = s R x + t, and the remaining errors of the cameras."""
 
     s: float
     R: Float64[np.ndarray, "3 3"]
     t: Float64[np.ndarray, "3"]
-    moved: Float64[np.ndarray, " n"]  # distances of the centres, as shares of the truth's extent
-    turned: Float64[np.ndarray, " n"]  # angles between the rotations, degrees
+    moved: Float64[np.ndarray, " n"]  # distances between centres, as fractions of the true extent
+    turned: Float64[np.ndarray, " n"]  # angles between rotations, degrees
 
 
 def box_camera(azimuth: float, elevation: float = 0.45, size: tuple[int, int] = (320, 240)) -> Camera:
-    """Make a camera that looks at the box.
+    """Make a camera facing the box.
 
     Args:
         azimuth: Around the vertical, radians.
         elevation: Above the floor, radians.
-        size: Width and height of its photo, px. Held upright or not, the focal length is the same.
+        size: Width and height of its photo, px; the focal length is the same in portrait and landscape.
     """
     W, H = size
     direction = np.array(
@@ -82,11 +82,11 @@ def box_camera(azimuth: float, elevation: float = 0.45, size: tuple[int, int] = 
 
 
 def box_orbit(count: int, turn: float = 2 * math.pi, size: tuple[int, int] = (320, 240)) -> list[Camera]:
-    """Make cameras around the box; the height swings, so that the poses fix the focal length.
+    """Make cameras around the box; the height oscillates, so that the poses determine the focal length.
 
     Args:
-        count: How many.
-        turn: The angle they go around by, radians.
+        count: Number of cameras.
+        turn: Angle that they span, radians.
         size: Width and height of the photos, px.
     """
     angles = turn * np.arange(count) / count
@@ -94,13 +94,13 @@ def box_orbit(count: int, turn: float = 2 * math.pi, size: tuple[int, int] = (32
 
 
 def photograph_box(camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
-    """Take a photo of the box, RGB.
+    """Render a photo of the box, RGB.
 
     Args:
-        camera: Where from; pixel centres are whole numbers.
+        camera: The camera; pixel centres have integer coordinates.
     """
     s = BOX_SHARPER
-    # resizing is about the image's corner, (-1/2, -1/2)
+    # resizing is relative to the image's corner, (-1/2, -1/2)
     middle = [(c + 0.5) * s - 0.5 for c in (camera.cx, camera.cy)]
     K = np.array([[camera.fx * s, 0, middle[0]], [0, camera.fy * s, middle[1]], [0, 0, 1]])
     size = (s * camera.W, s * camera.H)
@@ -125,10 +125,10 @@ def photograph_box(camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
 
 @functools.cache
 def box_texture(face: int) -> UInt8[np.ndarray, "side side 3"]:
-    """Return what is painted on a face: coloured noise of all sizes, so that features are found near and far.
+    """Return the texture of a face: coloured noise at all scales, which gives features near and far.
 
     Args:
-        face: Its place in `BOX_FACES`; it is the noise's seed.
+        face: Index in `BOX_FACES`; also the seed of the noise.
     """
     side = 512 if face == 0 else 256
     rng, image = np.random.default_rng(face), np.zeros((side, side, 3), np.float32)
@@ -139,14 +139,14 @@ def box_texture(face: int) -> UInt8[np.ndarray, "side side 3"]:
 
 
 def align_cameras(found: Mapping[str, Camera], truth: Mapping[str, Camera]) -> Alignment:
-    """Move cameras onto their truth by the similarity that brings their centres closest.
+    """Align cameras with the ground truth by the similarity that minimises the distances of their centres.
 
     Args:
-        found: Cameras by name, at least three, not in line.
-        truth: Theirs, and perhaps more.
+        found: Cameras by name, at least three, not collinear.
+        truth: True cameras by name; may contain more names.
 
     Returns:
-        The similarity and what it leaves, in the order of the sorted names of `found`.
+        The similarity and the remaining errors, in the order of the sorted names of `found`.
 
     Source: Umeyama 1991.
     """

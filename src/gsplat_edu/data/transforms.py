@@ -1,7 +1,7 @@
 """transforms.json, in the dialects of nerfstudio and instant-ngp.
 
-`transform_matrix` is camera to world with OpenGL's camera axes (+x right, +y up, +z backward); its y and z columns
-are turned round here, once, which makes it OpenCV's. The world stays the file's.
+`transform_matrix` maps camera to world coordinates with OpenGL's camera axes (+x right, +y up, +z backward). Its y and
+z columns are negated here, once, which gives OpenCV's axes. World coordinates stay unchanged.
 
 Source: nerfstudio's documentation, "Data conventions"; instant-ngp's "nerf_dataset_tips".
 """
@@ -27,12 +27,11 @@ from gsplat_edu.data.capture import (
     find_photo,
     is_file,
     is_outside,
-    missing_note,
-    outside_note,
 )
 from gsplat_edu.data.colmap import find_model, points_file, read_points
 from gsplat_edu.data.images import image_size
 from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.reading import parse_json, read_text
@@ -41,62 +40,65 @@ from gsplat_edu.text import as_file_name, legible
 FISHEYE_MODEL = "OPENCV_FISHEYE"
 
 CAMERA_MODELS = ("OPENCV", FISHEYE_MODEL, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-"""Words for `camera_model` that are understood; without the word it is OPENCV. All but the fisheye are OPENCV with
-coefficients that are zero."""
+"""Supported values of `camera_model`; OPENCV is the default. All except the fisheye are OPENCV with some coefficients
+zero."""
 
 FOCAL_KEYS = {axis: (f"fl_{axis}", f"camera_angle_{axis}") for axis in "xy"}
-"""Where a focal length is looked for: in px, or as a field of view."""
+"""Keys of the focal length: in px, or as a field of view."""
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 INTRINSICS = frozenset(
     ("w", "h", "cx", "cy", "camera_model", "is_fisheye", *COEFFICIENTS, *FOCAL_KEYS["x"], *FOCAL_KEYS["y"])
 )
-"""Keys that decide a lens."""
+"""Keys that determine a lens."""
 
 
 class Found(NamedTuple):
-    """What a file lists."""
+    """Contents of a file."""
 
     frames: list[Frame]
     missing: list[str]
-    """Names of photos that have no file."""
+    """Names of photos without a file."""
     outside: list[Path]
-    """Photos and masks that are not in the folder of the file."""
+    """Photos and masks outside the file's folder."""
 
 
 def read_transforms(path: Path) -> Capture:
-    """Read a capture whose poses stand in a transforms.json.
+    """Read a capture whose poses are in a transforms.json.
 
     Args:
-        path: The file; the paths in it are relative to its folder.
+        path: The file; its paths are relative to its folder.
 
     Raises:
-        DatasetError: the file is not JSON or lacks something, a camera model or pose cannot be used, or no frame
-            has a photo.
+        DatasetError: the file is not JSON or incomplete, a camera model or pose is unsupported, or no frame has a
+            photo.
     """
     contents = read_json(path)
     frames, missing, outside = read_frames(path, contents)
     if not frames:
         raise nothing_found(path, missing)
-    notes = [missing_note(missing, len(frames) + len(missing))] if missing else []
+    notes = list[Note]()
+    if missing:
+        notes.append(MissingPhotos(len(missing), len(frames) + len(missing), missing[0]))
     cloud, no_cloud = _cloud(path, contents)
     if "ply_file_path" in contents and is_outside(
         path.parent, points := _tidy(str(contents["ply_file_path"]))
     ):
         outside.append(path.parent / points)
-    notes += [outside_note(outside, path.parent)] if outside else []
+    if outside:
+        notes.append(FilesOutside(outside[0], len(outside), path.parent))
     return Capture("transforms.json", tuple(frames), cloud, tuple(notes), no_cloud or Capture.no_cloud)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds one object.
+    """Read a JSON file that contains one object.
 
     Returns:
-        The object. What is null, in it or in a frame, is left out: it says as much as nothing.
+        The object. null counts as missing, at the top level and in frames.
 
     Raises:
-        DatasetError: it does not; a syntax error is named by line and column.
+        DatasetError: the file does not contain an object; a syntax error is located by line and column.
     """
     try:
         contents = parse_json(read_text(path, "utf-8-sig"))
@@ -107,11 +109,11 @@ def read_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     except UnicodeDecodeError:
-        raise DatasetError(f"{path}: is not JSON (no UTF-8 text); repair the file") from None
+        raise DatasetError(f"{path}: is not JSON (not UTF-8 text); repair the file") from None
     except ValueError as error:
         raise DatasetError(f"{path}: is not JSON ({error}); repair the file") from None
     if not isinstance(contents, dict) or not isinstance(contents.get("frames"), list):
-        raise DatasetError(f"{path}: has no list of frames; it has to be a transforms.json")
+        raise DatasetError(f"{path}: has no list of frames; expected a transforms.json")
     contents["frames"] = [_stated(f) if isinstance(f, dict) else f for f in contents["frames"]]
     return _stated(contents)
 
@@ -121,11 +123,11 @@ def _stated(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def nothing_found(path: Path, missing: list[str]) -> DatasetError:
-    """Make the error for a file none of whose frames has a photo."""
+    """Return the error for a file in which no frame has a photo."""
     what = (
         f"none of its {len(missing)} photos has a file, first {missing[0]}" if missing else "lists no frames"
     )
-    return DatasetError(f"{path}: {what}; put the photos where the file says they are")
+    return DatasetError(f"{path}: {what}; put the photos where the file expects them")
 
 
 def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Found:
@@ -133,19 +135,19 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
 
     Args:
         path: The file.
-        contents: What it holds.
-        part: The part of the dataset all frames belong to; "": what the file's own lists say.
+        contents: Its contents.
+        part: The part of the dataset for all frames; "" uses the file's own lists.
 
     Raises:
-        DatasetError: names the frame, and the key it lacks or that cannot be used.
+        DatasetError: names the frame, and the missing or invalid key.
     """
     frames, missing, outside = list[Frame](), list[str](), list[Path]()
     parts, listings = _parts(path, contents), Listings()
     shared = {key: value for key, value in contents.items() if key in INTRINSICS}
-    common: Lens | None = None  # that of all frames without intrinsics of their own
+    common: Lens | None = None  # shared by all frames without their own intrinsics
     for number, frame in enumerate(contents["frames"]):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise DatasetError(f"{path}, frame {number}: has no file_path; every frame names its photo")
+            raise DatasetError(f"{path}, frame {number}: has no file_path; every frame needs one")
         name = _tidy(frame["file_path"])
         image = _photo(path.parent / as_file_name(name), listings)
         if image is None:
@@ -167,7 +169,7 @@ def read_frames(path: Path, contents: Mapping[str, Any], part: str = "") -> Foun
 
 
 def _photo(path: Path, listings: Listings) -> Path | None:
-    """Find the photo of a file_path, which may lack its ending."""
+    """Find the photo of a file_path, which may lack its suffix."""
     if not listings.may_hold(str(path)):
         return None
     if (photo := find_photo(path)) is not None:
@@ -177,12 +179,12 @@ def _photo(path: Path, listings: Listings) -> Path | None:
 
 
 def _tidy(file_path: str) -> str:
-    """Spell a path as POSIX does, without a dot in front."""
+    """Normalise a path to POSIX form, without a leading dot."""
     return PurePosixPath(file_path.replace("\\", "/")).as_posix()
 
 
 def _parts(path: Path, contents: Mapping[str, Any]) -> dict[str, str]:
-    """Say which part each name belongs to, and under "" that of all other names."""
+    """Return the part of each listed name, and under "" the part of all other names."""
     lists = {}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = contents.get(key, [])
@@ -198,10 +200,10 @@ def _parts(path: Path, contents: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _merged(contents: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys of a frame, and those of the whole file that it does not state itself.
+    """Return a frame's keys, completed with those of the file.
 
-    One that states its focal length in whatever way takes none of the file's; one that states only that along y takes
-    the file's along x.
+    If the frame gives its own focal length in x, none of the file's focal lengths is used; if it gives only the one in
+    y, the file's focal length in x is used.
     """
     axes = "xy" if any(key in frame for key in FOCAL_KEYS["x"]) else "y"
     stated = any(key in frame for axis in axes for key in FOCAL_KEYS[axis])
@@ -214,7 +216,7 @@ def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
     model = FISHEYE_MODEL if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
     if model not in CAMERA_MODELS:
         raise DatasetError(
-            f"{where}: camera_model {model!r} is not undistorted here, only {', '.join(CAMERA_MODELS)}; undistort the "
+            f"{where}: camera_model {model!r} is not supported, only {', '.join(CAMERA_MODELS)}; undistort the "
             "capture first"
         )
     W, H = (
@@ -226,7 +228,7 @@ def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
         W, H = image_size(image)
     fx, fy = _focal(where, values, "x", W), _focal(where, values, "y", H)
     if fx is None:
-        raise DatasetError(f"{where}: has neither fl_x nor camera_angle_x, nor has the file; add one of them")
+        raise DatasetError(f"{where}: neither it nor the file has fl_x or camera_angle_x; add one of them")
     named = {"fx": fx, "fy": fx if fy is None else fy, "cx": W / 2, "cy": H / 2}
     for key in ("cx", "cy", *COEFFICIENTS):
         if key in values:
@@ -238,7 +240,7 @@ def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
 
 
 def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
-    """Read a focal length, px, or turn a field of view into one: f = size / (2 tan(angle / 2))."""
+    """Read a focal length, px, or convert a field of view: f = size / (2 tan(angle / 2))."""
     length, key = FOCAL_KEYS[axis]
     if length in values:
         return _number(where, values, length)
@@ -246,7 +248,7 @@ def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float
         return None
     angle = _number(where, values, key)
     if not 0.0 < angle < math.pi:
-        raise DatasetError(f"{where}: {key} is {angle:g}, but has to be between 0 and pi radians")
+        raise DatasetError(f"{where}: {key} is {angle:g}, but must be between 0 and pi radians")
     return 0.5 * size / math.tan(0.5 * angle)
 
 
@@ -257,21 +259,21 @@ def _number(where: str, values: Mapping[str, Any], key: str) -> float:
     except (TypeError, OverflowError):
         number = float("nan")
     if not math.isfinite(number):
-        raise DatasetError(f"{where}: {key} is {str(value)[:40]}, but has to be a number")
+        raise DatasetError(f"{where}: {key} is {str(value)[:40]}, but must be a number")
     return number
 
 
 def _whole(where: str, values: Mapping[str, Any], key: str) -> int:
     number = _number(where, values, key)
     if number != round(number) or number < 1:
-        raise DatasetError(f"{where}: {key} is {number:g}, but has to be a size in pixels")
+        raise DatasetError(f"{where}: {key} is {number:g}, but must be a size in pixels")
     return int(number)
 
 
 def _pose(
     where: str, frame: Mapping[str, Any]
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
-    """Turn camera to world in OpenGL axes into a world-to-camera rotation in OpenCV axes, and the centre."""
+    """Convert a camera-to-world matrix in OpenGL axes to a world-to-camera rotation in OpenCV axes, and the centre."""
     if "transform_matrix" not in frame:
         raise DatasetError(f"{where}: has no transform_matrix; every frame needs its pose")
     matrix = _matrix(where, frame, "transform_matrix")
@@ -284,9 +286,9 @@ def _matrix(where: str, values: Mapping[str, Any], key: str) -> Float64[np.ndarr
     except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise DatasetError(f"{where}: {key} is not 3x4 or 4x4 numbers; repair it")
+        raise DatasetError(f"{where}: {key} is not a 3x4 or 4x4 matrix; repair it")
     if matrix.shape == (4, 4) and not np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() <= 1e-6:
-        raise DatasetError(f"{where}: {key} has the last row {matrix[3].tolist()}, but it has to be 0 0 0 1")
+        raise DatasetError(f"{where}: the last row of {key} is {matrix[3].tolist()}, but must be 0 0 0 1")
     return matrix
 
 
@@ -295,18 +297,18 @@ def _mask(where: str, folder: Path, frame: Mapping[str, Any]) -> Path | None:
         return None
     mask = folder / as_file_name(_tidy(str(frame["mask_path"])))
     if not is_file(mask):
-        raise DatasetError(f"{where}: its mask {mask} is not there; put it there or remove mask_path")
+        raise DatasetError(f"{where}: its mask {mask} does not exist; add it or remove mask_path")
     return mask
 
 
 def _cloud(path: Path, contents: Mapping[str, Any]) -> tuple[Cloud | None, str]:
-    """Read the start cloud: the PLY the file names, else the points of the COLMAP model the poses came from.
+    """Read the initial cloud: the PLY that the file names, else the points of the COLMAP model behind the poses.
 
-    The PLY is in the frame of the poses already. COLMAP's points are in the frame before `applied_transform`, so
-    they are moved by it; without that key, or where the poses were scaled too, nobody knows how the two are related.
+    The PLY already has the poses' coordinate frame. COLMAP's points precede `applied_transform`, which is applied to
+    them here. Without that key, or if the poses were scaled too, the relation between the two frames is unknown.
 
     Returns:
-        The points; or none, and why COLMAP's are not used where that is the reason.
+        The points; or None, and the reason if COLMAP's points exist but cannot be used.
     """
     if "ply_file_path" in contents:
         return read_points_ply(path.parent / as_file_name(_tidy(str(contents["ply_file_path"])))), ""
@@ -315,7 +317,7 @@ def _cloud(path: Path, contents: Mapping[str, Any]) -> tuple[Cloud | None, str]:
         return None, ""
     unused = f"the points of the COLMAP model in {model} are not used, because {path.name}"
     if "applied_transform" not in contents:
-        return None, f"{unused} does not say by applied_transform how its poses were moved"
+        return None, f"{unused} does not give applied_transform, the motion of its poses"
     scale = _number(str(path), contents, "applied_scale") if "applied_scale" in contents else 1.0
     if scale != 1.0:
         return None, f"{unused} has poses scaled by {scale:g} (applied_scale)"

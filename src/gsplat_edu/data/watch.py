@@ -1,4 +1,4 @@
-"""Which files photos were read from, so that none changes unnoticed while it is in use."""
+"""Detects photo files that change while they are in use."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from pathlib import Path
 from gsplat_edu.errors import DatasetError
 
 Stamp = tuple[int, int]
-"""Size in bytes and time of the last change in ns; a file is hashed again only if one of them differs."""
+"""Size in bytes and modification time in ns; a file is hashed again only if one of them differs."""
 
 
 @dataclass(frozen=True)
 class FileDigest:
-    """What a file holds.
+    """Content of a file.
 
     Args:
-        size: Bytes.
-        sha256: Digest of them, hexadecimal.
+        size: Number of bytes.
+        sha256: Hexadecimal digest.
     """
 
     size: int
@@ -30,10 +30,11 @@ class FileDigest:
 
 
 class FileWatch:
-    """Remembers the digest of every file that was read. Any number of threads may use it.
+    """Remembers the digest of every file that was read. Thread-safe.
 
-    A file of the same size and time counts as the same; one with another time is hashed again, and is the same if its
-    bytes are. Hashing reads a file once more, from the system's cache: a few percent of the time that decoding takes.
+    A file with the same size and time counts as unchanged. If only the time differs, the file is hashed again and
+    counts as unchanged if its bytes are the same. Hashing reads the file once more from the system's cache and takes a
+    few percent of the decoding time.
     """
 
     def __init__(self) -> None:
@@ -45,10 +46,10 @@ class FileWatch:
         """Check that the files read inside the block are unchanged.
 
         Args:
-            paths: The files; None stands for none.
+            paths: The files; None entries are ignored.
 
         Raises:
-            DatasetError: one has changed since it was first read, or while the block ran.
+            DatasetError: a file has changed since it was first read, or while the block ran.
         """
         given = [path for path in paths if path is not None]
         stamps = [self._check(path) for path in given]
@@ -58,7 +59,7 @@ class FileWatch:
                 self._check(path)
 
     def digest(self, path: Path) -> FileDigest | None:
-        """Return the digest of a file as it was first read, or is now; None if there is no such file."""
+        """Return a file's digest at its first reading, or now if it has not been read; None if it is missing."""
         self._check(path)
         with self._lock:
             known = self._known.get(path)
@@ -73,14 +74,14 @@ class FileWatch:
         with path.open("rb") as file:
             digest = FileDigest(stamp[0], hashlib.file_digest(file, "sha256").hexdigest())
         if known is not None and known[1] != digest:
-            raise DatasetError(f"{path}: has changed since it was first read; put the file back as it was")
+            raise DatasetError(f"{path}: has changed since it was first read; restore the file")
         with self._lock:
             self._known[path] = stamp, digest
         return stamp
 
 
 def _stamp(path: Path) -> Stamp | None:
-    """Return size and time of a regular file; None for anything else, which its decoder will refuse."""
+    """Return size and time of a regular file; None for anything else, which the decoder will reject."""
     try:
         status = path.stat()
     except (OSError, ValueError):

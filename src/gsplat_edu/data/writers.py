@@ -1,4 +1,4 @@
-"""Captures written to disk in each layout that is read, so that tests and examples need no download."""
+"""Write captures in every supported layout, so that tests and examples need no downloads."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from gsplat_edu.validation import ArrayLike, float64_array
 from gsplat_edu.views import Photo, View
 
 PINHOLE = 1
-"""COLMAP's number for a pinhole with two focal lengths."""
+"""COLMAP's model number for a pinhole with two focal lengths."""
 
 
 def write_colmap(
     folder: Path, views: Sequence[View], points: ArrayLike, colors: ArrayLike, *, binary: bool = True
 ) -> None:
-    """Write images/NAME, masks/NAME.png where a view has a mask, and a model in sparse/0.
+    """Write images/NAME, masks/NAME.png for views with a mask, and a model in sparse/0.
 
     Args:
-        folder: The capture; made where it is missing.
-        views: Views with different names that end in .png; a name may have folders.
+        folder: The capture; created if missing.
+        views: Views with different names that end in .png; a name may contain folders.
         points: (N, 3) world units.
         colors: (N, 3) 0 to 1, rounded to 8 bits.
-        binary: Whether the model is written as .bin or as .txt.
+        binary: Write the model as .bin instead of .txt.
 
     Raises:
-        ShapeError: points and colours are not (N, 3).
+        ShapeError: points or colours are not (N, 3).
     """
     cloud = _cloud(points, colors)
     model = folder / "sparse" / "0"
@@ -73,17 +73,17 @@ def write_transforms(
     *,
     extra: dict[str, Any] | None = None,
 ) -> None:
-    """Write images/NAME, masks/NAME.png where a view has a mask, points.ply and transforms.json.
+    """Write images/NAME, masks/NAME.png for views with a mask, points.ply and transforms.json.
 
     Args:
-        folder: The capture; made where it is missing.
+        folder: The capture; created if missing.
         views: Views with different names that end in .png.
-        points: (N, 3) world units, the start cloud; None for none.
-        colors: (N, 3) 0 to 1, rounded to 8 bits; given with the points.
-        extra: More keys for the file, such as `test_filenames`.
+        points: (N, 3) world units, the initial cloud; None for none.
+        colors: (N, 3) 0 to 1, rounded to 8 bits; required with points.
+        extra: Additional keys for the file, such as `test_filenames`.
 
     Raises:
-        ShapeError: points and colours are not (N, 3).
+        ShapeError: points or colours are not (N, 3).
     """
     frames = []
     for view in views:
@@ -114,13 +114,13 @@ def write_blender(folder: Path, train: Sequence[View], test: Sequence[View]) -> 
     """Write train/NAME.png, test/NAME.png and the two transforms files.
 
     Args:
-        folder: The scene; made where it is missing.
-        train: Views to train on.
-        test: Views to test with. All have square pixels, one field of view, and their principal point in the
-            middle, because the format can say nothing else.
+        folder: The scene; created if missing.
+        train: Training views.
+        test: Test views. All views need square pixels, the same field of view and a centred principal point, because
+            the format cannot represent anything else.
 
     Raises:
-        ArgumentError: a camera is not like that.
+        ArgumentError: a camera does not meet these conditions.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for part, views in (("train", train), ("test", test)):
@@ -141,8 +141,8 @@ def _check_blender(view: View, first: Camera) -> None:
     one_field = math.isclose(camera.fx / camera.W, first.fx / first.W, rel_tol=1e-9)
     if not (middle and one_field and math.isclose(camera.fx, camera.fy, rel_tol=1e-9)):
         raise ArgumentError(
-            f"{view.name}: Blender's layout needs square pixels, one field of view and the principal point in the "
-            "middle; write transforms.json instead"
+            f"{view.name}: Blender's layout needs square pixels, a common field of view and a centred principal point;"
+            " write transforms.json instead"
         )
 
 
@@ -158,7 +158,7 @@ def _intrinsics(camera: Camera) -> tuple[float, ...]:
 
 
 def _camera_to_world(camera: Camera) -> list[list[float]]:
-    """Return the 4x4 matrix with OpenGL's camera axes."""
+    """Return the camera-to-world matrix (4x4) with OpenGL's camera axes."""
     matrix = np.eye(4)
     matrix[:3, :3] = camera.R.T * np.array([1.0, -1.0, -1.0])
     matrix[:3, 3] = camera.eye
@@ -167,7 +167,7 @@ def _camera_to_world(camera: Camera) -> list[list[float]]:
 
 
 def _quaternion(camera: Camera) -> tuple[float, ...]:
-    """Turn R into (w, x, y, z): the eigenvector, of the largest eigenvalue, of a matrix linear in R.
+    """Convert R to (w, x, y, z): the eigenvector with the largest eigenvalue of a matrix linear in R.
 
     Source: Bar-Itzhack 2000, "New method for extracting the quaternion from a rotation matrix".
     """

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, command, counted, new_run
+from gsplat_edu.doctor.looks import EXPOSURE
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.gaussians import Gaussians
@@ -211,12 +212,11 @@ def _outliers(run: Trained) -> list[Finding]:
     if not low:
         return []
     low.sort(key=lambda view: view.psnr)
-    names = tuple(f"{view.name} ({view.psnr:.1f} dB)" for view in low)
+    names = tuple(view.name for view in low)
+    scores = tuple(f"{view.psnr:.1f} dB" for view in low)
     what = f"{len(low)} of {len(run.train) + len(run.test)} photos, far from what the scene shows"
-    advice = (
-        f"look at {low[0].name} beside its render: blurred, badly posed, in shadow? then train without it"
-    )
-    return [Finding("unexplained", Severity.WARNING, what, advice, names)]
+    advice = f"look at {names[0]} beside its render: blurred, badly posed, in shadow? then train without it"
+    return [Finding("unexplained", Severity.WARNING, what, advice, names, scores)]
 
 
 def _far_below(views: Sequence[Residual]) -> list[Residual]:
@@ -246,17 +246,17 @@ def _exposure(run: Trained) -> list[Finding]:
     # A scene that is not finished is too dark for all of them.
     usual = float(np.median([view.stops for view in views])) if views else 0.0
     off = sorted((v for v in views if abs(v.stops - usual) > JUMP), key=lambda v: -abs(v.stops - usual))
-    names = tuple(f"{view.name} ({view.stops - usual:+.1f})" for view in off)
+    names = tuple(view.name for view in off)
+    stops = tuple(f"{view.stops - usual:+.1f}" for view in off)
     what = f"{counted(len(off), 'photo')}, in stops against the scene"
     advice = "take out the photos whose exposure jumps, or make them even: the scene explains them with fog"
-    found = [Finding("exposure", Severity.WARNING, what, advice, names)] if off else []
+    found = [Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops)] if off else []
     # A scene that fits photos of differing exposure hides that they differ: what the photos themselves show counts too.
-    named = {view.name for view in off}
     hidden = "the scene fits them all the same, by fog or by colours that change with the view"
     found += [
         replace(before, sentence=f"{before.sentence}; {hidden}")
         for before in run.beforehand
-        if not before.images or any(image.rpartition(" (")[0] not in named for image in before.images)
+        if before.name != EXPOSURE or not before.images or not set(before.images) <= set(names)
     ]
     return found
 
@@ -265,10 +265,11 @@ def _floaters(run: Trained) -> list[Finding]:
     veiled = sorted((v for v in (*run.train, *run.test) if v.veiled > VEILED), key=lambda view: -view.veiled)
     if not veiled:
         return []
-    names = tuple(f"{view.name} ({100 * view.veiled:.0f} %)" for view in veiled)
+    names = tuple(view.name for view in veiled)
+    shares = tuple(f"{100 * view.veiled:.0f} %" for view in veiled)
     what = f"{counted(len(veiled), 'view')} through splats that hang close to the camera"
     advice = "start from real points, not random ones, and leave out exposure jumps; convert --crop cuts away the rest"
-    return [Finding("floaters", Severity.WARNING, what, advice, names)]
+    return [Finding("floaters", Severity.WARNING, what, advice, names, shares)]
 
 
 def _splats(run: Trained) -> list[Finding]:

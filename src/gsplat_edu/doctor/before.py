@@ -6,8 +6,9 @@ Chapter: 13_photos_to_scene.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from gsplat_edu.data.notes import MissingPhotos
 from gsplat_edu.doctor.cameras import (
     check_away,
     check_coverage,
@@ -16,7 +17,7 @@ from gsplat_edu.doctor.cameras import (
     check_sizes,
 )
 from gsplat_edu.doctor.cloud import check_cloud
-from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable, is_missing
+from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
 from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.looks import check_blur, check_exposure, check_twins
 from gsplat_edu.doctor.survey import Survey
@@ -49,11 +50,12 @@ OF_LISTS: tuple[tuple[str, Check], ...] = (
 """Checks of what is not there; most captures do without."""
 
 
-def examine(survey: Survey) -> Diagnosis:
+def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
     """Run all checks on a capture.
 
     Args:
         survey: The capture, prepared.
+        options: What the user wants to train with, as words of a command; the command that is recommended has them.
     """
     checks = [*OF_FILES, *(OF_VIEWS if len(survey.shots) > 1 else ()), *OF_LISTS]
     findings, fine = list[Finding](), list[str]()
@@ -62,7 +64,7 @@ def examine(survey: Survey) -> Diagnosis:
         findings += found
         if not found:
             fine.append(name)
-    return Diagnosis(_facts(survey), tuple(findings), tuple(fine), _otherwise(survey))
+    return Diagnosis(_facts(survey), tuple(findings), tuple(fine), _otherwise(survey, options))
 
 
 def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
@@ -77,7 +79,8 @@ def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
     facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
     if len(survey.shots) > 1:
         facts.append(("cameras", _stand(survey)))
-    return (*facts, *(("", note) for note in survey.notes if not is_missing(note)))
+    # `check_missing` reports the photos that have no file
+    return (*facts, *(("", str(note)) for note in survey.notes if not isinstance(note, MissingPhotos)))
 
 
 def _stand(survey: Survey) -> str:
@@ -91,7 +94,7 @@ def _stand(survey: Survey) -> str:
     return f"{said}; {geometry.depth:.3g} world units from what they see"
 
 
-def _otherwise(survey: Survey) -> tuple[str, ...]:
+def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:
     """Return advice for captures with little to mend."""
     place = survey.path.resolve()
     name = place.name if place.is_dir() else place.parent.name  # transforms.json is in its capture's folder
@@ -101,10 +104,13 @@ def _otherwise(survey: Survey) -> tuple[str, ...]:
         if len(survey.points)
         else ("start points help: add those of structure from motion with --points X.ply",)
     )
-    return (
-        f"train: {command('train', survey.path, '--out', out)}",
-        *cloud,
+    trial = (
         "a short run shows in minutes whether the poses are right: "
         + command("train", survey.path, "--iterations", "3000", "--out", short),
+    )
+    return (
+        f"train: {command('train', survey.path, *options, '--out', out)}",
+        *cloud,
+        *(() if options else trial),
         f"judge the run afterwards: {command('doctor', out)}",
     )

@@ -14,10 +14,6 @@ from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.evaluate.paths import common_up
 
-UNEVEN = 1.1
-"""Ratio of the focal lengths from which pixels are told not to be square. Those of cameras are, and good calibrations
-find it within 1 %."""
-
 OFF_CENTRE = 0.1
 """Distance of the principal point from the middle, in sides of the image, from which it is told: lenses sit within a
 few per cent, and a photo that was cut after its calibration is off by what was cut."""
@@ -115,7 +111,7 @@ def check_intrinsics(survey: Survey) -> list[Finding]:
 def _oddities(shot: Shot, zoomed: bool) -> list[tuple[str, str]]:
     """Return what is odd about a photo's intrinsics: its kind, and in words."""
     lens, found = shot.lens, list[tuple[str, str]]()
-    if not 1 / UNEVEN < lens.fx / lens.fy < UNEVEN:
+    if lens.uneven:
         found.append(
             ("uneven", f"fx is {lens.fx:.4g} px and fy {lens.fy:.4g}, but pixels of cameras are square")
         )
@@ -192,10 +188,11 @@ def check_away(survey: Survey) -> list[Finding]:
         )
         found.append(Finding("look away", Severity.WARNING, what, advice, names))
     if doubtful:
-        names = tuple(f"{survey.names[i]} ({why})" for i, why in sorted(doubtful.items()))
+        order = sorted(doubtful)
+        names, reasons = tuple(survey.names[i] for i in order), tuple(doubtful[i] for i in order)
         what = f"{len(names)} of {len(survey.shots)} cameras have poses with little support"
         advice = "take out the cameras with doubtful poses: a wrong pose spoils the scene for all others"
-        found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names))
+        found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons))
     return found
 
 

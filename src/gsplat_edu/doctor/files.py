@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-
+from gsplat_edu.data.notes import MissingPhotos
 from gsplat_edu.doctor.finding import Finding, Severity, counted, listed
 from gsplat_edu.doctor.survey import Survey
 
@@ -13,9 +12,6 @@ far as features are matched."""
 
 UNPOSED = 0.1
 """Share of photos without a pose from which it is a warning: some always fail, a tenth is a part of the scene."""
-
-_MISSING = re.compile(r"(\d+) of (\d+) photos have no file: skipped, first (.*)")
-"""As `gsplat_edu.data.capture.missing_note` says it."""
 
 
 def check_usable(survey: Survey) -> list[Finding]:
@@ -42,31 +38,24 @@ def check_usable(survey: Survey) -> list[Finding]:
 
 def check_missing(survey: Survey) -> list[Finding]:
     """Find photos that the capture lists and that are not there."""
-    found = next((match for note in survey.notes if (match := _MISSING.fullmatch(note))), None)
-    if found is None:
-        return []
-    missing, total, first = found.groups()
     return [
         Finding(
             "missing",
             Severity.WARNING,
-            f"{counted(int(missing), 'missing image')} of {total} listed, first {first}",
+            f"{counted(note.missing, 'missing image')} of {note.total} listed, first {note.first}",
             "copy the missing photos to where the capture lists them, or go on without them",
         )
+        for note in survey.notes
+        if isinstance(note, MissingPhotos)
     ]
-
-
-def is_missing(note: str) -> bool:
-    """Say whether a reader's note is what `check_missing` tells."""
-    return _MISSING.fullmatch(note) is not None
 
 
 def check_readable(survey: Survey) -> list[Finding]:
     """Find photos that cannot be decoded, or that do not fit their camera: training would refuse the capture."""
     if not survey.refused:
         return []
-    names = [name for name, _ in survey.refused]
-    reasons = "; ".join(dict.fromkeys(_reason(why) for _, why in survey.refused[:3]))
+    names = [photo.name for photo in survey.refused]
+    reasons = "; ".join(dict.fromkeys(photo.reason for photo in survey.refused[:3]))
     return [
         Finding(
             "unusable",
@@ -76,13 +65,6 @@ def check_readable(survey: Survey) -> list[Finding]:
             tuple(names),
         )
     ]
-
-
-def _reason(message: str) -> str:
-    """Shorten an error's line to why: what stands in brackets, or before the first semicolon without the file."""
-    inner = re.search(r"cannot be decoded \((.*)\);", message)
-    short = inner[1] if inner else message.split("; ")[0].rpartition(": ")[2]
-    return re.sub(r"^the photo of .* is (?=\d)", "the photo is ", short)
 
 
 def check_poses(survey: Survey) -> list[Finding]:

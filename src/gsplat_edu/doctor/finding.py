@@ -36,6 +36,7 @@ class Finding:
         sentence: What was found, with numbers.
         advice: What to do about it.
         images: Names of the images concerned; none where it is the whole capture.
+        values: What was measured of each of these images, in words; empty where there is nothing to add.
     """
 
     name: str
@@ -43,6 +44,14 @@ class Finding:
     sentence: str
     advice: str
     images: tuple[str, ...] = ()
+    values: tuple[str, ...] = ()
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The images' names, each with its value in brackets where there are values."""
+        if not self.values:
+            return self.images
+        return tuple(f"{name} ({value})" for name, value in zip(self.images, self.values, strict=True))
 
 
 @dataclass(frozen=True)
@@ -128,5 +137,5 @@ def table_lines(rows: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def _told(finding: Finding) -> str:
-    images = f": {listed(finding.images)}" if finding.images else ""
+    images = f": {listed(finding.labels)}" if finding.images else ""
     return f"{finding.name}: {finding.sentence}{images}"

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from gsplat_edu.camera import Camera
-from gsplat_edu.data.dataset import PARALLEL, scene_extent
+from gsplat_edu.data.dataset import scene_extent
 from gsplat_edu.evaluate.following import point_nearest_most_axes
 
 SAMPLES = 300
@@ -86,7 +86,7 @@ class Geometry:
 
         `gsplat_edu.evaluate.following.point_nearest_most_axes` says how it is found.
         """
-        centre = point_nearest_most_axes(self.cameras, PARALLEL)
+        centre = point_nearest_most_axes(self.cameras)
         return centre if centre is not None and np.mean(self.ahead(centre) > 0) >= MOST else None
 
     def angles_to(self, point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, " C"]:

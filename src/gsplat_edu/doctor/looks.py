@@ -17,8 +17,11 @@ from jaxtyping import Float32, Float64
 from gsplat_edu.doctor.cameras import looking_away
 from gsplat_edu.doctor.finding import Finding, Severity, counted
 from gsplat_edu.doctor.geometry import inside
-from gsplat_edu.doctor.photos import COARSE, WORK_SIDE
+from gsplat_edu.doctor.photos import BRIGHT, COARSE, DARK, GAMMA, WORK_SIDE
 from gsplat_edu.doctor.survey import Shot, Survey
+
+EXPOSURE = "exposure"
+"""Name of findings about brightness, before and after training."""
 
 ENOUGH = 3
 """Neighbours from which a photo is compared with them; with fewer, with all photos."""
@@ -73,12 +76,6 @@ thing."""
 
 AGREEING = 0.75
 """Share of the neighbours that have to say the same, by half of it at least: one edge of a shadow is no exposure."""
-
-GAMMA = 2.2
-"""Bytes are about light to the power of 1 / 2.2."""
-
-DARK, BRIGHT = 8.0, 247.0
-"""Values of bytes outside of which a colour counts as clipped: ratios mean nothing there."""
 
 PAIRS = 20
 """Points seen by both from which two photos are compared."""
@@ -209,15 +206,15 @@ def check_exposure(survey: Survey) -> list[Finding]:
     light, tint = gains.light, gains.tint
     found = []
     if len(jumping := [i for i in np.argsort(-np.abs(light)) if abs(light[i]) > unsure * JUMP]):
-        names = tuple(f"{survey.names[i]} ({light[i]:+.1f})" for i in jumping)
+        names = tuple(survey.names[i] for i in jumping)
+        stops = tuple(f"{light[i]:+.1f}" for i in jumping)
         what = f"{len(names)} of {len(light)} photos, in stops against neighbours that see the same"
-        first = survey.names[jumping[0]]
-        advice = f"look at {first}: did the exposure jump, or your shadow fall on the scene? fix it or leave it out"
-        found.append(Finding("exposure", Severity.WARNING, what, advice, names))
+        advice = f"look at {names[0]}: did the exposure jump, or your shadow fall on the scene? fix it or leave it out"
+        found.append(Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops))
     elif (share := gains.differing(unsure * JUMP)) > DIFFERING:
         what = f"{100 * share:.0f} % of neighbours differ by more than {unsure * JUMP:.1f} stops: photos in a row"
         advice = "fix the exposure while you take photos: part of them is brighter than the rest"
-        found.append(Finding("exposure", Severity.WARNING, what, advice))
+        found.append(Finding(EXPOSURE, Severity.WARNING, what, advice))
     if len(tinted := [i for i in np.argsort(-tint) if tint[i] > unsure * TINT]):
         names = tuple(survey.names[i] for i in tinted)
         what = f"{len(names)} of {len(tint)} photos, against neighbours that see the same"

@@ -36,6 +36,12 @@ ANGLES = np.arange(8) * math.pi / 8
 FLAT = 1e-2
 """Energy that is added to both scales, grey levels² per px²: below it there is nothing but rounding."""
 
+GAMMA = 2.2
+"""Bytes are about proportional to light to the power of 1 / 2.2."""
+
+DARK, BRIGHT = 8.0, 247.0
+"""Values of bytes outside of which a colour counts as clipped: ratios mean nothing there."""
+
 
 @dataclass(frozen=True, eq=False)
 class Look:
@@ -67,7 +73,7 @@ def look_at_photo(path: Path, lens: Lens, mask: Path | None = None) -> Look:
     small = _shrunk(pixels, THUMBNAIL_SIDE)
     h, w = small.shape[:2]
     if lens.distorts and min(h, w) > 1:
-        columns, rows, _ = undistortion(lens.resized(w, h), slice(0, h))
+        columns, rows, _ = undistortion(lens.scaled(w, h), slice(0, h))
         small = cv2.remap(small, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return Look(np.asarray(small, dtype=np.uint8), detail_of(pixels))
 

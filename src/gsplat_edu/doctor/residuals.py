@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
+from gsplat_edu.doctor.photos import BRIGHT, DARK, GAMMA
 from gsplat_edu.evaluate.metrics import Renderer, psnr
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
@@ -23,12 +24,6 @@ NEAR = 0.1
 
 VEIL = 0.2
 """Opacity of the near splats from which a pixel is covered: colours behind shift by a fifth."""
-
-GAMMA = 2.2
-"""Bytes are about light to the power of 1 / 2.2."""
-
-DARK, BRIGHT = 8.0 / 255.0, 247.0 / 255.0
-"""Values outside of which a colour is told to be cut off."""
 
 Progress = Callable[[int, int], None]
 """Is told how many views are done, and how many there are."""
@@ -112,7 +107,8 @@ def _stops(
     mask: Bool[np.ndarray, "H W"] | None,
 ) -> float:
     """Return the median of log2(photo / render) in light; 0 where nearly all is cut off."""
-    good = np.all((np.minimum(photo, image) > DARK) & (np.maximum(photo, image) < BRIGHT), axis=2)
+    dark, bright = DARK / 255.0, BRIGHT / 255.0
+    good = np.all((np.minimum(photo, image) > dark) & (np.maximum(photo, image) < bright), axis=2)
     good = good if mask is None else good & mask
     if good.mean() < 0.01:
         return 0.0

@@ -7,14 +7,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera, scaled_intrinsics
+from gsplat_edu.camera import Camera
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
 from gsplat_edu.data.dataset import read_capture
 from gsplat_edu.data.lens import Lens
+from gsplat_edu.data.notes import Note
 from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.photos import Look, look_at_photo
@@ -47,6 +49,15 @@ class Shot:
     look: Look
 
 
+class Refused(NamedTuple):
+    """A photo that cannot be used."""
+
+    name: str
+    """What the capture calls it."""
+    reason: str
+    """Why, in a few words: `DatasetError.reason`."""
+
+
 @dataclass(frozen=True, eq=False)
 class Survey:
     """What the checks look at.
@@ -55,20 +66,20 @@ class Survey:
         path: The capture.
         layout: "COLMAP", "transforms.json" or "Blender".
         shots: Photos that could be read, sorted by name.
-        refused: Name and reason of those that could not.
+        refused: Photos that could not, sorted by name.
         unposed: Names of files in the folders of the photos that have no pose.
         points: (N, 3) the capture's own points, world units; none where it has none.
-        notes: What the reader of the layout had to say.
+        notes: What the reader of the layout noted.
         observed: How many points were found in each photo, by the names of the shots; empty where nothing says so.
     """
 
     path: Path
     layout: str
     shots: tuple[Shot, ...]
-    refused: tuple[tuple[str, str], ...]
+    refused: tuple[Refused, ...]
     unposed: tuple[str, ...]
     points: Float64[np.ndarray, "N 3"]
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
     observed: Mapping[str, int] = field(default_factory=dict)
 
     @property
@@ -94,14 +105,14 @@ def prepare(path: Path, progress: Progress | None = None) -> Survey:
     """
     capture = read_capture(path)
     frames = sorted(capture.frames, key=lambda frame: frame.name)
-    shots, refused = list[Shot](), list[tuple[str, str]]()
+    shots, refused = list[Shot](), list[Refused]()
     with ThreadPoolExecutor(WORKERS) as pool:
         try:
             for done, found in enumerate(pool.map(_shot, frames), 1):
                 if isinstance(found, Shot):
                     shots.append(found)
                 else:
-                    refused.append((frames[done - 1].name, found))
+                    refused.append(found)
                 if progress is not None:
                     progress(done, len(frames))
         except BaseException:
@@ -119,16 +130,15 @@ def prepare(path: Path, progress: Progress | None = None) -> Survey:
     )
 
 
-def _shot(frame: Frame) -> Shot | str:
-    """Look at a photo; return why it cannot be used where it cannot."""
+def _shot(frame: Frame) -> Shot | Refused:
+    """Measure a photo, or return why it cannot be used."""
     try:
         source, camera, _ = photo_file(frame, None, (0.0, 0.0, 0.0))
         look = look_at_photo(source.path, source.lens, source.mask)
     except DatasetError as error:
-        return str(error)
+        return Refused(frame.name, error.reason)
     h, w = look.thumbnail.shape[:2]
-    intrinsics = scaled_intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, w / camera.W, h / camera.H)
-    small = Camera(camera.R, camera.eye, *intrinsics, h, w)
+    small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(w, h))
     return Shot(frame.name, frame.lens, (camera.W, camera.H), small, look)
 
 

@@ -1,4 +1,4 @@
-"""Whether a written scene still shows what was trained: the same cameras, both scenes, side by side."""
+"""Compare a written scene with its source: render both from the same cameras."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def compare_scenes(
     """Render two scenes from the same cameras and score the second against the first.
 
     Args:
-        source: What was to be written.
-        written: What was read back.
+        source: The scene before writing.
+        written: The scene read back from the file.
         cameras: Name and camera of each comparison.
         render: Renders Gaussians from a camera.
-        on_score: Is told of every score.
+        on_score: Called with each score.
 
     Returns:
-        A score per camera; both images clamped to 0..1. Equal ones have 100 dB.
+        A score per camera; both images clamped to 0..1. Equal images have 100 dB.
     """
     scores = []
     for name, camera in cameras:

@@ -1,4 +1,4 @@
-"""The pictures of a training run."""
+"""Figures of a training run."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from gsplat_edu.files import written_aside
 DPI = 150
 
 CURVE_POINTS = 400
-"""Points of a curve of a report; of a longer one the means of equal stretches are drawn."""
+"""Most points of a curve in a report; longer logs are averaged over stretches of equal length."""
 
 SVG_FACTS = ("Creator", "Date", "Format", "Type")
-"""What matplotlib says of a drawing unless told not to: dates and addresses."""
+"""Metadata that matplotlib writes into an SVG by default (dates and addresses); left out here."""
 
 RUN_CURVES = (
-    ("loss", "training loss", "loss of the iteration's view"),
+    ("loss", "training loss", "loss of each iteration's view"),
     ("psnr", "held-out views", "PSNR of the test views (dB)"),
     ("num_gaussians", "density control", "number of Gaussians"),
     ("ms", "speed", "ms per iteration"),
 )
-"""Curves of a run: key in its log, title and label."""
+"""A run's curves: key in the log, title, label."""
 
 
 def held_out_figure(panels: Sequence[tuple[str, Float[np.ndarray, "H W 3"]]]) -> Figure:
-    """Show renders of the held-out camera side by side.
+    """Show renders of the held-out view side by side.
 
     Args:
         panels: Title and (H, W, 3) image of each; values outside 0 to 1 are clipped.
@@ -47,7 +47,7 @@ def held_out_figure(panels: Sequence[tuple[str, Float[np.ndarray, "H W 3"]]]) ->
         axes.imshow(np.clip(image, 0.0, 1.0), interpolation="nearest")
         axes.set_title(title)
         axes.axis("off")
-    figure.suptitle("what the held-out camera sees")
+    figure.suptitle("renders of the held-out view")
     return figure
 
 
@@ -55,8 +55,8 @@ def curves_figure(losses: Sequence[float], counts: Sequence[int]) -> Figure:
     """Plot the training loss, on a logarithmic scale, and the number of Gaussians.
 
     Args:
-        losses: L1 of every iteration.
-        counts: Gaussians of every iteration.
+        losses: L1 of each iteration.
+        counts: Number of Gaussians at each iteration.
     """
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     loss_axes, count_axes = figure.subplots(1, 2)
@@ -77,7 +77,7 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
             no curve.
 
     Returns:
-        The figure; None where there is nothing to draw.
+        The figure; None if there is nothing to draw.
     """
     curves = []
     for key, title, label in RUN_CURVES:
@@ -103,12 +103,14 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
 
 
 def svg_element(figure: Figure) -> str:
-    """Return a figure as an <svg> element to stand in a page, the same to the byte for the same figure."""
+    """Return a figure as an <svg> element for a web page. Equal figures give equal bytes."""
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": "gsplat_edu", "svg.fonttype": "path"}):
         FigureCanvasAgg(figure).figure.savefig(text, format="svg", metadata=dict.fromkeys(SVG_FACTS))
     drawing = text.getvalue()
-    return drawing[drawing.index("<svg") :]  # without the XML and DOCTYPE lines, which a page has of its own
+    return drawing[
+        drawing.index("<svg") :
+    ]  # without the XML and DOCTYPE lines, which do not belong inside a page
 
 
 def _drawable(line: Mapping[str, Any], key: str) -> bool:
@@ -122,10 +124,10 @@ def _thinned(points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "Q 2"]:
 
 
 def save_figure(path: Path, figure: Figure) -> None:
-    """Write a figure as PNG; parent folders are made.
+    """Write a figure as PNG; parent folders are created.
 
     Raises:
-        OSError: the file cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     with written_aside(path) as aside:
         FigureCanvasAgg(figure).figure.savefig(aside, dpi=DPI, format="png")

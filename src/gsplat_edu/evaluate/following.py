@@ -1,7 +1,7 @@
-"""A camera path that shows a capture from where it was photographed.
+"""Camera paths that stay near a capture's cameras.
 
-Three kinds, by how the cameras stand: around what they look at, all round or as far as they go; a small loop between
-cameras that look one way; a flight along cameras that look outwards or wander.
+There are three kinds, depending on the cameras: an orbit or arc around a common centre of attention; a small loop
+between cameras with one viewing direction; a flight along cameras that face outwards or wander.
 """
 
 from __future__ import annotations
@@ -13,86 +13,86 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsplat_edu.camera import Camera, look_at, point_nearest_axes
-from gsplat_edu.evaluate.paths import PARALLEL, common_up
+from gsplat_edu.camera import Camera, as_camera, look_at, point_nearest_axes
+from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.validation import in_range, whole_number
 
 Vector = Float64[np.ndarray, "3"]
 Values = Float64[np.ndarray, " n"]
 
 SAMPLED, DRAWS = 5, 40
-"""Cameras of a random sample, and samples, from which the centre is found: with one camera in five wrong, a sample is
-free of them with probability 0.8^5 = 0.33, and 40 samples all have one with probability 1e-7."""
+"""Number of cameras in a random sample, and number of samples, for finding the centre. With one camera in five wrong, a
+sample contains none of them with probability 0.8^5 = 0.33; all 40 samples contain one with probability 1e-7."""
 
 MOST = 0.7
-"""Fraction of the cameras that has to see the centre, in front of it."""
+"""At least this fraction of the cameras must have the centre in view."""
 
 PAST, PAST_FACTOR = math.radians(20.0), 3.0
-"""A camera looks past the centre if it is off by more than this angle, and by more than this many times the median."""
+"""A camera misses the centre if its axis is off by more than this angle and this multiple of the median angle."""
 
 FAR = math.log(3.0)
-"""Cameras nearer or farther than the median by this logarithm, and by `PAST_FACTOR` times the median deviation, are
-outliers."""
+"""A camera is an outlier if the logarithm of its distance differs from the median by more than this and by more than
+`PAST_FACTOR` times the median deviation."""
 
 GAP, SPARSE_GAP, SPARSE = math.radians(40.0), math.radians(75.0), 2.0
-"""Azimuths without a camera that a path crosses: 40 degrees, and up to 75 where twice the median gap is as much. Rings
-of five or more evenly spaced photos are closed."""
+"""Largest range of azimuths without a camera that a path crosses: 40 degrees, or up to 75 if twice the median gap is
+that large. So a ring of five or more evenly spaced photos counts as closed."""
 
 STEEP = math.radians(65.0)
-"""Median elevation above which azimuths say nothing: the cameras look down on something."""
+"""Median elevation above which azimuths are meaningless: the cameras look down."""
 
 ONE_WAY = math.radians(20.0)
-"""Largest median angle to the mean viewing direction of cameras that look one way."""
+"""Cameras share one viewing direction if the median angle to the mean direction is below this."""
 
 BANDWIDTH = math.radians(15.0)
-"""Standard deviation of the kernel that averages cameras of similar azimuth and elevation; a sixth of narrow arcs."""
+"""Standard deviation of the kernel that averages neighbouring cameras; on narrow arcs, a sixth of the arc."""
 
 INSIDE = 0.95
-"""A path that turns round does so at this fraction of the covered angle."""
+"""A path that turns back does so at this fraction of the covered angle."""
 
 RISE = 0.85
-"""A path that turns round rises and sinks by this many local standard deviations of the elevation: between two rows, by
-0.85 of the way to them."""
+"""Amplitude of the rise and fall of a path that turns back, in local standard deviations of the elevation. Between two
+rows of cameras it covers 0.85 of the distance to them."""
 
 SPREAD = 1.2
-"""Half axes of a loop between cameras, in standard deviations: 0.7 of the way to the ends of a uniform line."""
+"""Half axes of a loop, in standard deviations of the cameras: 0.7 of the way to the ends of a uniform line."""
 
 LEAST_LOOP = 0.03
-"""Least half axis of a loop, in depths of the scene: one camera, or several in one place, still show some parallax."""
+"""Smallest half axis of a loop, in scene depths: even a single camera position gets some parallax."""
 
 MOST_TURN = math.tan(math.radians(12.0))
-"""A loop between parallel cameras turns its view towards its centre by 12 degrees at most."""
+"""Largest angle by which the view turns towards the centre on a loop between parallel cameras, as a tangent."""
 
 CHAIN = 400
-"""Cameras of a flight; of more, every n-th."""
+"""Most cameras of a flight; of a longer list, every n-th is used."""
 
 JUMP = 1.0
-"""A flight does not cross from one camera to the next if distance / depth + angle (radians) is larger."""
+"""A flight never connects two cameras if distance / depth + angle (radians) between them exceeds this."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPath:
-    """Cameras to render one after the other.
+    """Cameras to render in sequence.
 
     Args:
-        cameras: One per frame, evenly in time. The path is closed: the last one is followed by the first.
-        says: What kind of path it is and why, without a full stop.
+        cameras: One per frame, at equal time intervals. The path is closed: the first follows the last.
+        description: The kind of path and the reason for it, without a full stop.
     """
 
     cameras: list[Camera]
-    says: str
+    description: str
 
 
 def path_along(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> CameraPath:
-    """Make a smooth closed path among a capture's cameras.
+    """Make a smooth closed path near a capture's cameras.
 
     Args:
-        cameras: Any number; at least one.
-        frames: Cameras of the path, at least one.
-        depth: Distance of the scene from the cameras, world units; used where their optical axes meet nowhere.
+        cameras: At least one.
+        frames: Number of cameras of the path, at least one.
+        depth: Distance from the cameras to the scene, world units; used if the optical axes do not meet.
 
     Returns:
-        The path. Its cameras have the intrinsics and size of the first camera that is no outlier.
+        The path. Its cameras have the intrinsics and size of the first camera that is not an outlier.
 
     Raises:
         ArgumentError: there is no camera, frames is not a whole number of at least 1, or depth is not positive.
@@ -118,33 +118,33 @@ def path_along(cameras: Sequence[Camera], frames: int, depth: float = 1.0) -> Ca
 
 
 def point_looked_at(cameras: Sequence[Camera]) -> Vector | None:
-    """Find the point that most cameras look at, whatever a minority of them does.
+    """Find the point that most cameras look at, ignoring outliers.
 
     Args:
         cameras: At least one.
 
     Returns:
-        (3,) world units; None where the axes are parallel or meet behind the cameras, or where fewer than 70 % of the
-        cameras have the point in their picture.
+        (3,) world units; None if the axes are parallel or meet behind the cameras, or if fewer than 70 % of the cameras
+        have the point in view.
     """
-    centre = point_nearest_most_axes(cameras, PARALLEL)
+    centre = point_nearest_most_axes(cameras)
     if centre is None or np.mean([_shows(camera, centre) for camera in cameras]) < MOST:
         return None
     return centre
 
 
-def point_nearest_most_axes(cameras: Sequence[Camera], parallel: float) -> Vector | None:
+def point_nearest_most_axes(cameras: Sequence[Camera]) -> Vector | None:
     """Find the point nearest to the optical axes of most cameras.
 
-    It is sought in random samples of the cameras, always the same ones: one camera turned round would draw the mean
-    along. The point with the smallest median angle to all axes is refined with the cameras that do not look past it.
+    Each candidate is the point nearest to the axes of a random sample of the cameras (with a fixed seed): a single
+    reversed camera would shift the result for all of them. The candidate with the smallest median angle to all axes
+    wins and is refined without the cameras that miss it.
 
     Args:
         cameras: At least one.
-        parallel: As for `gsplat_edu.camera.point_nearest_axes`.
 
     Returns:
-        (3,) world units, perhaps behind the cameras; None where the axes are parallel.
+        (3,) world units, possibly behind the cameras; None if the axes are parallel.
     """
     eyes, axes = (np.stack(rows) for rows in zip(*((c.eye, c.R[2]) for c in cameras), strict=True))
     rng, count = np.random.default_rng(0), len(cameras)
@@ -152,24 +152,24 @@ def point_nearest_most_axes(cameras: Sequence[Camera], parallel: float) -> Vecto
         np.arange(count),
         *(rng.choice(count, min(SAMPLED, count), replace=False) for _ in range(DRAWS)),
     ]
-    found = [point_nearest_axes([cameras[int(i)] for i in rows], parallel) for rows in samples]
+    found = [point_nearest_axes([cameras[int(i)] for i in rows]) for rows in samples]
     points = [point for point in found if point is not None]
     if not points:
         return None
     angles = min((_angles(point - eyes, axes) for point in points), key=lambda each: float(np.median(each)))
     kept = np.flatnonzero(angles <= max(PAST, PAST_FACTOR * float(np.median(angles))))
-    return point_nearest_axes([cameras[int(i)] for i in kept], parallel)
+    return point_nearest_axes([cameras[int(i)] for i in kept])
 
 
 def _shows(camera: Camera, point: Vector) -> bool:
     u, v, z = camera.project(camera.world_to_cam(point))
-    # rounding puts the centre of a panorama's cameras in front of some of them
+    # Rounding can put the centre of a panorama's cameras in front of some of them.
     in_front = z > 1e-6 * max(1.0, float(np.abs(camera.eye).max()))
     return bool(in_front and -0.5 < u < camera.W - 0.5 and -0.5 < v < camera.H - 0.5)
 
 
 def _near_usual(cameras: Sequence[Camera], centre: Vector) -> list[Camera]:
-    """Leave out cameras that look past the centre, or stand at quite another distance than most."""
+    """Drop cameras that miss the centre or whose distance to it is unusual."""
     eyes, axes = (np.stack(rows) for rows in zip(*((c.eye, c.R[2]) for c in cameras), strict=True))
     angles = _angles(centre - eyes, axes)
     logs = np.log(np.maximum(np.linalg.norm(eyes - centre, axis=1), 1e-300))
@@ -180,7 +180,7 @@ def _near_usual(cameras: Sequence[Camera], centre: Vector) -> list[Camera]:
 
 
 def _around(cameras: Sequence[Camera], centre: Vector, up: Vector, turns: Values) -> CameraPath:
-    """Circle the centre, or swing over the covered azimuths, at the local mean elevation and distance.
+    """Orbit the centre, or swing over the covered azimuths, at the local mean elevation and distance.
 
     e = c + r (cos(el) (cos(az) a + sin(az) (up × a)) + sin(el) up),  a: the direction of azimuth 0
     """
@@ -196,32 +196,30 @@ def _around(cameras: Sequence[Camera], centre: Vector, up: Vector, turns: Values
         near = [cameras[i] for i in rows]
         path = _loop_between(near, turns, float(np.median(distances[rows])), centre)
         return CameraPath(
-            path.cameras, "the cameras stand too far apart for a path: a small loop at one place"
+            path.cameras, "the cameras are too far apart for a path: using a small loop at one place"
         )
-    # not narrower than most of a gap, or the average jumps from one camera to the next in the middle of it
+    # Not narrower than most of a gap: otherwise the average jumps from one camera to the next inside the gap.
     width = max(min(BANDWIDTH, covered / 6), 0.6 * crossed, 1e-6)
     data = azimuths[rows], elevations[rows], np.log(distances[rows])
     if covered >= 2.0 * np.pi:
         az, el, logs = turns, *_local_means(data, turns, None, width)[:2]
-        says = "the cameras stand all round: a full circle"
+        description = "the cameras surround the scene: using a full circle"
     else:
         az = (low + high) / 2 + INSIDE * covered / 2 * np.sin(turns)
         middle, _, spread = _local_means(data, az, None, width)
         el = middle + RISE * spread * np.cos(turns)
         logs = _local_means(data, az, el, width)[1]
-        says = (
-            f"the cameras cover {math.degrees(covered):.0f} degrees: the path swings over those, no farther"
-        )
+        description = f"the cameras cover {math.degrees(covered):.0f} degrees: the path stays within them"
     ring = np.cos(az)[:, None] * start + np.sin(az)[:, None] * side
     eyes = centre + np.exp(logs)[:, None] * (np.cos(el)[:, None] * ring + np.sin(el)[:, None] * up)
-    return CameraPath([_like(cameras[0], look_at(eye, centre, up), eye) for eye in eyes], says)
+    return CameraPath([_like(cameras[0], look_at(eye, centre, up), eye) for eye in eyes], description)
 
 
 def _covered(azimuths: Values) -> tuple[float, float, Int64[np.ndarray, " m"], float]:
-    """Find the longest stretch of azimuths that cameras cover.
+    """Find the longest range of azimuths covered by cameras.
 
     Returns:
-        Its ends, 2 pi apart where it is the full circle; the cameras in it; the largest gap in it.
+        Its ends, 2 pi apart for a full circle; the cameras inside; the largest gap inside.
     """
     order = np.argsort(azimuths, kind="stable")
     turned = azimuths[order]
@@ -230,7 +228,7 @@ def _covered(azimuths: Values) -> tuple[float, float, Int64[np.ndarray, " m"], f
     breaks = np.flatnonzero(gaps > limit)
     if not len(breaks):
         return 0.0, 2.0 * np.pi, order, float(gaps.max())
-    # the stretches between breaks; the one with the most cameras, as most photos are of that side
+    # Of the ranges between breaks, take the one with the most cameras.
     pieces = [
         np.arange(first + 1, last + 1)
         for first, last in zip(breaks, [*breaks[1:], breaks[0] + len(gaps)], strict=True)
@@ -247,12 +245,12 @@ def _local_means(
     el: Float64[np.ndarray, " F"] | None,
     width: float,
 ) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, " F"], Float64[np.ndarray, " F"]]:
-    """Average cameras around directions by a Gaussian kernel.
+    """Average cameras near given directions with a Gaussian kernel.
 
     Args:
         data: Azimuth, elevation and logarithm of the distance of each camera.
         az: Azimuths.
-        el: Elevations; all elevations count the same where None.
+        el: Elevations; None weights all elevations equally.
         width: Standard deviation of the kernel, radians.
 
     Returns:
@@ -273,7 +271,7 @@ def _local_means(
 def _loop_between(
     cameras: Sequence[Camera], turns: Values, depth: float, target: Vector | None
 ) -> CameraPath:
-    """Move on an ellipse across the viewing direction of cameras that look one way, within where they stand.
+    """Move on an ellipse perpendicular to the common viewing direction, within the spread of the cameras.
 
     e = m + h1 cos(t) p1 + h2 sin(t) p2,  m: median of the centres,  p: principal axes of the centres across the view
     """
@@ -296,14 +294,14 @@ def _loop_between(
         + np.outer(np.cos(turns) * halves[1], main[:, 1])
     )
     up = -np.sum([camera.R[1] for camera in cameras], axis=0)
-    if np.linalg.norm(np.cross(up, forward)) < 0.2 * len(cameras):  # strips flown to and fro
+    if np.linalg.norm(np.cross(up, forward)) < 0.2 * len(cameras):  # back and forth: up axes cancel
         up = -first.R[1]
-    says = "the cameras look one way: a loop between them"
-    return CameraPath([_like(first, look_at(eye, focus, up), eye) for eye in path], says)
+    description = "the cameras share one viewing direction: using a loop between them"
+    return CameraPath([_like(first, look_at(eye, focus, up), eye) for eye in path], description)
 
 
 def _flight(cameras: Sequence[Camera], turns: Values, depth: float) -> CameraPath:
-    """Follow a chain of cameras, each near the one before in place and direction; position and axes are averaged."""
+    """Fly along a chain of cameras, each close to its predecessor in position and direction, averaging both."""
     chosen = [cameras[i] for i in range(0, len(cameras), -(-len(cameras) // CHAIN))]
     eyes, axes = (np.stack(rows) for rows in zip(*((c.eye, c.R[2]) for c in chosen), strict=True))
     apart = np.linalg.norm(eyes[:, None] - eyes, axis=2) / depth + np.arccos(
@@ -330,14 +328,14 @@ def _flight(cameras: Sequence[Camera], turns: Values, depth: float) -> CameraPat
             weights @ eyes[chain], depth * _units(weights @ axes[chain]), weights @ downs, strict=True
         )
     ]
-    how = "round and round" if closed else "to their end and back"
-    return CameraPath(path, f"the cameras look at no common point: the path follows them, {how}")
+    how = "in a closed loop" if closed else "there and back"
+    return CameraPath(path, f"the cameras share no point of interest: the path follows them, {how}")
 
 
 def _chain(apart: Float64[np.ndarray, "n n"]) -> Int64[np.ndarray, " m"]:
-    """Order cameras so that neighbours are close: as they are listed, or from each to the nearest one left.
+    """Order cameras so that neighbours are close: in the given order or by nearest neighbour, whichever is shorter.
 
-    Of the shorter order, the longest stretch without a jump is returned.
+    Only the longest stretch without a jump is returned.
     """
     count = len(apart)
     listed = np.arange(count)
@@ -360,7 +358,7 @@ def _chain(apart: Float64[np.ndarray, "n n"]) -> Int64[np.ndarray, " m"]:
 
 
 def _like(camera: Camera, R: Float64[np.ndarray, "3 3"], eye: Vector) -> Camera:
-    return Camera(R, eye, camera.fx, camera.fy, camera.cx, camera.cy, camera.H, camera.W)
+    return Camera.posed(R, eye, as_camera("camera", camera).intrinsics)
 
 
 def _units(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:

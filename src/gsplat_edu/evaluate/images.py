@@ -1,4 +1,4 @@
-"""Renders as files: a PNG, two pictures side by side, a folder of frames, a video."""
+"""Write renders to files: a PNG, two images side by side, a folder of frames, a video."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsplat_edu.files import remove_leftovers, written_aside
 from gsplat_edu.validation import ArrayLike, check_shape, in_range
 
 SEPARATOR_WIDTH = 4
-"""px between two pictures side by side."""
+"""Width of the line between two images side by side, px."""
 
 SEPARATOR_GREY = 128
 
@@ -48,30 +48,30 @@ NOT_WRITTEN = frozenset(
         "wmv",
     )
 )
-"""Suffixes of pictures and videos that are not written: nobody means a folder by them."""
+"""Suffixes of image and video formats that are not supported; a folder is unlikely to be meant by them."""
 
-Frame = UInt8[np.ndarray, "H W 3"]
+RgbBytes = UInt8[np.ndarray, "H W 3"]
 
 
 def save_png(path: Path, image: ArrayLike) -> None:
-    """Write an image as PNG of 8 bits.
+    """Write an image as 8-bit PNG.
 
     Args:
-        path: The file; parent folders are made.
+        path: Output file; parent folders are created.
         image: (H, W, 3) uint8, or float from 0 to 1, clamped and rounded.
 
     Raises:
         ShapeError: not (H, W, 3).
         ArgumentError: a value is NaN or infinite.
-        OSError: the file cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     picture = Image.fromarray(to_bytes(image))
     with written_aside(path) as aside:
         picture.save(aside, format="PNG")
 
 
-def side_by_side(images: Sequence[ArrayLike]) -> Frame:
-    """Put images of one height beside each other, a thin grey line between them.
+def side_by_side(images: Sequence[ArrayLike]) -> RgbBytes:
+    """Put images of equal height side by side, with a thin grey line between them.
 
     Args:
         images: (H, W, 3) each, uint8 or float from 0 to 1; at least one.
@@ -80,15 +80,15 @@ def side_by_side(images: Sequence[ArrayLike]) -> Frame:
         (H, sum of W + separators, 3) uint8.
 
     Raises:
-        ShapeError: an image is not (H, W, 3), or of another height.
-        ArgumentError: there is none.
+        ShapeError: an image is not (H, W, 3), or its height differs.
+        ArgumentError: `images` is empty.
     """
     if not images:
         raise ArgumentError("images: is empty; give at least one")
     pictures = [to_bytes(image) for image in images]
     height = pictures[0].shape[0]
     line = np.full((height, SEPARATOR_WIDTH, 3), SEPARATOR_GREY, dtype=np.uint8)
-    row: list[Frame] = []
+    row: list[RgbBytes] = []
     for picture in pictures:
         check_shape("images", picture.shape, (height, "W", 3), {})
         row += [line, picture] if row else [picture]
@@ -96,18 +96,18 @@ def side_by_side(images: Sequence[ArrayLike]) -> Frame:
 
 
 def check_output(out: Path) -> None:
-    """Refuse a name that frames are not written to, before any is rendered.
+    """Reject an unsupported output name before any frame is rendered.
 
     Args:
         out: As for `write_frames`.
 
     Raises:
-        ArgumentError: it has the suffix of another format, is a folder but names a video, or the reverse.
+        ArgumentError: the suffix belongs to another format, the name of a video is a folder, or the reverse.
     """
     formats = f"give a video ({VIDEO_SUFFIX}) or a folder of PNGs"
     suffix = out.suffix.lower()
     if suffix in NOT_WRITTEN and not out.is_dir():
-        raise ArgumentError(f"{out}: {suffix[1:].upper()} is not written here; {formats}")
+        raise ArgumentError(f"{out}: {suffix[1:].upper()} is not supported; {formats}")
     if suffix == VIDEO_SUFFIX and out.is_dir():
         raise ArgumentError(f"{out}: is a folder; {formats} under another name")
     if suffix != VIDEO_SUFFIX and out.exists() and not out.is_dir():
@@ -119,21 +119,21 @@ def write_frames(
 ) -> list[Path]:
     """Write frames as a video, or as PNGs in a folder.
 
-    Temporary files that a killed process left there are removed.
+    Temporary files left by a killed process are removed.
 
     Args:
-        out: A file that ends in .mp4 (VP9, see `gsplat_edu.evaluate.video`), or a folder; it is made.
-        frames: (H, W, 3) each, uint8 or float from 0 to 1; taken one at a time. Those of a video have one size; an
-            odd side gets a copy of its last row or column.
+        out: A file that ends in .mp4 (VP9, see `gsplat_edu.evaluate.video`), or a folder; it is created.
+        frames: (H, W, 3) each, uint8 or float from 0 to 1; taken one at a time. The frames of a video have equal size;
+            an odd width or height is padded with a copy of the last column or row.
         fps: Frames per second of a video.
-        names: File names in a folder, one per frame; frame_0000.png and so on where None.
+        names: File names in a folder, one per frame; None means frame_0000.png and so on.
 
     Returns:
-        The files that were written.
+        The written files.
 
     Raises:
-        ArgumentError: there are no frames, the sizes differ, the name is of another format (see `check_output`), or
-            the video cannot be encoded here.
+        ArgumentError: there are no frames, their sizes differ, the name belongs to another format (see `check_output`),
+            or OpenCV cannot encode the video here.
         OSError: a file cannot be written.
     """
     check_output(out)

@@ -1,13 +1,13 @@
-"""How close renders come to photos, as numbers.
+"""Image quality of renders against photos.
 
-Every number is taken in float64 with NumPy's sums, or by the native SSIM: it is the same to the bit on any number
-of threads. Renders are clamped to 0..1 first, as a screen would. Three names say exactly what was measured:
+All metrics are computed in float64 with NumPy's sums or the native SSIM, so they are identical to the bit for any
+number of threads. Renders are clamped to 0..1 first, as a screen would do. Definitions:
 
-    psnr        10 log10(1 / MSE), the render in floating point against the photo's bytes / 255
-    psnr_8bit   the same, with the render rounded to bytes as in a PNG
-    ssim        mean of SSIM over pixels and channels: Gaussian window of 11 taps, sigma 1.5, zero outside the image
+    psnr        10 log10(1 / MSE) of the floating-point render against the photo's bytes / 255
+    psnr_8bit   the same with the render rounded to bytes, as in a PNG
+    ssim        mean SSIM over pixels and channels: Gaussian window of 11 taps, sigma 1.5, zero outside the image
 
-A mean over images is the mean of the images' values. PSNR of a mean error is another number; nothing here is that.
+A mean over images averages the images' values. It is not the PSNR of the mean error.
 
 Chapter: 13_photos_to_scene.
 """
@@ -30,7 +30,7 @@ from gsplat_edu.validation import ArrayLike, check_shape, float64_array
 from gsplat_edu.views import Photo, View
 
 MSE_FLOOR = 1e-10
-"""Smallest mean squared error: identical images have 100 dB, a number that can be averaged, plotted and written."""
+"""Smallest mean squared error: identical images have 100 dB, a finite number to average, plot and store."""
 
 Renderer = Callable[[Gaussians, Camera], RenderOutput]
 """Renders Gaussians from a camera."""
@@ -38,12 +38,12 @@ Renderer = Callable[[Gaussians, Camera], RenderOutput]
 
 @dataclass(frozen=True)
 class ImageScore:
-    """How close one render comes to its photo.
+    """Image quality of one render.
 
     Args:
-        name: What the capture calls the view.
-        psnr: dB, the render in floating point.
-        psnr_8bit: dB, the render rounded to bytes.
+        name: The view's name in the capture.
+        psnr: dB, of the floating-point render.
+        psnr_8bit: dB, of the render rounded to bytes.
         ssim: -1 to 1; 1 for equal images.
         l1: Mean absolute difference, 0 to 1.
     """
@@ -56,29 +56,29 @@ class ImageScore:
 
 
 OnImage = Callable[[View, ImageScore, UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"]], None]
-"""Is told of every scored view: the view, its score, the render and the photo, both rounded to bytes."""
+"""Called after each scored view with the view, its score, the render and the photo, both rounded to bytes."""
 
 
 def psnr(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
-    """Return the peak signal-to-noise ratio: 10 log10(1 / max(MSE, 1e-10)), the render in floating point.
+    """Return the PSNR of the floating-point render: 10 log10(1 / max(MSE, 1e-10)).
 
     Args:
-        image: (H, W, 3) rendered, 0 to 1, clamped to it; array or tensor.
+        image: (H, W, 3) render, array or tensor; clamped to 0..1.
         truth: (H, W, 3) photo: uint8, divided by 255; or float, 0 to 1.
-        mask: (H, W) true where a pixel counts; None where all do.
+        mask: (H, W) true for the pixels that count; None counts all.
 
     Returns:
         dB; 100 for equal images.
 
     Raises:
-        ShapeError: the arguments are not of one size.
-        ArgumentError: a value is NaN or infinite, or no pixel counts.
+        ShapeError: the sizes of the arguments differ.
+        ArgumentError: a value is NaN or infinite, or the mask excludes all pixels.
     """
     return _Pair(image, truth, mask).psnr()
 
 
 def psnr_8bit(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
-    """Return the peak signal-to-noise ratio of the render rounded to bytes, as it would be read from a PNG.
+    """Return the PSNR of the render rounded to bytes, as if read from a PNG.
 
     Arguments, result and errors are those of `psnr`.
     """
@@ -86,7 +86,7 @@ def psnr_8bit(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None)
 
 
 def mean_absolute_error(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
-    """Return mean |image - truth| over the pixels that count and the channels, 0 to 1.
+    """Return mean |image - truth| over channels and the pixels that count, 0 to 1.
 
     Arguments and errors are those of `psnr`.
     """
@@ -94,14 +94,14 @@ def mean_absolute_error(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | No
 
 
 def ssim(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
-    """Return the structural similarity: mean over pixels and channels, 11 taps, sigma 1.5, zero outside the image.
+    """Return the mean SSIM over pixels and channels: 11 taps, sigma 1.5, zero outside the image.
 
-    With a mask both images are zero where a pixel does not count, and the mean is still over all pixels.
+    With a mask, both images are set to zero where it is false; the mean still covers all pixels.
 
     Arguments and errors are those of `psnr`.
 
     Raises:
-        BackendUnavailableError: the native module is not there.
+        BackendUnavailableError: the native module is missing.
 
     Source: Wang et al. 2004.
     """
@@ -109,7 +109,7 @@ def ssim(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> f
 
 
 def to_bytes(image: ArrayLike) -> UInt8[np.ndarray, "H W 3"]:
-    """Round an image to bytes: floor(255 x + 0.5), x clamped to 0..1. What is uint8 already stays as it is.
+    """Round an image to bytes: floor(255 x + 0.5), with x clamped to 0..1. A uint8 image is returned unchanged.
 
     Args:
         image: (H, W, 3) array or tensor.
@@ -128,10 +128,10 @@ def to_bytes(image: ArrayLike) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def score_image(name: str, image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> ImageScore:
-    """Take all the numbers of one image.
+    """Compute all metrics of one image.
 
     Args:
-        name: What the capture calls it.
+        name: The view's name in the capture.
         image: As for `psnr`.
         truth: As for `psnr`.
         mask: As for `psnr`.
@@ -155,10 +155,10 @@ def score_views(
 
     Args:
         gaussians: N Gaussians.
-        views: Cameras and photos. A view in which no pixel counts is left out.
+        views: Cameras and photos. Views whose mask excludes all pixels are skipped.
         render: Renders Gaussians from a camera, over `background`.
-        background: (3,) what photos that are not opaque are put over.
-        on_image: Is told of every scored view.
+        background: (3,) colour behind photos that are not opaque.
+        on_image: Called after each scored view.
 
     Returns:
         The scores, in the order of the views.
@@ -179,14 +179,14 @@ def score_views(
 
 
 def summarize(scores: Sequence[ImageScore]) -> dict[str, float | int | None]:
-    """Return the means of scores over images: psnr, psnr_8bit, ssim, l1 (None for no images), and num_images."""
+    """Average scores over images: psnr, psnr_8bit, ssim, l1 (each None if there are no images), and num_images."""
     keys = ("psnr", "psnr_8bit", "ssim", "l1")
     means = {key: float(np.mean([getattr(s, key) for s in scores])) if scores else None for key in keys}
     return {**means, "num_images": len(scores)}
 
 
 def worst(scores: Sequence[ImageScore]) -> ImageScore:
-    """Return the score of the lowest PSNR, the first of equal ones.
+    """Return the score with the lowest PSNR; the first of equal ones.
 
     Raises:
         ArgumentError: there are no scores.
@@ -197,7 +197,7 @@ def worst(scores: Sequence[ImageScore]) -> ImageScore:
 
 
 def best(scores: Sequence[ImageScore]) -> ImageScore:
-    """Return the score of the highest PSNR, the first of equal ones.
+    """Return the score with the highest PSNR; the first of equal ones.
 
     Raises:
         ArgumentError: there are no scores.
@@ -212,7 +212,7 @@ def _as_array(image: ArrayLike) -> np.ndarray:
 
 
 class _Pair:
-    """A render and its photo, checked once: float64, 0 to 1, and which pixels count (None: all)."""
+    """A render and its photo after validation: float64, 0 to 1, and the mask (None: all pixels count)."""
 
     def __init__(self, image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None) -> None:
         sizes: dict[str, int] = {}

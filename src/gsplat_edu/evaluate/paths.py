@@ -1,4 +1,4 @@
-"""Orbits around a scene that came without cameras, and what cameras have in common."""
+"""Orbits around scenes without cameras, and the common up direction of cameras."""
 
 from __future__ import annotations
 
@@ -8,55 +8,51 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import WORLD_UP, Camera, scaled_intrinsics
+from gsplat_edu.camera import WORLD_UP, Camera, as_camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
 Vector = Float64[np.ndarray, "3"]
 
-PARALLEL = 1e-3
-"""Smallest eigenvalue of mean(I - f f') that still fixes a point: below it (about 1.8 degrees between axes) where the
-optical axes cross is noise."""
-
 SPREAD = 0.01
-"""Mean square of the right axes along their second direction (a spread of 6 degrees) from which they fix up."""
+"""The right axes define up from this mean square along their second principal direction (a spread of 6 degrees)."""
 
 STEEPEST = math.radians(80.0)
-"""Orbits stay this far from straight above, where up in the image is not defined."""
+"""Largest elevation of an orbit: straight above, the image's up direction is undefined."""
 
 ORBIT_FOV = math.radians(50.0)
-"""Field of view of an orbit around a bare scene."""
+"""Field of view of an orbit around a scene without cameras."""
 
 ORBIT_ELEVATION = math.radians(15.0)
-"""Height of an orbit around a bare scene: enough to see what a subject stands on."""
+"""Elevation of such an orbit: high enough to show the ground under a subject."""
 
 BOX = (0.1, 0.9)
-"""Shares of a bare scene's opacity, along each axis, between which an orbit has its centre: the middle of an object,
-however unevenly its splats are spread."""
+"""Quantiles of opacity along each axis; the orbit's centre is midway between them. This finds the middle of an object
+however unevenly its Gaussians are distributed."""
 
 EXTENT_QUANTILE = 0.95
-"""Share of a bare scene's opacity that an orbit keeps in the picture; the rest may be floaters."""
+"""Fraction of the opacity that an orbit keeps in view; the rest may be floaters."""
 
 ORBIT_MARGIN = 1.1
-"""Room around what an orbit keeps in the picture."""
+"""Margin around the extent that an orbit keeps in view, as a factor."""
 
 MOST_EXTENT = 2.0
-"""An orbit's extent is at most this many medians of the distance: beyond lies the background of a capture."""
+"""An orbit's extent is at most this multiple of the median distance; the background of a capture lies beyond."""
 
 
 def orbit_of_scene(gaussians: Gaussians, frames: int, size: int, up: ArrayLike = WORLD_UP) -> list[Camera]:
-    """Make a closed orbit around a scene that came without cameras.
+    """Make a closed orbit around a scene without cameras.
 
-    The centre is the middle of the box that holds 10 to 90 % of the opacity along each axis. The radius lets the
-    sphere that holds 95 % of the opacity, but at most twice as large as the one that holds half, fill a field of
-    view of 50 degrees but for a margin.
+    The centre is the middle of the box that holds 10 to 90 % of the opacity along each axis. The extent is the radius
+    of the sphere that holds 95 % of the opacity, at most twice the radius of the one that holds half. The orbit's
+    radius lets this sphere fill a field of view of 50 degrees, with a margin of 10 %.
 
     Args:
         gaussians: N Gaussians, at least one.
-        frames: Cameras of the orbit, at least one.
+        frames: Number of cameras, at least one.
         size: Height and width of the images, px.
-        up: (3,) direction that is up in the scene.
+        up: (3,) the scene's up direction.
 
     Raises:
         ShapeError: up is not of shape (3,).
@@ -82,7 +78,7 @@ def orbit_of_scene(gaussians: Gaussians, frames: int, size: int, up: ArrayLike =
 
 
 def resized(camera: Camera, longest: int) -> Camera:
-    """Return the camera with an image whose longer side has the given length; what it sees stays the same.
+    """Scale the camera's image so that its longer side has the given length; the field of view stays the same.
 
     Args:
         camera: The camera.
@@ -91,15 +87,16 @@ def resized(camera: Camera, longest: int) -> Camera:
     Raises:
         ArgumentError: longest is not a whole number of at least 1.
     """
-    longest = whole_number("longest", longest, 1)
+    camera, longest = as_camera("camera", camera), whole_number("longest", longest, 1)
     share = longest / max(camera.W, camera.H)
     W, H = (max(1, round(side * share)) for side in (camera.W, camera.H))
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return Camera(camera.R, camera.eye, *scaled_intrinsics(*intrinsics, W / camera.W, H / camera.H), H, W)
+    return Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(W, H))
 
 
 def common_up(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
-    """Find the direction that is up for cameras held level; their mean up leans where they look down on one side.
+    """Find the up direction of cameras that are held level.
+
+    The mean of their up axes would be tilted where cameras on one side look down.
 
     Args:
         cameras: At least one.
@@ -111,14 +108,14 @@ def common_up(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
     rights = np.stack([camera.R[0] for camera in cameras])
     values, vectors = np.linalg.eigh(rights.T @ rights / len(cameras))
     up: Vector = vectors[:, 0] if vectors[:, 0] @ mean > 0 else -vectors[:, 0]
-    # the right axes have to span a plane, and the plane has to be the ground: some cameras may be held upright
+    # The right axes must span a plane, and that plane must be the ground: some cameras may be held in portrait.
     return up if values[1] > SPREAD and values[1] > 4 * values[0] and up @ mean > 0.7 else mean
 
 
 def _circle(
     centre: Vector, up: Vector, start: Vector, radius: float, elevation: float, frames: int
 ) -> Float64[np.ndarray, "frames 3"]:
-    """Walk around the centre: e(t) = c + r (cos(el) (cos t a + sin t (up × a)) + sin(el) up), a the start."""
+    """Place eyes on a circle: e(t) = c + r (cos(el) (cos t a + sin t (up × a)) + sin(el) up), with a = start."""
     elevation = min(max(elevation, -STEEPEST), STEEPEST)
     angles = 2.0 * np.pi * np.arange(frames) / frames
     ring = np.cos(angles)[:, None] * start + np.sin(angles)[:, None] * np.cross(up, start)
@@ -134,7 +131,7 @@ def _level(vector: Vector, up: Vector) -> Vector:
 
 
 def _unit(vector: Vector, otherwise: Vector) -> Vector:
-    """Return the direction of a vector, or of the second one where the first is (nearly) nothing."""
+    """Return the direction of a vector, or of `otherwise` if the vector is nearly zero."""
     length = float(np.linalg.norm(vector))
     chosen = vector / length if length > 1e-6 else otherwise / np.linalg.norm(otherwise)
     return np.asarray(chosen, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""A run on one page: an HTML file that needs nothing but itself."""
+"""A training run's report: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from gsplat_edu.files import written_aside
 from gsplat_edu.text import write_text
 
 PICTURES = 8
-"""Test views that a report shows."""
+"""Most test views shown in a report."""
 
 PICTURE_SIDE = 640
-"""px: pictures are shrunk until their longer side is this."""
+"""Pictures are shrunk until their longer side has this many px."""
 
 JPEG_QUALITY = 88
 
-SCORES = (("psnr", "PSNR (dB)"), ("psnr_8bit", "PSNR of 8 bits (dB)"), ("ssim", "SSIM"), ("l1", "L1"))
+SCORES = (("psnr", "PSNR (dB)"), ("psnr_8bit", "PSNR, 8-bit (dB)"), ("ssim", "SSIM"), ("l1", "L1"))
 
 OVERFITTED = 5.0
-"""Decibels between training and test views from which a scene knows its photos by heart. After 2,000 iterations a
-capture of 97 photos had 2, one of 11 had 9, and one of 50 with random start points 12."""
+"""Report overfitting from this gap between the PSNR of training and test views, dB. Measured after 2,000 iterations: 2
+dB for a capture of 97 photos, 9 for one of 11, and 12 for one of 50 with random start points."""
 
-GRADES = ((30.0, "very close to them"), (25.0, "close to them"), (20.0, "soft or partly wrong"))
-"""Least mean PSNR of the held-out photos, dB, and what renders of them look like; below the last they look wrong."""
+GRADES = ((30.0, "very close"), (25.0, "close"), (20.0, "soft or partly wrong"))
+"""Lower limit of the mean test PSNR, dB, and the verdict on the renders; below the last limit, "wrong in places"."""
 
 SHOWN = 0.95
-"""Quantile of a difference that its picture shows at full brightness at most."""
+"""This quantile of a difference stays below white when the picture of the difference is brightened."""
 
 NAMES = {"num_gaussians": "Gaussians", "seconds": "training time"}
-"""What a report calls numbers of metrics.json whose key is not plain English."""
+"""Labels for the keys of metrics.json that are not plain English."""
 
 STYLE = """
 :root { color-scheme: light; }
@@ -85,11 +85,11 @@ for (const slider of document.querySelectorAll(".pair input")) {
   move();
 }
 """
-"""Moves the line between photo and render; without it a page shows half of each."""
+"""Moves the line between photo and render. Without scripts, a page shows half of each."""
 
 
 def machine_facts() -> dict[str, str]:
-    """Say what computed: the processor, the threads and the versions."""
+    """Return the processor, number of threads, and software versions of this machine."""
     return {
         "processor": _processor(),
         "threads": str(torch.get_num_threads()),
@@ -114,7 +114,7 @@ class Picture:
     """A test view as a report shows it: render, photo and their difference, as JPEG.
 
     Args:
-        name: What the capture calls the view.
+        name: The view's name in the capture.
         panels: Title and bytes of each JPEG.
     """
 
@@ -123,13 +123,13 @@ class Picture:
 
     @classmethod
     def of(cls, name: str, render: UInt8[np.ndarray, "H W 3"], truth: UInt8[np.ndarray, "H W 3"]) -> Picture:
-        """Make the picture of a view; it is shrunk to 640 px and compressed, so that hundreds fit into memory.
+        """Make the picture of a view, shrunk to 640 px and compressed so that hundreds fit into memory.
 
-        The difference is shown 1, 2, 4, 8 or 16 times as bright, whatever keeps 95 % of it below white: that of a good
-        render is black to the eye.
+        The difference is brightened by the largest factor among 1, 2, 4, 8 and 16 that keeps 95 % of it below white;
+        without this, the difference of a good render looks black.
 
         Args:
-            name: What the capture calls the view.
+            name: The view's name in the capture.
             render: (H, W, 3) rendered.
             truth: (H, W, 3) photo.
         """
@@ -137,25 +137,25 @@ class Picture:
         high = float(np.quantile(difference, SHOWN)) if difference.size else 0.0
         times = next((k for k in (16, 8, 4, 2) if k * high <= 255.0), 1)
         bright = np.minimum(times * difference, 255).astype(np.uint8)
-        title = "difference" if times == 1 else f"difference, {times} times as bright"
+        title = "difference" if times == 1 else f"difference, {times}x amplified"
         panels = (("render", render), ("photo", truth), (title, bright))
         return cls(name, tuple((title, _jpeg(panel)) for title, panel in panels))
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a report says.
+    """The contents of a report.
 
     Args:
-        title: Its heading.
-        metrics: As metrics.json has them: "test" and "train" by `gsplat_edu.evaluate.metrics.summarize`, and
-            single numbers beside them, and "exports", files in other formats.
-        log: Lines of the log: `iteration`, and any of loss, psnr (of an evaluation), num_gaussians, ms.
-        config: What decided the run.
+        title: The heading.
+        metrics: The contents of metrics.json: "test" and "train" from `gsplat_edu.evaluate.metrics.summarize`, single
+            numbers, and "exports" for files in other formats.
+        log: Entries of the log: `iteration`, and any of loss, psnr (of an evaluation), num_gaussians, ms.
+        config: The run's configuration.
         scores: Scores of the test views.
-        pictures: Pictures of test views, of which at most 8 are shown; best and worst among them.
-        notes: Sentences a reader should know.
-        machine: Facts of the machine; those of this one by default.
+        pictures: Pictures of test views. At most 8 are shown, the best and the worst among them.
+        notes: Notes for the reader, one sentence each.
+        machine: Facts about the machine; by default, this one.
     """
 
     title: str
@@ -169,14 +169,14 @@ class Report:
 
 
 def write_report(path: Path, report: Report) -> None:
-    """Write a report as one HTML file: images and curves inside, one small script, nothing from the network.
+    """Write a report as one HTML file with images, curves and a small script inside; it loads nothing from the network.
 
     Args:
-        path: The file; parent folders are made.
-        report: What it says.
+        path: Output file; parent folders are created.
+        report: Its contents.
 
     Raises:
-        OSError: the file cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     figure = run_curves_figure(_with_last(report.log, report.metrics))
     curves = svg_element(figure) if figure else ""
@@ -189,7 +189,7 @@ def write_report(path: Path, report: Report) -> None:
         _views(report.scores, report.pictures),
         _exports(report.metrics.get("exports")),
         _section("Notes", _list(report.notes)),
-        _section("Configuration", _folded("every value that decided this run", _facts(_flat(config)))),
+        _section("Configuration", _folded("all settings of this run", _facts(_flat(config)))),
         *_machines(report),
     ]
     title = html.escape(report.title)
@@ -204,10 +204,10 @@ def write_report(path: Path, report: Report) -> None:
 
 
 def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> str:
-    """Say in one sentence what the numbers mean.
+    """Summarise the metrics in one sentence.
 
     Args:
-        metrics: As `Report` has them.
+        metrics: As in `Report`.
         scores: Scores of the test views.
     """
     test, train = (_mean_psnr(metrics, split) for split in ("test", "train"))
@@ -215,19 +215,19 @@ def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> st
     after = f"After {steps:,} iterations, " if isinstance(steps, int) else ""
     if test is None:
         if train is None:
-            return "Nothing was judged: no photo was compared with its render."
+            return "The scene was not evaluated: no photo was compared with a render."
         known = f"renders of the training photos reach {train:.1f} dB PSNR"
-        sentence = f"{after}{known}; no photo was held out, so nothing says how it looks from elsewhere."
+        sentence = f"{after}{known}; no photo was held out, so the quality of new views is unknown."
         return sentence[0].upper() + sentence[1:]
     grade = next((words for least, words in GRADES if test >= least), "wrong in places")
-    parts = [f"{after}renders of the held-out photos reach {test:.1f} dB PSNR and look {grade}"]
+    parts = [f"{after}renders of the held-out photos reach {test:.1f} dB PSNR ({grade})"]
     if train is not None:
         gap = train - test
         how = f"{abs(gap):.1f} dB {'below' if gap > 0 else 'above'} the training photos"
-        parts.append(f"{how}, so the scene has overfitted to those" if gap >= OVERFITTED else how)
+        parts.append(f"{how}, so the scene has overfitted to them" if gap >= OVERFITTED else how)
     if len(scores) > 1:
         low = worst(scores)
-        parts.append(f"the worst is {low.name} at {low.psnr:.1f} dB")
+        parts.append(f"the worst view is {low.name} at {low.psnr:.1f} dB")
     sentence = "; ".join(parts) + "."
     return sentence[0].upper() + sentence[1:]
 
@@ -239,7 +239,7 @@ def _mean_psnr(metrics: Mapping[str, Any], split: str) -> float | None:
 
 
 def _with_last(log: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Add the final evaluation, which is in the metrics and not in the log, to the curve of evaluations."""
+    """Append the final evaluation, which only the metrics contain, to the log."""
     test, steps = _mean_psnr(metrics, "test"), metrics.get("iterations")
     lines = [line for line in log if "psnr" not in line or line.get("iteration") != steps]
     final = [] if test is None or not isinstance(steps, int) else [{"iteration": steps, "psnr": test}]
@@ -247,7 +247,7 @@ def _with_last(log: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any]) -> 
 
 
 def _page_link(report: Path, exports: object) -> str:
-    """Link to the page that shows the scene, or name the command that makes one."""
+    """Link to the page that shows the scene, or show the command that makes one."""
     folder = report.parent.absolute()
     entries = exports if isinstance(exports, list) else []
     named = [str(entry.get("path")) for entry in entries if isinstance(entry, Mapping)]
@@ -255,20 +255,20 @@ def _page_link(report: Path, exports: object) -> str:
     for page in pages:
         if page.is_file() and page.absolute() != report.absolute():
             place = quote(Path(os.path.relpath(page.absolute(), folder)).as_posix())
-            return f'<p><a href="{html.escape(place)}">Look at the scene in the browser</a></p>\n'
+            return f'<p><a href="{html.escape(place)}">View the scene in the browser</a></p>\n'
     command = shlex.join(["gsplat-edu", "convert", str(folder), str(folder / "page.html")])
-    return f"<p>A page that shows the scene in the browser: <code>{html.escape(command)}</code></p>\n"
+    return f"<p>To view the scene in the browser, make a page: <code>{html.escape(command)}</code></p>\n"
 
 
 def _machines(report: Report) -> list[str]:
-    """Show the machine once, or the two of a run that was trained on one and judged on another."""
+    """Show the machine; if training and evaluation ran on different machines, show both."""
     trained = report.config.get("machine")
     trained = {key: _plain(value) for key, value in trained.items()} if isinstance(trained, Mapping) else {}
     if not trained or trained == dict(report.machine):
         return [_section("Machine", _facts(report.machine))]
     return [
-        _section("Machine of the training", _facts(trained)),
-        _section("Machine of this report", _facts(report.machine)),
+        _section("Training machine", _facts(trained)),
+        _section("Evaluation machine", _facts(report.machine)),
     ]
 
 
@@ -289,14 +289,14 @@ def _headline(metrics: Mapping[str, Any]) -> str:
         if not isinstance(value, Mapping | list)
     }
     how = (
-        "Means of the images' values. PSNR compares the render, clamped to 0..1, with the photo's bytes; "
-        "SSIM has a Gaussian window of 11 taps, sigma 1.5."
+        "Each value is the mean over the images. PSNR compares the render, clamped to 0..1, with the photo's bytes; "
+        "8-bit PSNR rounds the render to bytes first. SSIM uses a Gaussian window of 11 taps, sigma 1.5."
     )
     return _section("Result", f'{table if rows else ""}<p class="quiet">{how}</p>\n{_facts(singles)}')
 
 
 def _exports(exports: object) -> str:
-    """Tell of files in other formats: size, and how their renders compare with those of the scene."""
+    """List the files in other formats: size, and PSNR of their renders against those of the scene."""
     if not isinstance(exports, list) or not all(isinstance(entry, Mapping) for entry in exports):
         return ""
     rows = []
@@ -304,9 +304,9 @@ def _exports(exports: object) -> str:
         cells = [_score("psnr", entry.get("psnr")), _score("psnr", entry.get("worst_psnr"))]
         cells += [html.escape(_plain(entry.get(key))) for key in ("worst_view", "num_views", "num_bytes")]
         rows.append(f"<tr><th>{html.escape(str(entry.get('path')))}</th>{_numbers(cells)}</tr>")
-    titles = ("PSNR (dB)", "lowest (dB)", "view of the lowest", "views", "bytes")
+    titles = ("PSNR (dB)", "lowest (dB)", "worst view", "views", "bytes")
     head = "".join(f'<th class="n">{title}</th>' for title in titles)
-    how = "Each file was read again, and its renders compared with those of the trained scene; equal ones have 100 dB."
+    how = "Each file was read back and its renders were compared with the trained scene's. Equal renders have 100 dB."
     table = _table(f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>")
     return _section("Exports", f'{table}<p class="quiet">{how}</p>\n' if rows else "")
 
@@ -317,7 +317,7 @@ def _numbers(cells: Sequence[str]) -> str:
 
 def _views(scores: Sequence[ImageScore], pictures: Sequence[Picture]) -> str:
     if not scores:
-        return _section("Test views", '<p class="quiet">No view was held out, so nothing was judged.</p>\n')
+        return _section("Test views", '<p class="quiet">No view was held out for testing.</p>\n')
     high, low = best(scores), worst(scores)
     said = (
         f"<p>Best: {html.escape(high.name)} ({_score('psnr', high.psnr)} dB). "
@@ -336,11 +336,11 @@ def _views(scores: Sequence[ImageScore], pictures: Sequence[Picture]) -> str:
         for score in scores
     )
     table = f"<table><thead><tr><th>view</th>{head}</tr></thead><tbody>{rows}</tbody></table>"
-    return _section("Test views", f"{said}{''.join(figures)}{_folded('every view', _table(table))}")
+    return _section("Test views", f"{said}{''.join(figures)}{_folded('all views', _table(table))}")
 
 
 def _chosen(pictures: Sequence[Picture], keep: Sequence[str]) -> list[Picture]:
-    """Choose the pictures that are shown: best and worst, and the rest spread evenly."""
+    """Choose the pictures to show: the best, the worst, and others at even intervals."""
     kept = {next((i for i, p in enumerate(pictures) if p.name == name), None) for name in keep} - {None}
     rest = [i for i in range(len(pictures)) if i not in kept]
     places = np.linspace(0, len(rest) - 1, max(0, min(PICTURES - len(kept), len(rest))))
@@ -349,7 +349,7 @@ def _chosen(pictures: Sequence[Picture], keep: Sequence[str]) -> list[Picture]:
 
 
 def _figure(picture: Picture, score: ImageScore | None) -> str:
-    """Lay the photo over the render, with a slider between them, and the difference beside them."""
+    """Lay the photo over the render with a slider between them; put the difference beside them."""
     (render, below), (photo, above), (difference, apart) = picture.panels
     name = html.escape(picture.name)
     pair = (
@@ -386,7 +386,7 @@ def _folded(summary: str, body: str) -> str:
 
 
 def _table(table: str) -> str:
-    """Let a table that is wider than a phone scroll by itself."""
+    """Wrap a table so that it scrolls on its own where it is wider than the screen."""
     return f'<div class="table">{table}</div>\n'
 
 
@@ -401,7 +401,7 @@ def _facts(facts: Mapping[str, str]) -> str:
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Turn nested sections into "section.key" and the text of the value."""
+    """Flatten nested sections into "section.key" and the value as text."""
     rows: dict[str, str] = {}
     for key, value in config.items():
         if isinstance(value, Mapping):
@@ -418,7 +418,7 @@ def _plain(value: object) -> str:
 
 
 def _single(key: str, value: object) -> str:
-    """Write a number of metrics.json: thousands apart, a duration in hours, minutes and seconds."""
+    """Format a number of metrics.json: thousands separators; a duration in hours, minutes and seconds."""
     if key == "seconds" and isinstance(value, int | float) and math.isfinite(value):
         minutes, seconds = divmod(value, 60)
         hours, minutes = divmod(int(minutes), 60)
@@ -428,7 +428,7 @@ def _single(key: str, value: object) -> str:
 
 
 def _score(key: str, value: object) -> str:
-    """Write decibels with two decimals, other scores with four; an en dash where there is none."""
+    """Format decibels with two decimals and other scores with four; an en dash if the score is missing."""
     if isinstance(value, int | float):
         return f"{value:.2f}" if key.startswith("psnr") else f"{value:.4f}"
     return "&ndash;"

@@ -1,6 +1,6 @@
-"""Videos that browsers play: VP9 in an MP4 file, its index in front of the frames.
+"""Videos that browsers play: VP9 in an MP4 file with its index before the frames.
 
-docs/decisions/0009-vp9-in-mp4.md says why it is not H.264.
+docs/decisions/0009-vp9-in-mp4.md explains why not H.264.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from gsplat_edu.validation import ArrayLike
 FOURCC = "vp09"
 
 BT709, BT601 = 1, 6
-"""Codes of ISO/IEC 23091-2 for colour primaries, transfer function and matrix: sRGB has the primaries of BT.709, and
-swscale, through which OpenCV converts to YUV, the matrix of BT.601."""
+"""Codes of ISO/IEC 23091-2 for colour primaries, transfer function and matrix. sRGB has the primaries of BT.709;
+swscale, which OpenCV uses to convert to YUV, has the matrix of BT.601."""
 
 CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
-"""Boxes on the way to the tables of an MP4 file's index."""
+"""Container boxes that lead to the tables in an MP4 file's index."""
 
 VISUAL_ENTRY = 8 + 8 + 78
-"""Bytes of a sample description table in front of its codec's boxes: version and count, the one entry's header, and the
-fields that every visual entry has."""
+"""Bytes before the codec's boxes in a sample description table: version and count, the header of its one entry, and the
+fields common to all visual entries."""
 
 
 def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: float) -> None:
     """Write frames as VP9, yuv420p, in an MP4 file. Equal frames give equal bytes.
 
-    An odd width or height is padded with a copy of the last column or row: chroma has half the resolution.
+    An odd width or height is padded with a copy of the last column or row because chroma has half the resolution.
 
     Args:
-        path: The file to write; it is there, perhaps empty.
-        shown: What messages call it.
-        frames: (H, W, 3) each, of one size, uint8 or float from 0 to 1; taken one at a time.
+        path: The file to write; it exists and may be empty.
+        shown: Its name in messages.
+        frames: (H, W, 3) each, of equal size, uint8 or float from 0 to 1; taken one at a time.
         fps: Frames per second.
 
     Raises:
@@ -80,22 +80,22 @@ def _writer(path: Path, shown: Path, size: tuple[int, int], fps: float) -> cv2.V
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), fps, (width, height))
     if not writer.isOpened():
         raise ArgumentError(
-            f"{shown}: OpenCV cannot encode VP9 at {width}x{height}, {fps:g} fps, here; write a folder of PNGs"
+            f"{shown}: OpenCV cannot encode VP9 at {width}x{height}, {fps:g} fps here; write a folder of PNGs"
         )
     return writer
 
 
 def streamable(data: bytes) -> bytes:
-    """Put an MP4 file's index in front of its frames, and name the colours of its VP9 track.
+    """Move an MP4 file's index before its frames, and set the colour codes of its VP9 track.
 
-    With the index behind the frames a player has to fetch the whole file first. Without the colours' names browsers
-    assume the matrix of BT.709, which turns (30, 220, 30) into (15, 190, 23).
+    With the index at the end, a player has to fetch the whole file first. Without colour codes, browsers assume the
+    matrix of BT.709, which turns (30, 220, 30) into (15, 190, 23).
 
     Args:
         data: The file.
 
     Returns:
-        The file, of the same length.
+        The file, with its length unchanged.
 
     Raises:
         ArgumentError: it is not an MP4 file with an index, or too large for the index's 32-bit offsets.
@@ -103,7 +103,7 @@ def streamable(data: bytes) -> bytes:
     boxes = {kind: (start, end) for kind, start, _, end in _boxes(data, 0, len(data))}
     if not {b"ftyp", b"moov", b"mdat"} <= set(boxes):
         raise ArgumentError(
-            "video: is not an MP4 file with an index; OpenCV's encoder failed, write a folder"
+            "video: is not an MP4 file with an index; OpenCV's encoder failed: write a folder instead"
         )
     (_, front), (start, end) = boxes[b"ftyp"], boxes[b"moov"]
     index = bytearray(data[start:end])
@@ -114,11 +114,11 @@ def streamable(data: bytes) -> bytes:
 
 
 def _boxes(data: bytes | bytearray, start: int, end: int) -> Iterator[tuple[bytes, int, int, int]]:
-    """Yield kind, start, start of the content, and end of the boxes of a stretch of an MP4 file."""
+    """Yield kind, start, start of the content, and end of each box in a part of an MP4 file."""
     while start + 8 <= end:
         length, kind = struct.unpack_from(">I4s", data, start)
         header = 8
-        if length == 1:  # too long for 32 bits
+        if length == 1:  # the length needs 64 bits
             (length,), header = struct.unpack_from(">Q", data, start + 8), 16
         if length < header or start + length > end:
             return
@@ -127,7 +127,7 @@ def _boxes(data: bytes | bytearray, start: int, end: int) -> Iterator[tuple[byte
 
 
 def _tables(index: bytearray, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Yield kind, start of the content and end of all boxes of an index that hold no others."""
+    """Yield kind, start of the content, and end of each box of an index that contains no other boxes."""
     for kind, _, content, stop in _boxes(index, start, end):
         if kind in CONTAINERS:
             yield from _tables(index, content, stop)
@@ -138,7 +138,7 @@ def _tables(index: bytearray, start: int, end: int) -> Iterator[tuple[bytes, int
 
 
 def _shift_offsets(index: bytearray, shift: int) -> None:
-    """Add what stands in front of the frames now to where the index says they are."""
+    """Add `shift` to the file offsets of the frames in the index."""
     for kind, content, _ in list(_tables(index, 0, len(index))):
         if kind in (b"stco", b"co64"):
             (count,) = struct.unpack_from(">I", index, content + 4)
@@ -150,7 +150,7 @@ def _shift_offsets(index: bytearray, shift: int) -> None:
 
 
 def _name_colours(index: bytearray) -> None:
-    """Set the bytes of vpcC for primaries, transfer function and matrix, behind 4 of version and 3 of format."""
+    """Set the bytes of vpcC for primaries, transfer function and matrix, after 4 bytes of version and 3 of format."""
     for kind, content, _ in list(_tables(index, 0, len(index))):
         if kind == b"vpcC":
             index[content + 7 : content + 10] = bytes((BT709, BT709, BT601))

@@ -1,1 +1,1 @@
-"""A picture made of 2D splats: rendered, differentiated by hand, fitted with Adam. In NumPy, without torch."""
+"""2D splats: rendered, differentiated by hand and fitted to an image with Adam. NumPy only, without torch."""

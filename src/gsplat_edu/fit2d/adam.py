@@ -1,4 +1,4 @@
-"""Adam for 2D splats: every number is moved by its own gradient over that gradient's usual size.
+"""Adam for 2D splats: each value moves by its gradient divided by the gradient's typical size.
 
 Chapter: 08_fit_an_image.
 """
@@ -18,23 +18,23 @@ from gsplat_edu.validation import in_range
 RATES_2D: Mapping[str, float] = MappingProxyType(
     {"means": 0.8, "log_scales": 0.1, "angles": 0.1, "colors": 0.05, "logit_opacities": 0.1}
 )
-"""Rates by parameter: about how far a step moves it, in its own unit (px, 1, radians, 1, 1)."""
+"""Learning rates by parameter: the approximate size of a step, in the parameter's unit (px, 1, radians, 1, 1)."""
 
 
 @dataclass(frozen=True)
 class AdamSettings:
-    """How Adam steps.
+    """Settings of Adam.
 
     m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g²
     p -= rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)
 
     Args:
-        rates: Rate of every parameter by name.
+        rates: Learning rate of every parameter by name.
         betas: b1 and b2, decay of the first and second moment, 0 to below 1.
-        eps: Floor under the root of the second moment.
+        eps: Added to the root of the second moment.
 
     Raises:
-        ArgumentError: a rate is missing, belongs to no parameter or is negative, or another number is out of range.
+        ArgumentError: a rate is missing, negative or belongs to no parameter, or another number is out of range.
 
     Source: Kingma and Ba 2015, algorithm 1.
     """
@@ -46,7 +46,7 @@ class AdamSettings:
     def __post_init__(self) -> None:
         """Check names and ranges."""
         if different := sorted(set(self.rates) ^ set(PER_SPLAT)):
-            wrong = "is missing" if different[0] in PER_SPLAT else "is no parameter"
+            wrong = "is missing" if different[0] in PER_SPLAT else "is not a parameter"
             raise ArgumentError(f"rates: {different[0]!r} {wrong}; the parameters are {', '.join(PER_SPLAT)}")
         for name, rate in self.rates.items():
             in_range(f"rates[{name!r}]", rate, 0.0)
@@ -57,12 +57,12 @@ class AdamSettings:
 
 @dataclass(frozen=True)
 class AdamState:
-    """What Adam remembers.
+    """State of Adam.
 
     Args:
         first: Running mean of the gradients.
         second: Running mean of their squares.
-        steps: t, steps taken.
+        steps: Number of steps taken, t.
     """
 
     first: Splats2D
@@ -71,31 +71,31 @@ class AdamState:
 
     @classmethod
     def fresh(cls, splats: Splats2D) -> AdamState:
-        """Return the memory of an Adam that has seen nothing."""
+        """Return the initial state."""
         return cls(splats.map(np.zeros_like), splats.map(np.zeros_like))
 
 
 def adam_step_2d(
     splats: Splats2D, gradients: Splats2D, state: AdamState, settings: AdamSettings, factor: float = 1.0
 ) -> tuple[Splats2D, AdamState]:
-    """Take one step of Adam; see `AdamSettings`. Nothing is changed in place.
+    """Take one step of Adam; see `AdamSettings`. Nothing is modified in place.
 
     Args:
         splats: N splats.
-        gradients: The loss's gradients by them.
-        state: What Adam remembers of the steps before.
-        settings: Rates, decays, floor.
-        factor: Multiplies every rate of this step.
+        gradients: Gradients of the loss with respect to them.
+        state: The state after the previous step.
+        settings: Learning rates, decays, eps.
+        factor: Multiplies all learning rates in this step.
 
     Returns:
-        The splats after the step, and what Adam remembers now.
+        The splats and the state after the step.
 
     Raises:
         ShapeError: splats, gradients and state have different N.
     """
     for name, other in (("gradients", gradients), ("state", state.first)):
         if len(other) != len(splats):
-            raise ShapeError(f"{name}: are of {len(other)} splats, but there are {len(splats)}")
+            raise ShapeError(f"{name}: has {len(other)} splats, but there are {len(splats)}")
     b1, b2 = settings.betas
     steps = state.steps + 1
     at, slopes = splats.arrays(), gradients.arrays()

@@ -1,4 +1,4 @@
-"""The loop that fits 2D splats to a picture: render, compare, differentiate, step.
+"""The loop that fits 2D splats to an image: render, compare, differentiate, step.
 
 Chapter: 08_fit_an_image.
 """
@@ -25,16 +25,16 @@ SQUARED_ERROR_FLOOR = 1e-10
 
 @dataclass(frozen=True)
 class Fit2DSettings:
-    """How a picture is fitted.
+    """Settings of a fit.
 
     Args:
-        iterations: Steps to take.
+        iterations: Number of steps.
         background: (r, g, b) behind the splats.
-        adam: Rates, decays, floor.
-        final_factor: What the rates have fallen to, exponentially, at the last step; 1 leaves them as they are.
+        adam: Learning rates, decays, eps.
+        final_factor: Factor reached by exponential decay of the learning rates at the last step; 1 keeps them constant.
 
     Raises:
-        ShapeError: the background has not three numbers.
+        ShapeError: the background does not have three values.
         ArgumentError: a number is out of range.
     """
 
@@ -51,13 +51,13 @@ class Fit2DSettings:
 
 
 class Step2D(NamedTuple):
-    """What a fit reports: of a picture, how good it is; after the last step, the finished one.
+    """State of a fit before a step, and after the last one.
 
     Args:
-        iteration: Steps taken before this picture, 0 to `iterations`.
-        loss: Its mean squared error, not clipped.
-        psnr: Its PSNR, dB.
-        rendered: The picture and its splats.
+        iteration: Steps taken so far, 0 to `iterations`.
+        loss: Mean squared error of the render, not clipped.
+        psnr: PSNR of the render, dB.
+        rendered: The render and its splats.
     """
 
     iteration: int
@@ -67,12 +67,12 @@ class Step2D(NamedTuple):
 
 
 class Fit2D(NamedTuple):
-    """What a fit comes to.
+    """Result of a fit.
 
     Args:
         splats: The fitted splats.
-        image: (H, W, 3) their picture, not clipped.
-        losses: Mean squared error before each step, and after the last one.
+        image: (H, W, 3) their render, not clipped.
+        losses: Mean squared error before each step and after the last one.
         psnrs: PSNR at the same times, dB.
     """
 
@@ -88,22 +88,22 @@ def fit_2d(
     settings: Fit2DSettings | None = None,
     callbacks: Sequence[Callable[[Step2D], None]] = (),
 ) -> Fit2D:
-    """Fit splats to a picture.
+    """Fit splats to an image.
 
-    The same arguments give the same bits, on any number of threads: every sum is NumPy's own.
+    Equal arguments give equal bits, for any number of threads, because all sums are NumPy's.
 
     Args:
-        target: (H, W, 3) the picture, 0 to 1.
-        splats: Where to start; N and the order stay.
-        settings: Iterations, rates, background; the defaults where None.
-        callbacks: Told of the picture before every step and after the last.
+        target: (H, W, 3) the image, 0 to 1.
+        splats: Initial splats; their number and order stay the same.
+        settings: Iterations, learning rates, background; None uses the defaults.
+        callbacks: Called with the state before every step and after the last one.
 
     Returns:
-        The fitted splats, their picture and the curves.
+        The fitted splats, their render and the curves.
 
     Raises:
         ShapeError: the target is not (H, W, 3).
-        ArgumentError: it is NaN or infinite somewhere.
+        ArgumentError: it contains NaN or infinity.
     """
     settings = settings or Fit2DSettings()
     truth = float64_array("target", target, ("H", "W", 3))
@@ -113,7 +113,7 @@ def fit_2d(
     losses: list[float] = []
     psnrs: list[float] = []
 
-    def look(iteration: int, splats: Splats2D) -> tuple[Render2D, Float64[np.ndarray, "H W 3"]]:
+    def render(iteration: int, splats: Splats2D) -> tuple[Render2D, Float64[np.ndarray, "H W 3"]]:
         rendered = render_2d(splats, height, width, settings.background)
         loss, grad_image = squared_error(rendered.image, truth)
         losses.append(loss)
@@ -125,21 +125,21 @@ def fit_2d(
     state = AdamState.fresh(splats)
     for iteration in range(settings.iterations):
         factor = settings.final_factor ** (iteration / max(1, settings.iterations - 1))
-        gradients = backward_2d(*look(iteration, splats))
+        gradients = backward_2d(*render(iteration, splats))
         splats, state = adam_step_2d(splats, gradients, state, settings.adam, factor)
-    rendered, _ = look(settings.iterations, splats)
+    rendered, _ = render(settings.iterations, splats)
     return Fit2D(splats, rendered.image, losses, psnrs)
 
 
 def psnr_2d(image: ArrayLike, target: ArrayLike) -> float:
-    """Return the peak signal-to-noise ratio, the image clamped to 0..1: -10 log10(max(MSE, 1e-10)).
+    """Return the PSNR of the image clamped to 0..1: -10 log10(max(MSE, 1e-10)).
 
     Args:
-        image: (H, W, 3) rendered.
-        target: (H, W, 3) what it should be, 0 to 1.
+        image: (H, W, 3) render.
+        target: (H, W, 3) reference, 0 to 1.
 
     Returns:
-        dB; 100 for equal images. The number that `gsplat_edu.evaluate.metrics.psnr` gives, without torch.
+        dB; 100 for equal images. The same value as `gsplat_edu.evaluate.metrics.psnr`, without torch.
 
     Raises:
         ShapeError: the sizes differ.
@@ -150,11 +150,11 @@ def psnr_2d(image: ArrayLike, target: ArrayLike) -> float:
 
 
 def shrunk_photo(pixels: UInt8[np.ndarray, "H W 3"], longest: int) -> Float64[np.ndarray, "h w 3"]:
-    """Bring a photo to a size that can be fitted, each new pixel the mean of the area it covers.
+    """Downscale a photo for fitting; each new pixel is the mean of the area it covers.
 
     Args:
         pixels: (H, W, 3) photo, uint8.
-        longest: Height or width to come to, whichever is larger, px; a smaller photo keeps its size.
+        longest: Length of the longer side after scaling, px; a smaller photo keeps its size.
 
     Returns:
         (h, w, 3) from 0 to 1.

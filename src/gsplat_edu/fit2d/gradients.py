@@ -1,8 +1,8 @@
-"""The gradient of a picture's error by every parameter of its 2D splats, written down by hand.
+"""The gradient of an image error with respect to all parameters of 2D splats, derived by hand.
 
-From the image to the parameters, each function one link of the chain: error -> image -> alpha and colour -> conic and
-mean -> covariance -> its factor -> log-scales and angle. The same steps, with projection behind them, are what the
-kernels of `gsplat_edu.render` do.
+Each function is one link of the chain from the image to the parameters: error -> image -> alpha and colour -> conic and
+mean -> covariance -> its factor -> log scales and angle. The kernels of `gsplat_edu.render` perform the same steps,
+followed by the projection.
 
 Chapter: 08_fit_an_image.
 """
@@ -20,13 +20,13 @@ Sums = Float64[np.ndarray, "9"]
 
 
 def squared_error(image: ArrayLike, target: ArrayLike) -> tuple[float, Float64[np.ndarray, "H W 3"]]:
-    """Return the mean squared error of an image, and its gradient by the image.
+    """Return the mean squared error of an image, and its gradient with respect to the image.
 
     L = mean (image - target)²,  dL/dimage = 2 (image - target) / (3 H W)
 
     Args:
-        image: (H, W, 3) rendered, not clipped.
-        target: (H, W, 3) what it should be.
+        image: (H, W, 3) render, not clipped.
+        target: (H, W, 3) reference.
 
     Raises:
         ShapeError: the sizes differ.
@@ -38,25 +38,25 @@ def squared_error(image: ArrayLike, target: ArrayLike) -> tuple[float, Float64[n
 
 
 def backward_2d(rendered: Render2D, grad_image: ArrayLike) -> Splats2D:
-    """Carry a gradient by the image back to every parameter of the splats that made it.
+    """Propagate the gradient of an image to all parameters of its splats.
 
     With g = dL/dimage at a pixel, R = g . image before the first splat, and i from near to far:
 
         w = T alpha_i;  R -= w g . c_i;  dL/dalpha_i = T g . c_i - R / (1 - alpha_i);  T *= 1 - alpha_i
 
-    R is what the splats behind i and the background add to g . image. Where the clamp at 0.99 holds alpha still, and
-    where the floor makes it zero, the gradient of everything inside the exponential is zero.
+    R is the contribution of the splats behind i and of the background to g . image. Where alpha is clamped at 0.99, and
+    where it is below the threshold and zero, the gradient of everything inside the exponential is zero.
 
     Args:
-        rendered: What `render_2d` returned.
-        grad_image: (H, W, 3) gradient of the loss by its image.
+        rendered: The result of `render_2d`.
+        grad_image: (H, W, 3) gradient of the loss with respect to the image.
 
     Returns:
-        The gradients of the loss by the raw parameters.
+        The gradients of the loss with respect to the raw parameters.
 
     Raises:
-        ShapeError: the gradient is not of the image's size.
-        ArgumentError: it is NaN or infinite somewhere.
+        ShapeError: the gradient's size differs from the image's.
+        ArgumentError: it contains NaN or infinity.
     """
     given = float64_array("grad_image", grad_image, ("H", "W", 3))
     check_shape("grad_image", given.shape, rendered.image.shape, {})
@@ -84,9 +84,9 @@ def _sums_over_pixels(
     T: Float64[np.ndarray, "h w"],
     R: Float64[np.ndarray, "h w"],
 ) -> Sums:
-    """Take one splat's sums: w g of three channels, and h, h dx, h dy, h dx², h dx dy, h dy². T and R are moved on.
+    """Return one splat's sums: w g of three channels, and h, h dx, h dy, h dx², h dx dy, h dy². Updates T and R.
 
-    h = alpha dL/dalpha: what dL/dalpha becomes by passing an exponential, d alpha / d power = alpha.
+    h = alpha dL/dalpha: the gradient after the exponential, because d alpha / d power = alpha.
     """
     alpha, dx, dy = footprint.alpha, footprint.dx, footprint.dy
     red, green, blue = color.tolist()
@@ -113,7 +113,7 @@ def _sums_over_pixels(
 
 
 def _to_parameters(rendered: Render2D, sums: Float64[np.ndarray, "N 9"]) -> Splats2D:
-    """Go on from each splat's sums to its parameters; Lambda: the conic, M = R S: the covariance's factor.
+    """Propagate each splat's sums to its parameters. Lambda: the conic; M = R S: the covariance's factor.
 
     dL/dmean = Lambda sum h d
     dL/dSigma = Lambda (sum h d d') Lambda / 2,  dL/dM = 2 dL/dSigma M
@@ -133,7 +133,7 @@ def _to_parameters(rendered: Render2D, sums: Float64[np.ndarray, "N 9"]) -> Spla
     )
     M = np.moveaxis(splats.factors, 0, -1)
     grad_M = twice[:, :1] * M[None, 0] + twice[:, 1:] * M[None, 1]
-    turned = np.stack([-M[1], M[0]])  # dR/dangle S: every column of R S a quarter turn on
+    turned = np.stack([-M[1], M[0]])  # dR/dangle S: every column of R S rotated by a quarter turn
     return Splats2D(
         means=grad_means,
         log_scales=np.ascontiguousarray((grad_M * M).sum(axis=0).T),

@@ -1,7 +1,7 @@
-"""2D splats, and the picture they make: raw parameters, activations, compositing. All in float64.
+"""2D splats and their rendering: raw parameters, activations, compositing. All in float64.
 
-What a 3D Gaussian becomes on the screen is here the thing itself: an ellipse with a colour and an opacity. The law of
-alpha, its floor and clamp, the dilation and the compositing are those of `gsplat_edu.render.numpy_reference`.
+The screen-space ellipse of a 3D Gaussian is the primitive here, with a colour and an opacity. The definition of alpha,
+its threshold and clamp, the dilation and the compositing are those of `gsplat_edu.render.numpy_reference`.
 
 Chapter: 08_fit_an_image.
 """
@@ -28,12 +28,12 @@ PER_SPLAT: dict[str, tuple[int, ...]] = {
     "colors": (3,),
     "logit_opacities": (),
 }
-"""The parameters and the shape of each splat's: nine numbers."""
+"""The parameters and their shapes per splat: nine values."""
 
 
 @dataclass(frozen=True, eq=False)
 class Splats2D:
-    """N splats of an image as raw parameters, near to far. Gradients by these parameters have the same type.
+    """N splats of an image as raw parameters, near to far. Gradients with respect to them have the same type.
 
     Args:
         means: (N, 2) centres (u, v), px: column, row.
@@ -66,26 +66,28 @@ class Splats2D:
 
     @property
     def scales(self) -> Float64[np.ndarray, "N 2"]:
-        """(N, 2) standard deviations, px: exp(log_scales)."""
+        """Standard deviations exp(log_scales), (N, 2), px."""
         return np.asarray(np.exp(self.log_scales))
 
     @property
     def opacities(self) -> Float64[np.ndarray, " N"]:
-        """(N,) opacities in (0, 1): sigmoid(logit_opacities)."""
-        # tanh does not overflow, as exp(-x) would.
+        """Opacities sigmoid(logit_opacities) in (0, 1), (N,)."""
+        # tanh does not overflow, unlike exp(-x).
         return np.asarray(0.5 * (1.0 + np.tanh(0.5 * self.logit_opacities)))
 
     @property
     def factors(self) -> Float64[np.ndarray, "N 2 2"]:
-        """(N, 2, 2) M = R S, the rotation with its columns multiplied by the scales, px."""
+        """M = R S, the rotation with its columns multiplied by the scales, (N, 2, 2), px."""
         c, s, (s0, s1) = np.cos(self.angles), np.sin(self.angles), self.scales.T
         return np.stack([np.stack([c * s0, -s * s1], -1), np.stack([s * s0, c * s1], -1)], axis=-2)
 
     @property
     def cov2d(self) -> Float64[np.ndarray, "N 2 2"]:
-        """(N, 2, 2) covariances as they are drawn, px²: M M' + 0.3 I."""
+        """Covariances including the dilation, M M' + 0.3 I, (N, 2, 2), px²."""
         M = self.factors
-        products = (M[:, :, None, :] * M[:, None, :, :]).sum(axis=-1)  # no BLAS: its sums depend on threads
+        products = (M[:, :, None, :] * M[:, None, :, :]).sum(
+            axis=-1
+        )  # no BLAS: its sums depend on the threads
         return np.asarray(products + DILATION * np.eye(2))
 
     def arrays(self) -> dict[str, Array]:
@@ -93,22 +95,22 @@ class Splats2D:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def map(self, change: Callable[[Array], Array]) -> Splats2D:
-        """Return new splats with the same change made to every raw parameter."""
+        """Apply a function to every raw parameter and return the new splats."""
         return Splats2D(**{name: change(array) for name, array in self.arrays().items()})
 
 
 def random_splats_2d(count: int, height: int, width: int, rng: np.random.Generator) -> Splats2D:
-    """Scatter faint round splats over an image: what a fit starts from. It knows nothing of the picture.
+    """Scatter faint round splats over an image as the start of a fit, without knowledge of the image.
 
     Args:
-        count: N, how many.
+        count: Number of splats, N.
         height: Height of the image, px.
-        width: Its width, px.
-        rng: Draws means, then colours.
+        width: Width of the image, px.
+        rng: Generator for the means, then the colours.
 
     Returns:
-        N splats, means uniform, colours uniform in 0..1, opacity 1/2, each as wide as its share of the image:
-        scale sqrt(height width / N) / 2.
+        N splats with uniform means, colours uniform in 0..1, opacity 1/2, and a size that covers the image: scale
+        sqrt(height width / N) / 2.
 
     Raises:
         ArgumentError: a count or size is not a whole number of at least 1.
@@ -126,7 +128,7 @@ def random_splats_2d(count: int, height: int, width: int, rng: np.random.Generat
 
 
 class Footprint(NamedTuple):
-    """The pixels one splat reaches, and what it does there."""
+    """The pixels that a splat reaches, and its alpha there."""
 
     rows: slice
     columns: slice
@@ -137,13 +139,13 @@ class Footprint(NamedTuple):
 
 
 class Render2D(NamedTuple):
-    """A rendered image and what its backward pass needs.
+    """A rendered image and the data for its backward pass.
 
     Args:
         image: (H, W, 3) not clipped.
-        transmittance: (H, W) what is left for the background.
-        splats: What was rendered.
-        footprints: One per splat, in its order.
+        transmittance: (H, W) remaining weight of the background.
+        splats: The rendered splats.
+        footprints: One per splat, in order.
     """
 
     image: Float64[np.ndarray, "H W 3"]
@@ -153,7 +155,7 @@ class Render2D(NamedTuple):
 
 
 def render_2d(splats: Splats2D, height: int, width: int, background: ArrayLike = (0, 0, 0)) -> Render2D:
-    """Composite splats over a background, the first one nearest.
+    """Composite splats over a background; the first splat is the nearest.
 
     alpha_i = min(0.99, o_i exp(-d' Sigma_i^-1 d / 2)), 0 below 1/255;  d = pixel - mean
     image = sum_i T_i alpha_i c_i + T_final bg,  T_i = product over j < i of (1 - alpha_j)
@@ -165,7 +167,7 @@ def render_2d(splats: Splats2D, height: int, width: int, background: ArrayLike =
         background: (3,) colour behind the last splat.
 
     Returns:
-        The image, and what `backward_2d` needs.
+        The image, including the data for `backward_2d`.
 
     Raises:
         ShapeError: the background is not of shape (3,).
@@ -179,16 +181,16 @@ def render_2d(splats: Splats2D, height: int, width: int, background: ArrayLike =
         T = transmittance[footprint.rows, footprint.columns]
         weight = T * footprint.alpha
         planes[:, footprint.rows, footprint.columns] += color[:, None, None] * weight
-        T *= 1.0 - footprint.alpha  # a view: the image's own transmittance
+        T *= 1.0 - footprint.alpha  # a view into the image's transmittance
     planes += behind[:, None, None] * transmittance
     image = np.ascontiguousarray(np.moveaxis(planes, 0, -1))
     return Render2D(image, transmittance, splats, footprints)
 
 
 def _footprints(splats: Splats2D, height: int, width: int) -> tuple[Footprint, ...]:
-    """Evaluate alpha of every splat on the box around its ellipse alpha = 1/255, cut to the image."""
+    """Evaluate every splat's alpha on the box around its ellipse alpha = 1/255, clipped to the image."""
     opacities = splats.opacities
-    with np.errstate(over="ignore", invalid="ignore"):  # told of by name
+    with np.errstate(over="ignore", invalid="ignore"):  # reported by name below
         cov2d = splats.cov2d
         a, b, c = cov2d[:, 0, 0], cov2d[:, 0, 1], cov2d[:, 1, 1]
         det = (splats.scales**2 + DILATION).prod(axis=-1)  # a c - b b would lose a needle's digits
@@ -212,14 +214,14 @@ def _footprints(splats: Splats2D, height: int, width: int) -> tuple[Footprint, .
 
 
 def ellipses_2d(splats: Splats2D, deviations: float = 1.0, points: int = 40) -> Float64[np.ndarray, "N P 2"]:
-    """Trace the splats' ellipses as they are drawn, to plot them.
+    """Trace the splats' ellipses, including the dilation, for plotting.
 
     The ellipse d' Sigma^-1 d = deviations² is mean + deviations L (cos t, sin t),  Sigma = L L'.
 
     Args:
         splats: N splats.
-        deviations: How many standard deviations from the mean.
-        points: P, evenly in t from 0 to 2 pi.
+        deviations: Distance from the mean in standard deviations.
+        points: Number of points P, equidistant in t from 0 to 2 pi.
 
     Returns:
         (N, P, 2) closed curves (u, v), px.
@@ -236,10 +238,10 @@ def ellipses_2d(splats: Splats2D, deviations: float = 1.0, points: int = 40) -> 
 
 
 def check_same_size(image: ArrayLike, target: ArrayLike) -> None:
-    """Check that two arrays are images of one size.
+    """Check that two arrays are images of equal size.
 
     Raises:
-        ShapeError: they are not.
+        ShapeError: they are not images, or their sizes differ.
     """
     sizes: dict[str, int] = {}
     check_shape("image", np.shape(image), ("H", "W", 3), sizes)

@@ -1,8 +1,8 @@
-"""Between this package's axes and those of formats whose y points up: half a turn about x.
+"""Conversion between this package's axes and those of y-up formats: a half turn about x.
 
 (x, y, z) right, down, forward  <->  (x, -y, -z) right, up, back
 
-Half a turn only changes signs, so that going there and back gives the same bits.
+A half turn only changes signs, so converting there and back preserves the bits.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from gsplat_edu.gaussians import Gaussians
 POSITION_SIGNS = (1.0, -1.0, -1.0)
 
 QUAT_SIGNS = (1.0, 1.0, -1.0, -1.0)
-"""Of (w, x, y, z): q' = i q i*, i the half turn."""
+"""Signs of (w, x, y, z): q' = i q i*, with i the half turn."""
 
 SH_REST_SIGNS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
-"""Of the coefficients of degrees 1 to 3: what b_i(x, -y, -z) is of b_i(x, y, z)."""
+"""Signs of the coefficients of degrees 1 to 3: the sign of b_i(x, -y, -z) relative to b_i(x, y, z)."""
 
 
 def half_turned(gaussians: Gaussians) -> Gaussians:
-    """Turn Gaussians half a turn about x: means, rotations and the directions of their colours.
+    """Rotate Gaussians by a half turn about x: means, rotations and SH coefficients.
 
-    Turning twice gives the same bits as not turning.
+    Applying it twice restores the original bits.
 
     Args:
         gaussians: N Gaussians, raw parameters.

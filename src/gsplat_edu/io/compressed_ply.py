@@ -1,21 +1,21 @@
-"""SuperSplat's compressed PLY: 16 bytes a splat, and a byte per SH coefficient of degree 1 and up.
+"""SuperSplat's compressed PLY: 16 bytes per splat, and one byte per SH coefficient above degree 0.
 
-Splats come in chunks of 256. Element `chunk` has the smallest and the largest position, log-scale and colour of each
-chunk (older files: no colour), float32. Element `vertex` says where between them a splat is, from the highest bit down:
+Splats are grouped into chunks of 256. Element `chunk` holds the bounds of each chunk's positions, log scales and
+colours (older files: no colours) as float32. Element `vertex` encodes each splat relative to these bounds, from the
+highest bit down:
 
     packed_position  x 11, y 10, z 11 bits
-    packed_rotation  which of (w, x, y, z) is the largest 2; the other three in their order 10 each, ± sqrt(1/2)
-    packed_scale     logarithms of the scales: 11, 10, 11
-    packed_color     red, green, blue 8 each: C0 f_dc + 1/2, from 0 to 1 where the chunk has no colours; opacity 8
+    packed_rotation  index of the largest of (w, x, y, z) 2; the other three in order, 10 each, ± sqrt(1/2)
+    packed_scale     log scales: 11, 10, 11
+    packed_color     red, green, blue 8 each: C0 f_dc + 1/2, from 0 to 1 if the chunk has no colours; opacity 8
 
-Element `sh`, where there is one, has bytes f_rest_*, channel by channel: 9, 24 or 45. Byte b is (b + 1/2) / 32 - 4, the
-middle of its step, but 0 is -4 and 255 is 4. No byte is zero: a coefficient of 0 comes back as 1/64.
+The optional element `sh` has bytes f_rest_*, channel by channel: 9, 24 or 45. Byte b decodes to (b + 1/2) / 32 - 4, the
+middle of its step, except that 0 decodes to -4 and 255 to 4. No byte decodes to zero: a coefficient of 0 becomes 1/64.
 
-Axes are those of the scene: nothing is flipped. What the format has no property for stands in comments: see
-`ply_comments`.
+Axes are those of the scene: nothing is flipped. Metadata without a property is stored in comments: see `ply_comments`.
 
-Source: the reader and the writer of PlayCanvas' splat-transform (MIT licence); the reader of the PlayCanvas engine,
-which takes 8 b / 255 - 4 for SH bytes: up to half a step away, 1/64.
+Source: the reader and writer of PlayCanvas' splat-transform (MIT licence); and the reader of the PlayCanvas engine,
+which decodes SH bytes as 8 b / 255 - 4, up to half a step (1/64) off.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from gsplat_edu.ply_table import Element, Header, read_elements, read_rows
 from gsplat_edu.reading import open_file
 
 CHUNK = 256
-"""Splats of a chunk; the last one may have fewer."""
+"""Splats per chunk; the last chunk may have fewer."""
 
 POSITION_BOUNDS = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
 SCALE_BOUNDS = ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z")
@@ -47,35 +47,35 @@ COLOR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 SH_COUNTS = (9, 24, 45)
-"""Bytes of `sh`: three channels of the coefficients of degrees 1 to 3."""
+"""Numbers of `sh` properties: three channels of the coefficients up to degrees 1 to 3."""
 
 MAX_LOG_SCALE = 20.0
-"""Logarithms of scales are written within ± this, as PlayCanvas does: 2e-9 to 5e8 world units."""
+"""Log scales are clamped to ± this when written, as in PlayCanvas: 2e-9 to 5e8 world units."""
 
 SETTLED = 0.9
-"""A scene is written in its own order where this share of its splats is in the chunk that sorting would choose."""
+"""A scene keeps its order if at least this fraction of its splats is in the chunk that sorting would assign."""
 
 _STEPS_11_10_11 = np.array((2047.0, 1023.0, 2047.0))
 _ROOT_HALF = np.sqrt(0.5)
 _OTHERS = np.array(((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)))
-"""By the index of a quaternion's largest component: the other three."""
+"""The other three components, by the index of a quaternion's largest one."""
 
 _SH_VALUES = ((np.arange(256) + 0.5) / 32.0 - 4.0).astype(np.float32)
 _SH_VALUES[[0, 255]] = -4.0, 4.0
 
 
 def read(path: Path) -> Scene:
-    """Read a compressed PLY, with chunks of 12 or 18 properties, of any SH degree.
+    """Read a compressed PLY, with chunks of 12 or 18 properties and any SH degree.
 
     Args:
         path: The file.
 
     Returns:
-        The scene, float32, in the order of the file; opacities are kept off 0 and 1.
+        The scene, float32, in file order; opacities are kept away from 0 and 1.
 
     Raises:
-        SceneFormatError: not a compressed PLY, or damaged: truncated, or with bounds that are NaN or infinite.
-        OSError: it cannot be read.
+        SceneFormatError: not a compressed PLY, or damaged: truncated, or with NaN or infinite bounds.
+        OSError: the file cannot be read.
     """
     with open_file(path) as file:
         header = read_elements(path, file)
@@ -89,7 +89,7 @@ def read(path: Path) -> Scene:
         colors = _between(_bounds(path, chunks, COLOR_BOUNDS), colors)
     means = _between(_bounds(path, chunks, POSITION_BOUNDS), _unpacked(splats["packed_position"]))
     log_scales = _between(_bounds(path, chunks, SCALE_BOUNDS), _unpacked(splats["packed_scale"]))
-    with np.errstate(over="ignore"):  # damaged bounds of colours: `read_scene` tells of what is infinite
+    with np.errstate(over="ignore"):  # damaged colour bounds: `read_scene` reports infinities
         sh0 = ((colors - SH_OFFSET) / C0).astype(np.float32)
     gaussians = Gaussians(
         means=torch.from_numpy(means.astype(np.float32)),
@@ -103,20 +103,20 @@ def read(path: Path) -> Scene:
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write a compressed PLY with chunks of 18 properties and SH of the scene's degree.
+    """Write a compressed PLY with chunks of 18 properties and the scene's SH degree.
 
-    The order of the splats changes: they are sorted along a Morton curve through their means, as PlayCanvas does, so
-    that those of a chunk are near one another. Where most are in the right chunk already, as those of a scene read from
-    such a file are, the order stays, and what was rounded once is not rounded again.
+    Splats are sorted along a Morton curve through their means, as in PlayCanvas, so that those of a chunk are close
+    together. If most are already in the right chunk, as in a scene read from such a file, the order is kept, so that
+    values are not rounded twice.
 
     Args:
-        path: The file; parent folders are made.
-        scene: Its quaternions are normalised, its log-scales clamped to ± `MAX_LOG_SCALE`, its SH coefficients of
-            degree 1 and up to ±4.
+        path: Output file; parent folders are created.
+        scene: Quaternions are normalised, log scales clamped to ± `MAX_LOG_SCALE`, and SH coefficients above degree 0
+            clamped to ±4.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite in float32, or a quaternion has zero length.
-        OSError: it cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     gaussians = scene.gaussians.map(torch.Tensor.float)
     gaussians.check_finite()
@@ -144,15 +144,15 @@ def write(path: Path, scene: Scene) -> None:
 
 
 def _elements(path: Path, header: Header) -> tuple[Element, Element, Element | None]:
-    """Return `chunk`, `vertex` and `sh` if they are what they have to be."""
+    """Return `chunk`, `vertex` and `sh` after checking their properties."""
     by_name = {element.name: element for element in header.elements}
     there = {name: by_name[name].names if name in by_name else () for name in ("vertex", "chunk")}
     colors = COLOR_BOUNDS if COLOR_BOUNDS[0] in there["chunk"] else ()
     for name, properties in (("vertex", PACKED), ("chunk", (*POSITION_BOUNDS, *SCALE_BOUNDS, *colors))):
         if missing := [other for other in properties if other not in there[name]]:
             raise SceneFormatError(
-                f"{path}: is not a compressed splat PLY: {name} lacks {', '.join(missing)}; give another file, or name"
-                " an uncompressed scene .ply"
+                f"{path}: is not a compressed splat PLY: {name} lacks {', '.join(missing)}; give another file, or"
+                " rename an uncompressed scene to .ply"
             )
     chunk, vertex, sh = by_name["chunk"], by_name["vertex"], by_name.get("sh")
     if header.format == "ascii":
@@ -182,7 +182,7 @@ def _check_sh(path: Path, sh: Element, count: int) -> None:
         )
     if sh.count != count:
         raise SceneFormatError(
-            f"{path}: has SH coefficients of {sh.count} splats, but {count} splats; the file is damaged, get it again"
+            f"{path}: has SH coefficients for {sh.count} of {count} splats; the file is damaged, get it again"
         )
 
 
@@ -194,8 +194,8 @@ def _rows(
 
 
 def _bounds(path: Path, rows: np.ndarray, names: tuple[str, ...]) -> Float64[np.ndarray, "C 6"]:
-    """Return bounds of all chunks: three smallest values, then three largest ones."""
-    with np.errstate(invalid="ignore"):  # NaN, told of below
+    """Return the bounds of all chunks: three minima, then three maxima."""
+    with np.errstate(invalid="ignore"):  # NaN is reported below
         bounds = structured_to_unstructured(rows[list(names)], dtype=np.float64)
     fine = np.abs(bounds) <= np.finfo(np.float32).max  # false for NaN
     if not fine.all():
@@ -207,7 +207,7 @@ def _bounds(path: Path, rows: np.ndarray, names: tuple[str, ...]) -> Float64[np.
 
 
 def _between(bounds: Float64[np.ndarray, "C 6"], t: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-    """Go from each chunk's smallest (t = 0) to its largest values (t = 1), both met exactly."""
+    """Interpolate from each chunk's minimum (t = 0) to its maximum (t = 1), both reached exactly."""
     low, high = np.split(_of_splats(bounds, len(t)), 2, axis=1)
     values: Float64[np.ndarray, "N 3"] = low * (1.0 - t) + high * t
     return values
@@ -220,7 +220,7 @@ def _of_splats(of_chunks: Float64[np.ndarray, "C W"], count: int) -> Float64[np.
 def _within_chunks(
     values: Float32[np.ndarray, "N 3"], steps: Float64[np.ndarray, "3"]
 ) -> tuple[Float32[np.ndarray, "C 6"], UInt32[np.ndarray, "N 3"]]:
-    """Return bounds of chunks, and where between them values are, rounded to the nearest of so many steps."""
+    """Return the bounds of chunks, and the values as the nearest of `steps` steps between them."""
     starts = np.arange(0, len(values), CHUNK)
     low, high = (extreme.reduceat(values, starts, axis=0) for extreme in (np.minimum, np.maximum))
     extents = high.astype(np.float64) - low
@@ -239,7 +239,7 @@ def _unpacked_rotations(words: UInt32[np.ndarray, " N"]) -> Float32[np.ndarray, 
     largest = (words >> 30).astype(np.int64)
     codes = np.stack([words >> 20 & 1023, words >> 10 & 1023, words & 1023], axis=1)
     others = (codes / 1023.0 - 0.5) / _ROOT_HALF
-    rest = np.maximum(1.0 - np.square(others).sum(axis=1), 0.0)  # below 0 where no unit quaternion was packed
+    rest = np.maximum(1.0 - np.square(others).sum(axis=1), 0.0)  # negative if no unit quaternion was packed
     quats = np.empty((len(words), 4))
     np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
     np.put_along_axis(quats, largest[:, None], np.sqrt(rest)[:, None], axis=1)
@@ -284,14 +284,14 @@ def _header(scene: Scene, splats: int, chunks: int, sh: int) -> bytes:
 
 
 def _order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Return the order to write splats in."""
+    """Return the order in which to write the splats."""
     order, own = _morton_order(means), np.arange(len(means))
     settled = np.count_nonzero(order // CHUNK == own // CHUNK)
     return own if settled >= SETTLED * len(means) else order
 
 
 def _morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Return the order along a Morton curve of 1024 cells an axis; cells of more than a chunk are sorted within."""
+    """Return the order along a Morton curve with 1024 cells per axis; cells larger than a chunk are sorted inside."""
     order = np.arange(len(means))
     if len(means) <= 1:
         return order
@@ -311,7 +311,7 @@ def _morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
 
 
 def _spread(values: UInt32[np.ndarray, "N 3"]) -> UInt32[np.ndarray, "N 3"]:
-    """Put two zero bits before each of ten bits."""
+    """Insert two zero bits before each of ten bits."""
     spread = np.zeros_like(values)
     for bit in range(10):
         spread |= (values >> bit & 1) << 3 * bit

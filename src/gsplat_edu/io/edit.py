@@ -1,4 +1,4 @@
-"""What can be done to a scene between two files: filter, cut, move, join."""
+"""Operations on scenes: filter, crop, transform, merge."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, as_camera
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
@@ -21,12 +21,12 @@ from gsplat_edu.threads import one_thread
 from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
 
 SHEAR = 1e-5
-"""Largest entry of A A' / s² - I that a similarity may have: room for matrices that were typed with six digits."""
+"""Largest entry of A A' / s² - I accepted for a similarity, to allow matrices typed with six digits."""
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Turning, scaling and moving: x' = s R x + t.
+    """Rotation, uniform scaling and translation: x' = s R x + t.
 
     Args:
         R: (3, 3) rotation.
@@ -40,46 +40,45 @@ class Similarity:
 
     @classmethod
     def of_matrix(cls, matrix: ArrayLike) -> Similarity:
-        """Take a matrix (3, 4) or (4, 4) apart: (s R | t).
+        """Decompose a matrix (3, 4) or (4, 4) into (s R | t).
 
         Raises:
-            ShapeError: it has another shape.
-            ArgumentError: it mirrors, shears, scales its axes differently, or its last row is not 0 0 0 1.
+            ShapeError: the shape differs.
+            ArgumentError: the matrix mirrors, shears or scales non-uniformly, or its last row is not 0 0 0 1.
         """
         given = np.asarray(matrix, dtype=np.float64)
         M = float64_array("matrix", given, (4, 4) if given.shape == (4, 4) else (3, 4))
         if len(M) == 4 and not np.array_equal(M[3], (0.0, 0.0, 0.0, 1.0)):
-            raise ArgumentError("matrix: its last row is not 0 0 0 1; rows come first")
+            raise ArgumentError("matrix: its last row is not 0 0 0 1; give it row by row")
         A = M[:3, :3]
         determinant = float(np.linalg.det(A))
         if determinant <= 0.0:
             what = "mirrors" if determinant < 0.0 else "is singular"
             raise ArgumentError(
-                f"matrix: {what}; Gaussians can be turned, scaled alike in x, y, z, and moved"
+                f"matrix: {what}; only rotation, uniform scaling and translation are possible"
             )
         s = determinant ** (1.0 / 3.0)
         if np.abs(A @ A.T / s**2 - np.eye(3)).max() > SHEAR:
             raise ArgumentError(
-                "matrix: shears or scales its axes differently; Gaussians can be turned, scaled alike in x, y, z,"
-                " and moved"
+                "matrix: shears or scales non-uniformly; only rotation, uniform scaling and translation"
+                " are possible"
             )
         return cls(A / s, s, M[:3, 3])
 
     def after(self, first: Similarity) -> Similarity:
-        """Return what this one does to what `first` has done."""
+        """Return the composition that applies `first` and then this one."""
         return Similarity(self.R @ first.R, self.s * first.s, self.s * self.R @ first.t + self.t)
 
     def camera(self, camera: Camera) -> Camera:
-        """Return the camera that sees of the moved scene what the given one sees of the scene."""
+        """Return the camera that has the same view of the transformed scene as `camera` has of the original."""
         eye = self.s * self.R @ camera.eye + self.t
-        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.H, camera.W)
-        return Camera(camera.R @ self.R.T, eye, *intrinsics)
+        return Camera.posed(camera.R @ self.R.T, eye, as_camera("camera", camera).intrinsics)
 
     def scene(self, scene: Scene) -> Scene:
-        """Move a scene: means, rotations, scales, the colours' directions, and what is up.
+        """Transform a scene: means, rotations, scales, SH coefficients and the up direction.
 
         Returns:
-            The scene, its Gaussians computed in float64 and rounded to their dtype.
+            The scene; its Gaussians are computed in float64 and rounded to their dtype.
         """
         gaussians = scene.gaussians
         dtype, degree = gaussians.means.dtype, gaussians.sh_degree
@@ -88,7 +87,7 @@ class Similarity:
             return torch.from_numpy(np.ascontiguousarray(values)).to(gaussians.means.device)
 
         turn = Rotation.from_matrix(self.R).as_quat(scalar_first=True)
-        with one_thread():  # the bits of a product may depend on how many there are
+        with one_thread():  # the bits of a product may depend on the number of threads
             means = self.s * gaussians.means.double() @ tensor(self.R.T) + tensor(self.t)
             rest = torch.einsum(
                 "jk,nkc->njc", tensor(sh_rotation(degree, self.R)), gaussians.sh_rest.double()
@@ -113,15 +112,15 @@ IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 
 @dataclass(frozen=True)
 class Filter:
-    """Which Gaussians of a scene stay, and how much of their colour.
+    """Criteria for the Gaussians to keep.
 
     Args:
-        min_opacity: Smallest opacity that stays, 0 to 1.
-        box: Corners (x0, y0, z0, x1, y1, z1) between which means stay, world units; None for everywhere.
-        sh_degree: Highest degree that stays.
+        min_opacity: Smallest opacity to keep, 0 to 1.
+        box: Corners (x0, y0, z0, x1, y1, z1) that must enclose a Gaussian's mean, world units; None for no limit.
+        sh_degree: Highest SH degree to keep.
 
     Raises:
-        ArgumentError: a value is outside its range, or a corner is not below the other.
+        ArgumentError: a value is out of range, or a corner is not below the other.
     """
 
     min_opacity: float = 0.0
@@ -135,10 +134,10 @@ class Filter:
         if self.box is not None:
             low, high = np.split(float64_array("box", self.box, (6,)), 2)
             if not np.all(low < high):
-                raise ArgumentError("box: x0, y0, z0 have to be below x1, y1, z1")
+                raise ArgumentError("box: x0, y0, z0 must be below x1, y1, z1")
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians that stay, in their order."""
+        """Return the Gaussians to keep, in their order."""
         stays = gaussians.opacities >= self.min_opacity
         if self.box is not None:
             low, high = torch.tensor(self.box, dtype=torch.float64).to(gaussians.means.device).chunk(2)
@@ -150,21 +149,21 @@ class Filter:
 
 
 def joined(scenes: Sequence[Scene]) -> Scene:
-    """Join scenes in the order given; those of a lower SH degree get zeros.
+    """Join scenes in the given order; those with a lower SH degree are padded with zeros.
 
     Args:
         scenes: At least one.
 
     Returns:
-        One scene; what they do not agree on is not known of it.
+        One scene; metadata on which the scenes disagree is unknown.
 
     Raises:
-        ArgumentError: some were trained for antialiased renders and some not, so that no render suits all.
+        ArgumentError: only some scenes were trained for antialiased rendering, so no renderer suits all of them.
     """
     said = {scene.antialiased for scene in scenes} - {None}
     if len(said) > 1:
         raise ArgumentError(
-            "scenes: some were trained with antialiasing and some without: no render suits both; train them alike"
+            "scenes: some were trained with antialiasing and some without, so no render suits both; train them alike"
         )
     most = max(scene.gaussians.sh_rest.shape[1] for scene in scenes)
     parts = []
@@ -179,6 +178,6 @@ def joined(scenes: Sequence[Scene]) -> Scene:
 
 
 def _left_product(q: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "4 4"]:
-    """Return the matrix L with L p = q p, the product of quaternions (w, x, y, z)."""
+    """Return the matrix L with L p = q p, the quaternion product for (w, x, y, z)."""
     w, x, y, z = q
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

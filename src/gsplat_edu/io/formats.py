@@ -1,4 +1,4 @@
-"""Every scene format by the suffix of its files: the one place that knows which there are."""
+"""The registry of all scene formats, by file suffix."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Format:
     """A scene format.
 
     Args:
-        suffix: How the names of its files end, in lower case.
+        suffix: Suffix of its files, in lower case.
         module: Module of `gsplat_edu.io` with `read(path) -> Scene` and `write(path, scene)`.
-        name: What people call it.
-        sh_degree: Highest degree of harmonics that it holds.
-        says_antialiased: Whether it has room for that.
+        name: Its common name.
+        sh_degree: Highest SH degree that it stores.
+        says_antialiased: Whether it can store that flag.
     """
 
     suffix: str
@@ -44,20 +44,20 @@ FORMATS = (
     Format(".ply", "ply", "Inria PLY"),
     Format(".splat", "splat", "antimatter splat", sh_degree=0, says_antialiased=False),
     Format(".spz", "spz", "Niantic SPZ"),
-    Format(".sog", "sog", "PlayCanvas SOG"),
+    Format(".sog", "sog.codec", "PlayCanvas SOG"),
     Format(".glb", "glb", "glTF with KHR_gaussian_splatting"),
 )
-"""A name that ends in two of the suffixes is of the first."""
+"""The first matching suffix wins."""
 
 SOG_META = "meta.json"
-"""File that a SOG in a folder, not in one file, is named by."""
+"""File that represents a SOG stored as a folder."""
 
 
 def format_of(path: str | Path) -> Format:
-    """Return the format that a file's name says it has.
+    """Return the format that a file's name indicates.
 
     Args:
-        path: The file's name; it need not be there. A meta.json is a SOG in its folder.
+        path: The file's name; it need not exist. meta.json denotes a SOG folder.
 
     Raises:
         ArgumentError: the name has no suffix of a scene format.
@@ -69,26 +69,26 @@ def format_of(path: str | Path) -> Format:
         if name.endswith(candidate.suffix):
             return candidate
     known = ", ".join(candidate.suffix for candidate in FORMATS)
-    raise ArgumentError(f"{path}: its name ends like no scene format; known are {known}")
+    raise ArgumentError(f"{path}: unknown scene format; known are {known}")
 
 
 def stored_bytes(path: Path) -> int:
-    """Return the bytes that a scene takes on disk; those of its images too where it is a meta.json."""
+    """Return the size of a scene on disk in bytes; for a meta.json, including its images."""
     if path.name.lower() != SOG_META:
         return path.stat().st_size
     return sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix in (".json", ".webp"))
 
 
 def losses(path: str | Path, scene: Scene) -> list[str]:
-    """Say what of a scene a file of that name cannot hold at all: a sentence each."""
+    """List the parts of a scene that the format of a path cannot store, one sentence each."""
     found, degree = format_of(path), scene.gaussians.sh_degree
     said = []
     if degree > found.sh_degree:
         said.append(
-            f"{path}: {found.name} holds harmonics up to degree {found.sh_degree}; those up to {degree} are left out"
+            f"{path}: {found.name} stores SH up to degree {found.sh_degree}; degrees up to {degree} are dropped"
         )
     if scene.antialiased and not found.says_antialiased:
-        said.append(f"{path}: {found.name} cannot say that the scene is to be rendered with antialiasing")
+        said.append(f"{path}: {found.name} cannot store that the scene needs antialiased rendering")
     return said
 
 
@@ -96,15 +96,15 @@ def read_scene(path: str | Path) -> Scene:
     """Read a scene of any format.
 
     Args:
-        path: The file; for a SOG in a folder, the folder or its meta.json.
+        path: The file; for a SOG folder, the folder or its meta.json.
 
     Returns:
         The scene, float32, in this package's axes.
 
     Raises:
         ArgumentError: the name has no suffix of a scene format.
-        SceneFormatError: the file is not what its name says, or damaged.
-        OSError: it cannot be read.
+        SceneFormatError: the file does not match its suffix, or is damaged.
+        OSError: the file cannot be read.
     """
     path = Path(path)
     if path.is_dir() and (path / SOG_META).is_file():
@@ -113,20 +113,20 @@ def read_scene(path: str | Path) -> Scene:
     scene = found.read(path)
     if not all(bool(tensor.isfinite().all()) for tensor in scene.gaussians.tensors().values()):
         bad = int((~scene.gaussians.finite_rows()).sum())
-        raise SceneFormatError(f"{path}: {bad} splats have a NaN or infinite number; export the scene again")
+        raise SceneFormatError(f"{path}: {bad} splats have NaN or infinite values; export the scene again")
     return scene
 
 
 def write_scene(path: str | Path, scene: Scene) -> None:
-    """Write a scene in the format that the file's name says; parent folders are made.
+    """Write a scene in the format that the file's name indicates; parent folders are created.
 
     Args:
-        path: The file; for a SOG in a folder, the meta.json in it.
+        path: The file; for a SOG folder, its meta.json.
         scene: The scene, in this package's axes.
 
     Raises:
         ArgumentError: the name has no suffix of a scene format, or a parameter is NaN or infinite.
-        OSError: it cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     found = format_of(path)
     scene.gaussians.check_finite()

@@ -1,21 +1,22 @@
-"""Binary glTF 2.0 with KHR_gaussian_splatting: the scene as points of a mesh, which viewers of glTF know how to draw.
+"""Binary glTF 2.0 with KHR_gaussian_splatting: the scene as a mesh of points, which glTF viewers can display.
 
-Everything is float32. What is stored are activated values: scales, not their logarithms, opacities,
-not their logits, quaternions (x, y, z, w) of length 1; each is right to float32, but what a logit above 17 or a
-quaternion's length was is lost. Scales above e^88, about where float32 ends, are clamped. Coefficients have glTF's
-signs, which are ours, one attribute each. What is known of the scene besides is in the asset's extras, up as glTF has
-it. A scene without Gaussians is a file without a mesh, because glTF has no empty ones.
+All values are float32 and activated: linear scales, opacities in 0..1, quaternions (x, y, z, w) of length 1. They are
+exact to float32, but logits above 17 and the length of a quaternion are lost. Scales above e^88, near the end of
+float32, are clamped. SH coefficients have glTF's signs, which equal ours, one attribute per coefficient. Further
+metadata is stored in the asset's extras, with up in glTF's axes. A scene without Gaussians is written without a mesh,
+because glTF has no empty meshes.
 
-glTF's y points up. Scenes get there by half a turn about x (`gsplat_edu.io.axes.half_turned`), as in SPZ: what faced
-a camera looking along our z, then faces glTF's +z, which glTF calls the front. Means, rotations and harmonics are
-turned, not the node: viewers do not all turn harmonics along with it. Some programs turn about z instead; their
-files differ from ours by half a turn about y.
+glTF's y points up. Scenes are converted by a half turn about x (`gsplat_edu.io.axes.half_turned`), as in SPZ: what
+faced a camera that looks along our z then faces glTF's +z, its front. Means, rotations and harmonics are converted, not
+the node's transform: not all viewers rotate harmonics with it. Some programs turn about z instead; their files differ
+from ours by a half turn about y.
 
-Read is what is stored in the same plain way, by whomever: one mesh primitive with the extension, its attributes float32
-and tightly packed in the file's own buffer, no transform on its node. Anything else is refused and named.
+Files of any program are read if they store the data in the same plain way: one mesh primitive with the extension,
+float32 attributes packed tightly in the file's own buffer, and no transform on the node. Anything else is rejected with
+an error that names it.
 
-Source: Khronos, "glTF 2.0 Specification" and extension KHR_gaussian_splatting, where scales are linear; drafts before
-April 2026 had logarithms.
+Source: Khronos, "glTF 2.0 Specification" and the extension KHR_gaussian_splatting, in which scales are linear; drafts
+before April 2026 had logarithms.
 """
 
 from __future__ import annotations
@@ -51,20 +52,20 @@ POINTS, FLOAT, ARRAY_BUFFER = 0, 5126, 34962
 """Mode of a primitive; component type of an accessor; target of a buffer view."""
 
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-"""Type of an accessor by the numbers it has per splat."""
+"""Type of an accessor by its number of components."""
 
 LARGEST_LOG_SCALE = 88.0
-"""exp of it is just below the largest float32."""
+"""exp of this is just below the largest float32."""
 
 LARGEST_FILE = (1 << 32) - 1
-"""Bytes: the file's length is written in 32 bits."""
+"""Largest file in bytes: its length is stored in 32 bits."""
 
 
 MOST_JSON = 1 << 20
-"""Bytes of JSON that are parsed: a description of splats takes a few thousand."""
+"""Most bytes of JSON to parse; a description of splats needs a few thousand."""
 
 OPAQUE = 2.0**-24
-"""Opacities are kept this far from 0 and 1, half a float32 step at 1: their logits are finite."""
+"""Opacities are kept this far from 0 and 1 (half a float32 step at 1), so that their logits are finite."""
 
 TRANSFORMS = ("matrix", "rotation", "scale", "translation")
 
@@ -73,24 +74,24 @@ def write(path: Path, scene: Scene) -> None:
     """Write a scene as binary glTF.
 
     Args:
-        path: The file; parent folders are made.
+        path: Output file; parent folders are created.
         scene: The scene, in this package's axes; written as float32.
 
     Raises:
         ArgumentError: a parameter is NaN, infinite, or beyond float32, a quaternion has zero length, or there are more
-            Gaussians than the format's 4 GiB hold.
-        OSError: it cannot be written. What stood there before is untouched.
+            Gaussians than fit into the format's 4 GiB.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     gaussians = half_turned(scene.gaussians).map(torch.Tensor.float)
     gaussians.check_finite()
     attributes = _attributes(gaussians) if len(gaussians) else {}
     described = json.dumps(_description(scene, attributes), separators=(",", ":")).encode("ascii")
     described += b" " * (-len(described) % 4)
-    size = sum(array.nbytes for array in attributes.values())  # a multiple of 4, as chunks have to be
+    size = sum(array.nbytes for array in attributes.values())  # a multiple of 4, as required for chunks
     length = FILE_HEADER.size + CHUNK_HEADER.size + len(described) + (CHUNK_HEADER.size + size if size else 0)
     if length > LARGEST_FILE:
         raise ArgumentError(
-            f"{path}: {len(gaussians):,} Gaussians are more than glTF's 4 GiB hold; write a .ply"
+            f"{path}: {len(gaussians):,} Gaussians do not fit into glTF's 4 GiB; write a .ply"
         )
     with written_aside(path) as aside, aside.open("wb") as file:
         file.write(FILE_HEADER.pack(b"glTF", 2, length))
@@ -102,9 +103,9 @@ def write(path: Path, scene: Scene) -> None:
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, Float32[np.ndarray, "N C"]]:
-    """Return the numbers of every attribute by its name."""
+    """Return the values of every attribute by name."""
     raw = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
-    with np.errstate(over="ignore"):  # exp of a large number: the opacity is 0
+    with np.errstate(over="ignore"):  # exp overflows to infinity: the opacity is 0
         opacities = 1.0 / (1.0 + np.exp(-raw["logit_opacities"].astype(np.float64)))
     scales = np.exp(np.minimum(raw["log_scales"].astype(np.float64), LARGEST_LOG_SCALE))
     arrays = {
@@ -200,7 +201,7 @@ def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview]:
     except ValueError:
         _refuse(path, "has JSON that cannot be read")
     if not isinstance(document, dict):
-        _refuse(path, "has JSON that is no object")
+        _refuse(path, "has JSON that is not an object")
     start += size
     if start == len(data):
         return document, memoryview(b"")
@@ -221,7 +222,7 @@ def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
     if up is not None:
         x, y, z = (float(sign) * float(value) for sign, value in zip(POSITION_SIGNS, up, strict=True))
         if not np.isfinite([x, y, z]).all() or not any((x, y, z)):
-            _refuse(path, "has an up that is no direction")
+            _refuse(path, "has an up that is not a direction")
         up = (x, y, z)
     found = [
         primitive
@@ -232,9 +233,9 @@ def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
     if not found and (body or document.get("meshes")):
         _refuse(path, f"has no splats: no primitive with {EXTENSION}")
     if len(found) > 1:
-        _refuse(path, f"has {len(found)} primitives of splats, where one is read")
+        _refuse(path, f"has {len(found)} primitives of splats, but only one is supported")
     if any(name in node for node in document.get("nodes", []) for name in TRANSFORMS):
-        _refuse(path, "moves its splats by a node's transform, which has to be applied to them first")
+        _refuse(path, "transforms its splats by a node; apply the transform first")
     attributes = found[0]["attributes"] if found else {}
     arrays = {
         name: _array(path, document, body, index) for name, index in attributes.items() if index is not None
@@ -243,23 +244,23 @@ def _scene(path: Path, document: dict[str, Any], body: memoryview) -> Scene:
 
 
 def _array(path: Path, document: dict[str, Any], body: memoryview, index: int) -> Float32[np.ndarray, "N C"]:
-    """Return the numbers of an accessor."""
+    """Return the values of an accessor."""
     accessor = document["accessors"][index]
     view = document["bufferViews"][accessor["bufferView"]]
     widths = [width for width, name in TYPES.items() if name == accessor["type"]]
     if accessor["componentType"] != FLOAT or not widths or "sparse" in accessor:
-        _refuse(path, f"has attributes of other numbers than float32 (accessor {index})")
+        _refuse(path, f"has attributes that are not float32 (accessor {index})")
     count, size = accessor["count"], 4 * widths[0]
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     if view.get("byteStride", size) != size or view.get("buffer", 0) != 0:
-        _refuse(path, f"interleaves its attributes, or has them in another file (accessor {index})")
+        _refuse(path, f"has attributes that are interleaved or in another file (accessor {index})")
     if not (
         type(count) is type(start) is int and count >= 0 and 0 <= start <= start + count * size <= len(body)
     ):
-        _refuse(path, f"has an attribute that reaches beyond its end (accessor {index})")
+        _refuse(path, f"has an attribute that extends beyond the file's end (accessor {index})")
     numbers = np.frombuffer(body, "<f4", count * widths[0], start)
     if not np.isfinite(numbers).all():
-        _refuse(path, f"has NaN or infinite numbers (accessor {index})")
+        _refuse(path, f"has NaN or infinite values (accessor {index})")
     return numbers.reshape(count, widths[0])
 
 

@@ -1,14 +1,14 @@
-"""Inria's scene PLY: the file that viewers of Gaussian splats read.
+"""Inria's scene PLY, the common format of 3DGS viewers.
 
-Written as binary little-endian float32, one vertex per Gaussian, raw values (logarithms of scales, logits of
-opacities): x y z, nx ny nz (zero), f_dc_0..2, f_rest_* channel by channel, opacity, scale_0..2, rot_0..3 as
-(w, x, y, z). A scene of SH degree 0 has no f_rest. Axes are those of the scene: nothing is flipped.
+Written as binary little-endian float32 with one vertex per Gaussian and raw values (log scales, logit opacities): x y
+z, nx ny nz (zero), f_dc_0..2, f_rest_* channel by channel, opacity, scale_0..2, rot_0..3 as (w, x, y, z). A scene of SH
+degree 0 has no f_rest. Axes are those of the scene: nothing is flipped.
 
-Read by the names of the properties: in any order, of any number type, with properties and elements that are not ours
-left aside, binary of either byte order or ASCII. A logit that is infinite is an opacity of 0 or 1. A file whose splats
-are packed as SuperSplat packs them is read too.
+Properties are read by name, in any order and of any number type; other properties and elements are ignored. The file
+may be binary of either byte order or ASCII. An infinite logit means an opacity of 0 or 1. SuperSplat's packed files are
+also read.
 
-What the format has no property for stands in comments: see `gsplat_edu.io.ply_comments`.
+Metadata without a property is stored in comments: see `gsplat_edu.io.ply_comments`.
 
 Source: the point_cloud.ply of Kerbl et al. 2023's code; Turk 1994, "The PLY Polygon File Format".
 
@@ -42,20 +42,20 @@ SCALES = tuple(f"scale_{i}" for i in range(3))
 QUATS = tuple(f"rot_{i}" for i in range(4))
 
 SH_REST_COUNTS = (0, 9, 24, 45)
-"""Numbers of f_rest properties: three channels of the coefficients of degrees 0 to 3."""
+"""Possible numbers of f_rest properties: three channels of the coefficients up to degrees 0 to 3."""
 
 ORIGIN = (0.0, 0.0, 0.0)
 
 LARGEST_LOGIT = 100.0
-"""What an infinite logit is read as: opacity 1 (or 0) to float32. Programs that keep opacities in bytes write them."""
+"""Replacement for an infinite logit: opacity 1 (or 0) in float32. Programs with 8-bit opacities write infinity."""
 
 
 def read(path: Path, finite: bool = True) -> Scene:
-    """Read a scene PLY and what its comments say; see `load_ply`.
+    """Read a scene PLY and the metadata in its comments; see `load_ply`.
 
     Args:
         path: The file.
-        finite: Refuse one with NaN or infinite numbers.
+        finite: Reject NaN and infinite values.
     """
     with open_file(path) as file:
         header = read_elements(path, file)
@@ -65,7 +65,7 @@ def read(path: Path, finite: bool = True) -> Scene:
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write a scene PLY and the comments; see `save_ply`."""
+    """Write a scene PLY with its metadata in comments; see `save_ply`."""
     _write(path, scene.gaussians, ORIGIN, comments(scene))
 
 
@@ -75,16 +75,16 @@ def save_ply(
     """Write Gaussians as a scene PLY.
 
     Args:
-        path: The file; parent folders are made.
+        path: Output file; parent folders are created.
         gaussians: N Gaussians, raw parameters; written as float32.
-        origin: (3,) added to the means in float64: where the scene's zero lies in the capture's own frame.
-        antialiased: Whether the Gaussians were trained to be rendered with antialiasing; a comment says so. The file
-            does not say where None.
+        origin: (3,) added to the means in float64: the position of the scene's origin in the capture's coordinates.
+        antialiased: Whether the Gaussians were trained for antialiased rendering, stored in a comment; None stores
+            nothing.
 
     Raises:
         ShapeError: the origin is not of shape (3,).
         ArgumentError: a parameter is NaN or infinite.
-        OSError: the file cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     gaussians.check_finite()
     _write(Path(path), gaussians, origin, comments(Scene(gaussians, antialiased)))
@@ -95,7 +95,7 @@ def _write(path: Path, gaussians: Gaussians, origin: ArrayLike, extra: list[str]
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     count = len(gaussians)
     means = tensors["means"]
-    if shift.any():  # not for zero: -0.0 + 0.0 is 0.0
+    if shift.any():  # skip zero, because -0.0 + 0.0 is 0.0
         means = means.astype(np.float64) + shift
     sh_rest = np.concatenate(np.moveaxis(tensors["sh_rest"], 2, 0), axis=1)  # channel-major
     columns: list[tuple[tuple[str, ...], np.ndarray]] = [
@@ -121,14 +121,14 @@ def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
 
     Args:
         path: The file.
-        origin: (3,) subtracted from the means in float64; what `save_ply` was given.
+        origin: (3,) subtracted from the means in float64; the value given to `save_ply`.
 
     Returns:
-        N Gaussians, raw parameters, float32, of the SH degree that the file holds. What `save_ply` wrote comes
-        back to the bit where the origin is zero.
+        N Gaussians, raw parameters, float32, of the file's SH degree. With an origin of zero, the result of `save_ply`
+        is restored to the bit.
 
     Raises:
-        SceneFormatError: not a PLY, or a PLY of something else, or damaged: truncated, NaN, infinite (but for logits).
+        SceneFormatError: not a scene PLY, or damaged: truncated, or with NaN or infinity (except for logits).
         ShapeError: the origin is not of shape (3,).
         OSError: the file cannot be read.
     """
@@ -168,12 +168,12 @@ def _floats(table: np.ndarray, columns: list[str]) -> Float32[np.ndarray, "N P"]
     names, native = list(table.dtype.names or ()), np.dtype(np.float32)
     if all(
         table.dtype[name] == native for name in names
-    ):  # as most files are: one copy, of all columns at once
+    ):  # the usual order of properties: one copy of all columns
         places = [names.index(name) for name in columns]
         return np.take(table.view(native).reshape(len(table), len(names)), places, axis=1)
     with np.errstate(
         over="ignore", invalid="ignore"
-    ):  # a double beyond float32 becomes infinite, told of later
+    ):  # a double beyond float32 becomes infinite, which is reported later
         return structured_to_unstructured(table[columns], dtype=np.float32)
 
 
@@ -182,11 +182,13 @@ def _rest_names(count: int) -> tuple[str, ...]:
 
 
 def _tensor(values: Float32[np.ndarray, "..."]) -> Tensor:
-    return torch.from_numpy(values.copy())  # its own memory: the columns of the file's table are interleaved
+    return torch.from_numpy(
+        values.copy()
+    )  # contiguous memory: the columns of the file's table are interleaved
 
 
 def _splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
-    """Return the element `vertex` if it has what a splat has."""
+    """Return the element `vertex` if it has all properties of a splat."""
     by_name = {element.name: element for element in elements}
     vertex = by_name.get("vertex")
     if vertex is None:

@@ -1,13 +1,13 @@
-"""What a scene PLY has no property for, in comments of its header, which other readers ignore.
+"""Scene metadata stored as comments in a PLY header, which other readers ignore.
 
     comment SplatRenderMode: mip
     comment antialiased 1
     comment gsplat_edu up 0.0 -1.0 0.0
 
-Each is written where it is known. Whether to render with antialiasing has no standard spelling. Brush writes and reads
-the first one ("default" where there is none), Postshot writes the second, PlayCanvas' splat-transform reads both
-since 3.2. Both are written here, and read in any case of letters, with or without our own earlier prefix "gsplat_edu".
-The last one wins, as in Brush and splat-transform.
+Each line is written if its value is known. There is no standard spelling for antialiasing: Brush writes and reads the
+first line ("default" without antialiasing), Postshot writes the second, PlayCanvas' splat-transform reads both since
+3.2. Both are written here. They are read in any letter case, with or without our former prefix "gsplat_edu"; the last
+one wins, as in Brush and splat-transform.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.io.scene import Scene
 
 OURS = "gsplat_edu"
-"""First word of comments that only this package writes."""
+"""First word of comments that are specific to this package."""
 
 RENDER_MODES = {"mip": True, "default": False}
-"""Brush's modes, and whether each renders with antialiasing."""
+"""Brush's render modes, and whether each uses antialiasing."""
 
 ANTIALIASED = re.compile(rf"(?:{OURS} )?(?:splatrendermode: ?(mip|default)|antialiased ([01]))")
-"""A comment, in lower case, that says whether to render with antialiasing; a mode unknown here says nothing."""
+"""Lower-case comment that specifies antialiasing; an unknown mode specifies nothing."""
 
 
 def comments(scene: Scene) -> list[str]:
-    """Return the header lines for what is known of a scene besides its Gaussians."""
+    """Return the header lines for the known metadata of a scene."""
     lines = []
     if scene.antialiased is not None:
         mode = next(mode for mode, antialiased in RENDER_MODES.items() if antialiased == scene.antialiased)
@@ -43,14 +43,14 @@ def comments(scene: Scene) -> list[str]:
 def read_comments(
     path: Path, said: tuple[tuple[str, ...], ...]
 ) -> tuple[bool | None, tuple[float, float, float] | None]:
-    """Return what the comments of a header say: whether antialiased, and what is up.
+    """Parse the comments of a header: whether the scene is antialiased, and its up direction.
 
     Args:
         path: The file, for messages.
         said: Words of each comment.
 
     Raises:
-        SceneFormatError: a comment of ours cannot be read.
+        SceneFormatError: one of our comments is malformed.
     """
     antialiased, up = None, None
     for words in said:
@@ -61,7 +61,7 @@ def read_comments(
             up = _direction(list(words[2:]))
             if up is None:
                 raise SceneFormatError(
-                    f"{path}: comment {' '.join(words)[:60]!r} is no direction; correct or remove it"
+                    f"{path}: comment {' '.join(words)[:60]!r} is not a direction; correct or remove it"
                 )
     return antialiased, up
 

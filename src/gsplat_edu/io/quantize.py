@@ -1,4 +1,4 @@
-"""What formats have in common: opacities in a byte, unit quaternions, and how much a small file may claim to hold."""
+"""Shared by several formats: opacities as bytes, unit quaternions, and a limit on the size that a file may claim."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.validation import first_index
 
 OPACITY_EDGE = 0.25 / 255.0
-"""Bytes 0 and 255 stand for opacities this far inside 0 and 1, whose logits are finite: a quarter of a step."""
+"""Bytes 0 and 255 decode to opacities this far from 0 and 1 (a quarter of a step), whose logits are finite."""
 
 MAX_EXPANSION = 64
-"""A file is refused that says it holds more than this many times its own size; scenes compress to a half or so."""
+"""A file that claims to contain more than this multiple of its size is rejected; scenes compress to about half."""
 
 SMALL = 1 << 20
-"""Bytes that even the smallest file may claim to hold: tests and toys compress very well."""
+"""Bytes that even the smallest file may claim, since test and toy scenes compress very well."""
 
 
 def byte_to_logit(values: Integer[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
-    """Turn opacities stored as bytes into logits, all finite; `logit_to_byte` gives back the same bytes.
+    """Convert opacities stored as bytes to finite logits; `logit_to_byte` returns the same bytes.
 
     Args:
         values: 0 to 255.
 
     Returns:
-        log(o / (1 - o)), o = values / 255 kept `OPACITY_EDGE` from 0 and 1.
+        log(o / (1 - o)), with o = values / 255 kept `OPACITY_EDGE` away from 0 and 1.
     """
     opacities = np.clip(values / 255.0, OPACITY_EDGE, 1.0 - OPACITY_EDGE)
     logits: Float32[np.ndarray, "..."] = np.log(opacities / (1.0 - opacities)).astype(np.float32)
@@ -35,41 +35,41 @@ def byte_to_logit(values: Integer[np.ndarray, "..."]) -> Float32[np.ndarray, "..
 
 
 def logit_to_byte(logits: Float32[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
-    """Turn logits into opacities rounded to bytes: floor(255 sigmoid(logit) + 1/2)."""
-    with np.errstate(over="ignore"):  # exp of a large number: the opacity is 0
+    """Convert logits to opacities rounded to bytes: floor(255 sigmoid(logit) + 1/2)."""
+    with np.errstate(over="ignore"):  # exp overflows to infinity: the opacity is 0
         opacities = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
     rounded: UInt8[np.ndarray, "..."] = np.floor(255.0 * opacities + 0.5).astype(np.uint8)
     return rounded
 
 
 def unit_quats(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
-    """Normalise quaternions of any length but zero.
+    """Normalise quaternions of nonzero length.
 
     Raises:
-        ArgumentError: one has zero length.
+        ArgumentError: a quaternion has zero length.
     """
     largest = np.abs(quats.astype(np.float64)).max(axis=1, keepdims=True, initial=0.0)
     if not largest.all():
         raise ArgumentError(
-            f"quats{first_index(largest[:, 0] == 0)}: has zero length, so it is no rotation; remove the splat"
+            f"quats{first_index(largest[:, 0] == 0)}: has zero length, so it is not a rotation; remove the splat"
         )
-    scaled = quats / largest  # first, so that the norm neither over- nor underflows
+    scaled = quats / largest  # first, so that the norm neither overflows nor underflows
     units: Float64[np.ndarray, "N 4"] = scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
     return units
 
 
 def check_expansion(path: Path, claimed: int, stored: int) -> None:
-    """Refuse a file that says it holds far more than it can, before anything is allocated for it.
+    """Reject a file that claims an implausible content size, before memory is allocated for it.
 
     Args:
-        path: The file's name, for the message.
-        claimed: Bytes that its contents would take.
-        stored: Bytes that the file has.
+        path: The file's name for messages.
+        claimed: Bytes that its contents would need.
+        stored: Size of the file in bytes.
 
     Raises:
         SceneFormatError: it claims more than `MAX_EXPANSION` times its size, and more than `SMALL`.
     """
     if claimed > max(SMALL, MAX_EXPANSION * stored):
         raise SceneFormatError(
-            f"{path}: says it holds {claimed:,} bytes in a file of {stored:,}; it is damaged, get it again"
+            f"{path}: claims to hold {claimed:,} bytes in a file of {stored:,}; it is damaged, get it again"
         )

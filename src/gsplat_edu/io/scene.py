@@ -1,4 +1,4 @@
-"""What a scene file holds: Gaussians, and the few facts about them that some formats carry along.
+"""The contents of a scene file: Gaussians, and metadata that some formats store.
 
 Chapter: 07_a_trained_scene.
 """
@@ -12,12 +12,12 @@ from gsplat_edu.gaussians import Gaussians
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Gaussians as a file holds them, in this package's axes (+x right, +y down, +z forward).
+    """The contents of a scene file, in this package's axes (+x right, +y down, +z forward).
 
     Args:
-        gaussians: N Gaussians, raw parameters, float32 where they were read from a file.
-        antialiased: Whether they were trained to be drawn with antialiasing; None where the file does not say.
-        up: Direction that is up in the scene, of length 1; None where it is not known.
+        gaussians: N Gaussians, raw parameters; float32 if read from a file.
+        antialiased: Whether they were trained for antialiased rendering; None if the file does not say.
+        up: The scene's up direction, of length 1; None if unknown.
     """
 
     gaussians: Gaussians

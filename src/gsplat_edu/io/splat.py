@@ -1,8 +1,9 @@
-"""antimatter's .splat: 32 bytes a splat, nothing else in the file.
+"""antimatter's .splat: 32 bytes per splat and nothing else.
 
-Position 3 float32, scales 3 float32 (not their logarithms), red, green, blue and opacity a byte each, quaternion
-(w, x, y, z) a byte each: 128 q + 128. Little-endian. Colours are those of SH degree 0, C0 f_dc + 1/2 from 0 to 1; there
-is no room for higher degrees. A file has no header and no count: one without bytes is a scene without splats.
+Each splat has 3 float32 for the position, 3 float32 for the scales (linear), one byte each for red, green, blue and
+opacity, and one byte each for the quaternion (w, x, y, z) as 128 q + 128. Little-endian. Colours are those of SH degree
+0, C0 f_dc + 1/2 from 0 to 1; higher degrees are not stored. There is no header and no count: an empty file is a scene
+without splats.
 
 Axes are those of the scene: nothing is flipped.
 
@@ -29,7 +30,7 @@ from gsplat_edu.reading import read_bytes
 SPLAT = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 MIN_SCALE, MAX_SCALE = (float(x) for x in (np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max))
-"""Scales are kept within what float32 has above zero, so that their logarithms are finite."""
+"""Scales are clamped to the positive range of float32, so that their logarithms are finite."""
 
 
 def read(path: Path) -> Scene:
@@ -39,13 +40,13 @@ def read(path: Path) -> Scene:
         path: The file.
 
     Returns:
-        The scene, float32, SH degree 0, in the order of the file. A scale of 0 becomes `MIN_SCALE`, opacities are kept
-        off 0 and 1, and a quaternion of zeros is no rotation, as in antimatter's viewer: (1, 0, 0, 0).
+        The scene, float32, SH degree 0, in file order. A scale of 0 becomes `MIN_SCALE`, opacities are kept away from 0
+        and 1, and a zero quaternion becomes the identity (1, 0, 0, 0), as in antimatter's viewer.
 
     Raises:
-        SceneFormatError: the size is not a multiple of 32 bytes, a position is NaN or infinite, or a scale is that or
-            negative.
-        OSError: it cannot be read.
+        SceneFormatError: the size is not a multiple of 32 bytes, a position is NaN or infinite, or a scale is NaN,
+            infinite or negative.
+        OSError: the file cannot be read.
     """
     stored = read_bytes(path)
     if stored.startswith(LFS_POINTER):
@@ -53,11 +54,11 @@ def read(path: Path) -> Scene:
             f"{path}: is a Git LFS pointer, not the file itself; fetch it with: git lfs pull"
         )
     if stored.startswith(b"ply"):
-        raise SceneFormatError(f"{path}: is a PLY, not a .splat; name it .ply")
+        raise SceneFormatError(f"{path}: is a PLY, not a .splat; rename it to .ply")
     if left := len(stored) % SPLAT.itemsize:
         raise SceneFormatError(
-            f"{path}: is {len(stored)} bytes, {left} more than whole splats of {SPLAT.itemsize}; it is truncated or no"
-            " .splat, get it again"
+            f"{path}: is {len(stored)} bytes, {left} more than whole splats of {SPLAT.itemsize}; it is truncated or not"
+            " a .splat, get it again"
         )
     splats = np.frombuffer(stored, dtype=SPLAT)
     _check(path, splats)
@@ -78,19 +79,19 @@ def read(path: Path) -> Scene:
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write a .splat; SH coefficients of degree 1 and up are left out.
+    """Write a .splat; SH coefficients above degree 0 are dropped.
 
-    The order of the splats changes: largest opacity times volume first, as antimatter's converter writes them, so that
-    a viewer that has only the beginning of the file shows what matters. Both are taken as the file holds them; ties
-    keep their order.
+    Splats are reordered by decreasing opacity times volume, as in antimatter's converter, so that viewers that have
+    loaded only the beginning of the file show the most important ones. Both values are taken as stored; ties keep their
+    order.
 
     Args:
-        path: The file; parent folders are made.
-        scene: Its quaternions are normalised, its scales clamped to `MIN_SCALE` and `MAX_SCALE`, its colours to 0 to 1.
+        path: Output file; parent folders are created.
+        scene: Quaternions are normalised, scales clamped to `MIN_SCALE` and `MAX_SCALE`, and colours clamped to 0..1.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite in float32, or a quaternion has zero length.
-        OSError: it cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     gaussians = scene.gaussians.map(torch.Tensor.float)
     gaussians.check_finite()
@@ -114,8 +115,8 @@ def _check(path: Path, splats: np.ndarray) -> None:
         if not right.all():
             bad = np.flatnonzero(~right.all(axis=1))
             raise SceneFormatError(
-                f"{path}: splat {bad[0]} has a {what} ({len(bad)} such splats in all); it is damaged or no .splat, get"
-                " it again"
+                f"{path}: splat {bad[0]} has a {what} ({len(bad)} such splats in all); it is damaged or not a .splat,"
+                " get it again"
             )
 
 

@@ -1,22 +1,23 @@
-"""Niantic's SPZ: the splats packed into bytes and compressed. Versions 1 to 4 are read, version 4 is written.
+"""Niantic's SPZ: splats quantised to bytes and compressed. Versions 1 to 4 are read; version 4 is written.
 
-Version 4: a header of 32 bytes; extension records, which are skipped; a table of contents, two 64-bit sizes per stream,
-packed and not; then, each packed with zstd, positions, opacities, colours, scales, rotations, coefficients. A stream
-without bytes is left out. Versions 1 to 3: a header of 16 bytes and the same streams, one gzip around all; without the
-gzip they are read as well. `gsplat_edu.io.spz_values` has the numbers.
+Version 4 consists of a header of 32 bytes; extension records, which are skipped; a table of contents with two 64-bit
+sizes per stream, compressed and uncompressed; then the streams, each compressed with zstd: positions, opacities,
+colours, scales, rotations, coefficients. An empty stream is omitted. Versions 1 to 3 consist of a header of 16 bytes
+and the same streams in a single gzip; files without the gzip are read as well. `gsplat_edu.io.spz_values` describes the
+values.
 
-What is written uses the bits that the format has. Positions get the largest number of fractional bits that holds the
-scene, up to 24; other programs always take 12. Coefficients of the higher degrees use all 8 bits; other programs round
-them to 5 and 4 by default. On a trained scene that rounding takes a render from 56 dB down to 40 dB against the
-original, and the file from 49 to 29 bytes per splat: here fidelity wins. Scenes beyond +-8,388,607 units are refused.
-Scales are clamped to e^-10 to e^5.94, the coefficient of degree 0 to +-3.33, the others to -1 to 0.992. Which direction
-is up is not stored: y is, by definition. Whether antialiased is always said: what was not known reads back as no. Of
-harmonics of degree 4, degrees up to 3 are read.
+The writer uses the full precision of the format. Positions get the largest number of fractional bits that holds the
+scene, up to 24; other programs always use 12. Coefficients of the higher degrees use all 8 bits; other programs round
+them to 5 and 4 by default. On a trained scene that rounding lowers the PSNR against the original from 56 dB to 40 dB,
+and the file from 49 to 29 bytes per splat: fidelity is preferred here. Scenes beyond +-8,388,607 units are rejected.
+Scales are clamped to e^-10 to e^5.94, the coefficient of degree 0 to +-3.33, the others to -1 to 0.992. The up
+direction is not stored: it is y by definition. The antialiasing flag is always stored, so an unknown value reads back
+as false. Degree 4 of the harmonics is dropped on reading.
 
-Axes are right, up, back; they become ours by `gsplat_edu.io.axes.half_turned`. An extension may name others; of these,
-ours are read and the rest are refused.
+Axes are right, up, back; `gsplat_edu.io.axes.half_turned` converts them to ours. An extension may name other axes; of
+these, ours are supported and the rest are rejected.
 
-Niantic's library refuses scenes without splats; here they are written and read.
+Niantic's library rejects scenes without splats; here they can be written and read.
 
 Source: load-spz.cc, the README and extensions/README of Niantic's spz library.
 """
@@ -51,25 +52,25 @@ HEADER = struct.Struct("<4sIIBBBx")
 """Magic, version, splats, SH degree, fractional bits, flags."""
 
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")
-"""The same, streams, offset of the table of contents."""
+"""The same, then number of streams and offset of the table of contents."""
 
 TABLE_ROW = struct.Struct("<QQ")
-"""Packed and unpacked size of a stream."""
+"""Compressed and uncompressed size of a stream."""
 
 ANTIALIASED, EXTENDED, LEVELS_OF_DETAIL = 0x01, 0x02, 0x80
-"""Flags. The last is of the viewer Spark: splats are a tree of which not all are to be drawn."""
+"""Flags. The last one belongs to the viewer Spark: the splats form a tree, of which only a part is drawn."""
 
 COORDINATES = 0xADBE0003
-"""Extension that names the axes."""
+"""Extension that specifies the axes."""
 
 RIGHT_UP_BACK, RIGHT_DOWN_FORWARD = 4, 6
-"""Axes by their number in that extension; 0 is not said."""
+"""Axes by their number in that extension; 0 means unspecified."""
 
 SH_COUNTS = (0, 3, 8, 15, 24)
 """Coefficients per channel above degree 0, by degree."""
 
 LEVEL = 12
-"""Effort of zstd, as in Niantic's library."""
+"""Compression level of zstd, as in Niantic's library."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class _Header:
         }
 
     def size(self) -> int:
-        """Return the bytes of all streams."""
+        """Return the total size of all streams in bytes."""
         return self.count * sum(self.widths().values())
 
 
@@ -109,8 +110,8 @@ def read(path: Path) -> Scene:
         The scene, float32, in this package's axes.
 
     Raises:
-        SceneFormatError: the file is no SPZ, damaged, or of a kind that is not read; the message says which.
-        OSError: it cannot be read.
+        SceneFormatError: the file is not an SPZ, is damaged, or is of an unsupported kind; the message says which.
+        OSError: the file cannot be read.
     """
     data = read_bytes(path)
     if data.startswith(LFS_POINTER):
@@ -140,44 +141,44 @@ def _read_header(path: Path, data: bytes) -> _Header:
     _, version, count, degree, bits, flags = HEADER.unpack_from(data)
     if not 1 <= version <= 4:
         raise SceneFormatError(
-            f"{path}: is SPZ of version {version}, but 1 to 4 are read; export it as version 4"
+            f"{path}: has SPZ version {version}, but 1 to 4 are supported; export it as version 4"
         )
     if degree >= len(SH_COUNTS):
-        raise _damaged(path, f"says that its harmonics are of degree {degree}, but SPZ has 0 to 4")
+        raise _damaged(path, f"its header gives SH degree {degree}, but SPZ has 0 to 4")
     if bits > values.MAX_FRACTIONAL_BITS:
-        raise _damaged(path, f"says that positions have {bits} fractional bits, but SPZ has 0 to 24")
+        raise _damaged(path, f"its header gives {bits} fractional bits for positions, but SPZ has 0 to 24")
     if flags & LEVELS_OF_DETAIL:
         raise SceneFormatError(
-            f"{path}: holds levels of detail, which are not read; export the scene without them"
+            f"{path}: holds levels of detail, which are not supported; export the scene without them"
         )
     return _Header(version, count, degree, bits, flags)
 
 
 def _unzipped(path: Path, data: bytes) -> tuple[_Header, memoryview]:
-    """Unpack a file of versions 1 to 3: never more than its header says, and room for extensions."""
+    """Decompress a file of versions 1 to 3, at most the size in its header plus room for extensions."""
     unzip = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
     try:
         header = _read_header(path, unzip.decompress(data, HEADER.size))
         if header.version == 4:
-            raise _damaged(path, "is of version 4, but in one gzip, as only versions 1 to 3 are")
+            raise _damaged(path, "is of version 4, but in one gzip as in versions 1 to 3")
         check_expansion(path, header.size(), len(data))
         limit = header.size() + (SMALL if header.flags & EXTENDED else 0)
         body = unzip.decompress(unzip.unconsumed_tail, limit + 1)
     except zlib.error:
         raise _damaged(path, "its gzip cannot be unpacked") from None
     if not unzip.eof and len(body) <= limit:
-        raise _damaged(path, f"ends early: {len(body):,} of {header.size():,} bytes are there")
+        raise _damaged(path, f"is truncated: {len(body):,} of {header.size():,} bytes are present")
     if len(body) > limit or unzip.unused_data:
-        raise _damaged(path, "holds more than its header says")
+        raise _damaged(path, "holds more than its header declares")
     return header, memoryview(body)
 
 
 def _planes(path: Path, header: _Header, body: memoryview) -> tuple[Streams, memoryview]:
-    """Cut the contents of versions 1 to 3 into streams and extension records."""
+    """Split the contents of versions 1 to 3 into streams and extension records."""
     if len(body) < header.size():
-        raise _damaged(path, f"ends early: {len(body):,} of {header.size():,} bytes are there")
+        raise _damaged(path, f"is truncated: {len(body):,} of {header.size():,} bytes are present")
     if len(body) > header.size() and not header.flags & EXTENDED:
-        raise _damaged(path, "holds more than its header says")
+        raise _damaged(path, "holds more than its header declares")
     streams, start = {}, 0
     for name, width in header.widths().items():
         end = start + header.count * width
@@ -187,7 +188,7 @@ def _planes(path: Path, header: _Header, body: memoryview) -> tuple[Streams, mem
 
 
 def _read_streams(path: Path, header: _Header, data: bytes) -> tuple[Streams, memoryview]:
-    """Unpack the streams of version 4; return them and the extension records."""
+    """Decompress the streams of version 4; return them and the extension records."""
     if len(data) < HEADER_4.size:
         raise _damaged(path, "ends within its header")
     *_, there, table = HEADER_4.unpack_from(data)
@@ -195,17 +196,17 @@ def _read_streams(path: Path, header: _Header, data: bytes) -> tuple[Streams, me
     named = [name for name, width in widths.items() if header.count * width]
     start = table + there * TABLE_ROW.size
     if there != len(named):
-        raise _damaged(path, f"has {there} streams, but its header asks for {len(named)}")
+        raise _damaged(path, f"has {there} streams, but its header requires {len(named)}")
     if table < HEADER_4.size or start > len(data):
-        raise _damaged(path, "its table of contents does not fit in it")
+        raise _damaged(path, "its table of contents extends beyond its end")
     check_expansion(path, header.size(), len(data))
     view = memoryview(data)
     streams = {name: np.empty((header.count, width), np.uint8) for name, width in widths.items()}
     for name, (packed, unpacked) in zip(named, TABLE_ROW.iter_unpack(view[table:start]), strict=True):
         if unpacked != streams[name].size:
-            raise _damaged(path, f"its {name} are not as many as its header says")
+            raise _damaged(path, f"the number of its {name} differs from its header")
         if packed > len(data) - start:
-            raise _damaged(path, f"ends early: within its {name}")
+            raise _damaged(path, f"is truncated within its {name}")
         stream = _unpacked(path, name, view[start : start + packed], unpacked)
         streams[name] = np.frombuffer(stream, dtype=np.uint8).reshape(streams[name].shape)
         start += packed
@@ -215,9 +216,9 @@ def _read_streams(path: Path, header: _Header, data: bytes) -> tuple[Streams, me
 
 
 def _unpacked(path: Path, name: str, packed: memoryview, size: int) -> bytes:
-    """Unpack a stream of version 4 that has to be of that size."""
+    """Decompress a stream of version 4 that must have the given size."""
     try:
-        # A frame may say of itself how much it holds, and as much would be allocated: that is looked at first.
+        # A zstd frame may declare its content size, which would be allocated: check it first.
         claimed = zstandard.get_frame_parameters(packed).content_size
         if claimed in (size, zstandard.CONTENTSIZE_UNKNOWN):
             stream = zstandard.ZstdDecompressor().decompress(
@@ -231,14 +232,14 @@ def _unpacked(path: Path, name: str, packed: memoryview, size: int) -> bytes:
 
 
 def _axes(path: Path, records: memoryview) -> int:
-    """Return the axes that the extension records name: those of the format where they name none."""
+    """Return the axes named by the extension records; the format's own axes if they name none."""
     at = 0
     while at + 12 <= len(records):
         kind, length, axes = struct.unpack_from("<III", records, at)
         if kind == COORDINATES:
             if axes not in (0, RIGHT_UP_BACK, RIGHT_DOWN_FORWARD):
                 raise SceneFormatError(
-                    f"{path}: its axes, number {axes} of the extension for them, are not read; export it without"
+                    f"{path}: its axes (number {axes} in the axes extension) are not supported; export it without"
                 )
             return int(axes)
         at += 8 + length
@@ -266,12 +267,12 @@ def write(path: Path, scene: Scene) -> None:
     """Write an SPZ file of version 4.
 
     Args:
-        path: The file; parent folders are made.
-        scene: The scene, in this package's axes, its parameters finite: `write_scene` looks at that.
+        path: Output file; parent folders are created.
+        scene: The scene, in this package's axes, with finite parameters (`write_scene` checks this).
 
     Raises:
-        ArgumentError: a mean is further from the origin than the format reaches, or a quaternion has zero length.
-        OSError: it cannot be written. What stood there before is untouched.
+        ArgumentError: a mean is beyond the format's range, or a quaternion has zero length.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     turned = half_turned(scene.gaussians)
     arrays = {name: tensor.numpy(force=True) for name, tensor in turned.tensors().items()}
@@ -279,7 +280,7 @@ def write(path: Path, scene: Scene) -> None:
     if bits is None:
         far = float(np.abs(arrays["means"]).max())
         raise ArgumentError(
-            f"means: one is {far:,.0f} units from the origin along an axis, but SPZ reaches {values.LARGEST_FIXED:,};"
+            f"means: one is {far:,.0f} units from the origin along an axis, but SPZ ends at {values.LARGEST_FIXED:,};"
             " scale the scene down or move it"
         )
     streams = (

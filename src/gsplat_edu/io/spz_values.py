@@ -1,14 +1,14 @@
-"""The numbers of an SPZ file, to bytes and back.
+"""Conversion between the values of an SPZ file and its bytes.
 
-    position       24-bit fixed point, a number of fractional bits for the whole file (version 1: float16)
+    position       24-bit fixed point with one number of fractional bits per file (version 1: float16)
     opacity        b = 255 o
     colour         b = 38.25 c + 127.5, c the coefficient of degree 0: -3.33 to 3.33
     scale          b = 16 (log s + 10): steps of 6 %
-    rotation       three components of 10 bits and the number of the largest (versions 1 and 2: x, y, z in a byte each)
+    rotation       three 10-bit components and the index of the largest (versions 1 and 2: x, y, z as a byte each)
     coefficients   b = 128 c + 128 of the higher degrees: -1 to 0.992
 
-What is out of range is clamped, before arithmetic might overflow. Positions are not: a file's fractional bits have to
-suit all of them.
+Values out of range are clamped before the arithmetic can overflow. Positions are not clamped: the number of fractional
+bits must suit all of them.
 
 Source: load-spz.cc and the README of Niantic's spz library.
 """
@@ -22,42 +22,42 @@ from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.io.quantize import unit_quats
 
 MAX_FRACTIONAL_BITS = 24
-"""Niantic's library refuses more."""
+"""Largest number that Niantic's library accepts."""
 
 LARGEST_FIXED = (1 << 23) - 1
-"""Largest 24-bit integer with a sign."""
+"""Largest signed 24-bit integer."""
 
 COLOR_STEPS = 0.15 * 255.0
-"""Steps of a byte per unit of the coefficient of degree 0."""
+"""Byte steps per unit of the coefficient of degree 0."""
 
 LARGEST_SMALL = 511 * np.sqrt(2.0)
-"""Steps per unit of the three smaller components of a quaternion: none is above sqrt(1/2), which is 511."""
+"""Steps per unit of a quaternion's three smaller components; none exceeds sqrt(1/2), which is stored as 511."""
 
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Components (x, y, z, w) that are stored, by the number of the one that is not."""
+"""Components of (x, y, z, w) that are stored, by the index of the omitted one."""
 
 SH_KEPT = (SH_MAX_DEGREE + 1) ** 2 - 1
-"""Coefficients per channel that are read; degree 4, which versions 3 and 4 may hold, is left out."""
+"""SH coefficients per channel that are read; degree 4 of versions 3 and 4 is dropped."""
 
 
 def read_half(data: UInt8[np.ndarray, "N 6"]) -> Float32[np.ndarray, "N 3"]:
-    """Turn positions of version 1 into numbers."""
-    with np.errstate(invalid="ignore"):  # NaNs that signal; who reads the scene looks for NaN
+    """Decode the positions of version 1."""
+    with np.errstate(invalid="ignore"):  # signalling NaNs; `read_scene` checks for NaN
         positions: Float32[np.ndarray, "N 3"] = np.ascontiguousarray(data).view("<f2").astype(np.float32)
     return positions
 
 
 def read_fixed(data: UInt8[np.ndarray, "N 9"], bits: int) -> Float32[np.ndarray, "N 3"]:
-    """Turn 24-bit positions with that many fractional bits into numbers, without rounding."""
+    """Decode 24-bit positions with the given number of fractional bits, exactly."""
     padded = np.zeros((len(data), 3, 4), dtype=np.uint8)
     padded[:, :, 1:] = data.reshape(-1, 3, 3)
-    fixed = padded.view("<i4")[:, :, 0] >> 8  # an arithmetic shift: the sign stays
+    fixed = padded.view("<i4")[:, :, 0] >> 8  # an arithmetic shift keeps the sign
     positions: Float32[np.ndarray, "N 3"] = (fixed * 2.0**-bits).astype(np.float32)
     return positions
 
 
 def fractional_bits(positions: Float[np.ndarray, "N 3"]) -> int | None:
-    """Return the largest number of fractional bits with which all positions fit; None where there is none."""
+    """Return the largest number of fractional bits with which all positions fit; None if there is none."""
     largest = float(np.abs(positions).max(initial=0.0))
     for bits in range(MAX_FRACTIONAL_BITS, -1, -1):
         if np.rint(largest * 2.0**bits) <= LARGEST_FIXED:
@@ -66,23 +66,23 @@ def fractional_bits(positions: Float[np.ndarray, "N 3"]) -> int | None:
 
 
 def write_fixed(positions: Float[np.ndarray, "N 3"], bits: int) -> UInt8[np.ndarray, "N 9"]:
-    """Turn positions into 24-bit integers with that many fractional bits."""
+    """Encode positions as 24-bit integers with the given number of fractional bits."""
     fixed = np.rint(positions.astype(np.float64) * 2.0**bits).astype("<i4")
     return np.ascontiguousarray(fixed[:, :, None].view(np.uint8)[:, :, :3]).reshape(-1, 9)
 
 
 def read_first_three(data: UInt8[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 4"]:
-    """Turn rotations of versions 1 and 2 into quaternions (w, x, y, z), w >= 0."""
+    """Decode rotations of versions 1 and 2 to quaternions (w, x, y, z) with w >= 0."""
     xyz = data / 127.5 - 1.0
     w = np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1, keepdims=True)))
     return np.concatenate([w, xyz], axis=1).astype(np.float32)
 
 
 def read_smallest_three(data: UInt8[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
-    """Turn rotations of versions 3 and 4 into quaternions (w, x, y, z), the largest component positive.
+    """Decode rotations of versions 3 and 4 to quaternions (w, x, y, z) with a positive largest component.
 
-    32 bits, from the highest: 2 for the number of the largest component in (x, y, z, w), then for each other in
-    order a sign and 9 of magnitude.
+    32 bits, from the highest: 2 for the index of the largest component in (x, y, z, w), then a sign and 9 bits of
+        magnitude for each of the others, in order.
     """
     packed = np.ascontiguousarray(data).view("<u4").astype(np.int64)
     fields = packed >> np.array([20, 10, 0])
@@ -96,7 +96,7 @@ def read_smallest_three(data: UInt8[np.ndarray, "N 4"]) -> Float32[np.ndarray, "
 
 
 def write_smallest_three(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:
-    """Turn quaternions (w, x, y, z) of any length but zero into 32 bits; see `read_smallest_three`."""
+    """Encode quaternions (w, x, y, z) of nonzero length in 32 bits; see `read_smallest_three`."""
     unit = unit_quats(quats)[:, [1, 2, 3, 0]]
     largest = np.abs(unit).argmax(axis=1)[:, None]
     small = np.take_along_axis(unit, OTHERS[largest[:, 0]], axis=1)
@@ -110,34 +110,34 @@ def write_smallest_three(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "
 
 
 def read_colors(data: UInt8[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 1 3"]:
-    """Turn colours into the coefficients of degree 0."""
+    """Decode colours to coefficients of degree 0."""
     coefficients: Float32[np.ndarray, "N 1 3"] = ((data - 127.5) / COLOR_STEPS).astype(np.float32)[:, None]
     return coefficients
 
 
 def write_colors(sh0: Float[np.ndarray, "N 1 3"]) -> UInt8[np.ndarray, "N 3"]:
-    """Turn the coefficients of degree 0 into colours."""
+    """Encode coefficients of degree 0 as colours."""
     return _to_bytes(np.clip(sh0[:, 0], -4, 4).astype(np.float64) * COLOR_STEPS + 127.5)
 
 
 def read_scales(data: UInt8[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
-    """Turn scales into their logarithms, without rounding."""
+    """Decode scales to their logarithms, exactly."""
     return data.astype(np.float32) / 16 - 10
 
 
 def write_scales(log_scales: Float[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "N 3"]:
-    """Turn logarithms of scales into bytes."""
+    """Encode logarithms of scales as bytes."""
     return _to_bytes((np.clip(log_scales, -10, 6).astype(np.float64) + 10.0) * 16.0)
 
 
 def read_harmonics(data: UInt8[np.ndarray, "N B"]) -> Float32[np.ndarray, "N K 3"]:
-    """Turn the coefficients of the higher degrees into numbers, without rounding; degree 4 is left out."""
+    """Decode the coefficients of the higher degrees, exactly; degree 4 is dropped."""
     kept = data.reshape(len(data), data.shape[1] // 3, 3)[:, :SH_KEPT]
     return kept.astype(np.float32) / 128 - 1
 
 
 def write_harmonics(sh_rest: Float[np.ndarray, "N K 3"]) -> UInt8[np.ndarray, "N B"]:
-    """Turn the coefficients of the higher degrees into bytes."""
+    """Encode the coefficients of the higher degrees as bytes."""
     return _to_bytes(np.clip(sh_rest.reshape(len(sh_rest), sh_rest.shape[1] * 3), -1, 1) * 128 + 128)
 
 

@@ -1,1 +1,1 @@
-"""Gaussians and a camera in, an image out: projection, sort and compositing, once per backend."""
+"""Render Gaussians from a camera: projection, sorting and compositing, with one implementation per backend."""

@@ -1,4 +1,4 @@
-"""The one door to rendering: raw parameters and a camera in, an image and what training needs out."""
+"""The public rendering function: from raw parameters and a camera to an image and the data for training."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_dense
 
 BYTES_PER_PIXEL = 40
-"""Memory that an image takes while it is made and used: 20 as float32 with transmittance and depth, and as much again
-for its copies as bytes or its gradient."""
+"""Memory for creating and using an image: 20 bytes as float32 with transmittance and depth, and as much again for its
+copies as bytes or its gradient."""
 
 
 @overload
@@ -54,26 +54,26 @@ def render(
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> RenderOutput | RenderStack:
-    """Render Gaussians as seen by a camera, or by several of one size.
+    """Render Gaussians from one camera, or from several of equal image size.
 
     Args:
         gaussians: N Gaussians, raw parameters, float32 or float64 (cuda: float32).
-        camera: The camera, a `Camera` or anything with its members (`gsplat_edu.CameraLike`); or a sequence of cameras
-            of one image size.
-        settings: Background, SH degree, antialiasing, depth; the defaults where None.
-        background: (3,) background as a tensor, to differentiate in; that of the settings where None.
-        backend: "auto" for the fastest there is where the Gaussians are, or a backend by name (see
+        camera: A `Camera` or any object with its members (`gsplat_edu.CameraLike`); or a sequence of cameras of equal
+            image size.
+        settings: Background, SH degree, antialiasing, depth; None uses the defaults.
+        background: (3,) background as a tensor, for differentiation; None uses the settings' background.
+        backend: "auto" for the fastest one on the Gaussians' device, or a backend by name (see
             `gsplat_edu.render.backends`).
 
     Returns:
-        The view and what density control needs; for several cameras their views stacked.
+        The view, including the data for density control; for several cameras, a stack of views.
 
     Raises:
-        BackendUnavailableError: the backend does not run here.
+        BackendUnavailableError: the backend cannot run here.
         ShapeError: the background is not of shape (3,), or cameras have different sizes.
-        NotEnoughMemoryError: an image alone takes more memory than is free.
-        ArgumentError: on the backend torch, a parameter is NaN or infinite, or a quaternion has zero length.
-            The kernels leave such a Gaussian out instead, with gradient zero, and no other notices.
+        NotEnoughMemoryError: the image alone needs more memory than is free.
+        ArgumentError: on the backend torch, a parameter is NaN or infinite, or a quaternion has zero length. The
+            kernels skip such a Gaussian, with zero gradient and no effect on others.
 
     Differentiable in: every raw parameter of the Gaussians, and the background. Not in: the camera.
     """
@@ -89,7 +89,7 @@ def render(
     cameras = [as_camera(f"camera[{k}]", one) for k, one in enumerate(camera)]
     if len({(c.H, c.W) for c in cameras}) != 1:
         raise ArgumentError(
-            "camera: is a sequence that is empty or of different image sizes; render those one by one"
+            "camera: is an empty sequence or has different image sizes; render the cameras one by one"
         )
     views = tuple(_render_one(name, gaussians, c, settings, background) for c in cameras)
     depths = [view.depth for view in views if view.depth is not None]
@@ -102,7 +102,7 @@ def render(
 
 
 def _background(color: tuple[float, float, float], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return a colour, which the settings have checked, as a tensor; it is sent to a GPU once, as that waits."""
+    """Return a validated colour as a tensor. It is sent to a GPU only once, because that synchronises."""
     if device.type == "cpu":
         return torch.tensor(color, dtype=dtype)
     return _sent(color, dtype, device)
@@ -110,7 +110,7 @@ def _background(color: tuple[float, float, float], dtype: torch.dtype, device: t
 
 @functools.lru_cache(maxsize=64)
 def _sent(color: tuple[float, float, float], dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False):  # else the first render decides what the others may do with it
+    with torch.inference_mode(False):  # otherwise a first render in inference mode would restrict later ones
         return torch.tensor(color, dtype=dtype, device=device)
 
 
@@ -124,11 +124,11 @@ def _render_one(
             "close other programs, or render fewer pixels (--size)",
         )
     if name == "cpu":
-        from gsplat_edu.render.cpu import render_cpu  # the native module is there: backends.py has seen to it
+        from gsplat_edu.render.cpu import render_cpu  # backends.py has checked the native module
 
         return render_cpu(gaussians, camera, settings, background)
     if name == "cuda":
-        from gsplat_edu.render.triton.rasterize import render_triton  # so is triton
+        from gsplat_edu.render.triton.rasterize import render_triton  # and Triton
 
         return render_triton(gaussians, camera, settings, background)
     return render_dense(gaussians, camera, settings, background)

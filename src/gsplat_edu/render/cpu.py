@@ -2,9 +2,8 @@
 
     project -> intersect -> composite, and back: composite_backward -> project_backward
 
-The kernels live in `native/`; this module owns the tensors, and the native module checks each that it is given.
-Nothing of torch's stands between parameters and gradients, so the gradients are the same to the bit on any
-number of threads.
+The kernels are in `native/`; this module owns the tensors, and the native module validates each of them. No torch
+operation lies between parameters and gradients, so the gradients are identical to the bit for any number of threads.
 
 Chapters: 11_tiles, 12_the_backward_pass.
 """
@@ -31,7 +30,7 @@ from gsplat_edu.render.settings import RenderSettings
 
 @dataclass
 class _Call:
-    """What one render needs besides tensors, and what it leaves besides images."""
+    """State of one render: non-tensor inputs and non-image outputs."""
 
     camera: Camera
     settings: RenderSettings
@@ -46,7 +45,7 @@ class _Call:
 def render_cpu(
     gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Tensor
 ) -> RenderOutput:
-    """Render raw parameters; see `gsplat_edu.render.api.render`, which checks them.
+    """Render raw parameters; `gsplat_edu.render.api.render` validates the arguments.
 
     Args:
         gaussians: N Gaussians, float32 or float64, on the CPU.
@@ -71,23 +70,24 @@ def render_covariances(
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
 ) -> RenderOutput:
-    """Render Gaussians given as covariances and colours: what the chapter's dense `render_t` takes.
+    """Render Gaussians given as covariances and colours, the inputs of the chapter's dense `render_t`.
 
     Args:
         means: (N, 3) centres, world units.
-        cov3ds: (N, 3, 3) covariances, world units squared, symmetric; that they are is not checked here.
+        cov3ds: (N, 3, 3) covariances, world units squared; symmetry is not checked.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
-        camera: The camera, a `Camera` or anything with its members.
-        settings: Background, antialiasing and depth; the defaults where None.
-        background: (3,) background as a tensor, to differentiate in; that of the settings where None.
+        camera: A `Camera` or any object with its members.
+        settings: Background, antialiasing and depth; None uses the defaults.
+        background: (3,) background as a tensor, for differentiation; None uses the settings' background.
 
     Returns:
         The view.
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: an entry is NaN or infinite, dtypes are not one of float32 and float64, or `camera` is no camera.
+        ArgumentError: a value is NaN or infinite, the dtypes are not all float32 or all float64, or `camera` is
+            invalid.
 
     Differentiable in: means, cov3ds, colors, opacities, background. Not in: the camera.
     """
@@ -108,15 +108,13 @@ RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 """Raw parameters, in the order of the renderer's arguments."""
 
 DIRECT = ("means", "cov3ds", "colors", "opacities")
-"""What `render_covariances` takes, in its order."""
+"""Arguments of `render_covariances`, in order."""
 
 
 def _output(call: _Call, background: Tensor, *parameters: Tensor) -> RenderOutput:
     dtype = parameters[0].dtype
     if dtype not in SUFFIXES or any(p.dtype != dtype or p.device.type != "cpu" for p in parameters):
-        raise ArgumentError(
-            "means: the backend cpu takes float32 or float64 tensors on the CPU, all of one dtype"
-        )
+        raise ArgumentError("means: the backend cpu needs tensors on the CPU, all float32 or all float64")
     image, transmittance, depth = _Rasterize.apply(call, background, *parameters)  # type: ignore[no-untyped-call]
 
     def norms() -> Tensor:
@@ -129,7 +127,7 @@ def _output(call: _Call, background: Tensor, *parameters: Tensor) -> RenderOutpu
 
 
 class _Rasterize(torch.autograd.Function):
-    """The whole of the native renderer as one differentiable step."""
+    """The complete native renderer as one differentiable operation."""
 
     @staticmethod
     def forward(
@@ -175,7 +173,7 @@ class _Rasterize(torch.autograd.Function):
         outgoing = [reusable_tensor(p.shape, p) for p in kept]
         norms = reusable_tensor((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
-        # Saved tensors may have moved since the forward pass, so the kernels get them again.
+        # Saved tensors may have moved since the forward pass, so they are passed again.
         ctx.frame.backward(
             scene=_scene(kept, call.direct),
             images=_images(image, transmittance, depth if call.settings.depth else None),
@@ -191,7 +189,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _arrays(parameters: list[Tensor], direct: bool) -> dict[str, Any]:
-    """Name six raw parameters, or means and three direct ones, as the native structures do."""
+    """Map six raw parameters, or means and three direct ones, to the names in the native structures."""
     return dict(zip(DIRECT if direct else RAW, map(native_array, parameters), strict=True))
 
 

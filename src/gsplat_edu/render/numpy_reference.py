@@ -1,6 +1,6 @@
-"""The renderer that is trusted: project, sort, composite, one splat at a time, in float64 NumPy.
+"""The reference renderer: project, sort, composite, one splat at a time, in float64 NumPy.
 
-It is short enough to check by eye against the equations, and everything else is measured against it.
+It is short enough to check by eye against the equations; all other renderers are measured against it.
 
 Chapter: 05_sort_and_composite.
 """
@@ -23,17 +23,17 @@ Stop = Literal["box", "tile", "none"]
 Box = tuple[slice, slice]
 
 RESOLVED = 16 * np.finfo(np.float64).eps
-"""Smallest ratio of the variances across and along an ellipse whose inverse is still a number to rely on. A float64
-covariance holds its smaller variance to about eps times the larger one; at sixteen times that, digits are left."""
+"""Smallest ratio of an ellipse's minor to major variance for which its inverse is reliable. A float64 covariance holds
+its smaller variance to about eps times the larger one; at sixteen times that, some digits are left."""
 
 COV_TOLERANCE = 1e-6
-"""How far a covariance may be from symmetric and positive, as a fraction of its trace: room for float32."""
+"""Largest deviation of a covariance from symmetric and positive, as a fraction of its trace; allows float32 input."""
 
 
 class Projection(NamedTuple):
-    """The visible splats in the image, near to far; ties keep the order of the input."""
+    """The visible splats in the image, near to far; ties keep the input order."""
 
-    order: Int64[np.ndarray, " M"]  # which Gaussian each one is
+    order: Int64[np.ndarray, " M"]  # indices of the Gaussians
     means2d: Float64[np.ndarray, "M 2"]  # px
     cov2d: Float64[np.ndarray, "M 2 2"]  # px², dilated
 
@@ -51,13 +51,13 @@ def render_gaussians(
     stop: Stop = "box",
     jacobian_limit: float | None = None,
 ) -> tuple[Float64[np.ndarray, "H W 3"], Float64[np.ndarray, "H W"]]:
-    """Render Gaussians as seen by a camera.
+    """Render Gaussians from a camera.
 
     alpha_i = min(0.99, o_i exp(-d' Sigma2d_i^-1 d / 2)), 0 below 1/255;  d = pixel - mean
     image = sum_i T_i alpha_i c_i + T_final bg,  T_i = product over j nearer than i of (1 - alpha_j)
 
     Args:
-        cam: The camera, any with the members of a `Camera`; pixels are sampled at integer coordinates.
+        cam: The camera, any object with the members of a `Camera`; pixels are sampled at integer coordinates.
         means: (N, 3) centres, world units.
         cov3ds: (N, 3, 3) covariances, world units squared, symmetric and positive semi-definite.
         colors: (N, 3) any range.
@@ -66,17 +66,17 @@ def render_gaussians(
         z_near: Means at this camera depth or nearer are culled, world units, >= 0.
         extent: Which pixels a splat may reach. "box3sigma": the chapter's box of radius ceil(3 sqrt(lambda_max)), which
             cuts faint tails. "exact": every pixel with alpha >= 1/255.
-        stop: When nothing more is drawn. "box": a splat is skipped when its whole box is below 1e-4 transmittance.
-            "tile": a 16x16 tile ends when all its pixels are. "none": never.
-        jacobian_limit: As for `project_cov3d`: the course clamps nothing, captures are trained with 1.3.
+        stop: When drawing ends. "box": skip a splat if its whole box is below 1e-4 transmittance. "tile": end a 16x16
+            tile once all its pixels are. "none": never.
+        jacobian_limit: As for `project_cov3d`: the course does not clamp, captures are trained with 1.3.
 
     Returns:
-        image (H, W, 3), not clipped, the background where the scene is empty; T_final (H, W), in [0, 1].
+        image (H, W, 3), not clipped, equal to the background if the scene is empty; T_final (H, W), in [0, 1].
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: NaN or infinite numbers, an opacity outside 0 to 1, a covariance that is not one, no camera; or a
-            Gaussian, by number, whose ellipse is too large or too thin for float64.
+        ArgumentError: NaN or infinite values, an opacity outside 0 to 1, an invalid covariance or camera; or a
+            Gaussian, by index, whose ellipse is too large or too thin for float64.
 
     Source: Kerbl et al. 2023, eq. 2-5; Zwicker et al. 2001 for the projection.
     """
@@ -85,7 +85,7 @@ def render_gaussians(
     bg, z_near = float64_array("bg", bg, (3,)), in_range("z_near", z_near, 0.0)
     _check_modes(extent, stop)
     image = np.zeros((cam.H, cam.W, 3))
-    # Whole tiles are kept; pixels outside the image have no transmittance and keep no tile alive.
+    # Tiles are whole; pixels outside the image have no transmittance and do not keep a tile alive.
     padded = np.pad(np.ones((cam.H, cam.W)), ((0, -cam.H % TILE), (0, -cam.W % TILE)))
     transmittance = padded[: cam.H, : cam.W]
     for i, mean2d, cov2d in zip(*project(cam, means, cov3ds, z_near, jacobian_limit), strict=True):
@@ -118,7 +118,7 @@ def _checked(
     with np.errstate(over="ignore"):
         trace = np.abs(np.trace(cov3ds, axis1=1, axis2=2))
     skew = np.abs(cov3ds - np.swapaxes(cov3ds, 1, 2)).max(axis=(1, 2), initial=0.0)
-    # Of the covariance over its trace, which neither overflows nor fails to converge.
+    # The covariance divided by its trace neither overflows nor prevents convergence.
     unit = np.where(trace > 0, trace, 1.0)
     smallest = np.linalg.eigvalsh(cov3ds / unit[:, None, None])[:, 0]
     if np.any(improper := (skew > COV_TOLERANCE * trace) | (smallest < -COV_TOLERANCE)):
@@ -133,11 +133,11 @@ def project(
     z_near: float,
     jacobian_limit: float | None,
 ) -> Projection:
-    """Project what is in front of the camera to screen-space ellipses and sort it near to far.
+    """Project Gaussians in front of the camera to screen-space ellipses, sorted near to far.
 
     Sigma2d = J W Sigma W' J' + 0.3 I
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is named below
+    with np.errstate(over="ignore", invalid="ignore"):  # overflows are reported below
         means_cam = cam.world_to_cam(means)
         fits = np.isfinite(means_cam).all(axis=1)
         if not fits.all():
@@ -148,7 +148,7 @@ def project(
         cov2d = project_cov3d(
             cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit
         ) + DILATION * np.eye(2)
-        # As _box and _alpha use it: the determinant, and the squares of distances.
+        # As used by _box and _alpha: the determinant, and squared distances.
         fits = np.isfinite(u * u + v * v + np.trace(cov2d, axis1=1, axis2=2) ** 2)
     if not fits.all():
         i = index[np.argmin(fits)]
@@ -181,11 +181,11 @@ def _check_modes(extent: Extent, stop: Stop) -> None:
 
 
 def _resolved(i: np.int64, cov2d: Float64[np.ndarray, "2 2"]) -> Float64[np.ndarray, "2 2"]:
-    """Return the covariance of Gaussian i; refuse an ellipse whose inverse would be rounding."""
+    """Return the covariance of Gaussian i; reject an ellipse whose inverse would be dominated by rounding."""
     if np.linalg.det(cov2d) <= RESOLVED * np.trace(cov2d) ** 2:
         raise ArgumentError(
-            f"cov3ds[{i}]: is {np.sqrt(np.trace(cov2d)):.2g} px long on the screen and too thin for its inverse "
-            "to be more than rounding in float64; leave this Gaussian out or make it smaller"
+            f"cov3ds[{i}]: is {np.sqrt(np.trace(cov2d)):.2g} px long on the screen and too thin to invert accurately "
+            "in float64; remove this Gaussian or make it smaller"
         )
     return cov2d
 
@@ -203,7 +203,7 @@ def _alpha(
 
 
 def _in_live_tile(padded: Float64[np.ndarray, "th tw"], box: Box) -> Bool[np.ndarray, "h w"]:
-    """Say of each pixel of a box whether some pixel of its tile still lets 1e-4 of the light through."""
+    """Return, for each pixel of a box, whether its tile has a pixel with at least 1e-4 transmittance."""
     (y0, x0), (y1, x1) = ((s.start // TILE for s in box), (-(-s.stop // TILE) for s in box))
     tiles = padded[y0 * TILE : y1 * TILE, x0 * TILE : x1 * TILE].reshape(y1 - y0, TILE, x1 - x0, TILE)
     live: Bool[np.ndarray, "th tw"] = (

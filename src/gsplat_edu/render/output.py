@@ -1,4 +1,4 @@
-"""What a render gives back, whichever backend made it."""
+"""The result of a render, common to all backends."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ class RenderOutput:
     """One rendered view.
 
     Args:
-        image: (H, W, 3) over the background, not clipped.
-        transmittance: (H, W) light that passed all Gaussians, in [0, 1].
-        depth: (H, W) expected depth, sum of w z, world units: not divided by the sum of w, no background.
-            None where `RenderSettings.depth` is off.
-        visible: (M,) indices of the Gaussians that take part. On the backend torch: those in front of the
-            camera. On cpu and cuda: those whose ellipse alpha >= 1/255 also reaches the image.
-        radii: (M, 2) half width and height of that ellipse, px; 0 where a Gaussian is nowhere above 1/255.
-        num_pairs: Pairs of Gaussian and tile that were composited; None on torch, which has no tiles.
-        grad_norms: Gives `means2d_grad_norms`.
+        image: (H, W, 3) composited over the background, not clipped.
+        transmittance: (H, W) fraction of light that passes all Gaussians, in [0, 1].
+        depth: (H, W) expected depth, sum of w z, world units; not normalised by the sum of w, without background. None
+            if `RenderSettings.depth` is off.
+        visible: (M,) indices of the Gaussians taking part. On the backend torch: those in front of the camera. On cpu
+            and cuda: those whose ellipse alpha >= 1/255 also reaches the image.
+        radii: (M, 2) half width and half height of that ellipse, px; 0 if a Gaussian is nowhere above 1/255.
+        num_pairs: Number of composited pairs of Gaussian and tile; None on torch, which has no tiles.
+        grad_norms: Returns `means2d_grad_norms`.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -34,27 +34,27 @@ class RenderOutput:
     grad_norms: Callable[[], Tensor]
 
     def means2d_grad_norms(self) -> Float[Tensor, " M"]:
-        """Return the signal of density control: |(gx W/2, gy H/2)|, g = d loss / d mean in the image, px.
+        """Return the signal for density control: |(gx W/2, gy H/2)|, with g = d loss / d mean in the image, px.
 
-        The factors turn pixels into normalised device coordinates, so that one threshold serves every image
-        size. Zero for Gaussians the loss does not reach. A second backward through the same image adds to it, as it
-        does to gradients.
+        The factors convert pixels to normalised device coordinates, so that one threshold suits every image size. The
+        value is zero for Gaussians that the loss does not reach. A second backward pass through the same image
+        accumulates, as for gradients.
 
         Raises:
-            ArgumentError: backward has not run through this image.
+            ArgumentError: backward has not been called on a loss of this image.
         """
         return self.grad_norms()
 
 
 @dataclass(frozen=True, eq=False)
 class RenderStack:
-    """Several views of one size, rendered in one call.
+    """Several views of equal size, rendered in one call.
 
     Args:
         image: (B, H, W, 3).
         transmittance: (B, H, W).
-        depth: (B, H, W), or None where it was not asked for.
-        views: The B single outputs.
+        depth: (B, H, W), or None if not requested.
+        views: The B individual outputs.
     """
 
     image: Float[Tensor, "B H W 3"]

@@ -1,4 +1,4 @@
-"""How to render: the choices that are not the scene's and not the camera's."""
+"""Render settings: choices independent of scene and camera."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from gsplat_edu.errors import BackendUnavailableError
 from gsplat_edu.validation import float64_array, in_range, whole_number
 
 BACKENDS = ("cuda", "cpu", "torch")
-"""All backends, the fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, every splat at
-every pixel."""
+"""All backends, fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, which evaluates every
+splat at every pixel."""
 
 
 def check_backend(name: str) -> None:
-    """Check that a backend's name is known; `gsplat_edu.render.backends` says whether it runs here.
+    """Check that a backend's name is known; `gsplat_edu.render.backends` tells whether it is available here.
 
     Args:
         name: "auto", or a backend by name.
 
     Raises:
-        BackendUnavailableError: there is no such backend.
+        BackendUnavailableError: the backend does not exist.
     """
     if name not in ("auto", *BACKENDS):
         raise BackendUnavailableError(
@@ -30,22 +30,22 @@ def check_backend(name: str) -> None:
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Choices of one render.
+    """Settings of a render.
 
     Args:
-        background: Colour behind everything, RGB.
-        sh_degree: Highest degree of spherical harmonics to use; less where the Gaussians store less.
-        antialiased: Lower each opacity by the light that the dilation adds (Mip-Splatting), see
+        background: RGB colour behind everything.
+        sh_degree: Highest SH degree to use; lower if the Gaussians store fewer coefficients.
+        antialiased: Lower each opacity to compensate for the dilation (Mip-Splatting), see
             `gsplat_edu.gaussian_math.opacity_compensation`.
-        depth: Render expected depth too. Training that does not look at depth is faster without.
-        jacobian_limit: x/z and y/z inside the projection's Jacobian are clamped to this many half fields of view
-            (`Camera.jacobian_bounds`); 1.3 for captures, as in Kerbl et al.'s code; None clamps nothing.
-        dense_chunk: Splats that the dense torch backend evaluates at once. It decides speed, not the image
-            (beyond rounding); 16 keeps a chunk in a core's cache at 128 px (benchmarks/RESULTS.md).
+        depth: Also render expected depth. Training without a depth loss is faster without it.
+        jacobian_limit: Clamp x/z and y/z inside the projection's Jacobian to this multiple of half the field of view
+            (`Camera.jacobian_bounds`); 1.3 for captures, as in Kerbl et al.'s code; None disables clamping.
+        dense_chunk: Number of splats that the dense torch backend evaluates at once. It affects speed, not the image
+            (except for rounding); 16 keeps a chunk in a core's cache at 128 px (benchmarks/RESULTS.md).
 
     Raises:
         ShapeError: the background is not of shape (3,).
-        ArgumentError: a value is outside its range.
+        ArgumentError: a value is out of range.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -56,7 +56,7 @@ class RenderSettings:
     dense_chunk: int = 16
 
     def __post_init__(self) -> None:
-        """Check the ranges, and turn NumPy scalars and arrays into plain Python values, which the kernels take."""
+        """Check the ranges, and convert NumPy scalars and arrays to plain Python values for the kernels."""
         limit = self.jacobian_limit
         plain = {
             "background": tuple(float64_array("background", self.background, (3,)).tolist()),

@@ -1,7 +1,7 @@
 """The dense renderer: the mathematics of the NumPy reference, batched in torch for autograd.
 
-Every splat is evaluated at every pixel: no boxes and no early stop, which changes cost and not values. The
-names end in _t, as in the course, and take any float dtype.
+Every splat is evaluated at every pixel: without boxes and early termination, which affects cost but not values. The
+names end in _t, as in the course; any float dtype works.
 
 Chapter: 09_train_in_3d.
 """
@@ -25,12 +25,12 @@ from gsplat_edu.validation import first_index, in_range, whole_number
 
 
 class DenseRender(NamedTuple):
-    """What `render_t` returns."""
+    """The result of `render_t`."""
 
     image: Float[Tensor, "H W 3"]
     transmittance: Float[Tensor, "H W"]
-    means2d: Float[Tensor, "M 2"]  # px, near to far; keeps its gradient when asked to
-    visible: Int64[Tensor, " M"]  # which Gaussian each row of means2d is
+    means2d: Float[Tensor, "M 2"]  # px, near to far; retains its gradient on request
+    visible: Int64[Tensor, " M"]  # index of the Gaussian for each row of means2d
 
 
 class _Screen(NamedTuple):
@@ -53,7 +53,7 @@ def eval_sh_t(degree: int, sh: Float[Tensor, "N K 3"], dirs: Float[Tensor, "N 3"
         dirs: (N, 3) unit vectors from the camera to each Gaussian.
 
     Returns:
-        (N, 3) colours, 0 and up.
+        (N, 3) colours, at least 0.
 
     Raises:
         ShapeError: a shape differs, N differs, or K is too small for the degree.
@@ -93,13 +93,13 @@ def render_t(
 
     Args:
         means: (N, 3) centres, world units.
-        cov3ds: (N, 3, 3) covariances, world units squared; that they are is not checked here.
+        cov3ds: (N, 3, 3) covariances, world units squared; validity is not checked.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
-        cam: The camera, a `Camera` or anything with its members; means at depth 0.05 or nearer are culled.
+        cam: A `Camera` or any object with its members; means at depth 0.05 or nearer are culled.
         alpha_min: Alpha below this is zero. 0 makes the image smooth, for finite differences.
-        chunk: Splats evaluated at once, near to far. It bounds the size of a temporary and decides speed.
-        track_means2d: Keep the gradient of means2d, for density control.
+        chunk: Number of splats evaluated at once, near to far. It bounds a temporary and affects speed.
+        track_means2d: Retain the gradient of means2d, for density control.
 
     Returns:
         image (H, W, 3), final transmittance (H, W), means2d (M, 2) px and the indices (M,) of the visible
@@ -108,7 +108,7 @@ def render_t(
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
         ArgumentError: an entry is NaN or infinite, an opacity is outside 0 to 1, alpha_min is negative,
-            chunk is not a whole number of at least 1, or `cam` is no camera.
+                chunk is not a whole number of at least 1, or `cam` is not a camera.
 
     Differentiable in: means, cov3ds, colors, opacities. Not in: the camera.
     Source: Kerbl et al. 2023, eq. 2-5.
@@ -190,8 +190,8 @@ def _composite(
     alpha_min: float,
     chunk: int,
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
-    """Mix C channels on zero, near to far; returns them and the final transmittance."""
-    # Empty sums tie the image to the inputs, so that backward gives zeros when nothing is visible.
+    """Composite C channels over zero, near to far; return them and the final transmittance."""
+    # Empty sums connect the image to the inputs, so that backward returns zeros if nothing is visible.
     tie = sum(tensor[:0].sum() for tensor in (screen.means2d, screen.ellipses, colors, opacities))
     dtype, device = colors.dtype, colors.device
     image = torch.zeros(cam.H, cam.W, colors.shape[1], dtype=dtype, device=device) + tie
@@ -207,10 +207,10 @@ def _composite(
 
 
 def _viewing_directions(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 3"]:
-    """Point from the camera to each mean; a mean at the camera, which is culled, gets the zero vector."""
+    """Return directions from the camera to the means; a mean at the camera, which is culled, gets the zero vector."""
     offset = means - torch.tensor(camera.eye, dtype=means.dtype, device=means.device)
     squared = (offset * offset).sum(dim=-1, keepdim=True)
-    # where() twice, so that the square root's infinite slope at 0 never meets the chain rule.
+    # where() twice keeps the square root's infinite slope at 0 out of the chain rule.
     return torch.where(squared > 0, offset / torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
 
 
@@ -237,7 +237,7 @@ def _project(
     *,
     factors: tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]] | None = None,
 ) -> _Screen:
-    """Project; `shapes` are covariances, or M = R S where the factors are given: thin ones keep their digits."""
+    """Project; `shapes` are covariances, or M = R S if the factors are given, which keeps the digits of thin ones."""
     R = torch.tensor(cam.R, dtype=means.dtype, device=means.device)
     means_cam = (means - torch.tensor(cam.eye, dtype=means.dtype, device=means.device)) @ R.T
     visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]
@@ -252,7 +252,8 @@ def _project(
     if factors is not None:
         rows_of_M = JW @ shapes[visible]
         cov2d = rows_of_M @ rows_of_M.mT
-        # |n|² = a c - b² without the cancellation, n the cross product of the rows of J W R S, by way of that of J W.
+        # |n|² = a c - b² without cancellation; n is the cross product of the rows of J W R S, computed from that of J
+        # W.
         axes, (s0, s1, s2) = factors[0][visible], factors[1][visible].unbind(-1)
         normal = torch.linalg.cross(JW[:, 0], JW[:, 1])[:, None, :] @ axes
         normal = normal[:, 0] * torch.stack([s1 * s2, s2 * s0, s0 * s1], dim=-1)

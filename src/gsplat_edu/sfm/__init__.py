@@ -1,1 +1,1 @@
-"""Structure from motion: photos or a video without poses become a COLMAP capture."""
+"""Structure from motion: convert photos or a video without poses to a COLMAP capture."""

@@ -1,4 +1,4 @@
-"""Where up is, where zero is, and how long a unit is: what photos alone do not say."""
+"""Choose up direction, origin and scale, which photos alone do not determine."""
 
 from __future__ import annotations
 
@@ -9,31 +9,30 @@ from jaxtyping import Float64
 
 from gsplat_edu.camera import Camera, point_nearest_axes
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.paths import PARALLEL, common_up
+from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.io.edit import Similarity
 
 DISTANCE = 5.0
-"""Median distance of the cameras from what they look at, in the units of the result. It is about what COLMAP's own
-normalisation gives (cameras spread over 10), for which renderers chose the depth in front of which they draw nothing:
-0.2 in the code of Kerbl et al. 2023."""
+"""Median distance of the cameras from their target, in units of the result. It is similar to COLMAP's own normalisation
+(cameras spread over 10), for which renderers chose their near plane: 0.2 in the code of Kerbl et al. 2023."""
 
 NEAREST = 0.2
-"""A point that cameras are said to look at is at least this share of the depth of what they see away from them."""
+"""A common target must be at least this fraction of the median depth away from the cameras."""
 
 IN_FRONT = 0.9
-"""Share of the cameras that have to have it in front of them."""
+"""At least this fraction of the cameras must have the target in front of them."""
 
 
 def upright(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) -> Similarity:
-    """Find the move after which up is (0, -1, 0), zero is what the cameras look at, and they stand 5 from it.
+    """Find the transform to up (0, -1, 0), with the origin at the cameras' target and the cameras 5 units from it.
 
-    Up is `gsplat_edu.evaluate.paths.common_up`. The first camera looks along +z, but for its tilt. Zero is the point
-    nearest to all optical axes; where those do not meet in front of the cameras, in a room seen from its middle for
-    example, it is the cameras' mean, and the median depth of the points becomes 5.
+    Up is `gsplat_edu.evaluate.paths.common_up`. The first camera looks along +z, except for its tilt. The origin is the
+    point nearest to all optical axes. If these do not meet in front of the cameras, for example in a room photographed
+    from its centre, the origin is the mean camera centre, and the median depth of the points becomes 5.
 
     Args:
         cameras: At least one.
-        points: (N, 3) what they see, world units; at least one.
+        points: (N, 3) points seen by the cameras, world units; at least one.
 
     Raises:
         ArgumentError: there is no camera or no point.
@@ -43,7 +42,7 @@ def upright(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) -> Si
     eyes = np.stack([camera.eye for camera in cameras])
     forwards = np.stack([camera.R[2] for camera in cameras])
     down = -common_up(cameras)
-    # where the first camera looks straight up or down, the top of its image is ahead
+    # if the first camera looks straight up or down, the top of its image is forward
     ahead = next(
         level
         for axis in (forwards[0], -cameras[0].R[1], cameras[0].R[0])
@@ -52,7 +51,7 @@ def upright(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) -> Si
     ahead = ahead / np.linalg.norm(ahead)
     R = np.stack([np.cross(down, ahead), down, ahead])
     depth = _depth(cameras, points)
-    centre = point_nearest_axes(cameras, PARALLEL)
+    centre = point_nearest_axes(cameras)
     if centre is not None:
         before = np.sum((centre - eyes) * forwards, axis=1) > 0
         distance = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
@@ -63,7 +62,7 @@ def upright(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) -> Si
 
 
 def _depth(cameras: Sequence[Camera], points: Float64[np.ndarray, "N 3"]) -> float:
-    """Return the median, over the cameras, of the median depth of the points in their images."""
+    """Return the median over cameras of the median depth of the points in their images."""
     some = points[:: max(1, len(points) // 5_000)]
     depths = []
     for camera in cameras:

@@ -1,4 +1,4 @@
-"""COLMAP from the outside: jobs for `gsplat_edu.sfm.engine`, and what became of them."""
+"""Run COLMAP in a separate process: jobs for `gsplat_edu.sfm.engine` and their results."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ import numpy as np
 from gsplat_edu.errors import ArgumentError, DatasetError
 
 POLL = 0.25
-"""Seconds between two looks at how far a job has come."""
+"""Seconds between two queries of a job's progress."""
 
 COUNTS = {
     "features": "SELECT COUNT(*) FROM descriptors",
     "matches": "SELECT COUNT(*) FROM two_view_geometries",
 }
-"""What tells how far the jobs are that say nothing themselves."""
+"""Queries that measure the progress of jobs without progress reports."""
 
 COLMAP_SEED = 0
-"""Seed of every random draw of COLMAP and of this package while poses are found."""
+"""Seed for all random numbers of COLMAP and of this package during structure from motion."""
 
 
 def require_colmap() -> None:
     """Check that pycolmap is installed, without loading it.
 
     Raises:
-        ArgumentError: it is not; says how to install it.
+        ArgumentError: it is missing; says how to install it.
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ArgumentError(
@@ -46,21 +46,21 @@ def require_colmap() -> None:
 def call(
     job: str, log: Path, progress: Callable[[int], None] = lambda done: None, **arguments: object
 ) -> dict[str, Any]:
-    """Let COLMAP do a job, in a process that ends with this call whatever happens.
+    """Run a COLMAP job in a process that always ends with this call.
 
     Args:
         job: One of `gsplat_edu.sfm.engine.jobs.JOBS`.
-        log: Where COLMAP's own words go, behind what stands there.
-        progress: Told how much is done, from the calling thread. What it raises ends the job.
-        arguments: Of the job.
+        log: File to which COLMAP's output is appended.
+        progress: Called with the amount done, in the calling thread. An exception from it ends the job.
+        arguments: Arguments of the job.
 
     Returns:
-        What the job returns.
+        The job's result.
 
     Raises:
         DatasetError: the job failed; names the log.
     """
-    # -P: the files beside the program are no modules to be imported by their bare names
+    # -P: the files next to the program cannot be imported as modules by their bare names
     command = [sys.executable, "-P", str(Path(__file__).parent / "engine" / "__main__.py")]
     with log.open("ab") as words:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
@@ -70,7 +70,7 @@ def call(
     result: dict[str, Any] | None = None
     assert process.stdin is not None and process.stdout is not None
     try:
-        with suppress(BrokenPipeError), process.stdin as stdin:  # broken: it failed at once
+        with suppress(BrokenPipeError), process.stdin as stdin:  # broken if the process failed at once
             stdin.write(json.dumps({"job": job, **arguments}).encode())
         listener.start()
         while result is None:
@@ -99,8 +99,8 @@ def call(
     if result is None:
         how = f"was ended by signal {-code}" if code < 0 else f"failed with code {code}"
         raise DatasetError(
-            f"COLMAP's {job} {how}: the last lines of {log} say why; give it less with --max-features or "
-            "--max-image-size, or start the command again"
+            f"COLMAP's {job} {how}: see the last lines of {log}; reduce --max-features or "
+            "--max-image-size, or run the command again"
         )
     return result
 
@@ -109,10 +109,10 @@ def forget_matches(database: Path) -> None:
     """Remove all matches from the database; features stay.
 
     Args:
-        database: COLMAP's. Nothing is done where it is not there.
+        database: COLMAP's database. If it does not exist, nothing is done.
 
     Raises:
-        DatasetError: it cannot be changed.
+        DatasetError: the database cannot be modified.
     """
     if not database.is_file():
         return
@@ -125,17 +125,17 @@ def forget_matches(database: Path) -> None:
 
 
 def limit_features(database: Path, most: int) -> None:
-    """Keep the features of the largest scales of each photo: COLMAP's own limit keeps whole levels of scale.
+    """Keep each photo's features of the largest scales; COLMAP's own limit keeps whole scale levels.
 
-    It passes over the finest levels only while the rest is still more than the limit, and counts places, some of which
-    become two features with two orientations: a limit of 2,000 gave 3,500.
+    COLMAP skips the finest levels only while the remaining ones exceed the limit, and counts positions, some of which
+        become two features with two orientations: a limit of 2,000 gave 3,500.
 
     Args:
-        database: COLMAP's, before anything is matched.
-        most: Features of a photo.
+        database: COLMAP's database, before matching.
+        most: Most features per photo.
 
     Raises:
-        DatasetError: it cannot be changed.
+        DatasetError: the database cannot be modified.
     """
     tables = (("keypoints", np.float32), ("descriptors", np.uint8))
     try:
@@ -158,13 +158,13 @@ def limit_features(database: Path, most: int) -> None:
 
 def _unchangeable(database: Path, error: sqlite3.Error) -> DatasetError:
     return DatasetError(
-        f"{database}: cannot be changed ({error}); remove {database.parent / 'stages.json'} and "
-        f"{database}, or name another folder"
+        f"{database}: cannot be modified ({error}); remove {database.parent / 'stages.json'} and "
+        f"{database}, or choose another folder"
     )
 
 
 def _listen(process: subprocess.Popen[bytes], answers: queue.SimpleQueue[dict[str, Any]]) -> None:
-    """Pass on what a process says, and say that it has ended."""
+    """Forward a process's messages, and report its end."""
     assert process.stdout is not None
     for line in process.stdout:
         answers.put(json.loads(line))
@@ -172,14 +172,14 @@ def _listen(process: subprocess.Popen[bytes], answers: queue.SimpleQueue[dict[st
 
 
 def _rows(database: Path, query: str) -> int:
-    """Count what a job has written; zero while there is nothing to read."""
+    """Count the rows that a job has written; zero if there are none yet."""
     try:
         reader = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=1.0)
-    except sqlite3.Error:  # it is not there yet
+    except sqlite3.Error:  # the file does not exist yet
         return 0
     try:
         return int(reader.execute(query).fetchone()[0])
-    except sqlite3.Error:  # its tables are not there yet, or it is being written
+    except sqlite3.Error:  # its tables do not exist yet, or it is being written
         return 0
     finally:
         reader.close()

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.data.colmap import read_cameras, read_images
-from gsplat_edu.data.lens import straightened
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call
 from gsplat_edu.sfm.source import FEWEST
@@ -267,7 +266,7 @@ def _usable(out: Path, model: dict[str, Any]) -> dict[str, Any]:
     folder, good = out / model["folder"], dict[int, bool]()
     for number, lens in read_cameras(folder / "cameras.bin").items():
         try:
-            straightened(lens)
+            lens.undistorted()
             good[number] = True
         except DatasetError:
             good[number] = False

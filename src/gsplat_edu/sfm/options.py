@@ -1,4 +1,4 @@
-"""What structure from motion can be asked for. It imports nothing heavy: the command line checks it first."""
+"""Options of structure from motion. Imports nothing heavy, because the command line checks them first."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ CAMERA_MODELS = (
 
 @dataclass(frozen=True)
 class SfmOptions:
-    """One structure from motion.
+    """Options of one reconstruction.
 
     Args:
         source: A folder of photos, or a video.
-        out: Folder of the capture. The work is kept in its folder sfm/.
-        frames: How many frames of a video are taken, at most.
-        matcher: "exhaustive": every pair. "sequential": each photo with those that follow. "nearest": those, the ones
-            that look alike, and the ones taken close by. "auto": exhaustive up to 150 photos, else nearest; for
-            videos nearest.
-        mapper: "incremental", "global", or "auto": the former, and the other one where it does not do.
-        camera_model: COLMAP's name of the lens model; "auto": SIMPLE_RADIAL, or a freer one that the photos support.
-        max_features: Most SIFT features of a photo.
-        max_image_size: Longest side at which features are found, px. The capture has the photos at full size.
-        threads: Threads of COLMAP; 0 for all.
+        out: Folder of the capture. Intermediate results are kept in its subfolder sfm/.
+        frames: Most frames to take from a video.
+        matcher: "exhaustive": all pairs. "sequential": each photo with the following ones. "nearest": these, similar
+            photos, and photos taken nearby. "auto": exhaustive up to 150 photos, else nearest; nearest for videos.
+        mapper: "incremental", "global", or "auto": incremental, then global if its result is insufficient.
+        camera_model: COLMAP's name of the lens model; "auto": SIMPLE_RADIAL, or a model with more parameters if the
+            photos support it.
+        max_features: Most SIFT features per photo.
+        max_image_size: Longest side for feature extraction, px. The capture keeps the photos' full size.
+        threads: Threads of COLMAP; 0 uses all.
 
     Raises:
         ArgumentError: a value is out of range.

@@ -1,4 +1,4 @@
-"""Which photos are compared with which: all, or those that follow one another, look alike, or stand close by."""
+"""Choose the pairs of photos to match: all, or those that are consecutive, similar, or taken nearby."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 WORDS = 64
-"""Visual words of the descriptor of a photo (Jégou et al. 2010 take 16 to 256)."""
+"""Visual words in a photo's descriptor (Jégou et al. 2010 use 16 to 256)."""
 
 SAMPLE = 40_000
-"""Local descriptors from which the words are learnt."""
+"""Number of local descriptors from which the words are learnt."""
 
 BLOCK = 256
-"""Photos whose distances to all others are in memory at once."""
+"""Number of photos whose distances to all others are in memory at once."""
 
 EARTH = 6_371_000.0
 """Mean radius of the earth, m."""
 
 Pair = tuple[int, int]
-"""Two photos by their places in the sorted list, the first one first."""
+"""Indices of two photos in the sorted list, the smaller one first."""
 
 
 def all_pairs(count: int) -> set[Pair]:
-    """Return every pair of so many photos."""
+    """Return all pairs of `count` photos."""
     return set(combinations(range(count), 2))
 
 
 def sequential_pairs(count: int, overlap: int) -> set[Pair]:
-    """Return each photo with the next ones, and with those 2, 4, 8 ... farther on as often.
+    """Pair each photo with the next ones, and with those 2, 4, 8 ... positions ahead, as many times.
 
     Args:
-        count: How many photos.
-        overlap: With how many that follow, and up to which power of two.
+        count: Number of photos.
+        overlap: Number of following photos, and of powers of two.
     """
     steps = {*range(1, overlap + 1), *(2**power for power in range(overlap))}
     return {(i, i + step) for step in steps for i in range(count - step)}
 
 
 def nearest_pairs(points: Float[np.ndarray, "n d"], k: int, apart: int = 1) -> set[Pair]:
-    """Return each point with its k nearest.
+    """Pair each point with its k nearest ones.
 
     Args:
         points: (n, d) any coordinates.
-        k: How many.
-        apart: Points whose places in the list differ by less are not looked at.
+        k: Number of neighbours.
+        apart: Points whose indices differ by less are excluded.
     """
     count, pairs = len(points), set[Pair]()
     centred = points - points.mean(axis=0)
@@ -67,7 +67,7 @@ def nearest_pairs(points: Float[np.ndarray, "n d"], k: int, apart: int = 1) -> s
 
 
 def on_the_ground(places: Sequence[tuple[float, float, float]]) -> Float64[np.ndarray, "n 3"]:
-    """Turn latitude, longitude (degrees) and height (m) into positions in m.
+    """Convert latitude, longitude (degrees) and height (m) to positions in m.
 
     Args:
         places: One per photo.
@@ -83,21 +83,21 @@ def on_the_ground(places: Sequence[tuple[float, float, float]]) -> Float64[np.nd
     return np.asarray((EARTH + height)[:, None] * direction)
 
 
-def looks(database: Path, names: Sequence[str], seed: int) -> Float32[np.ndarray, "n d"]:
-    """Describe each photo by one vector: VLAD, the sums of its SIFT descriptors' offsets from visual words.
+def photo_descriptors(database: Path, names: Sequence[str], seed: int) -> Float32[np.ndarray, "n d"]:
+    """Describe each photo by a VLAD vector: the sums of its SIFT descriptors' offsets from visual words.
 
-    v_w = sum over descriptors d whose nearest word is w of (d - c_w), each v_w of length 1, then the whole of length 1
+    v_w = sum over descriptors d whose nearest word is w of (d - c_w); each v_w is normalised, then the whole vector
 
     Args:
-        database: COLMAP's, with descriptors.
+        database: COLMAP's database, with descriptors.
         names: The photos, in the order of the rows.
-        seed: Of the words.
+        seed: Seed for learning the words.
 
     Returns:
-        (n, 8192) of length 1; zero where a photo has no features. Near photos look alike.
+        (n, 8192) unit vectors; zero for a photo without features. Similar photos have nearby vectors.
 
-    Source: Jégou et al. 2010, "Aggregating local descriptors into a compact image representation"; each part of length
-    1 as by Arandjelović and Zisserman 2013.
+    Source: Jégou et al. 2010, "Aggregating local descriptors into a compact image representation"; the normalisation of
+        each part follows Arandjelović and Zisserman 2013.
     """
     rng = np.random.default_rng(seed)
     share = max(20, SAMPLE // max(len(names), 1))
@@ -115,11 +115,11 @@ def looks(database: Path, names: Sequence[str], seed: int) -> Float32[np.ndarray
 
 
 def largest_part(count: int, pairs: Sequence[Pair]) -> list[int]:
-    """Return the photos of the largest part that hangs together.
+    """Return the photos of the largest connected component.
 
     Args:
-        count: How many photos.
-        pairs: Which are connected.
+        count: Number of photos.
+        pairs: Connected pairs.
     """
     first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))

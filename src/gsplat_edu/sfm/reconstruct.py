@@ -288,8 +288,10 @@ class _Run:
         chosen = pairs.sequential_pairs(count, overlap)
         if kind == "sequential":
             return chosen
-        looks = pairs.looks(self.folder / "database.db", [photo.copy for photo in self.photos], COLMAP_SEED)
-        chosen |= pairs.nearest_pairs(looks, farther * ALIKE[origin], overlap + 1)
+        described = pairs.photo_descriptors(
+            self.folder / "database.db", [photo.copy for photo in self.photos], COLMAP_SEED
+        )
+        chosen |= pairs.nearest_pairs(described, farther * ALIKE[origin], overlap + 1)
         places = [photo.place for photo in self.photos if photo.place is not None]
         if len(places) == count:
             chosen |= pairs.nearest_pairs(pairs.on_the_ground(places), farther * CLOSE_BY)

@@ -17,11 +17,12 @@ from PIL import Image
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.colmap import read_cameras, read_images, read_points
-from gsplat_edu.data.images import AT_ONCE, PhotoFile, develop
-from gsplat_edu.data.lens import Lens, straightened
+from gsplat_edu.data.images import AT_ONCE, PhotoFile, load_photo
+from gsplat_edu.data.lens import Lens
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussian_math import quat_to_R
+from gsplat_edu.intrinsics import Intrinsics
 from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.sfm.align import upright
 from gsplat_edu.sfm.colmap import call
@@ -57,7 +58,7 @@ class Undistorted:
     photo: PhotoFacts
     name: str
     lens: Lens
-    pinhole: Lens
+    pinhole: Intrinsics
 
     def entry(self) -> dict[str, Any]:
         """Return what `gsplat_edu.sfm.engine.jobs.finish` wants to know."""
@@ -98,11 +99,12 @@ def build_capture(
     entries, cameras = list[Undistorted](), list[Camera]()
     for photo, name in zip(chosen, output_names(chosen), strict=True):
         pose = poses[photo.copy]
-        lens = lenses[pose.camera].resized(photo.W, photo.H)
-        pinhole = turned(straightened(lens), photo.turns)
+        lens = lenses[pose.camera].scaled(photo.W, photo.H)
+        pinhole = lens.undistorted().turned(photo.turns)
         entries.append(Undistorted(photo, name, lens, pinhole))
         R = quat_to_R(pose.quat)
-        cameras.append(_camera(pinhole, np.linalg.matrix_power(QUARTER, photo.turns) @ R, -R.T @ pose.shift))
+        upright_R = np.linalg.matrix_power(QUARTER, photo.turns) @ R
+        cameras.append(Camera.posed(upright_R, -R.T @ pose.shift, pinhole))
     cloud = read_points(found)
     if cloud is None:
         raise DatasetError(f"{found}: holds no points; the photos show too little in common")
@@ -198,18 +200,6 @@ def note_published(folder: Path, parts: Iterable[str]) -> None:
         aside.write_text(json.dumps({"parts": sorted(parts)}) + "\n", encoding="utf-8")
 
 
-def turned(lens: Lens, turns: int) -> Lens:
-    """Return the pinhole of a photo that was turned clockwise: (u, v) becomes (H - 1 - v, u).
-
-    Args:
-        lens: A lens that does not distort.
-        turns: Quarter turns.
-    """
-    for _ in range(turns % 4):
-        lens = Lens(lens.H, lens.W, lens.fy, lens.fx, lens.H - 1 - lens.cy, lens.cx)
-    return lens
-
-
 def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
     """Name the undistorted photos as the photos are named, each differently, and as the files they are.
 
@@ -234,11 +224,6 @@ def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
     return names
 
 
-def _camera(pinhole: Lens, R: np.ndarray, eye: np.ndarray) -> Camera:
-    p = pinhole
-    return Camera(R, eye, p.fx, p.fy, p.cx, p.cy, p.H, p.W)
-
-
 def _write_photos(
     entries: Sequence[Undistorted], source: Path, result: Path, progress: Callable[[str, int, int], None]
 ) -> None:
@@ -257,7 +242,7 @@ def _write_photos(
 def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
     lens = entry.lens
     counts = Path(entry.photo.mask) if entry.photo.mask else None
-    photo = develop(PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None))
+    photo = load_photo(PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None))
     pixels = np.asarray(photo.image)
     if photo.alpha is not None:
         pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)

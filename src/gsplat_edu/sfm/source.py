@@ -1,4 +1,4 @@
-"""What the user named: photos, a video, or something that poses cannot be found for."""
+"""Classify the input: photos, a video, or something without usable photos."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from gsplat_edu.sfm.result import PARTS, published
 from gsplat_edu.sfm.video import is_video
 
 FEWEST = 3
-"""Photos of a model that is worth having: two photos alone leave nothing to check their poses with."""
+"""Fewest photos of a useful model: the poses of only two photos cannot be verified."""
 
 NAMED = 12
-"""Photos that a sentence names; more are counted."""
+"""Most photos named in a message; the others are counted."""
 
-WANTED = "name a folder of photos, or a video"
-OR_CAPTURE = "name a capture, a folder of photos, or a video"
+WANTED = "give a folder of photos, or a video"
+OR_CAPTURE = "give a capture, a folder of photos, or a video"
 
 
 def needs_poses(path: str | Path) -> bool:
-    """Say whether a path is a video, or a folder of photos without poses in any layout that is read.
+    """Return whether a path is a video, or a folder of photos without poses in any supported layout.
 
     Args:
-        path: What the user named.
+        path: The path given by the user.
 
     Raises:
-        DatasetError: it is a run's folder, an empty one, or a file of another kind; or its photos lie in several
+        DatasetError: the path is a run folder, an empty folder, or a file of another kind; or its photos lie in several
             folders.
     """
     path = Path(path)
@@ -45,35 +45,35 @@ def needs_poses(path: str | Path) -> bool:
         return False
     _check_run(path)
     if not any(place.name[0] != "." for place in entries(path)):
-        raise DatasetError(f"{path}: holds no photos, it is empty; {OR_CAPTURE}")
+        raise DatasetError(f"{path}: is empty; {OR_CAPTURE}")
     return bool(photo_files(path))
 
 
 def check_source(source: Path, out: Path) -> list[Path]:
-    """Find out before any work whether there is something to do it with, and somewhere to put it.
+    """Check, before any work, that the input has photos and the output folder can be used.
 
     Args:
         source: Folder of the photos, or a video.
         out: Folder of the result.
 
     Returns:
-        The photos; none where the source is a video.
+        The photos; empty if the source is a video.
 
     Raises:
-        ArgumentError: the result cannot go there.
-        DatasetError: the source is of no use.
+        ArgumentError: the output folder cannot be used.
+        DatasetError: the source cannot be used.
     """
     check_folder("OUT", out)
     here, there = source.resolve(), out.resolve()
     if here == there or any(here.is_relative_to(there / part) for part in (*PARTS, "sfm")):
-        raise ArgumentError(f"OUT: {out} is where the photos themselves are; name another folder")
+        raise ArgumentError(f"OUT: {out} is the folder of the photos; choose another folder")
     if _holds_others(out):
-        raise ArgumentError(f"OUT: {out} holds photos or poses already; name another folder")
+        raise ArgumentError(f"OUT: {out} already holds photos or poses; choose another folder")
     if is_file(source):
         _check_file(source, WANTED)
         return []
     if not is_folder(source):
-        raise DatasetError(f"{source}: is not there; {WANTED}")
+        raise DatasetError(f"{source}: does not exist; {WANTED}")
     _check_run(source)
     files = photo_files(source, there)
     if len(files) < FEWEST:
@@ -82,12 +82,12 @@ def check_source(source: Path, out: Path) -> list[Path]:
 
 
 def too_few(source: Path, count: int, unreadable: Sequence[str]) -> str:
-    """Say why there is nothing to do.
+    """Explain why the photos are insufficient.
 
     Args:
-        source: What the user named.
-        count: Photos that can be decoded.
-        unreadable: The others.
+        source: The path given by the user.
+        count: Number of photos that can be decoded.
+        unreadable: Names of the other photos.
     """
     if count:
         held = "one photo" if count == 1 else f"{count} photos"
@@ -97,25 +97,25 @@ def too_few(source: Path, count: int, unreadable: Sequence[str]) -> str:
         return f"{source}: holds no photo that can be decoded: {listed(unreadable)}; export them as JPEG"
     video = next((path.name for path in sorted(source.iterdir()) if is_video(path)), None)
     return f"{source}: holds no photos; " + (
-        f"it holds a video, name that: {source / video}" if video else WANTED
+        f"it holds a video; give that: {source / video}" if video else WANTED
     )
 
 
 def listed(names: Sequence[str]) -> str:
-    """Name the first photos of a list, and count the others."""
+    """Join the first names of a list, and count the others."""
     more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
 
 
 def _check_file(path: Path, wanted: str) -> None:
-    """Refuse a file that is no video."""
+    """Reject a file that is not a video."""
     if not is_video(path):
         what = "a single photo" if is_photo(path) else "neither a photo nor a video"
         raise DatasetError(f"{path}: is {what}; {wanted}")
 
 
 def _check_run(folder: Path) -> None:
-    """Refuse the folder of a run: what it holds are renders."""
+    """Reject a run folder, whose images are renders."""
     if not is_run(folder):
         return
     try:
@@ -125,14 +125,14 @@ def _check_run(folder: Path) -> None:
         capture = None
     instead = f", {capture}" if capture else ""
     raise DatasetError(
-        f"{folder}: is a run, and its pictures are renders, not photos; name the capture it was trained on{instead}"
+        f"{folder}: is a run, whose pictures are renders, not photos; give the capture it was trained on{instead}"
     )
 
 
 def _holds_others(out: Path) -> bool:
-    """Say whether the folder of the result holds what no run put there and a run would put away.
+    """Return whether the output folder holds files of other origin that a run would move away.
 
-    Masks beside a run's capture are no such thing: they stay.
+    Masks next to a run's capture do not count, because they stay.
     """
     work = out / "sfm"
     if not (work / "stages.json").is_file():
@@ -143,7 +143,7 @@ def _holds_others(out: Path) -> bool:
 
 
 def _is_capture(path: Path) -> bool:
-    """Say whether a folder has poses in a layout that is read."""
+    """Return whether a folder has poses in a supported layout."""
     return (
         any(is_file(path / name) for name in (TRAIN_FILE, "transforms.json")) or find_model(path) is not None
     )

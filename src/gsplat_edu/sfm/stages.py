@@ -1,4 +1,4 @@
-"""Which stages are finished: what lets an interrupted run go on."""
+"""Records completed stages, so that an interrupted run can resume."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from gsplat_edu.reading import parse_json, read_text
 
 
 class Stages:
-    """The stages of a run, in a file that is whole at any time.
+    """The stages of a run, stored in a file that is always complete.
 
-    A stage has options: whatever its outcome depends on, beside the stages before it. When they differ from
-    those before, it and all that follow are forgotten.
+    A stage has options: everything that determines its result, apart from earlier stages. If they change, the stage and
+        all later ones are discarded.
 
     Args:
-        path: stages.json; it need not be there.
-        say: Told why stages are done again.
+        path: stages.json; it need not exist.
+        say: Called with the reason when stages are repeated.
 
     Raises:
         DatasetError: the file is damaged.
@@ -36,20 +36,20 @@ class Stages:
                     raise ValueError
             except (ValueError, KeyError, TypeError, AttributeError):
                 raise DatasetError(
-                    f"{path}: is damaged; remove {path.parent}, and the same command begins anew"
+                    f"{path}: is damaged; remove {path.parent} and run the same command again"
                 ) from None
 
     @property
     def any_finished(self) -> bool:
-        """Whether there is something to resume."""
+        """Whether there is a stage to resume from."""
         return any(stage["facts"] is not None for stage in self._stages.values())
 
     def finished(self, name: str, options: dict[str, Any]) -> dict[str, Any] | None:
-        """Return what a finished stage left to say; None where it is not finished, or was with other options.
+        """Return the facts recorded by a completed stage; None if it is incomplete or had other options.
 
         Args:
             name: The stage.
-            options: What they are now, as JSON has them.
+            options: The current options, as JSON values.
         """
         known = self._stages.get(name)
         if known is None:
@@ -58,15 +58,17 @@ class Stages:
             facts: dict[str, Any] | None = known["facts"]
             return facts
         changed = [key for key in options if known["options"].get(key) != options[key]]
-        self._say(f"{name}: {', '.join(changed) or 'options'} differ from those before; again from here")
+        self._say(
+            f"{name}: {', '.join(changed) or 'options'} changed; repeating this stage and the later ones"
+        )
         self.forget(name)
         return None
 
     def begun(self, name: str, options: dict[str, Any]) -> bool:
-        """Note that a stage begins.
+        """Record the start of a stage.
 
         Returns:
-            Whether it goes on with what an interrupted one with the same options left.
+            Whether it resumes an interrupted stage with the same options.
         """
         goes_on = name in self._stages
         self._stages[name] = {"options": options, "facts": None}
@@ -74,12 +76,12 @@ class Stages:
         return goes_on
 
     def end(self, name: str, facts: dict[str, Any]) -> None:
-        """Note that a stage is finished, and what it found out."""
+        """Record the completion of a stage and its facts."""
         self._stages[name]["facts"] = facts
         self._write()
 
     def forget(self, name: str) -> None:
-        """Forget a stage and those that were begun after it."""
+        """Discard a stage and those started after it."""
         if name in self._stages:
             kept = list(self._stages)[: list(self._stages).index(name)]
             self._stages = {stage: self._stages[stage] for stage in kept}

@@ -1,4 +1,4 @@
-"""Frames of a video that are worth being photos: sharp ones, a step of the camera apart."""
+"""Select video frames that are useful as photos: sharp, with camera motion between them."""
 
 from __future__ import annotations
 
@@ -28,47 +28,47 @@ VIDEO_ENDINGS = (
     ".3gp",
     ".wmv",
 )
-"""What names of videos end in, in any case."""
+"""Suffixes of videos, in any case."""
 
 CANDIDATES = 24
-"""Frames that are looked at for each that is taken, about; a longer video is looked at in larger steps."""
+"""Approximate number of frames examined per selected frame; longer videos are sampled more coarsely."""
 
 SHARPNESS_SIDE = 640
-"""Longest side at which sharpness is measured, px: noise and compression are gone, motion blur is not."""
+"""Longest side for measuring sharpness, px: it removes noise and compression artefacts but not motion blur."""
 
 MOTION_SIDE = 160
-"""Longest side at which motion is measured, px."""
+"""Longest side for measuring motion, px."""
 
 STILL = 0.0002
-"""Motion between two frames, as a share of the longest side, below which a camera stands still: noise moves, too."""
+"""Motion between frames, relative to the longest side, below which the camera counts as still; noise moves too."""
 
 DIFFERENT = 0.005
-"""Motion, as a share of the longest side, from which two frames are two photos."""
+"""Motion, relative to the longest side, from which two frames count as different photos."""
 
 FRAME_QUALITY = 97
-"""JPEG quality of frames that become photos."""
+"""JPEG quality of the selected frames."""
 
 Progress = Callable[[str, int, int], None]
-"""Told which stage, how much of it is done, and of how much."""
+"""Called with the stage, the amount done and the total."""
 
 
 def is_video(path: Path) -> bool:
-    """Say whether a file is named like a video."""
+    """Return whether a file has the suffix of a video."""
     return path.suffix.lower() in VIDEO_ENDINGS
 
 
 def choose_frames(path: Path, count: int, progress: Progress) -> list[int]:
-    """Choose frames: the video is cut into intervals of equal motion, and the sharpest frame of each is taken.
+    """Select frames: divide the video into intervals of equal motion and take the sharpest frame of each.
 
     Sharpness is the variance of the Laplacian, motion the mean length of the optical flow (DIS, Kroeger et al. 2016).
 
     Args:
         path: The video.
-        count: How many intervals.
-        progress: Told of the frames that were read.
+        count: Number of intervals.
+        progress: Called as frames are read.
 
     Returns:
-        Numbers of frames, ascending; fewer than `count` where the video has fewer, or the camera stands still.
+        Frame numbers, ascending; fewer than `count` if the video has fewer frames or the camera is still.
 
     Raises:
         DatasetError: the file cannot be decoded.
@@ -100,13 +100,13 @@ def choose_frames(path: Path, count: int, progress: Progress) -> list[int]:
 
 
 def write_frames(path: Path, chosen: Sequence[int], folder: Path, progress: Progress) -> list[Path]:
-    """Write frames as photos, upright, but for those that show the same as the one before.
+    """Write frames as upright photos, skipping those that show the same as the previous one.
 
     Args:
         path: The video.
-        chosen: Numbers of frames, ascending.
-        folder: Where to; made where it is missing. Frames are named frame_NUMBER.jpg.
-        progress: Told of the frames that were written or left out.
+        chosen: Frame numbers, ascending.
+        folder: Output folder; created if missing. Files are named frame_NUMBER.jpg.
+        progress: Called as frames are written or skipped.
 
     Returns:
         The photos.
@@ -124,7 +124,7 @@ def write_frames(path: Path, chosen: Sequence[int], folder: Path, progress: Prog
             if before is None or flow(before, small) >= DIFFERENT:
                 before = small
                 target = folder / f"frame_{number:06d}.jpg"
-                # not imwrite: it crashes on names that are not UTF-8, and does not say why it fails
+                # not imwrite: it crashes on names that are not UTF-8, and does not report the cause of a failure
                 _, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, FRAME_QUALITY])
                 with written_aside(target) as aside:
                     aside.write_bytes(data.tobytes())
@@ -136,14 +136,14 @@ def write_frames(path: Path, chosen: Sequence[int], folder: Path, progress: Prog
 
 
 class _Flow:
-    """Measures motion between two small frames."""
+    """Measures the motion between two small frames."""
 
     def __init__(self) -> None:
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
 
     def __call__(self, before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
-        """Return the mean length of the flow, as a share of the longer side."""
-        if before.shape != after.shape:  # a video may change its size
+        """Return the mean length of the optical flow, relative to the longer side."""
+        if before.shape != after.shape:  # the frame size may change within a video
             return 1.0
         field = self._flow.calc(before, after, np.zeros((*before.shape, 2), np.float32))
         lengths: Float32[np.ndarray, "h w"] = np.hypot(field[..., 0], field[..., 1])
@@ -152,7 +152,7 @@ class _Flow:
 
 
 def _intervals(motion: Float64[np.ndarray, " n"], count: int) -> Int64[np.ndarray, " n"]:
-    """Return which interval of equal motion each frame lies in."""
+    """Return the index of each frame's interval of equal motion."""
     path = np.cumsum(motion)
     if path[-1] == 0.0:
         return np.zeros(len(motion), dtype=np.int64)
@@ -162,7 +162,7 @@ def _intervals(motion: Float64[np.ndarray, " n"], count: int) -> Int64[np.ndarra
 
 @contextmanager
 def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
-    # FFmpeg and OpenCV would print their complaints beside ours. FFmpeg's are looked at once, at the first video.
+    # Keep messages of FFmpeg and OpenCV off the terminal. FFmpeg reads its setting once, at the first video.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     with named_in_utf8(path) as plain:
         before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -171,9 +171,9 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
         try:
             if not video.isOpened():
                 raise DatasetError(
-                    f"{path}: is no video that OpenCV can decode; convert it, for example to H.264 in mp4"
+                    f"{path}: is not a video that OpenCV can decode; convert it, for example to H.264 in mp4"
                 )
-            # Phones store how a video was held, not the turned frames.
+            # Phones store the orientation of a video separately, without rotating its frames.
             video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
             yield video
         finally:
@@ -183,7 +183,7 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
 def _every(
     video: cv2.VideoCapture, step: int, wanted: set[int] | None = None
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """Yield frames and their numbers: every `step`-th, or the wanted ones."""
+    """Yield frames and their numbers: every `step`-th frame, or the wanted ones."""
     number = 0
     while video.grab():
         if number in wanted if wanted is not None else number % step == 0:

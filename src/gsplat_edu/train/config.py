@@ -32,51 +32,53 @@ class TrainConfig:
     """One training run; see `recipe` for runs of other lengths than 30,000 iterations.
 
     Args:
-        iterations: Number of steps; each renders one view.
-        seed: Seed of the start, the view order, splits, relocations and noise.
-        means_rate: Adam's rate of the means at the start, times the scene's extent. (2023)
-        means_rate_final: The same at `means_rate_iterations`; log-linear between, constant afterwards. (2023)
-        means_rate_iterations: Where the means' rate has come down.
-        quats_rate: Rate of the quaternions. (2023)
-        scales_rate: Rate of the log scales. (2023)
-        sh0_rate: Rate of the constant harmonic. (2023)
-        sh_rest_rate: Rate of the higher harmonics: a twentieth of it. (2023)
-        opacities_rate: Rate of the logit opacities. (2023; newer forks use 2.5e-2.)
-        adam_eps: Floor under the root of Adam's second moment. (2023)
-        ssim_weight: k of the loss (1 - k) L1 + k (1 - SSIM). (2023, eq. 7)
+        iterations: Number of training steps; each renders one view.
+        seed: Seed of the initial Gaussians, the view order, splits, relocations and noise.
+        means_rate: Initial learning rate of the means, times the scene's extent. (2023)
+        means_rate_final: Learning rate of the means from `means_rate_iterations` on, times the extent; log-linear
+            before. (2023)
+        means_rate_iterations: Iteration at which the learning rate of the means reaches its final value.
+        quats_rate: Learning rate of the quaternions. (2023)
+        scales_rate: Learning rate of the log scales. (2023)
+        sh0_rate: Learning rate of the degree-0 harmonic. (2023)
+        sh_rest_rate: Learning rate of the higher harmonics. (2023: a twentieth of `sh0_rate`)
+        opacities_rate: Learning rate of the logit opacities. (2023; newer forks use 2.5e-2)
+        adam_eps: Adam's epsilon. (2023)
+        ssim_weight: Weight k in the loss (1 - k) L1 + k (1 - SSIM). (2023, eq. 7)
         sh_degree: Highest degree of spherical harmonics.
-        sh_every: Iterations after which the degree in use goes up by one; 0 uses all from the start. (2023)
-        view_order: "shuffled": each view once before any comes again (2023); "random": drawn with replacement.
-        background: Colour behind everything, RGB.
-        random_background: Draw another background for every iteration instead.
+        sh_every: Iterations between increases of the degree in use; 0 uses all degrees from the start. (2023)
+        view_order: "shuffled": each view once before any is repeated (2023); "random": drawn with replacement.
+        background: Background colour, RGB, 0 to 1.
+        random_background: Draw a new background colour for every iteration.
         antialiased: Train for antialiased rendering, see `gsplat_edu.render.settings.RenderSettings`.
-        jacobian_limit: Clamp of the projection's Jacobian, half fields of view (2023); None clamps nothing.
-        start_opacity: Opacity of the start cloud. (2023)
-        start_scale: Factor on the start cloud's scales, which are the root mean squared distance to 3 neighbours.
-        strategy: "adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "none".
-        max_gaussians: Cap on the number of Gaussians; None for none, which mcmc does not take.
-        over_cap: adc: what is done where more are due than there is room for. "strongest": only those are cloned or
-            split that are pulled hardest; "cut": survivors come first, then clones, then children, and what is over
-            the cap is cut from the end; a parent whose children are cut is gone all the same (the course).
-        densify_start: Neither this iteration nor an earlier one densifies. (2023; both strategies)
-        densify_stop: Neither this iteration nor a later one does. (2023)
-        densify_every: Iterations that are a multiple of this densify. (2023; 2024)
-        grad_threshold: adc: Gaussians whose mean gradient norm, in normalised device coordinates, is above this
-            fail to explain their place and are cloned or split. (2023)
-        percent_dense: adc: fraction of the extent; offenders of a larger scale are split, others cloned. (2023)
-        split_shrink: adc: the two children of a split have their parent's scales divided by this. (2023)
-        min_opacity: Gaussians below this opacity are pruned (2023), or relocated (2024).
-        prune_scale: adc: fraction of the extent; Gaussians of a larger scale are pruned once opacities have been
-            reset; 0 prunes none. (2023)
-        prune_screen_size: adc: Gaussians whose ellipse had a larger half axis in the image, px, are pruned once
-            opacities have been reset; 0 prunes none. (2023 has 20, but it never took effect there.)
-        reset_every: adc: iterations between resets of the opacities while densifying; 0 for never. (2023)
-        reset_opacity: adc: what opacities are lowered to. (2023)
-        mcmc_stop: mcmc: as densify_stop. (2024's code)
-        mcmc_start_opacity: mcmc: as start_opacity. (2024's code)
-        mcmc_start_scale: mcmc: as start_scale. (2024's code)
-        mcmc_growth: mcmc: the number of Gaussians grows by this factor, up to the cap. (2024, section 4.3)
-        mcmc_noise: mcmc: noise on the means, times their rate. (2024, section 4.1: lambda_noise)
+        jacobian_limit: Clamp of the projection's Jacobian, in half fields of view (2023); None for no clamp.
+        start_opacity: Opacity of the initial Gaussians. (2023)
+        start_scale: Factor on the initial scales, which are the root mean squared distance to 3 neighbours.
+        strategy: "adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "none": fixed number.
+        max_gaussians: Cap on the number of Gaussians; None for no cap. mcmc requires one.
+        over_cap: adc: which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with
+            the largest gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors,
+            clones, children; the parent of dropped children is removed too (the course).
+        densify_start: Densification begins after this iteration. (2023; both strategies)
+        densify_stop: Densification ends before this iteration. (2023)
+        densify_every: Densify at iterations that are a multiple of this. (2023; 2024)
+        grad_threshold: adc: Gaussians whose mean gradient norm, in normalised device coordinates, exceeds this are
+            cloned or split. (2023)
+        percent_dense: adc: fraction of the extent; among these, larger Gaussians are split, smaller ones cloned. (2023)
+        split_shrink: adc: divisor of the scales of the two children of a split. (2023)
+        min_opacity: Gaussians below this opacity are pruned (2023) or relocated (2024).
+        prune_scale: adc: fraction of the extent; larger Gaussians are pruned after the first opacity reset; 0 prunes
+            none. (2023)
+        prune_screen_size: adc: Gaussians with a larger half axis in an image, px, are pruned after the first opacity
+            reset; 0 prunes none. (2023 has 20, but it never took effect there)
+        reset_every: adc: iterations between opacity resets while densifying; 0 for none. (2023)
+        reset_opacity: adc: upper bound of opacities after a reset. (2023)
+        mcmc_stop: mcmc: `densify_stop` of this strategy. (2024's code)
+        mcmc_start_opacity: mcmc: `start_opacity` of this strategy. (2024's code)
+        mcmc_start_scale: mcmc: `start_scale` of this strategy. (2024's code)
+        mcmc_growth: mcmc: growth factor of the number of Gaussians per densification, up to the cap. (2024, section
+            4.3)
+        mcmc_noise: mcmc: noise on the means, relative to their learning rate. (2024, section 4.1: lambda_noise)
         mcmc_opacity_weight: mcmc: weight of the mean opacity in the loss. (2024, eq. 10: lambda_o)
         mcmc_scale_weight: mcmc: weight of the mean scale in the loss. (2024, eq. 10: lambda_Sigma)
 

@@ -2,7 +2,23 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.optimizer import ParameterGroup
+
+
+def gaussian_groups(config: TrainConfig, extent: float) -> dict[str, ParameterGroup]:
+    """Return the parameter groups of the Gaussians: one for each raw parameter, by its name.
+
+    Args:
+        config: Rates, eps and the schedule of the means.
+        extent: Size of the scene, world units.
+    """
+    rates: dict[str, float | Callable[[int], float]] = dict(config.learning_rates)
+    rates["means"] = functools.partial(means_rate, config, extent)
+    return {name: ParameterGroup(rate, eps=config.adam_eps) for name, rate in rates.items()}
 
 
 def means_rate(config: TrainConfig, extent: float, iteration: int) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsplat_edu.adam import AdamKernel, adam_step
 from gsplat_edu.buffers import reused_buffers
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
@@ -28,7 +29,7 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.feed import ViewFeed
 from gsplat_edu.train.optimizer import MOMENTS, Adam
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_tensor_kind, check_whole
-from gsplat_edu.train.schedule import means_rate, sh_degree
+from gsplat_edu.train.schedule import gaussian_groups, sh_degree
 from gsplat_edu.views import View
 
 
@@ -103,6 +104,7 @@ class Trainer:
         extent: Size of the scene, world units: the means' learning rate is a fraction of it.
         density: The density strategy; None keeps the number of Gaussians.
         callbacks: Told of every step and every change, in this order.
+        adam: Moves one tensor by Adam's rule; by default the fastest kernel that takes it.
 
     Raises:
         ArgumentError: there are no views, no Gaussians, or more Gaussians than the cap.
@@ -124,6 +126,7 @@ class Trainer:
         extent: float = 1.0,
         density: DensityStrategy | None = None,
         callbacks: Sequence[Callback] = (),
+        adam: AdamKernel = adam_step,
     ) -> None:
         if not views:
             raise ArgumentError("views: is empty; give at least one view to learn from")
@@ -141,7 +144,8 @@ class Trainer:
         self._render, self._callbacks = render, tuple(callbacks)
         behind, device = None if config.random_background else config.background, gaussians.means.device
         self._feed = ViewFeed(views, config.view_order, config.seed, behind, device)
-        self._optimizer = Adam(self.gaussians, config.learning_rates, eps=config.adam_eps)
+        self._groups, self._adam = gaussian_groups(config, extent), adam
+        self._optimizer = Adam(self.gaussians.tensors(), self._groups, adam)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> TrainResult:
@@ -189,8 +193,8 @@ class Trainer:
         if self.density is not None:
             with one_thread():
                 self.density.observe(self.gaussians, output)
-        self._optimizer.learning_rates["means"] = means_rate(config, self.extent, iteration)
-        self._optimizer.step(self.gaussians)
+        self._optimizer.schedule(iteration)
+        self._optimizer.step(self.gaussians.tensors())
         self.last = output.image.detach(), target.image, target.mask
         self.iteration += 1
         return StepEvent(iteration, loss.detach(), len(self.gaussians))
@@ -238,8 +242,8 @@ class Trainer:
             raise ArgumentError("steps: has to be the iteration")
         self._feed.check_state(given["feed"])
         check_numpy_generator("backgrounds", given["backgrounds"], self._backgrounds)
-        optimizer = Adam(gaussians, self._optimizer.learning_rates, eps=self.config.adam_eps)
-        optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, gaussians)
+        optimizer = Adam(gaussians.tensors(), self._groups, self._adam)
+        optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, gaussians.tensors())
         if self.density is not None:  # the last that can fail
             if not isinstance(given["density"], dict):
                 raise ArgumentError("density: has to be an object")

@@ -1,4 +1,4 @@
-"""Writing a scene in any format, the page included, and checking what the file shows."""
+"""Write a scene in any format, including the HTML page, and check the written file."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from gsplat_edu.runs.source import Source
 from gsplat_edu.viewer import page
 
 PAGE = ".html"
-"""Suffix of the page that draws a scene in a browser."""
+"""Suffix of the HTML page that renders a scene in a browser."""
 
 VIEWS = 8
-"""Cameras that a file is checked from."""
+"""Number of cameras used to check a file."""
 
 SIDE = 800
-"""px: longer side of the images it is checked by."""
+"""Longer side of the images used to check a file, px."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written, and how it compares with what was to be written.
+    """A written file and its comparison with the source.
 
     Args:
         path: The file.
-        num_bytes: Its size; that of the whole folder for a SOG in one.
-        num_gaussians: Gaussians in it.
+        num_bytes: Its size; for a SOG folder, the size of the whole folder.
+        num_gaussians: Number of Gaussians in it.
         psnr: Mean over the cameras, dB; 100 for equal images.
-        worst_psnr: Of the camera that shows the largest difference, dB.
+        worst_psnr: PSNR of the camera with the largest difference, dB.
         worst_view: That camera's name.
         num_views: Number of cameras.
     """
@@ -53,43 +53,43 @@ class Exported:
     num_views: int
 
     def line(self) -> str:
-        """Say it in one line."""
+        """Summarise the comparison in one line."""
         size = f"{self.num_bytes:,} bytes, {self.num_bytes / max(self.num_gaussians, 1):.1f} per splat"
         lowest = f"worst {self.worst_psnr:.2f} ({self.worst_view})"
         return f"{self.path}: PSNR {self.psnr:.2f} dB over {self.num_views} views, {lowest}; {size}"
 
     def document(self) -> dict[str, Any]:
-        """Return what metrics.json holds of it."""
+        """Return the entry for metrics.json."""
         return {**self.__dict__, "path": str(self.path)}
 
 
 def check_target(name: str, path: Path) -> None:
-    """Find out, before anything is computed, whether a scene can be written under a name.
+    """Check that a scene can be written to a path, before anything is computed.
 
     Args:
-        name: What the user calls it, for the message.
+        name: The user's name for the argument, for messages.
         path: The file.
 
     Raises:
-        ArgumentError: its name has no suffix of a format, it is a folder, or its folder cannot be written to.
+        ArgumentError: the suffix belongs to no format, the path is a folder, or its parent folder is not writable.
     """
     if path.suffix.lower() != PAGE:
         try:
             format_of(path)
         except ArgumentError:
             known = ", ".join([*(found.suffix for found in FORMATS), PAGE, f"FOLDER/{SOG_META}"])
-            raise ArgumentError(f"{name}: {path}: ends like no scene format; known are {known}") from None
+            raise ArgumentError(f"{name}: {path}: unknown scene format; known are {known}") from None
     if path.is_dir():
-        raise ArgumentError(f"{name}: {path} is a folder; give the name of a file")
+        raise ArgumentError(f"{name}: {path} is a folder; give a file name")
     check_folder(name, path.parent)
 
 
 def write(path: Path, source: Source) -> None:
-    """Write a scene in the format of the file's name; a page gets the cameras and settings too.
+    """Write a scene in the format given by the file's name; a page also gets the cameras and settings.
 
     Raises:
-        ArgumentError: the name has no suffix of a format, or the format cannot hold the scene.
-        OSError: it cannot be written. What stood there before is untouched.
+        ArgumentError: the suffix belongs to no format, or the format cannot hold the scene.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     if path.suffix.lower() == PAGE:
         page.write(path, source.scene, source.cameras, source.settings, source.held_out)
@@ -98,22 +98,22 @@ def write(path: Path, source: Source) -> None:
 
 
 def losses(path: Path, scene: Scene) -> list[str]:
-    """Say what of a scene a file of that name cannot hold at all: a sentence each."""
+    """List the parts of a scene that the format of a path cannot store, one sentence each."""
     return [] if path.suffix.lower() == PAGE else formats.losses(path, scene)
 
 
 def kept_degree(path: Path, scene: Scene) -> int:
-    """Return the highest degree of harmonics of a scene that a file of that name holds."""
+    """Return the highest SH degree of a scene that the format of a path can store."""
     degree = scene.gaussians.sh_degree
     return degree if path.suffix.lower() == PAGE else min(degree, format_of(path).sh_degree)
 
 
 def read_back(path: Path) -> Scene:
-    """Read what `write` wrote.
+    """Read a file written by `write`.
 
     Raises:
         SceneFormatError: the file is damaged.
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     return page.read(path) if path.suffix.lower() == PAGE else read_scene(path)
 
@@ -121,13 +121,13 @@ def read_back(path: Path) -> Scene:
 def check(
     path: Path, source: Source, backend: str, on_score: Callable[[ImageScore], None] | None = None
 ) -> Exported:
-    """Render a file and what was written to it from the same cameras.
+    """Compare renders of a written file with renders of its source from the same cameras.
 
     Args:
         path: The file.
-        source: What was to be written, its cameras and its settings.
-        backend: Of the renders.
-        on_score: Is told of every camera.
+        source: The source, with its cameras and settings.
+        backend: Backend of the renders.
+        on_score: Called with each camera's score.
 
     Raises:
         ArgumentError: there is nothing to render.

@@ -1,11 +1,11 @@
-"""A training watched in the browser while it runs: renders of the Gaussians as they are, from the browser's camera.
+"""Watch a training in the browser while it runs, rendered from the browser's camera.
 
-viser serves its client and a WebSocket from threads of its own. They only note what browsers say. The thread that
-trains reads it between two steps, where nothing else touches the Gaussians, and renders there; rendering changes
-nothing, so the training has the bits of one that nobody watches.
+viser serves its client and a WebSocket from its own threads, which only record the browsers' input. The training thread
+reads this input between two steps, while nothing else touches the Gaussians, and renders there. Rendering changes
+nothing, so a watched training gives the same bits as an unwatched one.
 
-viser opens one TCP port, for the files of its client and the WebSocket. Its tunnel to a public server is closed here,
-and `gsplat_edu.viewer.live_guard` checks who asks.
+viser opens one TCP port for its client's files and the WebSocket. Its tunnel to a public server is disabled here, and
+`gsplat_edu.viewer.live_guard` checks every request.
 """
 
 from __future__ import annotations
@@ -45,39 +45,39 @@ from gsplat_edu.views import View
 PORT = 8080
 
 NAMES = ("--view-host", "--view-port")
-"""What the user calls host and port."""
+"""The user's names for host and port."""
 
 SHARE = 0.2
-"""Largest share of the time that is spent on browsers while a training runs."""
+"""Largest fraction of the time spent on browsers during training."""
 
 WIDTHS = (160, 1920)
-"""px: narrowest and widest image that the browser can ask for; it is never wider than the browser's own."""
+"""Smallest and largest width that the browser can choose, px; the image is never wider than the browser's own."""
 
 START_WIDTH = 800
-"""px: width of the image at first."""
+"""Initial width of the image, px."""
 
 MOVING = 0.4
-"""Part of the width that is rendered while the camera moves."""
+"""Fraction of the width that is rendered while the camera moves."""
 
 SETTLED = 0.3
-"""Seconds without a move after which the camera stands still."""
+"""Seconds without a move after which the camera counts as still."""
 
 STILL_EVERY = 0.2
-"""Seconds between two images for a camera that stands still, while the training changes what it sees."""
+"""Seconds between two images for a still camera while the training changes the scene."""
 
 FIGURES_EVERY = 0.5
-"""Seconds between two looks at loss and PSNR."""
+"""Seconds between two updates of loss and PSNR."""
 
 POLL = 0.03
-"""Seconds between two looks at the browsers while the training is paused."""
+"""Seconds between two polls of the browsers while the training is paused."""
 
 GRACE = 5.0
-"""Seconds after which a browser that went away is not expected back: a page that is loaded again takes one or two."""
+"""Seconds after which a disconnected browser is not expected to return; reloading a page takes one or two."""
 
 JPEG_QUALITY = 85
 
 MOST_ASPECT = 4.0
-"""A browser's image is at most this many times wider than high, or higher than wide."""
+"""Largest aspect ratio of a browser's image, in either direction."""
 
 WIDEST_FOV = math.radians(170.0)
 
@@ -85,7 +85,7 @@ WIDEST_FOV = math.radians(170.0)
 def browser_camera(
     wxyz: ArrayLike, position: ArrayLike, fov: float, canvas: tuple[int, int], width: int
 ) -> Camera:
-    """Turn viser's camera into ours. Both look along +z with y down, so only the direction of the rotation differs.
+    """Convert viser's camera. Its axes agree with ours (+z forward, y down); only the rotation is inverted.
 
     Args:
         wxyz: (4,) quaternion of the camera-to-world rotation.
@@ -98,7 +98,7 @@ def browser_camera(
         A camera whose image, stretched over the browser's, shows the same view to the pixel.
 
     Raises:
-        ArgumentError: the browser sent numbers that are no camera.
+        ArgumentError: the browser sent values that do not form a camera.
     """
     columns, rows = whole_number("width", canvas[0], 1), whole_number("height", canvas[1], 1)
     aspect = in_range("aspect", columns / rows, 1 / MOST_ASPECT, MOST_ASPECT)
@@ -111,7 +111,7 @@ def browser_camera(
 
 @dataclass
 class _Browser:
-    """A browser and what it was sent: camera's time stamp, width and iteration of its image, and when that was."""
+    """A connected browser and its last image: time stamp of the camera, width, iteration, and time of sending."""
 
     handle: viser.ClientHandle
     stamp: float
@@ -121,19 +121,19 @@ class _Browser:
 
 
 class LiveView:
-    """Shows a training to browsers, and lets them pause it.
+    """Shows a training to browsers and lets them pause it.
 
     Args:
-        capture: The run; its dataset is there, its trainer need not be.
-        stop: Says whether the program is asked to end.
-        host: Address to listen at.
-        port: Port; 0 for any that is free.
+        capture: The run; its dataset is loaded, its trainer may come later.
+        stop: Returns whether the program should end.
+        host: Address to listen on.
+        port: Port; 0 picks a free one.
 
     Raises:
-        ArgumentError: the address is none of this computer's, or the port is taken or out of range.
+        ArgumentError: the address does not belong to this computer, or the port is in use or out of range.
 
     Attributes:
-        url: Where a browser finds the view; its token lets the browser in.
+        url: The view's address, including the token that grants access.
     """
 
     def __init__(
@@ -145,10 +145,10 @@ class LiveView:
         self._event: StepEvent | None = None
         self._browsers: dict[int, _Browser] = {}
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._left = math.inf  # iterations until the training holds
+        self._left = math.inf  # iterations until the training pauses
         self._free_at = self._figures_at = -math.inf
         self._seen_at = -math.inf
-        self._said = ""
+        self._state = self._said = self._failure = ""
         with ExitStack() as closing:
             self._server, token = _server(host, port, closing)
             self.url = f"{url_of(host, self._server.get_port())}?token={token}"
@@ -157,7 +157,7 @@ class LiveView:
             self._closing = closing.pop_all()
 
     def __enter__(self) -> LiveView:
-        """Return the view itself; it has been listening since it was made."""
+        """Return the view itself; it has been listening since its creation."""
         return self
 
     def __exit__(
@@ -168,35 +168,35 @@ class LiveView:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is connected, or may be about to come back."""
+        """Whether a browser is connected, or disconnected so recently that it may return."""
         now = time.perf_counter()
-        self._look_around(now)
+        self._poll_browsers(now)
         return now - self._seen_at <= GRACE
 
     def show(self, trainer: Trainer, event: Event) -> None:
-        """Serve the browsers after a step, in the trainer's thread; wait here while the training is paused.
+        """Serve the browsers after a training step, in the trainer's thread; block while the training is paused.
 
-        A callback of the trainer. Takes at most `SHARE` of the time, and microseconds where no browser is connected.
+        A callback of the trainer. It takes at most `SHARE` of the time, and microseconds if no browser is connected.
         """
         if not isinstance(event, StepEvent):
             return
         self._trainer, self._event = trainer, event
         self._left = max(self._left - 1, 0)
         with self._capture.clock_stopped():
-            self.look()
+            self.update()
             if self._left == 0:
                 self._hold()
 
-    def look(self, state: str = "training") -> None:
-        """Serve the browsers once, if it is their turn.
+    def update(self, state: str = "training") -> None:
+        """Serve the browsers once if an image is due.
 
         Args:
-            state: What the program does meanwhile, for the panel.
+            state: The program's current activity, shown in the panel.
         """
         while not self._commands.empty():
             self._commands.get()()
         now = time.perf_counter()
-        self._look_around(now)
+        self._poll_browsers(now)
         if not self._browsers or now < self._free_at:
             return
         if now - self._figures_at >= FIGURES_EVERY:
@@ -206,22 +206,22 @@ class LiveView:
         self._free_at = now + (time.perf_counter() - now) / SHARE
 
     def stay(self) -> None:
-        """Show the finished scene until no browser is connected any more, or the program is asked to end."""
+        """Show the finished scene until no browser is connected or the program should end."""
         self._left = math.inf
         self._pause.disabled = self._step.disabled = True
         self._wait("finished", lambda: False)
 
     def _hold(self) -> None:
-        """Wait until the training is to go on: a step, a resume, no browser left, or the end of the program."""
+        """Wait for a single step, a resume, the last browser to leave, or the end of the program."""
         self._pause.label = "Resume"
         self._wait("paused", lambda: self._left > 0)
-        if self._left == 0:  # nobody is there who could resume it
+        if self._left == 0:  # no browser is left to resume it
             self._left = math.inf
         if self._left == math.inf:
             self._pause.label = "Pause"
 
     def _wait(self, state: str, over: Callable[[], bool]) -> None:
-        """Draw for whoever looks until something is over, the program is to end, or no browser is left."""
+        """Serve the browsers until `over` returns true, the program should end, or no browser is left."""
         self._say(state)
         while not (over() or self._stop()):
             if not self.watched:
@@ -232,8 +232,8 @@ class LiveView:
             except queue.Empty:
                 continue
 
-    def _look_around(self, now: float) -> None:
-        """Note which browsers are there, and whose camera has moved."""
+    def _poll_browsers(self, now: float) -> None:
+        """Update the list of browsers and detect moved cameras."""
         handles = self._server.get_clients()
         for gone in self._browsers.keys() - handles.keys():
             del self._browsers[gone]
@@ -247,7 +247,7 @@ class LiveView:
             self._seen_at = now
 
     def _draw(self, now: float) -> None:
-        """Send one image, to the browser that has waited longest of those that need one."""
+        """Send one image, to the browser that has waited longest for one."""
         if self._trainer is None:
             return
         due = [browser for browser in self._browsers.values() if self._is_due(browser, now)]
@@ -256,15 +256,20 @@ class LiveView:
         browser = min(due, key=lambda candidate: candidate.drawn_at)
         browser.drawn, browser.drawn_at = self._wanted(browser, now), now
         seen, width = browser.handle.camera, browser.drawn[1]
+        canvas = (seen.image_width, seen.image_height)
         try:
-            canvas = (seen.image_width, seen.image_height)
             camera = browser_camera(seen.wxyz, seen.position, seen.fov, canvas, width)
+        except ArgumentError:
+            return  # the browser has sent no camera yet, or an invalid one: the next may be valid
+        try:
             with torch.no_grad():
                 image = self._render(self._trainer.gaussians, camera).image
-        except (SplatError, MemoryError, torch.cuda.OutOfMemoryError):
-            return  # no camera, or none that can be drawn: the training goes on, and the next one may be
+        except (SplatError, MemoryError, torch.cuda.OutOfMemoryError) as error:
+            self._note_failure(f"not drawn: {str(error) or 'out of memory'}")
+            return
+        self._note_failure("")
         levels = torch.nan_to_num(image).clamp(0.0, 1.0) * 255.0 + 0.5
-        with warnings.catch_warnings():  # viser warns where the browser has just gone
+        with warnings.catch_warnings():  # viser warns if the browser has just disconnected
             warnings.simplefilter("ignore")
             browser.handle.scene.set_background_image(
                 levels.to(torch.uint8).numpy(force=True), format="jpeg", jpeg_quality=JPEG_QUALITY
@@ -272,8 +277,10 @@ class LiveView:
         browser.handle.flush()
 
     def _wanted(self, browser: _Browser, now: float) -> tuple[float, int, int]:
-        """Return which image a browser should have: its camera's stamp, width and iteration."""
-        asked = int(min(WIDTHS[1], max(WIDTHS[0], self._width.value)))  # in this order NaN is the narrowest
+        """Return the image that a browser should have: time stamp of its camera, width, iteration."""
+        asked = int(
+            min(WIDTHS[1], max(WIDTHS[0], self._width.value))
+        )  # in this order, NaN becomes the smallest width
         width = min(asked, browser.handle.camera.image_width)
         if now - browser.moved_at < SETTLED:
             width = round(MOVING * width)
@@ -285,8 +292,15 @@ class LiveView:
             return True
         return wanted != browser.drawn and now - browser.drawn_at >= STILL_EVERY
 
+    def _note_failure(self, failure: str) -> None:
+        """Show in the panel why the last image was not drawn, or that it was: training continues either way."""
+        if failure != self._failure:
+            self._failure = failure
+            self._say(self._state)
+
     def _say(self, state: str) -> None:
-        """Show the figures of the last step."""
+        """Show the metrics of the last step."""
+        self._state = state
         lines = [f"**{state}**"]
         if self._event is not None and self._trainer is not None:
             total = self._trainer.config.iterations
@@ -296,8 +310,10 @@ class LiveView:
                 f"loss {self._event.loss:.4f}",
             ]
             if self._trainer.last is not None:
-                lines.append(f"PSNR {_psnr(self._trainer):.2f} dB, of the last photo")
-        said = "  \n".join(lines)  # two spaces end a line in Markdown
+                lines.append(f"PSNR {_psnr(self._trainer):.2f} dB (last photo)")
+        if self._failure:
+            lines.append(f"`{self._failure.replace('`', '')}`")
+        said = "  \n".join(lines)  # two spaces force a line break in Markdown
         if said != self._said:
             self._said = self._figures.content = said
 
@@ -316,15 +332,15 @@ class LiveView:
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         gui.set_panel_label("gsplat-edu train")
-        self._figures = gui.add_markdown("reading photos")
+        self._figures = gui.add_markdown("loading photos")
         self._pause, self._step = gui.add_button("Pause"), gui.add_button("Step")
         low, high = WIDTHS
-        self._width = gui.add_slider("Width, px", low, high, step=20, initial_value=START_WIDTH)
+        self._width = gui.add_slider("Width (px)", low, high, step=20, initial_value=START_WIDTH)
         self._pause.on_click(lambda event: self._commands.put(self._toggle))
         self._step.on_click(lambda event: self._commands.put(self._step_once))
         dataset = self._capture.dataset
         start = dataset.train[0].camera
-        reset = gui.add_button("Back to the start")
+        reset = gui.add_button("Reset view")
         reset.on_click(lambda event: self._send(event.client, start, self._up))
         views = _cameras(dataset.train, dataset.test)
         cameras = gui.add_dropdown("Camera", list(views), initial_value=dataset.train[0].name)
@@ -336,16 +352,16 @@ class LiveView:
         camera: Camera | None,
         up: Float64[np.ndarray, "3"] | None = None,
     ) -> None:
-        """Have a browser moved to a camera by the thread that trains; see `_move`."""
-        if browser is not None and camera is not None:  # a browser may ask for a name that is not in the list
+        """Ask the training thread to move a browser to a camera; see `_move`."""
+        if browser is not None and camera is not None:  # a browser may send a name that is not in the list
             self._commands.put(functools.partial(self._move, browser, camera, up))
 
     def _move(self, browser: viser.ClientHandle, camera: Camera, up: Float64[np.ndarray, "3"] | None) -> None:
-        """Move a browser to a camera, with `up` upwards; with the camera's own up where None."""
+        """Move a browser to a camera, with `up` upwards; None takes the camera's own up."""
         seen = browser.camera
-        if not seen.update_timestamp:  # it has not said yet where it stands
+        if not seen.update_timestamp:  # it has not sent its camera yet
             return
-        with warnings.catch_warnings(), browser.atomic():  # viser warns where the browser has just gone
+        with warnings.catch_warnings(), browser.atomic():  # viser warns if the browser has just disconnected
             warnings.simplefilter("ignore")
             seen.fov = _vertical_fov(camera)
             seen.position = camera.eye
@@ -364,7 +380,7 @@ class LiveView:
 
 
 class _Server(viser.ViserServer):
-    """viser without its tunnel, which any browser could ask for: it shows the view to the internet."""
+    """viser without its tunnel. Any browser could request the tunnel, which exposes the view to the internet."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Refuse."""
@@ -372,9 +388,9 @@ class _Server(viser.ViserServer):
 
 
 def _server(host: str, port: int, closing: ExitStack) -> tuple[viser.ViserServer, str]:
-    """Start viser's server; `closing` gets what ends it. Return the server and its token.
+    """Start viser's server and return it with its token; `closing` receives the clean-up.
 
-    viser takes the next free port where one is taken, and waits for ever for one that cannot be had.
+    If the port is in use, viser would take the next free one; if the address cannot be bound, it would wait forever.
     """
     wanted = free_port(host, port, NAMES)
     closing.enter_context(_silence())
@@ -384,14 +400,14 @@ def _server(host: str, port: int, closing: ExitStack) -> tuple[viser.ViserServer
         closing.callback(server.stop)
     if server.get_port() != wanted:
         raise ArgumentError(
-            f"{NAMES[1]}: {wanted} was taken this moment; give another, or 0 for any that is free"
+            f"{NAMES[1]}: {wanted} has just been taken; choose another port, or 0 for any free one"
         )
     return server, guard.token
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Keep what viser prints through rich's own console, and what its WebSockets log, off the terminal."""
+    """Keep viser's console output and its WebSocket log off the terminal."""
     console, logger = rich.get_console(), logging.getLogger("websockets")
     before = console.quiet, logger.level
     console.quiet = True
@@ -404,7 +420,7 @@ def _silence() -> Iterator[None]:
 
 
 def _cameras(train: Sequence[View], test: Sequence[View]) -> dict[str, Camera]:
-    """Return the cameras by the names that the list shows, in the capture's order."""
+    """Return the cameras by their names in the list, in the capture's order."""
     names = {view.name: view.name for view in train} | {view.name: f"{view.name} (held out)" for view in test}
     return {names[view.name]: view.camera for view in sorted([*train, *test], key=lambda view: view.name)}
 
@@ -416,5 +432,5 @@ def _vertical_fov(camera: Camera) -> float:
 def _psnr(trainer: Trainer) -> float:
     try:
         return math.nan if trainer.last is None else psnr(*trainer.last)
-    except SplatError:  # an image that is not finite has none
+    except SplatError:  # an image with NaN or infinity has no PSNR
         return math.nan

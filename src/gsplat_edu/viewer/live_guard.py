@@ -1,12 +1,12 @@
-"""Who may see a live view: whoever has the token of its URL, from its own page, by a name of this computer.
+"""Access control for the live view: only its own page, with the URL's token, under a name of this computer.
 
-viser serves anyone who connects, and browsers let any page open a WebSocket to any address. So each request, for a
-file or a WebSocket, passes three checks before viser sees it:
+viser serves anyone who connects, and browsers let any page open a WebSocket to any address. So each request for a file
+or a WebSocket must pass three checks before viser sees it:
 
-- Host names this computer (`gsplat_edu.viewer.serve.names_this_computer`), against DNS rebinding.
-- Origin, which a WebSocket must have, is that same host and port: the page was served here.
-- The token, random for each run, is in the URL or in the cookie that the page got when it was opened with it. viser's
-  client drops the query of its URL before it opens the WebSocket, so the cookie is what carries the token there.
+- Host names this computer (`gsplat_edu.viewer.serve.names_this_computer`); this prevents DNS rebinding.
+- Origin, required for a WebSocket, has the same host and port: the page was served here.
+- The token, random for each run, is in the URL or in the cookie set when the page was opened with it. viser's client
+  drops the URL's query before it opens the WebSocket, so there the cookie carries the token.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.viewer.serve import REQUEST_SECONDS, names_this_computer
 
 TOKEN_BYTES = 16
-"""Random bytes of a token: no guess will find one of 2^128."""
+"""Random bytes of a token: 2^128 possibilities cannot be guessed."""
 
 Process = Callable[[ServerConnection, Request], Response | None]
 
@@ -37,8 +37,8 @@ class Guard:
     """Checks requests to one server.
 
     Args:
-        host: What the server listens at.
-        port: Its port, which tells its cookie from those of other servers on this computer.
+        host: Address that the server listens on.
+        port: Its port, which distinguishes its cookie from those of other servers on this computer.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -48,10 +48,11 @@ class Guard:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Put the guard before the WebSocket server that is started meanwhile.
+        """Install the guard in front of the WebSocket server that is started inside the context.
 
         Raises:
-            ArgumentError: none was started by the function of websockets that viser calls, so nothing would be checked.
+            ArgumentError: viser did not start one through the expected function of websockets, so nothing would be
+                checked.
         """
         serve, started = websockets.asyncio.server.serve, []
 
@@ -68,13 +69,13 @@ class Guard:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
         if not started:
             raise ArgumentError(
-                "--view: this version of viser cannot be guarded; install that of constraints.txt, or leave it out"
+                "--view: this version of viser cannot be guarded; install the one in constraints.txt, or omit --view"
             )
 
     def _process(
         self, process: Process | None, connection: ServerConnection, request: Request
     ) -> Response | None:
-        """Refuse a request, or let viser answer it."""
+        """Reject a request, or let viser answer it."""
         if (fault := self._fault(request)) is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"403 Forbidden: {fault}\n")
         response = None if process is None else process(connection, request)
@@ -89,21 +90,19 @@ class Guard:
     def _fault(self, request: Request) -> str | None:
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) != 1 or not names_this_computer(hosts[0], self._host):
-            return "this server has no such name"
-        own = {
-            f"{scheme}://{hosts[0]}".lower() for scheme in ("http", "https")
-        }  # https where a proxy adds it
+            return "unknown host name for this server"
+        own = {f"{scheme}://{hosts[0]}".lower() for scheme in ("http", "https")}  # https if a proxy adds it
         is_socket = "Upgrade" in request.headers
         if len(origins) > 1 or (is_socket and not origins) or not own.issuperset(map(str.lower, origins)):
-            return "a page from elsewhere"
+            return "requests from other pages are not allowed"
         if not any(
             secrets.compare_digest(given.encode(), self.token.encode()) for given in self._given(request)
         ):
-            return "open the URL that the training printed, with its token"
+            return "open the URL that the training printed, including its token"
         return None
 
     def _given(self, request: Request) -> list[str]:
-        """Return the tokens that a request has: in its URL, and in its cookies."""
+        """Return the tokens of a request, from its URL and its cookies."""
         query = urllib.parse.urlsplit(request.path).query
         given = urllib.parse.parse_qs(query).get("token", [])
         for header in request.headers.get_all("Cookie"):

@@ -1,8 +1,8 @@
-"""A scene as one HTML file that draws it in any browser with WebGL2, from disk and without a network.
+"""Export a scene as one HTML file that renders it in any browser with WebGL2, offline.
 
-The file holds, in this order: our style, shaders and scripts (`viewer/web`), the facts of the scene as JSON, and the
-splats (`viewer/page_data.py`), gzip'ed and in base64, cut into elements that a browser can take one after another. Its
-Content-Security-Policy allows these scripts by their hashes and nothing from elsewhere.
+The file contains, in this order: our style, shaders and scripts (`viewer/web`), metadata of the scene as JSON, and the
+splats (`viewer/page_data.py`), compressed with gzip, encoded in base64, and split into elements that a browser can
+process one by one. Its Content-Security-Policy allows these scripts by their hashes and blocks everything external.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FORMAT = "gsplat-edu page"
 VERSION = 1
 
 SCRIPTS = ("scene.js", "region.js", "camera.js", "draw.js", "sorter.js", "controls.js", "panel.js", "main.js")
-"""Scripts of the page, in the order in which they are loaded: they share one scope."""
+"""The page's scripts in loading order; they share one scope."""
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
 
@@ -53,13 +53,13 @@ SHADER_CONSTANTS = (
     "C2",
     "C3",
 )
-"""Names of `gsplat_edu.constants` that shaders use."""
+"""Names in `gsplat_edu.constants` that the shaders use."""
 
 FINITE = 3e38
-"""What is larger than this in a shader counts as infinite: float32 ends at 3.4e38."""
+"""Larger values count as infinite in a shader; float32 ends at 3.4e38."""
 
 PIECE = 12 << 20
-"""Bytes of compressed splats in an element, a multiple of 3 so that the base64 of one goes on in the next."""
+"""Compressed bytes per element, a multiple of 3 so that the base64 of one element continues in the next."""
 
 FACTS_OPEN, SPLATS_OPEN, CLOSE = (
     b'<script type="application/json" id="facts">',
@@ -75,19 +75,19 @@ def write(
     settings: RenderSettings | None = None,
     held_out: Collection[str] = (),
 ) -> None:
-    """Write the page; the file's name without its suffix is the title.
+    """Write the page; its title is the file's name without the suffix.
 
     Args:
-        path: The file; parent folders are made.
+        path: Output file; parent folders are created.
         scene: The scene; it may be empty.
-        views: Name and camera of each place to look from, as the list shows them; the page begins at the first one
-            that was not held out.
-        settings: How to draw; as scene files are drawn where None (`gsplat_edu.runs.source.file_settings`).
-        held_out: Names of the views that judge the scene: the list marks them.
+        views: Name and camera of each viewpoint in the page's list; the page starts at the first one that was not held
+            out.
+        settings: Render settings; None takes those of scene files (`gsplat_edu.runs.source.file_settings`).
+        held_out: Names of the test views, which are marked in the list.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
-        OSError: the file cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     pieces = _pieces(path.stem, scene, views, settings, held_out)
     with written_aside(path) as aside, aside.open("wb") as file:
@@ -101,13 +101,13 @@ def html(
     title: str = "scene",
     held_out: Collection[str] = (),
 ) -> bytes:
-    """Return the page as `write` writes it.
+    """Return the page's bytes.
 
     Args:
         scene: As for `write`.
         views: As for `write`.
         settings: As for `write`.
-        title: What stands above the picture.
+        title: Heading of the page.
         held_out: As for `write`.
 
     Raises:
@@ -117,19 +117,19 @@ def html(
 
 
 def policy() -> str:
-    """Return the Content-Security-Policy of every page: its scripts, its style, and a worker that sorts."""
+    """Return the Content-Security-Policy of every page: its scripts, its style, and a sorting worker."""
     return content_policy(map(_web, SCRIPTS), [_web("style.css")], workers=True)
 
 
 def read(path: Path) -> Scene:
-    """Read the scene back that a page draws: positions and scales to the bit, the rest as the page has it.
+    """Read the scene from a page: means and scales are exact, the other parameters have the page's precision.
 
     Args:
         path: The file.
 
     Raises:
-        SceneFormatError: it is no page of ours, or damaged.
-        OSError: it cannot be read.
+        SceneFormatError: the file is not one of our pages, or it is damaged.
+        OSError: the file cannot be read.
     """
     data = read_bytes(path)
     if data.startswith(b"version https://git-lfs"):
@@ -154,11 +154,11 @@ def _pieces(
     settings: RenderSettings | None,
     held_out: Collection[str],
 ) -> Iterator[bytes]:
-    """Yield the file, so that its parts need not be in memory together."""
+    """Yield the file in parts, so that they need not be in memory together."""
     scene.gaussians.check_finite()
     facts = _facts(title, scene, views, settings or file_settings(scene), held_out)
     head, tail = _web("index.html").split("{{splats}}\n")
-    yield _filled(head, title, facts).encode("utf-8", errors="replace")  # a file's name may be no text at all
+    yield _filled(head, title, facts).encode("utf-8", errors="replace")  # a file name may not be valid text
     compressed = memoryview(gzip.compress(page_data.packed(scene.gaussians), 6, mtime=0))
     for begin in range(0, len(compressed), PIECE):
         yield SPLATS_OPEN + base64.b64encode(compressed[begin : begin + PIECE]) + CLOSE + b"\n"
@@ -207,20 +207,20 @@ def _camera(camera: Camera) -> dict[str, Any]:
 
 
 def _filled(template: str, title: str, facts: dict[str, Any]) -> str:
-    """Fill in what stands before the splats."""
+    """Fill in the part before the splats."""
     style = _web("style.css")
     scripts = [_web(name) for name in SCRIPTS]
     texts = {
         "title": html_text.escape(title),
         "policy": policy_element(policy()),
         "style": style,
-        # "<" as an escape: no text in JSON can end the element that it stands in
+        # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         "shaders": "\n".join(_text_element(name, _shader(name)) for name in SHADERS),
         "worker": _text_element("sort-worker", _web("sort_worker.js")),
         "scripts": "\n".join(f"<script>{script}</script>" for script in scripts),
     }
-    # one pass over the template alone: what looks like a name inside a text stays as it is
+    # One pass over the template only: placeholders inside inserted text stay unchanged.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], template)
 
 
@@ -233,7 +233,7 @@ def _web(name: str) -> str:
 
 
 def _shader(name: str) -> str:
-    """Return a shader of ours, with the renderer's constants in front."""
+    """Return one of our shaders, preceded by the renderer's constants."""
     lines = ["#version 300 es", "precision highp float;", f"const float FINITE = {FINITE!r};"]
     for constant in SHADER_CONSTANTS:
         value = getattr(constants, constant)
@@ -246,20 +246,22 @@ def _shader(name: str) -> str:
 
 
 def _read_facts(path: Path, data: bytes) -> dict[str, Any]:
-    """Return the facts of a page, those that `read` uses checked."""
+    """Return a page's metadata; the entries that `read` uses are validated."""
     begin = data.find(FACTS_OPEN) + len(FACTS_OPEN)
     end = data.find(CLOSE, begin)
     if begin < len(FACTS_OPEN) or end < 0:
-        raise SceneFormatError(f"{path}: is no page of this package, or cut off; export the page again")
+        raise SceneFormatError(
+            f"{path}: is not a page of this package, or is truncated; export the page again"
+        )
     try:
         facts = parse_json(data[begin:end])
     except ValueError:
         facts = None
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise SceneFormatError(f"{path}: its facts are damaged; export the page again")
+        raise SceneFormatError(f"{path}: the metadata is damaged; export the page again")
     if facts.get("version") != VERSION:
         raise SceneFormatError(
-            f"{path}: is a page of version {facts.get('version')!r}, read is {VERSION}; export it again"
+            f"{path}: has page version {facts.get('version')!r}, but {VERSION} is supported; export the page again"
         )
     count, degree, antialiased, up = (
         facts.get(name, "missing") for name in ("count", "sh_degree", "antialiased", "up")
@@ -271,7 +273,7 @@ def _read_facts(path: Path, data: bytes) -> dict[str, Any]:
         "up": up is None or _is_direction(up),
     }.items():
         if not fits:
-            raise SceneFormatError(f"{path}: its fact '{name}' is missing or wrong; export the page again")
+            raise SceneFormatError(f"{path}: metadata '{name}' is missing or invalid; export the page again")
     return facts
 
 
@@ -282,10 +284,10 @@ def _is_direction(value: object) -> bool:
 
 
 def _inflated(path: Path, data: bytes, size: int) -> bytes:
-    """Return the splats' bytes: exactly so many, or an error."""
+    """Decompress the splats; fail unless they have exactly the expected number of bytes."""
     inflater = zlib.decompressobj(wbits=31)
     pieces = []
-    room = size + 1  # one more than there may be, so that more is noticed; and zlib takes 0 for no limit
+    room = size + 1  # one extra byte reveals surplus data; zlib treats 0 as no limit
     begin = data.find(SPLATS_OPEN)
     try:
         while begin >= 0:
@@ -299,7 +301,7 @@ def _inflated(path: Path, data: bytes, size: int) -> bytes:
                 packed = inflater.unconsumed_tail
             begin = data.find(SPLATS_OPEN, begin)
     except (zlib.error, ValueError):  # binascii's error is a ValueError
-        raise SceneFormatError(f"{path}: its splats are damaged; export the page again") from None
+        raise SceneFormatError(f"{path}: the splats are damaged; export the page again") from None
     if room != 1 or not inflater.eof:
-        raise SceneFormatError(f"{path}: its splats are cut off or damaged; export the page again")
+        raise SceneFormatError(f"{path}: the splats are truncated or damaged; export the page again")
     return b"".join(pieces)

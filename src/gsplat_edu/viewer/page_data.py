@@ -1,4 +1,4 @@
-"""The splats of a page as bytes: one array after another, little-endian, each splat's numbers together.
+"""Binary layout of a page's splats: one little-endian array after another, each with all splats.
 
     means            3 float32   world units
     log_scales       3 float32
@@ -6,8 +6,8 @@
     sh               3 (d + 1)² float16   coefficient by coefficient, RGB
     logit_opacities  1 float16
 
-Positions and scales keep their bits, because a needle seen from nearby shows every error of them. A component of a
-quaternion is off by at most 1/65534, which turns the splat by less than 1e-4; float16 keeps 11 bits.
+Means and scales keep their full precision because every error of a needle is visible close up. A quaternion component
+is off by at most 1/65534, which rotates the splat by less than 1e-4 rad; float16 keeps 11 bits.
 
 `viewer/web/scene.js` reads the same list.
 """
@@ -24,14 +24,14 @@ from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.gaussians import Gaussians
 
 QUAT_STEPS = 32767
-"""Whole numbers between 0 and 1 of a quaternion's component."""
+"""Integer steps from 0 to 1 in a quaternion component."""
 
 
 def packed(gaussians: Gaussians) -> bytes:
     """Pack Gaussians.
 
     Args:
-        gaussians: N Gaussians, all finite. Harmonics and logits beyond what float16 holds become its largest.
+        gaussians: N Gaussians, all finite. SH coefficients and logits beyond the range of float16 are clamped to it.
 
     Returns:
         The bytes, `size(N, degree)` of them.
@@ -50,7 +50,7 @@ def packed(gaussians: Gaussians) -> bytes:
 
 
 def size(count: int, sh_degree: int) -> int:
-    """Return how many bytes so many Gaussians of an SH degree are packed into."""
+    """Return the packed size of Gaussians in bytes."""
     return count * (12 + 12 + 8 + 6 * (sh_degree + 1) ** 2 + 2)
 
 
@@ -58,7 +58,7 @@ def unpacked(path: Path, data: bytes, count: int, sh_degree: int) -> Gaussians:
     """Unpack Gaussians.
 
     Args:
-        path: The file's name, for the message.
+        path: The file's name for messages.
         data: `size(count, sh_degree)` bytes.
         count: Number of Gaussians.
         sh_degree: Their SH degree.
@@ -67,7 +67,7 @@ def unpacked(path: Path, data: bytes, count: int, sh_degree: int) -> Gaussians:
         N Gaussians, float32.
 
     Raises:
-        SceneFormatError: a number is NaN or infinite.
+        SceneFormatError: a value is NaN or infinite.
     """
     begin = 0
 
@@ -90,7 +90,7 @@ def unpacked(path: Path, data: bytes, count: int, sh_degree: int) -> Gaussians:
     finite = gaussians.finite_rows()
     if not bool(finite.all()):
         bad = int((~finite).sum())
-        raise SceneFormatError(f"{path}: {bad} splats have a NaN or infinite number; export the page again")
+        raise SceneFormatError(f"{path}: {bad} splats have NaN or infinite values; export the page again")
     return gaussians
 
 
@@ -113,7 +113,7 @@ def _rounded(
 
 
 def _whole(quats: Float[np.ndarray, "N 4"]) -> Int16[np.ndarray, "N 4"]:
-    # The largest entry is divided out first, so that the norm neither overflows nor underflows.
+    # Dividing by the largest entry first keeps the norm from overflowing or underflowing.
     largest = np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
     scaled = quats / np.where(largest > 0, largest, 1.0)
     norms = np.linalg.norm(scaled, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Where a page begins: its first camera, the point that orbits go around, and what is up."""
+"""A page's initial view: its camera, the pivot of orbits, and the up direction."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from gsplat_edu.evaluate.paths import common_up, orbit_of_scene
 from gsplat_edu.io.scene import Scene
 
 SIDE = 800
-"""px of the start's image where no camera lends its size; the window's size takes its place."""
+"""Size of the initial image if there is no camera, px; the page replaces it by the window's size."""
 
 ORBIT = 4
-"""Cameras of the orbit that its centre is found from."""
+"""Cameras of the orbit whose centre becomes the pivot."""
 
 CENTRAL_PART = 0.5
-"""Part of a camera's image, along each side, in which what it looks at is sought."""
+"""Central fraction of a camera's image, along each side, that is searched for its subject."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The first view.
+    """The initial view.
 
     Args:
         camera: The camera.
-        pivot: (3,) point that orbits go around.
-        up: (3,) direction that is up, of length 1.
-        index: Which of the capture's cameras it is; -1 where it is none of them.
+        pivot: (3,) centre of orbits.
+        up: (3,) up direction, of length 1.
+        index: Index of the camera in the capture; -1 if it is not from the capture.
     """
 
     camera: Camera
@@ -41,12 +41,12 @@ class Start:
 
 
 def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
-    """Choose the first view: a camera, or where an orbit around the scene begins.
+    """Choose the initial view: a camera of the capture, or else the first one of an orbit around the scene.
 
     Args:
         scene: The scene; it may be empty.
-        cameras: Those of its capture, if any.
-        index: Which of them.
+        cameras: The capture's cameras, if any.
+        index: The camera to start at.
     """
     up = np.array(scene.up or WORLD_UP, dtype=np.float64)
     up = common_up(cameras) if scene.up is None and cameras else up / np.linalg.norm(up)
@@ -65,18 +65,18 @@ def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
 def pivot_of(
     cameras: Sequence[Camera], index: int, points: Float[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, "3"]:
-    """Find what an orbit from a camera should go around.
+    """Find the pivot of orbits that start at a camera.
 
-    Cameras that stand around something look at its centre. Where they face one way, or wander, their axes cross at
-    random or nowhere: there it is the median depth of the points in the middle of the camera's image.
+    If the cameras surround a subject, the pivot is its centre. If they face one way or wander, their axes have no
+    meaningful intersection; the pivot then lies at the median depth of the points in the middle of the camera's image.
 
     Args:
         cameras: At least one.
-        index: Which of them the orbit begins at.
-        points: (N, 3) what there is to look at; may be empty.
+        index: The camera that the orbit starts at.
+        points: (N, 3) points of the scene; may be empty.
 
     Returns:
-        (3,) a point in front of the camera, on its axis unless the cameras stand around it.
+        (3,) a point in front of the camera, on its axis unless the cameras surround a subject.
     """
     camera, geometry = cameras[index], Geometry(cameras, np.asarray(points, dtype=np.float64))
     centre = geometry.centre if geometry.arrangement == INWARD else None

@@ -1,4 +1,4 @@
-"""One page, served from memory to browsers on this computer. No file can be reached through the server."""
+"""Serve one page from memory to browsers on this computer. The server gives no access to files."""
 
 from __future__ import annotations
 
@@ -22,48 +22,48 @@ from gsplat_edu.validation import whole_number
 LOOPBACK = "127.0.0.1"
 
 LOCAL_NAME = r"(?:127(?:\.\d{1,3}){3}|localhost|\[::1\])(?::\d+)?"
-"""How a browser on this computer names it, as a regular expression; the port may be that of a tunnel."""
+"""Names by which a browser on this computer addresses it, as a regular expression; a tunnel may change the port."""
 
 HIGHEST_PORT = 65_535
 
 CHUNK = 1 << 20
-"""Bytes written at a time: the time limit is for each of them, not for a page of many MB."""
+"""Bytes per write. The time limit holds for each chunk, not for a page of many MB."""
 
 PATIENCE = 30.0
-"""Seconds that a browser may take for each chunk of the page."""
+"""Seconds allowed for each chunk of the page."""
 
 REQUEST_SECONDS = 10.0
-"""Seconds in which a whole request has to arrive, however it trickles in."""
+"""Seconds within which a whole request must arrive, however slowly it trickles in."""
 
 REQUEST_BYTES = 64 << 10
-"""Longest request. Browsers send one or two KB; bodies are not read at all."""
+"""Longest request. Browsers send one or two KB; bodies are never read."""
 
 MOST_CONNECTIONS = 128
-"""Connections, each with a thread, that are served at once. More are closed unanswered."""
+"""Connections, with a thread each, that are served at once. Further ones are closed without an answer."""
 
 PRIVATE_SUFFIXES = (".local", ".localdomain", ".lan", ".home", ".home.arpa", ".internal")
-"""How names end that only a local network can give: no page from elsewhere can have one."""
+"""Suffixes of names that only a local network can assign; no external page can have such a name."""
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves one page at `/`, and nothing else.
+    """Serves one page at `/` and nothing else.
 
-    It takes connections from the moment it is made; `serve_forever` answers them. Bound to this computer, it answers
-    only requests that name this computer as their host: otherwise a page from elsewhere could have its own name point
-    here, and read what is served (DNS rebinding). Bound to other addresses, it answers those that name an address, this
-    computer, or a name that only a local network can give.
+    It accepts connections once created; `serve_forever` answers them. A server bound to a loopback address answers only
+    requests whose Host names this computer. Otherwise an external page could let its own name resolve to this address
+    and read the page (DNS rebinding). A server bound to another address also answers requests that name an address or a
+    name that only a local network can assign.
 
-    A request has to arrive within `REQUEST_SECONDS` and `REQUEST_BYTES`, or its connection is closed.
+    A request must arrive within `REQUEST_SECONDS` and `REQUEST_BYTES`; otherwise its connection is closed.
 
     Args:
         page: The page.
-        host: Address to listen at.
-        port: Port; 0 for any that is free.
-        names: What the user calls host and port, for messages.
-        policy: Content-Security-Policy of the page, sent as a header too; none where empty.
+        host: Address to listen on.
+        port: Port; 0 picks a free one.
+        names: The user's names for host and port, for messages.
+        policy: Content-Security-Policy of the page, also sent as a header; empty sends none.
 
     Raises:
-        ArgumentError: the address is none of this computer's, or the port is taken or out of range.
+        ArgumentError: the address does not belong to this computer, or the port is in use or out of range.
     """
 
     daemon_threads = True
@@ -88,36 +88,36 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Where a browser finds the page."""
+        """The page's address."""
         return url_of(str(self.server_address[0]), self.server_port)
 
     def server_bind(self) -> None:
-        """Bind, without asking the network for the name of this computer."""
+        """Bind without looking up this computer's name on the network."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Serve a connection in a thread of its own, or close it where there are too many."""
+        """Serve a connection in its own thread, or close it if there are too many."""
         if self._room.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Serve a connection, in its thread."""
+        """Serve a connection in its thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Say nothing: all that can fail is a connection that the browser has closed, or that was cut off."""
+        """Ignore errors: only connections that were closed or cut off can fail."""
 
 
 class _Request(io.RawIOBase):
-    """The bytes of one request, from a socket, within limits on their time and number.
+    """The bytes of one request from a socket, limited in time and number.
 
-    A time limit on each read would let a client send a byte now and then, and hold its thread for ever.
+    A time limit per read would not suffice: a client could send a byte now and then and hold its thread forever.
     """
 
     def __init__(self, connection: socket.socket) -> None:
@@ -148,7 +148,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.rfile = io.BufferedReader(_Request(self.connection))
 
     def __getattr__(self, name: str) -> Callable[[], None]:
-        # http.server looks for do_METHOD: whatever has none here is a method that is not allowed
+        # http.server looks up do_METHOD; a missing one means that the method is not allowed
         if name.startswith("do_"):
             return lambda: self._say(http.HTTPStatus.METHOD_NOT_ALLOWED)
         raise AttributeError(name)
@@ -163,7 +163,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(page[begin : begin + CHUNK])
 
     def _answer(self) -> bool:
-        """Send the headers of the page and say so; else those that say why not."""
+        """Send the page's headers and return true, or send an error and return false."""
         hosts = self.headers.get_all("Host") or []
         if len(hosts) != 1 or not names_this_computer(hosts[0], self.server.bound_host):
             self._say(http.HTTPStatus.FORBIDDEN)
@@ -202,49 +202,47 @@ class _Handler(BaseHTTPRequestHandler):
 def checked_address(
     host: str, port: int, names: tuple[str, str]
 ) -> tuple[socket.AddressFamily, tuple[Any, ...]]:
-    """Turn host and port into what a socket is bound to.
+    """Convert host and port to the address of a socket.
 
     Args:
         host: Name or address.
-        port: Port; 0 for any that is free.
-        names: What the user calls the two, for messages.
+        port: Port; 0 picks a free one.
+        names: The user's names for host and port, for messages.
 
     Returns:
-        The family of the address, and the address.
+        The address family and the address.
 
     Raises:
-        ArgumentError: the host has no address, or the port is out of range.
+        ArgumentError: the host cannot be resolved, or the port is out of range.
     """
     port = whole_number(names[1], port, 0, HIGHEST_PORT)
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except (OSError, UnicodeError):  # names of no letters, or too many, fail in their encoding
+    except (OSError, UnicodeError):  # names without letters, or too long, fail in their encoding
         raise ArgumentError(
-            f"{names[0]}: {host!r} is no address; give {LOOPBACK}, or one of this computer's"
+            f"{names[0]}: {host!r} is not an address; give {LOOPBACK} or an address of this computer"
         ) from None
     family, _, _, _, address = found[0]
     return family, address
 
 
 def free_port(host: str, port: int, names: tuple[str, str]) -> int:
-    """Find out whether a port can be listened at, for servers that do not say it when it cannot.
+    """Check that a port is available, for servers that do not report it themselves.
 
     Args:
         host: Name or address.
-        port: Port; 0 for any that is free.
-        names: What the user calls the two, for messages.
+        port: Port; 0 picks a free one.
+        names: The user's names for host and port, for messages.
 
     Returns:
-        The port, or one that is free.
+        The port, or a free one if `port` is 0.
 
     Raises:
-        ArgumentError: the address is none of this computer's, or the port is taken or out of range.
+        ArgumentError: the address does not belong to this computer, or the port is in use or out of range.
     """
     family, address = checked_address(host, port, names)
     with socket.socket(family, socket.SOCK_STREAM) as probe:
-        if (
-            os.name == "posix"
-        ):  # as servers do it: a port whose last connections are just being closed is free
+        if os.name == "posix":  # as servers do: a port whose last connections are closing counts as free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(address)
@@ -255,15 +253,14 @@ def free_port(host: str, port: int, names: tuple[str, str]) -> int:
 
 
 def names_this_computer(header: str, bound: str) -> bool:
-    """Say whether a Host header names this computer in a way that no page from elsewhere could arrange.
+    """Return whether a Host header names this computer in a way that no external page could arrange.
 
-    A page whose name is in the public DNS can have that name point to any address, and would then share the origin of
-    what is served there. It cannot do so with an address, nor with a name outside the public DNS.
+    The owner of a name in the public DNS can let it resolve to any address; a page under that name would then share the
+    origin of this server. Addresses and names outside the public DNS are safe.
 
     Args:
-        header: Value of the header: a name or address, and a port or none.
-        bound: What the server was told to listen at. Names of other computers are turned away where it is a loopback
-            address.
+        header: Value of the header: a name or address, with an optional port.
+        bound: Address that the server is bound to. If it is a loopback address, names of other computers are rejected.
     """
     if re.fullmatch(LOCAL_NAME, header, re.IGNORECASE):
         return True
@@ -280,40 +277,40 @@ def names_this_computer(header: str, bound: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Say whether only this computer can reach what listens at a host."""
+    """Return whether an address can be reached only from this computer."""
     return re.fullmatch(rf"{LOCAL_NAME}|::1", host, re.I) is not None
 
 
 def url_of(host: str, port: int) -> str:
-    """Return the URL of a page on this computer that is served at a host and port."""
-    if host in ("0.0.0.0", "::"):  # every address of this computer
+    """Return the URL of a page served on this computer."""
+    if host in ("0.0.0.0", "::"):  # all addresses of this computer
         host = LOOPBACK if host == "0.0.0.0" else "::1"
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
 def exposure(host: str, what: str, token: bool = False) -> str | None:
-    """Return the sentence that warns of a server which others can reach; None where only this computer can.
+    """Return a warning if other computers can reach a server; None if only this one can.
 
     Args:
-        host: Where it listens.
-        what: What it lets them do.
-        token: Whether its URL has a token, without which it answers nobody.
+        host: Address that the server listens on.
+        what: What others can do with it, as a verb phrase.
+        token: Whether the server requires the token in its URL.
     """
     if is_loopback(host):
         return None
     if token:
-        who = "whoever can reach this computer and has the URL"
-        return f"warning: listening at {host}: {who} {what}; the connection is not encrypted"
-    return f"warning: listening at {host}: whoever can reach this computer {what}; there is no password"
+        who = "anyone who can reach this computer and has the URL"
+        return f"warning: listening on {host}: {who} {what}; the connection is not encrypted"
+    return f"warning: listening on {host}: anyone who can reach this computer {what}; there is no password"
 
 
 def _refusal(host: str, port: int, names: tuple[str, str], error: OSError) -> ArgumentError:
     if error.errno == errno.EADDRINUSE:
         return ArgumentError(
-            f"{names[1]}: {port} is taken on {host}; give another, or 0 for any that is free"
+            f"{names[1]}: {port} is in use on {host}; choose another port, or 0 for any free one"
         )
     if error.errno == errno.EACCES:
-        return ArgumentError(f"{names[1]}: {port} may not be used ({error.strerror}); give one above 1023")
+        return ArgumentError(f"{names[1]}: {port} is not permitted ({error.strerror}); choose one above 1023")
     return ArgumentError(
-        f"{names[0]}: cannot listen at {host} ({error.strerror}); give {LOOPBACK}, or leave it out"
+        f"{names[0]}: cannot listen on {host} ({error.strerror}); give {LOOPBACK} or omit the option"
     )

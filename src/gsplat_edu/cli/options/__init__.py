@@ -1,5 +1,7 @@
-"""The options of every command, a module each: EXAMPLE and `add_arguments`, and `check` where there is one.
+"""The options of every command, one module each: EXAMPLE, `add_arguments`, and optionally `check` and COMMON.
 
-Nothing here imports torch, OpenCV, SciPy or matplotlib, which take seconds: usage errors, `--help` and values that are
-out of range are answered before a command's own module, `gsplat_edu.cli.NAME` with its `run`, is imported.
+COMMON names the options that `--help` shows where a command has many; `--help-all` shows the others too.
+
+Nothing here imports torch, OpenCV, SciPy or matplotlib, which take seconds: usage errors, `--help` and values out of
+range are answered before the command's own module, `gsplat_edu.cli.NAME` with its `run`, is imported.
 """

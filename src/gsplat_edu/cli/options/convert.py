@@ -10,47 +10,51 @@ from gsplat_edu.constants import SH_MAX_DEGREE
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
 
-MOVES = "scale=S, rotate=AXIS:DEGREES (x:90), move=X,Y,Z or matrix=FILE (12 or 16 numbers, rows first)"
+MOVES = "scale=S, rotate=AXIS:DEGREES (x:90), move=X,Y,Z or matrix=FILE (12 or 16 numbers, row by row)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("sources", type=Path, nargs="+", metavar="IN", help="scene file, or folder of a run")
+    parser.add_argument("sources", type=Path, nargs="+", metavar="IN", help="scene file or run folder")
     parser.add_argument(
         "out",
         type=Path,
         metavar="OUT",
-        help="file to write: its suffix is the format, .ply .compressed.ply .splat .spz .sog .glb or .html"
-        " (a page that draws the scene); FOLDER/meta.json is a SOG in a folder",
+        help="file to write; its suffix selects the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb or .html"
+        " (a page that shows the scene); FOLDER/meta.json writes an unzipped SOG",
     )
-    parser.add_argument("--merge", action="store_true", help="join several IN into one scene")
+    parser.add_argument("--merge", action="store_true", help="join several scenes into one")
     parser.add_argument(
         "--sh-degree",
         type=whole_number_text,
         default=SH_MAX_DEGREE,
         metavar="N",
-        help="highest degree of harmonics to keep (default: %(default)s)",
+        help="highest degree of spherical harmonics to keep (default: %(default)s)",
     )
     parser.add_argument(
-        "--min-opacity", type=float, default=0.0, metavar="A", help="leave out splats of lower opacity"
+        "--min-opacity",
+        type=float,
+        default=0.0,
+        metavar="A",
+        help="drop Gaussians with a lower opacity (default: 0)",
     )
     parser.add_argument(
         "--crop",
         type=numbers_text(6),
         metavar="X0,Y0,Z0,X1,Y1,Z1",
-        help="keep splats whose centre lies in the box, in the coordinates of IN; --crop=-1,... where it"
-        " begins with a minus",
+        help="keep only Gaussians whose centre lies in this box, in the coordinates of IN; write --crop=-1,... if the"
+        " first number is negative",
     )
     parser.add_argument(
         "--transform",
         action="append",
         default=[],
         metavar="KIND=VALUE",
-        help=f"move the scene, after --crop; {MOVES}; several are done in their order",
+        help=f"transform the scene after --crop: {MOVES}; may be repeated and is applied in order",
     )
     parser.add_argument(
         "--verify",
         action="store_true",
-        help="read OUT again and compare renders of both, from some of the run's cameras or an orbit",
+        help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",
     )
     add_backend(parser)

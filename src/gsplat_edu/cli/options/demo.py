@@ -12,7 +12,7 @@ EXAMPLE = "example: gsplat-edu demo --iters 100 --size 48 --out out/quick.png"
 
 
 class Budget(NamedTuple):
-    """How long to train, up to how many Gaussians, at which image size."""
+    """Iterations, cap on the number of Gaussians, and image size in px."""
 
     iters: int
     cap: int
@@ -23,7 +23,7 @@ CHAPTER = Budget(iters=800, cap=1600, size=128)
 """The chapter's run."""
 
 REDUCED = Budget(iters=300, cap=800, size=64)
-"""What the dense backend torch trains by default: about a twentieth of the chapter's work."""
+"""Default of the dense backend torch: about a twentieth of the chapter's work."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,18 +36,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     for name, text in (
         ("iters", "training iterations"),
-        ("cap", "largest number of Gaussians"),
-        ("size", "height and width of the images in px"),
+        ("cap", "maximum number of Gaussians"),
+        ("size", "height and width of the images, px"),
     ):
-        default = f"(default: {getattr(CHAPTER, name)}; {getattr(REDUCED, name)} on the dense backend torch)"
+        default = f"(default: {getattr(CHAPTER, name)}; {getattr(REDUCED, name)} with --backend torch)"
         parser.add_argument(f"--{name}", type=whole_number_text, metavar="N", help=f"{text} {default}")
-    number("--k0", 400, "Gaussians at the start")
-    number("--seed", 9, "seed of the start, the splits and the view order")
+    number("--k0", 400, "initial number of Gaussians")
+    number("--seed", 9, "seed of the initial Gaussians, the splits and the view order")
     add_backend(parser)
     parser.add_argument(
         "--out",
         type=Path,
         metavar="X.png",
         default=Path("out/sphere.png"),
-        help="figure of the held-out camera; X_curves.png and X.ply go beside it (default: %(default)s)",
+        help="figure to write; X_curves.png and X.ply are written beside it (default: %(default)s)",
     )

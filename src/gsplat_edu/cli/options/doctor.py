@@ -14,33 +14,31 @@ EXAMPLE = "example: gsplat-edu doctor captures/plush"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument(
-        "path", type=Path, metavar="PATH", help="a capture before training, or the folder of a run after it"
+        "path", type=Path, metavar="PATH", help="capture (before training) or run folder (after it)"
     )
     before = parser.add_argument_group("before training")
     before.add_argument(
-        "--no-forecast", action="store_true", help="do not say what a training would take on this machine"
+        "--no-forecast", action="store_true", help="skip the forecast of training time and memory"
     )
     before.add_argument(
         "--iterations",
         type=whole_number_text,
         metavar="N",
         default=RECIPE_ITERATIONS,
-        help=f"steps of the training that is forecast (default: {RECIPE_ITERATIONS})",
+        help=f"iterations of the forecast training (default: {RECIPE_ITERATIONS})",
     )
     before.add_argument(
         "--resolution",
         type=float,
         metavar="R",
-        help="of that training: a factor below 32, or the longest side in px",
+        help="resolution of the forecast training: a divisor below 32, or the longest side in px",
     )
     after = parser.add_argument_group("after training")
     after.add_argument(
         "--dataset",
         type=Path,
         metavar="PATH",
-        help="the dataset's folder, where it is not where the run had it",
+        help="the run's capture, if its folder has moved",
     )
-    after.add_argument(
-        "--all-views", action="store_true", help="list the PSNR of every view, the worst first"
-    )
+    after.add_argument("--all-views", action="store_true", help="list the PSNR of every view, worst first")
     add_backend(parser)

@@ -14,18 +14,18 @@ EXAMPLE = "example: gsplat-edu eval out/plush"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
     parser.add_argument(
         "--dataset",
         type=Path,
         metavar="PATH",
-        help="the dataset's folder, if it is not where the run had it; another dataset needs --out",
+        help="the run's capture, if its folder has moved; any other capture needs --out",
     )
     parser.add_argument(
         "--out",
         type=Path,
         metavar="FOLDER",
-        help="write metrics, renders and report to this folder and leave those of the run as they are",
+        help="write metrics, renders and report to this folder instead of the run",
     )
     add_backend(parser)
 

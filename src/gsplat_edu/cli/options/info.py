@@ -10,4 +10,4 @@ EXAMPLE = "example: gsplat-edu info captures/plush"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's argument."""
-    parser.add_argument("path", type=Path, metavar="PATH", help="dataset folder, run folder or scene file")
+    parser.add_argument("path", type=Path, metavar="PATH", help="capture, run folder or scene file")

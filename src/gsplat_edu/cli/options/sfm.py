@@ -12,7 +12,7 @@ EXAMPLE = "example: gsplat-edu sfm holiday.mp4 captures/holiday --frames 200"
 
 
 def check(arguments: argparse.Namespace) -> None:
-    """Refuse what is out of range; raises as `options_from` does."""
+    """Check the ranges; raises as `options_from` does."""
     options_from(arguments)
 
 
@@ -22,10 +22,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "source",
         type=Path,
         metavar="PHOTOS",
-        help="a folder of photos (with masks/ or alpha, if any), or a video",
+        help="folder of photos, optionally with masks/ or alpha, or a video",
     )
     parser.add_argument(
-        "out", type=Path, metavar="OUT", help="folder of the capture; work is kept in OUT/sfm"
+        "out",
+        type=Path,
+        metavar="OUT",
+        help="folder of the capture to write; intermediate results are kept in OUT/sfm",
     )
 
     def number(flag: str, text: str, default: int) -> None:
@@ -38,13 +41,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             flag, metavar="NAME", default="auto", help=f"{text}: {', '.join(names)} (default: auto)"
         )
 
-    number("--frames", "frames taken from a video, at most", SfmOptions.frames)
-    choice("--matcher", "which photos are compared", MATCHERS)
-    choice("--mapper", "how poses are found", MAPPERS)
-    choice("--camera-model", "lens model; auto frees what held-out photos support", CAMERA_MODELS)
-    number("--max-features", "features of a photo, at most", SfmOptions.max_features)
-    number("--max-image-size", "longest side at which features are found, px", SfmOptions.max_image_size)
-    number("--threads", "threads of COLMAP, 0 for all", SfmOptions.threads)
+    number("--frames", "maximum number of frames taken from a video", SfmOptions.frames)
+    choice("--matcher", "which pairs of photos are matched", MATCHERS)
+    choice("--mapper", "COLMAP mapper", MAPPERS)
+    choice(
+        "--camera-model",
+        "lens model (auto refines as many parameters as held-out photos support)",
+        CAMERA_MODELS,
+    )
+    number("--max-features", "maximum number of features per photo", SfmOptions.max_features)
+    number(
+        "--max-image-size", "longest side of the photos for feature detection, px", SfmOptions.max_image_size
+    )
+    number("--threads", "threads of COLMAP; 0 for all", SfmOptions.threads)
 
 
 def options_from(arguments: argparse.Namespace) -> SfmOptions:

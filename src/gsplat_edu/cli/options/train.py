@@ -21,35 +21,44 @@ EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iteration
 FOR_POINTS = ("start_opacity", "start_scale", "mcmc_start_opacity", "mcmc_start_scale")
 """Fields of the recipe that only a start from points uses."""
 
+COMMON = (
+    *("out", "resume", "scene", "iterations", "time_limit", "max_memory", "strategy", "max_gaussians"),
+    *("resolution", "test_every", "white_background", "antialiased", "seed", "backend", "debug"),
+    *("eval_every", "save_every", "export", "view"),
+)
+"""What `--help` shows; `--help-all` shows the other options too."""
+
 NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background")
 """Fields of the recipe that have their options spelled out below; the others are made from `TrainConfig`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    parser.usage = "%(prog)s DATA --out RUN [options]"
     parser.add_argument(
         "data",
         type=Path,
         metavar="DATA",
-        help="a capture: COLMAP, transforms.json or Blender; or photos or a video, whose poses are found first",
+        help="capture (COLMAP, transforms.json or Blender), or photos or a video, whose poses are found first",
     )
-    parser.add_argument("--out", type=Path, metavar="RUN", required=True, help="folder of the run")
-    parser.add_argument(
+    run = parser.add_argument_group("run")
+    run.add_argument("--out", type=Path, metavar="RUN", required=True, help="run folder to write (required)")
+    run.add_argument(
         "--resume",
         action="store_true",
-        help="continue from the last checkpoint in RUN; with more --iterations than before, the run is extended: its"
-        " milestones and rates stay those of the shorter run",
+        help="continue from the last checkpoint in RUN; a larger --iterations extends the run, keeping its milestones"
+        " and learning rates",
     )
-    _add_budget(parser.add_argument_group("budget"))
+    _add_start(run.add_mutually_exclusive_group())
+    _add_number(run, "--seed", "seed of every random draw (default: 0)", 0)
+    add_backend(run)
+    _add_length(parser.add_argument_group("length and limits"))
+    _add_photos(parser.add_argument_group("photos"))
+    _add_results(parser.add_argument_group("results"))
     _add_view(parser.add_argument_group("live view"))
-    _add_data(parser.add_argument_group("photos"))
-    group = parser.add_argument_group("recipe, see docs/RECIPE.md; defaults are those of 30,000 iterations")
-    behind = group.add_mutually_exclusive_group()
-    behind.add_argument(
-        "--white-background", action="store_true", help="white behind everything (default: black)"
-    )
-    behind.add_argument(
-        "--background", type=float, nargs=3, metavar=("R", "G", "B"), help="another colour, 0 to 1"
+    group = parser.add_argument_group(
+        "training parameters",
+        "docs/RECIPE.md explains them. Defaults are those of 30,000 iterations; milestones scale with --iterations.",
     )
     group.add_argument(
         "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
@@ -60,110 +69,127 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             _add_field(group, field.name, field.default, meanings[field.name])
 
 
-def _add_budget(group: argparse._ArgumentGroup) -> None:
-    def number(flag: str, text: str, default: int | None = None) -> None:
-        group.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
+def _add_number(group: argparse._ActionsContainer, flag: str, text: str, default: int | None = None) -> None:
+    group.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
 
-    number("--iterations", f"steps of training (default: {RECIPE_ITERATIONS}, or what fits --time-limit)")
+
+def _add_start(start: argparse._MutuallyExclusiveGroup) -> None:
+    start.add_argument(
+        "--from",
+        dest="scene",
+        type=Path,
+        metavar="SCENE|RUN",
+        help="start from the Gaussians of a trained scene, or of a run's latest one, instead of points; all harmonics"
+        f" are in use from the first iteration, and --means-rate is {FROM_SCENE['means_rate']:g} unless given",
+    )
+    start.add_argument(
+        "--points", type=Path, metavar="X.ply", help="start from these points instead of the capture's"
+    )
+
+
+def _add_length(group: argparse._ArgumentGroup) -> None:
+    _add_number(
+        group,
+        "--iterations",
+        f"number of training steps (default: {RECIPE_ITERATIONS}, or as many as fit --time-limit)",
+    )
     group.add_argument(
         "--no-rescale",
         action="store_true",
-        help="keep the schedule of 30,000 iterations whatever --iterations is",
+        help="keep the milestones of 30,000 iterations for any --iterations",
     )
-    names = ", ".join(STRATEGIES)
-    group.add_argument("--strategy", metavar="NAME", default="adc", help=f"one of {names} (default: adc)")
-    number("--max-gaussians", "cap on the number of Gaussians (default: none; mcmc needs one)")
-    number("--seed", "seed of all that is drawn at random (default: 0)", 0)
-    for flag, what, every in (
-        ("--eval-every", "judgements by the test views", RunOptions.eval_every),
-        ("--save-every", "checkpoints", RunOptions.save_every),
-    ):
-        number(flag, f"iterations between {what}, 0 for none (default: {every})", every)
     group.add_argument(
         "--time-limit",
         type=seconds_text,
         metavar="TIME",
-        help="end after, for example, 90s, 20m or 2h: without --iterations, as many are chosen as fit",
+        help="stop after this time, for example 90s, 20m or 2h; without --iterations, run as many as fit",
     )
     group.add_argument(
         "--max-memory",
         type=bytes_text,
         metavar="SIZE",
-        help="keep the process below, for example, 4GiB: photos' size, those kept and the cap of Gaussians are chosen",
+        help="keep the process below this size, for example 4GiB, by choosing the photos' resolution, how many photos"
+        " stay in memory, and the cap on Gaussians; based on a forecast",
     )
+    names = ", ".join(STRATEGIES)
+    group.add_argument(
+        "--strategy", metavar="NAME", default="adc", help=f"density control: {names} (default: adc)"
+    )
+    _add_number(group, "--max-gaussians", "cap on the number of Gaussians (default: none; mcmc requires one)")
+
+
+def _add_results(group: argparse._ArgumentGroup) -> None:
+    for flag, what, every in (
+        ("--eval-every", "evaluations on the test views", RunOptions.eval_every),
+        ("--save-every", "checkpoints", RunOptions.save_every),
+    ):
+        _add_number(group, flag, f"iterations between {what}; 0 for the end only (default: {every})", every)
     group.add_argument(
         "--export",
         type=Path,
         nargs="+",
         default=[],
         metavar="FILE",
-        help="write the scene in other formats too, as `gsplat-edu convert --verify` does: scene.spz scene.html ...",
+        help="also write the scene in other formats, as `gsplat-edu convert --verify` does: scene.spz scene.html ...",
     )
-    add_backend(group)
 
 
 def _add_view(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--view",
         action="store_true",
-        help="show the training in the browser while it runs, with pause and single step; it takes at most a fifth of"
-        " the time and changes no bit. The URL that is printed holds a token: only who has it gets in. Afterwards the"
-        " scene is shown until the last browser is closed, or Ctrl-C",
+        help="show the training in the browser, with pause and single step. It takes at most a fifth of the time and"
+        " does not change the result. The printed URL contains a token that is required for access. After the training"
+        " the view stays open until the last browser is closed, or Ctrl-C",
     )
     group.add_argument(
-        "--view-host", metavar="ADDRESS", help="where to listen (default: 127.0.0.1, for this computer only)"
+        "--view-host",
+        metavar="ADDRESS",
+        help="address to listen on (default: 127.0.0.1, reachable from this computer only)",
     )
     group.add_argument(
         "--view-port",
         type=whole_number_text,
         metavar="N",
-        help="port, 0 for any that is free (default: 8080)",
+        help="port to listen on; 0 for any free one (default: 8080)",
     )
 
 
-def _add_data(group: argparse._ArgumentGroup) -> None:
+def _add_photos(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--resolution",
         type=float,
         metavar="R",
-        help="below 32: divide sizes by it; from 32 on: longest side in px (default: as they are)",
+        help="below 32: divide the photos' size by this; from 32 on: their longest side in px (default: full size)",
     )
-    group.add_argument(
+    _add_number(
+        group,
         "--test-every",
-        type=whole_number_text,
-        metavar="N",
-        help="every n-th view by name is for testing, 0 for none (default: the capture's own split, or 8)",
+        "hold out every N-th view, by name, for testing; 0 for none (default: the capture's own split, or 8)",
     )
     group.add_argument(
         "--image-memory",
         type=bytes_text,
         metavar="SIZE",
-        help="decoded photos kept in memory, for example 500MB; others are read again (default: 4GiB)",
+        help="memory for decoded photos, for example 500MB; others are read again for each use (default: 4GiB)",
     )
-    start = group.add_mutually_exclusive_group()
-    start.add_argument(
-        "--points", type=Path, metavar="X.ply", help="start from these points, not the capture's"
-    )
-    start.add_argument(
-        "--from",
-        dest="scene",
-        type=Path,
-        metavar="SCENE|RUN",
-        help="start from the Gaussians of a trained scene, or of a run's latest one, not from points; all harmonics"
-        f" are in use from the first iteration, and --means-rate is {FROM_SCENE['means_rate']:g} unless given",
+    behind = group.add_mutually_exclusive_group()
+    behind.add_argument("--white-background", action="store_true", help="white background (default: black)")
+    behind.add_argument(
+        "--background", type=float, nargs=3, metavar=("R", "G", "B"), help="background colour, 0 to 1"
     )
 
 
 def _meanings() -> dict[str, str]:
-    """Return what the docstring of `TrainConfig` says of each field."""
+    """Return the description of each field in the docstring of `TrainConfig`."""
     text = (inspect.getdoc(TrainConfig) or "").partition("Args:")[2].partition("Raises:")[0]
     entries = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
-    found = {name: " ".join(words.split()).replace("%", "%%") for name, words in entries}
+    found = {name: " ".join(words.replace("`", "").split()).replace("%", "%%") for name, words in entries}
     return {field.name: found.get(field.name, "") for field in fields(TrainConfig)}
 
 
 def _add_field(group: argparse._ArgumentGroup, name: str, default: object, meaning: str) -> None:
-    flag, text = f"--{name.replace('_', '-')}", f"{meaning} (default: {default})"
+    flag, text = f"--{name.replace('_', '-')}", f"{meaning.rstrip('.')} (default: {default})"
     if isinstance(default, bool):
         group.add_argument(flag, action="store_true", default=None, help=text)
     elif isinstance(default, str):

@@ -15,18 +15,18 @@ PORT = 8080
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("source", type=Path, metavar="SCENE|RUN", help="scene file, or folder of a run")
+    parser.add_argument("source", type=Path, metavar="SCENE|RUN", help="scene file or run folder")
     parser.add_argument(
         "--host",
         default=LOOPBACK,
         metavar="ADDRESS",
-        help=f"where to listen (default: {LOOPBACK}, which only this computer can reach)",
+        help=f"address to listen on (default: {LOOPBACK}, reachable from this computer only)",
     )
     parser.add_argument(
         "--port",
         type=whole_number_text,
         default=PORT,
         metavar="N",
-        help=f"port to listen at, 0 for any that is free (default: {PORT})",
+        help=f"port to listen on; 0 for any free one (default: {PORT})",
     )
-    parser.add_argument("--no-open", action="store_true", help="print the URL, but do not open the browser")
+    parser.add_argument("--no-open", action="store_true", help="print the URL without opening a browser")

@@ -1,10 +1,10 @@
-"""composite: a tile's Gaussians, near to far, into its pixels; and back in the same order.
+"""composite: blend a tile's Gaussians into its pixels, near to far; backward in the same order.
 
     p = log2_o - s² - t²;   alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 
-A program takes one tile and goes through its pairs in batches, as a matrix of pixels by Gaussians: T before each comes
-from a running product along the batch, the colours are a matrix product. The sums of the way back are plain sums: as
-exact matrix products they would take more registers than there are.
+A program handles one tile and processes its pairs in batches, as a matrix of pixels by Gaussians. The transmittance T
+before each Gaussian is a running product along the batch, and the colours are a matrix product. The backward pass uses
+plain sums: exact matrix products would need more registers than available.
 
 Chapter: 10_the_naive_kernel.
 """
@@ -26,13 +26,13 @@ T_STOP = tl.constexpr(constants.T_STOP)
 LOG2_ALPHA_MIN = tl.constexpr(math.log2(constants.ALPHA_MIN))
 LOG2_ALPHA_MAX = tl.constexpr(math.log2(constants.ALPHA_MAX))
 CHANNELS = tl.constexpr(16)
-"""Columns of the matrices of channels: red, green, blue, depth, and zeros, because matrix units take no fewer."""
+"""Columns of the channel matrices: red, green, blue, depth, and zero padding, the minimum for matrix units."""
 
 
 @triton.jit
 @no_type_check
 def _pixels(tile, tiles_x, W, H):
-    """Return the column and row of a tile's pixels, and which lie in the image."""
+    """Return columns and rows of a tile's pixels, and whether each lies in the image."""
     lane = tl.arange(0, PIXELS)
     x = tile % tiles_x * TILE + lane % TILE
     y = tile // tiles_x * TILE + lane // TILE
@@ -42,7 +42,7 @@ def _pixels(tile, tiles_x, W, H):
 @triton.jit
 @no_type_check
 def _alphas(records, ids, mask, x, y):
-    """Return p and alpha of every pixel and Gaussian."""
+    """Return p and alpha for every pair of pixel and Gaussian."""
     row = records + ids.to(tl.int64) * RECORD
     dx = x[:, None].to(tl.float32) - tl.load(row, mask=mask, other=0.0)[None, :]
     dy = y[:, None].to(tl.float32) - tl.load(row + 1, mask=mask, other=0.0)[None, :]
@@ -56,7 +56,7 @@ def _alphas(records, ids, mask, x, y):
 @triton.jit
 @no_type_check
 def _weights(alpha, T):
-    """Return T before each Gaussian, alpha until every pixel of the tile is below 1e-4, and T after the batch."""
+    """Return T before each Gaussian, alpha (zero once all pixels of the tile are below 1e-4), and T after the batch."""
     after = T[:, None] * tl.cumprod(1 - alpha, axis=1)
     before = after / (1 - alpha)
     live = tl.max(before, axis=0) >= T_STOP
@@ -69,7 +69,7 @@ def _weights(alpha, T):
 def _channels(records, ids, mask):
     """Return red, green, blue and depth of the Gaussians as rows of a matrix."""
     column = tl.arange(0, CHANNELS)[None, :]
-    place = tl.where(column < 4, column + 6, 0)  # red, green, blue and depth stand at 6 to 9
+    place = tl.where(column < 4, column + 6, 0)  # red, green, blue and depth are at 6 to 9
     return tl.load(
         records + ids.to(tl.int64)[:, None] * RECORD + place, mask=mask[:, None] & (column < 4), other=0.0
     )
@@ -142,7 +142,7 @@ def composite_backward_kernel(
     grad_image, grad_transmittance, grad_depth, slots, W, H, tiles_x,
     WITH_T: tl.constexpr, WITH_DEPTH: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
-    """Write every pair's sums over one tile to a slot of its own; slots of pairs that were not drawn stay as they are.
+    """Write every pair's sums over one tile to its own slot; slots of pairs that were not drawn stay unchanged.
 
     cg = g . c;   R -= w cg;   dL/dalpha = T cg - R / (1 - alpha);   h = alpha dL/dalpha, 0 where alpha was clamped
     """
@@ -161,7 +161,7 @@ def composite_backward_kernel(
         WITH_T,
         WITH_DEPTH,
     )
-    # Moments are taken about the tile's middle, and moved to each mean afterwards.
+    # Moments are computed about the tile's centre and shifted to each mean afterwards.
     x0, y0 = (
         (tile % tiles_x * TILE + TILE // 2).to(tl.float32),
         (tile // tiles_x * TILE + TILE // 2).to(tl.float32),
@@ -206,7 +206,7 @@ def _column(matrix, j: tl.constexpr):
 @triton.jit
 @no_type_check
 def _store_moments(out, h, x, y, u, v, mask):
-    """Sum h and its moments over the pixels, about the tile's middle, and store them about the means at (u, v)."""
+    """Sum h and its moments about the tile's centre over the pixels, and store them about the means at (u, v)."""
     hx, hy = h * x[:, None], h * y[:, None]
     s, sx, sy = tl.sum(h, axis=0), tl.sum(hx, axis=0), tl.sum(hy, axis=0)
     sxx, sxy = tl.sum(hx * x[:, None], axis=0), tl.sum(hx * y[:, None], axis=0)

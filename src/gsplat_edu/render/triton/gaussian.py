@@ -1,6 +1,6 @@
-"""The mathematics of one Gaussian, forward and backward, for a block of Gaussians at a time.
+"""The mathematics of a Gaussian, forward and backward, for blocks of Gaussians.
 
-Mirrors `native/gaussian_math.h`: lanes are Gaussians, and what is a loop over axes there is written out here.
+Mirrors `native/gaussian_math.h`: lanes are Gaussians, and loops over axes are unrolled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ C3_0, C3_1, C3_2, C3_3, C3_4, C3_5, C3_6 = (tl.constexpr(value) for value in con
 DILATION = tl.constexpr(constants.DILATION)
 DET_FLOOR = tl.constexpr(constants.DET_FLOOR)
 
-# Places in a camera's row of numbers, see `camera_row`.
+# Offsets in a camera's row of values, see `camera_row`.
 EYE_AT, FOCAL_AT, MIDDLE_AT, SIZE_AT, BOUNDS_AT, NEAR_AT, EYE_REST_AT = (
     tl.constexpr(place) for place in (9, 12, 14, 16, 18, 22, 23)
 )
@@ -55,12 +55,12 @@ def store3(pointer, i, v0, v1, v2, mask):
 @triton.jit
 @no_type_check
 def unit_quaternion(quats, i, mask):
-    """Load quaternions and divide by their lengths; of zero length they are not a number."""
+    """Load and normalise quaternions; those of zero length become NaN."""
     w = tl.load(quats + 4 * i, mask=mask, other=1.0)
     x = tl.load(quats + 4 * i + 1, mask=mask, other=0.0)
     y = tl.load(quats + 4 * i + 2, mask=mask, other=0.0)
     z = tl.load(quats + 4 * i + 3, mask=mask, other=0.0)
-    # The largest entry is divided out first, so that the length neither overflows nor underflows.
+    # Dividing by the largest entry first keeps the length from overflowing or underflowing.
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     length = tl.sqrt(
         (w / largest) * (w / largest)
@@ -95,7 +95,7 @@ def rotation(w, x, y, z):
 @triton.jit
 @no_type_check
 def into_camera(means, camera, i, mask):
-    """Return mean - eye in world axes, and in camera axes; the eye comes as float32 and the rest of it."""
+    """Return mean - eye in world and in camera axes; the eye is given as float32 plus its rounding error."""
     m0, m1, m2 = load3(means, i, mask)
     o0 = m0 - tl.load(camera + EYE_AT) - tl.load(camera + EYE_REST_AT)
     o1 = m1 - tl.load(camera + EYE_AT + 1) - tl.load(camera + EYE_REST_AT + 1)
@@ -109,7 +109,7 @@ def into_camera(means, camera, i, mask):
 @triton.jit
 @no_type_check
 def jacobian_row(camera, axis: tl.constexpr, p, z):
-    """Return a row of J W and p/z as it is clamped there: f/z (W_row - p/z W_2)."""
+    """Return a row of J W, and p/z after clamping: f/z (W_row - p/z W_2)."""
     low, high = tl.load(camera + BOUNDS_AT + 2 * axis), tl.load(camera + BOUNDS_AT + 2 * axis + 1)
     ratio = tl.minimum(tl.maximum(p / z, low), high)
     scale = tl.load(camera + FOCAL_AT + axis) / z
@@ -122,7 +122,7 @@ def jacobian_row(camera, axis: tl.constexpr, p, z):
 @triton.jit
 @no_type_check
 def onto_axes(t0, t1, t2, R, s0, s1, s2):
-    """Return t M, M = R S: a row of J W on the Gaussian's own axes."""
+    """Return t M with M = R S: a row of J W in the Gaussian's own axes."""
     r0 = dot3(t0, t1, t2, R[0], R[3], R[6]) * s0
     r1 = dot3(t0, t1, t2, R[1], R[4], R[7]) * s1
     r2 = dot3(t0, t1, t2, R[2], R[5], R[8]) * s2
@@ -132,11 +132,11 @@ def onto_axes(t0, t1, t2, R, s0, s1, s2):
 @triton.jit
 @no_type_check
 def shape_on_screen(r, q):
-    """Return a, b, c and the determinant of r r', r q', q q' before the dilation, and the dilated determinant."""
+    """Return a, b, c and the determinant of r r', r q', q q' before dilation, and the dilated determinant."""
     a = dot3(r[0], r[1], r[2], r[0], r[1], r[2])
     b = dot3(r[0], r[1], r[2], q[0], q[1], q[2])
     c = dot3(q[0], q[1], q[2], q[0], q[1], q[2])
-    # |r x q|² = a c - b² without the cancellation.
+    # |r x q|² = a c - b² without cancellation.
     n0, n1, n2 = r[1] * q[2] - r[2] * q[1], r[2] * q[0] - r[0] * q[2], r[0] * q[1] - r[1] * q[0]
     det0 = dot3(n0, n1, n2, n0, n1, n2)
     return a, b, c, det0, det0 + (a + c) * DILATION + DILATION * DILATION
@@ -145,7 +145,7 @@ def shape_on_screen(r, q):
 @triton.jit
 @no_type_check
 def harmonic(j: tl.constexpr, x, y, z):
-    """Return the real harmonic number j, 1 to 15, in the direction (x, y, z)."""
+    """Return real harmonic j, 1 to 15, in the direction (x, y, z)."""
     xx, yy, zz = x * x, y * y, z * z
     if j == 1:
         b = y * (-C1)
@@ -183,7 +183,7 @@ def harmonic(j: tl.constexpr, x, y, z):
 @triton.jit
 @no_type_check
 def harmonic_slope(j: tl.constexpr, x, y, z):
-    """Return the gradient of harmonic number j in x, y and z."""
+    """Return the gradient of harmonic j with respect to x, y and z."""
     xx, yy, zz, zero = x * x, y * y, z * z, 0.0 * x
     if j == 1:
         d = (zero, zero - C1, zero)

@@ -1,7 +1,7 @@
-"""intersect: which tiles an ellipse alpha >= 1/255 meets, exactly, and the pairs of Gaussian and tile.
+"""intersect: find exactly the tiles that an ellipse alpha >= 1/255 touches, and write the pairs of Gaussian and tile.
 
-The ellipse's x interval over a band of rows is found where the band meets it, as in `native/intersect.cpp`. Gaussians
-come near to far, so pairs are written in depth order, and a stable sort by tile leaves every tile's list sorted.
+The ellipse's x interval over a band of rows is computed as in `native/intersect.cpp`. Gaussians arrive near to far, so
+pairs are written in depth order, and a stable sort by tile leaves every tile's list sorted by depth.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ RIM_SLACK = tl.constexpr(constants.RIM_SLACK)
 @triton.jit
 @no_type_check
 def _ellipse(records, i, mask):
-    """Return centre, half extents, slant of the rightmost point, tangent and half width of the ellipse."""
+    """Return centre, half extents, slope of the rightmost point, tangent and half width of the ellipse."""
     row = records + i * RECORD
     u, v = tl.load(row, mask=mask, other=0.0), tl.load(row + 1, mask=mask, other=0.0)
     sx = tl.load(row + 2, mask=mask, other=1.0)
@@ -40,7 +40,7 @@ def _ellipse(records, i, mask):
 @triton.jit
 @no_type_check
 def _rows(v, ey, height, seen):
-    """Return the first row of tiles that the ellipse meets, and how many."""
+    """Return the first row of tiles that the ellipse touches, and the number of rows."""
     first = tl.maximum(tl.ceil(v - ey - RIM_SLACK), 0.0).to(tl.int32)
     last = tl.minimum(tl.floor(v + ey + RIM_SLACK), height - 1.0).to(tl.int32)
     return first // TILE, tl.where(seen & (first <= last), last // TILE - first // TILE + 1, 0)
@@ -49,10 +49,10 @@ def _rows(v, ey, height, seen):
 @triton.jit
 @no_type_check
 def _columns(u, v, ex, ey, slant, tangent, half, ty, width):
-    """Return the first column of tiles that the ellipse meets in a row of tiles, and how many."""
+    """Return the first column that the ellipse touches in a row of tiles, and the number of columns."""
     low, high = (ty * TILE).to(tl.float32) - v, (ty * TILE + TILE - 1).to(tl.float32) - v
     low, high = tl.maximum(low, -ey), tl.minimum(high, ey)
-    middle = (low + high) / 2  # where the band is met by the slack alone
+    middle = (low + high) / 2  # if only the slack touches the band
     met = low <= high
     low, high = tl.where(met, low, middle), tl.where(met, high, middle)
     right, left = (
@@ -90,7 +90,7 @@ def count_kernel(records, pairs_of, n, width, height, BLOCK: tl.constexpr):
 def emit_kernel(
     records, order, begin, pairs_of, tiles, gaussians, n, width, height, tiles_x, BLOCK: tl.constexpr
 ):
-    """Write tile and Gaussian of every pair, Gaussian by Gaussian in the given order; never more than were counted."""
+    """Write tile and Gaussian of every pair, by Gaussian in the given order; never more than were counted."""
     k = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = k < n
     i = tl.load(order + k, mask=mask, other=0)

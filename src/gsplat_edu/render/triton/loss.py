@@ -1,4 +1,4 @@
-"""The loss of captures, (1 - k) L1 + k (1 - SSIM), and its gradient, as Triton kernels.
+"""The loss (1 - k) L1 + k (1 - SSIM) and its gradient, as Triton kernels.
 
 With G a blur of 11 taps (sigma 1.5, zero outside the image), mx = G x, my = G y, v = G (x² + y²) - mx² - my² (the sum
 of both variances), c = G xy - mx my, all per channel:
@@ -8,8 +8,8 @@ of both variances), c = G xy - mx my, all per channel:
     dsum(S)/dx = G dS/dmx + 2 x G dS/dv + y G dS/dc
 
 G is separable, and a program sees only its own block of an array, so each direction of each blur is a kernel: four in
-all, and a fifth that adds the blocks' sums. An image is taken as H rows of 3 W numbers; a tap to the right is three
-numbers further on. Nothing is added atomically: two runs give the same bits.
+all, and a fifth that adds the sums of the blocks. An image is treated as H rows of 3 W values; the next tap to the
+right is three values further. Without atomics, two runs give the same bits.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from gsplat_edu import constants
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.validation import check_shape, in_range
 
-# A block's rows are read again for every tap down: 16 rows of 26 stay in the first cache.
+# A block's rows are read again for every vertical tap: its 26 rows for 16 stay in the L1 cache.
 ROWS = tl.constexpr(16)
 COLUMNS = tl.constexpr(64)
 LANES = tl.constexpr(1024)
-"""Sums of blocks that are added at a time."""
+"""Number of block sums added at a time."""
 WARPS = 16
-"""Of a block. With 4, a thread's eight numbers and their taps need more registers than there are."""
+"""Warps per block. With 4, a thread's eight values and their taps would need more registers than available."""
 
 CHANNELS = tl.constexpr(3)
 HALF = tl.constexpr(5)
-"""Taps on either side of the middle one."""
+"""Taps on each side of the centre."""
 
 _FALL = math.exp(-0.5 / constants.SSIM_SIGMA**2)
 FALL = tl.constexpr(_FALL)
-"""A tap k from the middle has weight PEAK FALL^(k²)."""
+"""The tap at distance k from the centre has weight PEAK FALL^(k²)."""
 PEAK = tl.constexpr(1.0 / sum(_FALL ** (k * k) for k in range(-5, 6)))
 C1 = tl.constexpr(constants.SSIM_C1)
 C2 = tl.constexpr(constants.SSIM_C2)
@@ -51,12 +51,12 @@ C2 = tl.constexpr(constants.SSIM_C2)
 @triton.jit
 @no_type_check
 def _block(size):
-    """Return this program's rows and columns, their place in an array (H, 3 W), and which are inside it."""
+    """Return this program's rows and columns, their offsets in an array (H, 3 W), and which are inside it."""
     height, width = size
     top = tl.program_id(1) * ROWS
     row = top + tl.arange(0, ROWS)[:, None]
     column = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
-    # 64 bits for what grows with the image, 32 for what stays within the block.
+    # 64 bits for offsets that grow with the image, 32 for those within the block.
     place = top.to(tl.int64) * (width * CHANNELS) + (
         tl.arange(0, ROWS)[:, None] * (width * CHANNELS) + column
     )
@@ -66,7 +66,7 @@ def _block(size):
 @triton.jit
 @no_type_check
 def _blur(array, at, length, stride, inside):
-    """Blur along one axis: `at` is a lane's position on it, below `length`; neighbours are `stride` numbers apart."""
+    """Blur along one axis: `at` is a lane's position on it, below `length`; neighbours are `stride` values apart."""
     total = tl.load(array, mask=inside, other=0.0) * PEAK
     for k in tl.static_range(1, HALF + 1):
         before = tl.load(array - k * stride, mask=inside & (at >= k), other=0.0)
@@ -78,7 +78,7 @@ def _blur(array, at, length, stride, inside):
 @triton.jit
 @no_type_check
 def _pair(image, target, place, scale, inside):
-    """Load x and y, the target from bytes or floats."""
+    """Load x and y; the target may be bytes or floats."""
     x = tl.load(image + place, mask=inside, other=0.0)
     return x, tl.load(target + place, mask=inside, other=0).to(tl.float32) * scale
 
@@ -146,7 +146,7 @@ def _maps_across(maps, planes, size):
 @triton.jit
 @no_type_check
 def _gradient_down(image, target, planes, gradient, sums, size, numbers):
-    """Write the loss's gradient and the block's sum of l1 |x - y|; without planes, the loss is L1 alone."""
+    """Write the loss's gradient and the block's sum of l1 |x - y|; without planes, the loss is L1 only."""
     height, width = size
     scale, l1, ssim = numbers
     row, _, place, inside = _block(size)
@@ -167,7 +167,7 @@ def _gradient_down(image, target, planes, gradient, sums, size, numbers):
 @triton.jit
 @no_type_check
 def _add(sums, count, total):
-    """Add all sums in one program: each lane its own in order, then the lanes."""
+    """Add all sums in one program: each lane adds its own in order, then the lanes are added."""
     lane = tl.arange(0, LANES)
     partial = tl.zeros([LANES], tl.float32)
     start = 0
@@ -182,23 +182,23 @@ def l1_ssim_triton(
     target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
     ssim_weight: float = 0.2,
 ) -> Float[Tensor, ""]:
-    """Return the loss of captures, (1 - k) L1 + k (1 - SSIM), its gradient made along with it.
+    """Return the loss (1 - k) L1 + k (1 - SSIM), computed together with its gradient.
 
     SSIM is the mean over pixels and channels of (2 mx my + C1)(2 c + C2) / ((mx² + my² + C1)(v + C2)), with means,
-    covariance c and sum of variances v under a Gaussian window of 11 taps (sigma 1.5), zero outside the image. Nothing
-    here waits for the device.
+    covariance c and sum of variances v under a Gaussian window of 11 taps (sigma 1.5), zero outside the image. The
+    function does not synchronise with the device.
 
     Args:
-        image: (H, W, 3) rendered, float32.
-        target: (H, W, 3) photo, 0 to 1, float32; or uint8, 0 to 255; no gradient reaches it.
-        ssim_weight: k, 0 to 1; nothing is blurred where it is 0.
+        image: (H, W, 3) render, float32.
+        target: (H, W, 3) photo, 0 to 1, float32; or uint8, 0 to 255; receives no gradient.
+        ssim_weight: k, 0 to 1; 0 skips the blurs.
 
     Returns:
         () scalar, differentiable in the image; NaN for an image without pixels.
 
     Raises:
-        ShapeError: the image is not (H, W, 3), or the target of another size.
-        ArgumentError: a dtype is another one, the two are on different devices, or the weight is outside 0 to 1.
+        ShapeError: the image is not (H, W, 3), or the target's size differs.
+        ArgumentError: a dtype is unsupported, the devices differ, or the weight is outside 0 to 1.
 
     Source: Kerbl et al. 2023, eq. 7; Wang et al. 2004.
     """
@@ -216,7 +216,7 @@ def l1_ssim_triton(
 
 
 class _L1Ssim(torch.autograd.Function):
-    """Loss and gradient in one go; backward only scales."""
+    """Compute loss and gradient together; backward only scales."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:  # noqa: ANN401
@@ -231,12 +231,12 @@ class _L1Ssim(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        # Also where it is 1: looking would wait for the device.
+        # Even if it is 1: checking would synchronise with the device.
         return gradient * grad, None, None
 
 
 def _loss_and_gradient(x: Tensor, y: Tensor, gradient: Tensor, ssim_weight: float) -> Tensor:
-    """Fill the gradient and return the loss: sum over blocks of (1 - k)/n |x - y| + k/n (1 - S), n = 3 H W."""
+    """Write the gradient and return the loss: sum over blocks of (1 - k)/n |x - y| + k/n (1 - S), n = 3 H W."""
     height, width, n = x.shape[0], x.shape[1], x.numel()
     size = (height, width)
     grid = (triton.cdiv(3 * width, COLUMNS.value), triton.cdiv(height, ROWS.value))

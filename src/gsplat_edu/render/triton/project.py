@@ -1,10 +1,10 @@
-"""project: raw parameters to ellipses on the screen, one packed record per Gaussian; and back.
+"""project: from raw parameters to screen-space ellipses, one packed record per Gaussian; and the backward pass.
 
     Sigma2d = J W Sigma W' J' + 0.3 I,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
 
-A record holds u, v, sx, sy, ty, log2 o, red, green, blue, depth, half width, half height: alpha is
-2^(log2 o - (sx dx + sy dy)² - (ty dy)²), whose squares cannot cancel where an ellipse is long and thin. A half width of
-0 says that nothing of it can be seen.
+A record holds u, v, sx, sy, ty, log2 o, red, green, blue, depth, half width, half height. Then alpha = 2^(log2 o - (sx
+dx + sy dy)² - (ty dy)²), whose squares cannot cancel for long, thin ellipses. A half width of 0 marks an invisible
+Gaussian.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from gsplat_edu.render.triton.gaussian import (
 )
 
 RECORD = tl.constexpr(16)
-"""Numbers in a record; twelve are used, sixteen are a line of cache."""
+"""Values per record; twelve are used, sixteen fill a cache line."""
 
 SLOT = tl.constexpr(16)
-"""Numbers in a slot: sums of w g (3), of w times the depth's gradient, and six moments of h."""
+"""Values per slot: sums of w g (3), of w times the depth's gradient, and six moments of h."""
 
 ALPHA_MIN = tl.constexpr(constants.ALPHA_MIN)
 COLOR_LIMIT = tl.constexpr(constants.COLOR_LIMIT)
@@ -52,7 +52,7 @@ LOG2E = tl.constexpr(math.log2(math.e))
 @triton.jit
 @no_type_check
 def _colors(sh0, sh_rest, i, d0, d1, d2, mask, DEGREE: tl.constexpr, REST: tl.constexpr):
-    """Colour = sum_i b_i(d) sh_i + 0.5, before the floor at 0."""
+    """Return sum_i b_i(d) sh_i + 0.5, the colour before it is floored at 0."""
     red, green, blue = load3(sh0, i, mask)
     red, green, blue = red * C0 + SH_OFFSET, green * C0 + SH_OFFSET, blue * C0 + SH_OFFSET
     for j in tl.static_range(1, (DEGREE + 1) * (DEGREE + 1)):
@@ -123,7 +123,7 @@ def project_kernel(
 @triton.jit
 @no_type_check
 def _sums(slots, slot_begin, pairs_of, i, mask, BLOCK: tl.constexpr):
-    """Add up each Gaussian's slots, in order."""
+    """Add each Gaussian's slots, in order."""
     begin = tl.load(slot_begin + i, mask=mask, other=0)
     count = tl.load(pairs_of + i, mask=mask, other=0)
     zero = tl.zeros([BLOCK], tl.float32)
@@ -160,7 +160,7 @@ def _sums(slots, slot_begin, pairs_of, i, mask, BLOCK: tl.constexpr):
 @triton.jit
 @no_type_check
 def _shape_gradient(a, b, c, det0, det, a0, c0, h, hxx, hxy, hyy, ANTIALIASED: tl.constexpr):
-    """From the moments of h to Sigma2d: -K G K, K = Sigma2d^-1, G the gradient of K; and antialiasing's share."""
+    """Return Sigma2d's gradient from the moments of h, with antialiasing: -K G K, K = Sigma2d^-1, G = dL/dK."""
     A, B, C = c / det, -b / det, a / det
     gA, gB, gC = -hxx / 2, -hxy / 2, -hyy / 2
     m00, m01, m10, m11 = gA * A + gB * B, gA * B + gB * C, gB * A + gC * B, gB * B + gC * C
@@ -181,7 +181,7 @@ def _color_gradient(
     sh0, sh_rest, grad_sh0, grad_sh_rest, i, direction, colors, sums, mask, touched,
     DEGREE: tl.constexpr, REST: tl.constexpr,
 ):  # fmt: skip
-    """From the colour to the coefficients; returns the gradient of the direction."""
+    """Propagate the colour's gradient to the coefficients; return the gradient of the direction."""
     d0, d1, d2 = direction
     gr = tl.where(touched & (colors[0] > 0), sums[0], 0.0)
     gg = tl.where(touched & (colors[1] > 0), sums[1], 0.0)
@@ -193,9 +193,9 @@ def _color_gradient(
             basis = tl.where(touched, harmonic(j, d0, d1, d2), 0.0)
             store3(grad_sh_rest, i * REST + j - 1, basis * gr, basis * gg, basis * gb, mask)
             r, g, b = load3(sh_rest, i * REST + j - 1, mask)
-            pull = dot3(r, g, b, gr, gg, gb)
+            grad_basis = dot3(r, g, b, gr, gg, gb)
             s0, s1, s2 = harmonic_slope(j, d0, d1, d2)
-            e0, e1, e2 = e0 + pull * s0, e1 + pull * s1, e2 + pull * s2
+            e0, e1, e2 = e0 + grad_basis * s0, e1 + grad_basis * s1, e2 + grad_basis * s2
         else:
             store3(grad_sh_rest, i * REST + j - 1, 0.0 * gr, 0.0 * gr, 0.0 * gr, mask)
     return e0, e1, e2
@@ -204,7 +204,7 @@ def _color_gradient(
 @triton.jit
 @no_type_check
 def _turn_gradient(w, x, y, z, G):
-    """dL/dq of a unit quaternion from G = dL/dR, without the part along q."""
+    """Return dL/dq of a unit quaternion from G = dL/dR, without the component along q."""
     dw = 2 * (x * (G[7] - G[5]) + y * (G[2] - G[6]) + z * (G[3] - G[1]))
     dx = 2 * (y * (G[1] + G[3]) + z * (G[2] + G[6]) + w * (G[7] - G[5]) - 2 * x * (G[4] + G[8]))
     dy = 2 * (x * (G[1] + G[3]) + z * (G[5] + G[7]) + w * (G[2] - G[6]) - 2 * y * (G[0] + G[8]))
@@ -216,7 +216,7 @@ def _turn_gradient(w, x, y, z, G):
 @triton.jit
 @no_type_check
 def _store_if(pointer, stride: tl.constexpr, place: tl.constexpr, i, value, touched, mask):
-    """Store a gradient; zero where the Gaussian was not drawn, whose numbers may be anything."""
+    """Store a gradient; zero if the Gaussian was not drawn, whose values are undefined."""
     tl.store(pointer + stride * i + place, tl.where(touched, value, 0.0), mask=mask)
 
 
@@ -227,7 +227,7 @@ def project_backward_kernel(
     grad_means, grad_quats, grad_log_scales, grad_sh0, grad_sh_rest, grad_logits, norms, n,
     DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Add up slots and go on to raw parameters: conic -> Sigma2d -> (J W, M); colour -> (coefficients, direction)."""
+    """Add slots and propagate to raw parameters: conic -> Sigma2d -> (J W, M); colour -> (coefficients, direction)."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
     sums = _sums(slots, slot_begin, pairs_of, i, mask, BLOCK)
@@ -251,7 +251,7 @@ def project_backward_kernel(
     _store_if(norms, 1, 0, i, tl.sqrt(nu * nu + nv * nv), touched, mask)
     da, db, dc = _shape_gradient(a, b, c, det0, det, a0, c0, sums[4], sums[7], sums[8], sums[9], ANTIALIASED)
 
-    # Sigma2d to r and q, the rows of J W M; then to M's rotation and scales, and to J W.
+    # From Sigma2d to r and q, the rows of J W M; then to M's rotation and scales, and to J W.
     f0, f1, f2 = 2 * da * r[0] + db * q[0], 2 * da * r[1] + db * q[1], 2 * da * r[2] + db * q[2]
     g0, g1, g2 = 2 * dc * q[0] + db * r[0], 2 * dc * q[1] + db * r[1], 2 * dc * q[2] + db * r[2]
     G = (
@@ -297,10 +297,10 @@ def _along_rows(R, v0, v1, v2):
 @triton.jit
 @no_type_check
 def _mean_gradient(camera, x, y, z, ratio_x, ratio_y, t, p, d, e, gu, gv, deep):
-    """From the gradients d, e of the rows of J W, of the image position and of the depth to the mean, world axes."""
+    """Return the mean's gradient, world axes, from those of the rows of J W (d, e), image position and depth."""
     u, v = x / z, y / z
     r6, r7, r8 = tl.load(camera + 6), tl.load(camera + 7), tl.load(camera + 8)
-    # J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³ W_2. A clamped x/z is a constant.
+    # J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³ W_2. A clamped x/z is constant.
     w0 = tl.where(ratio_x == u, dot3(d[0], d[1], d[2], r6, r7, r8), 0.0)
     w1 = tl.where(ratio_y == v, dot3(e[0], e[1], e[2], r6, r7, r8), 0.0)
     along = dot3(d[0], d[1], d[2], t[0], t[1], t[2]) + dot3(e[0], e[1], e[2], p[0], p[1], p[2])

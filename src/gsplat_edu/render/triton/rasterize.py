@@ -1,9 +1,9 @@
-"""The backend cuda: Triton kernels behind one autograd function, from Python source, without nvcc.
+"""The backend cuda: Triton kernels behind one autograd function, compiled from Python source without nvcc.
 
     project -> intersect -> composite, and back: composite_backward -> project_backward
 
-Every sum has its place: pairs write to slots of their own and Gaussians add theirs up in order, without atomics, so
-two runs give the same bits. All launches are on torch's current stream; the host waits once per render, for the
+Every sum has a fixed order: pairs write to their own slots and Gaussians add theirs in order, without atomics, so two
+runs give the same bits. All launches are on torch's current stream. The host synchronises once per render, for the
 numbers of pairs and of visible Gaussians. With TRITON_INTERPRET=1 the same kernels run on CPU tensors.
 """
 
@@ -32,26 +32,26 @@ BLOCK = 128
 """Gaussians per program of project, count and emit."""
 
 BACKWARD_BLOCK = 64
-"""Gaussians per program of project_backward, which keeps many numbers of each."""
+"""Gaussians per program of project_backward, which keeps many values of each."""
 
 BATCH = 16
-"""Gaussians per step of composite: the least a matrix unit takes."""
+"""Gaussians per step of composite: the minimum for matrix units."""
 
 PRECISION = "ieee"
-"""How composite's matrix product is computed: as float32 has it; tf32x3 and tf32 are faster and round more."""
+"""Precision of composite's matrix product: full float32; tf32x3 and tf32 are faster and less accurate."""
 
 COMPOSITE_BACKWARD_WARPS, PROJECT_BACKWARD_WARPS = 8, 2
-"""Warps of a program: chosen so that the compilers of triton 3.6 and 3.9 keep all numbers in registers."""
+"""Warps per program, chosen so that triton 3.6 and 3.9 keep all values in registers."""
 
 RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
-"""Raw parameters in the order in which the kernels take them."""
+"""Raw parameters in the kernels' argument order."""
 
 _camera_rows: WeakKeyDictionary[Camera, dict[tuple[str, float | None], Tensor]] = WeakKeyDictionary()
 
 
 @dataclass
 class _Call:
-    """What one render needs besides tensors, and what it leaves besides images."""
+    """State of one render: non-tensor inputs and non-image outputs."""
 
     camera: Camera
     settings: RenderSettings
@@ -77,7 +77,7 @@ class _Lists:
 def render_triton(
     gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Tensor
 ) -> RenderOutput:
-    """Render raw parameters; see `gsplat_edu.render.api.render`, which checks them.
+    """Render raw parameters; `gsplat_edu.render.api.render` validates the arguments.
 
     Args:
         gaussians: N Gaussians, float32, on the GPU; on the CPU under Triton's interpreter.
@@ -92,7 +92,7 @@ def render_triton(
         ArgumentError: the Gaussians are not float32.
     """
     if gaussians.means.dtype != torch.float32:
-        raise ArgumentError(f"means: are {gaussians.means.dtype}, but the backend cuda takes float32")
+        raise ArgumentError(f"means: are {gaussians.means.dtype}, but the backend cuda needs float32")
     call = _Call(camera, settings, min(settings.sh_degree, gaussians.sh_degree))
     tensors = gaussians.tensors()
     with torch.cuda.device_of(gaussians.means):  # type: ignore[no-untyped-call]
@@ -108,7 +108,7 @@ def render_triton(
 
 
 class _Rasterize(torch.autograd.Function):
-    """The whole of the renderer as one differentiable step."""
+    """The complete renderer as one differentiable operation."""
 
     @staticmethod
     def forward(
@@ -151,7 +151,7 @@ class _Rasterize(torch.autograd.Function):
             WITH_T=grad_T is not None, WITH_DEPTH=grad_depth is not None and call.settings.depth, BATCH=BATCH,
             num_warps=COMPOSITE_BACKWARD_WARPS,
         )  # fmt: skip
-        outgoing = [torch.empty_like(p) for p in kept]  # written whole
+        outgoing = [torch.empty_like(p) for p in kept]  # fully overwritten
         count = len(kept[0])
         norms = kept[0].new_zeros(count)
         if count:
@@ -179,7 +179,7 @@ def _project(call: _Call, kept: list[Tensor]) -> Tensor:
 
 
 def _intersect(call: _Call, records: Tensor) -> _Lists:
-    """Sort by depth, count and write the pairs in that order, and sort them by tile, stably."""
+    """Sort by depth, count and write the pairs in that order, and stably sort them by tile."""
     camera, count, device = call.camera, len(records), records.device
     tiles_x, tiles = _grid(camera)
     seen = records[:, 10] > 0
@@ -192,7 +192,7 @@ def _intersect(call: _Call, records: Tensor) -> _Lists:
     begin = torch.empty_like(ends)
     begin[order] = ends - pairs_of[order]
     totals = torch.stack([pairs_of.sum(dtype=torch.int64), seen.sum()])
-    call.num_pairs, num_visible = totals.tolist()  # the one place where the host waits
+    call.num_pairs, num_visible = totals.tolist()  # the only synchronisation of the host
     call.visible = order[:num_visible]
     call.radii = records[call.visible, 10:12]
     tile_of = torch.zeros(call.num_pairs, dtype=torch.int32, device=device)
@@ -218,15 +218,15 @@ def _intersect(call: _Call, records: Tensor) -> _Lists:
 
 
 def _grid(camera: Camera) -> tuple[int, int]:
-    """Return the number of tiles in a row, and in all."""
+    """Return the number of tiles per row, and in total."""
     tiles_x = -(-camera.W // TILE)
     return tiles_x, tiles_x * -(-camera.H // TILE)
 
 
 def _camera_row(call: _Call, device: torch.device) -> Tensor:
-    """Return the camera's numbers on the device: R, eye, f, c, size, bounds of x/z and y/z, near plane, rest of eye.
+    """Return the camera on the device: R, eye, f, c, size, bounds of x/z and y/z, near plane, remainder of eye.
 
-    They are kept with the camera, so that nothing is copied when it is rendered from again.
+    They are cached with the camera, so that later renders copy nothing.
     """
     camera, key = call.camera, (str(device), call.settings.jacobian_limit)
     rows = _camera_rows.setdefault(camera, {})
@@ -242,7 +242,7 @@ def _camera_row(call: _Call, device: torch.device) -> Tensor:
             camera.W,
             camera.H,
         ]
-        rest = camera.eye - camera.eye.astype(np.float32)  # what float32 rounds off
+        rest = camera.eye - camera.eye.astype(np.float32)  # rounding error of float32
         rows[key] = torch.tensor(
             [*numbers, *x_bounds, *y_bounds, Z_NEAR, *rest], dtype=torch.float32, device=device
         )

@@ -1,4 +1,4 @@
-"""Start a job without importing the package around this one, whose libraries do not get along with COLMAP's."""
+"""Start a job without importing the enclosing package, whose libraries conflict with COLMAP's."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 NAME = "gsplat_edu_sfm_engine"
-"""Under which this folder is imported: a package of its own, so that no parent is loaded."""
+"""Name under which this folder is imported: a top-level package, so that no parent is loaded."""
 
 
 def load() -> None:
-    """Make this folder importable as a package of its own."""
+    """Make this folder importable as a top-level package."""
     here = Path(__file__).parent
     spec = spec_from_file_location(NAME, here / "__init__.py", submodule_search_locations=[str(here)])
     assert spec is not None and spec.loader is not None

@@ -1,4 +1,4 @@
-"""From matches to models: COLMAP's two mappers, and what is done about poses that do not count."""
+"""From matches to models: COLMAP's two mappers, and the removal of unreliable poses."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import pycolmap
 from .judge import agreement, take_out, unsupported
 
 Tell = Callable[[int], None]
-"""Told how much is done."""
+"""Called with the amount done."""
 
 ROUNDS = 5
-"""Most rounds of taking photos out: what is left may lose what supported it."""
+"""Most rounds of removing photos; each round may leave other photos without support."""
 
 
 class Options(NamedTuple):
-    """What mappers have in common."""
+    """Options common to all mappers."""
 
     loose: bool
     threads: int
@@ -28,24 +28,24 @@ class Options(NamedTuple):
 def incremental(
     tell: Tell, database: str, photos: str, out: str, common: Options, begin: str = ""
 ) -> dict[int, pycolmap.Reconstruction]:
-    """Place one photo after the other (Schönberger and Frahm 2016).
+    """Register one photo after the other (Schönberger and Frahm 2016).
 
     Args:
-        tell: Told how many photos have a pose.
-        database: With features and matches.
+        tell: Called with the number of registered photos.
+        database: Database with features and matches.
         photos: Folder of the photos, for the colours of the points.
-        out: Folder for what COLMAP writes.
+        out: Folder for COLMAP's output.
         common: Thresholds, threads and seed.
-        begin: Folder of a model to begin with.
+        begin: Folder of an initial model.
 
     Returns:
-        The models by their numbers.
+        The models by number.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = common.threads, common.seed
-    options.min_model_size = 3  # photos are few here, and the best model is taken anyway
+    options.min_model_size = 3  # photos may be few, and the best model is used anyway
     options.multiple_models = not begin
-    if common.loose:  # half the matches, and a quarter of the angle, that COLMAP asks for
+    if common.loose:  # half the matches and a quarter of the angle that COLMAP requires
         options.min_num_matches = 10
         options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = 50, 15
         options.mapper.init_min_tri_angle, options.mapper.abs_pose_min_inlier_ratio = 4.0, 0.15
@@ -73,7 +73,7 @@ def incremental(
 
 
 def all_at_once(database: str, photos: str, out: str, common: Options) -> dict[int, pycolmap.Reconstruction]:
-    """Place all photos together (Pan et al. 2024, GLOMAP); arguments as for `incremental`."""
+    """Register all photos together (Pan et al. 2024, GLOMAP); arguments as for `incremental`."""
     calibration = pycolmap.ViewGraphCalibrationOptions()
     calibration.random_seed = common.seed
     pycolmap.calibrate_view_graph(database, calibration)
@@ -87,21 +87,21 @@ def all_at_once(database: str, photos: str, out: str, common: Options) -> dict[i
 def mended(
     model: pycolmap.Reconstruction, database: str, photos: str, folder: Path, options: Options
 ) -> pycolmap.Reconstruction:
-    """Take out photos whose poses do not count, and let the mapper place them in what is left.
+    """Remove photos with unreliable poses, and let the mapper register them again in the remaining model.
 
-    While focal lengths are still guesses, the incremental mapper may place two photos well beside each other but
-    wrongly beside the rest, and never looks at them again. The global mapper gives every photo a pose, however few
+    While focal lengths are still guesses, the incremental mapper may place two photos consistently with each other but
+    inconsistently with the rest, and it never re-examines them. The global mapper gives every photo a pose, however few
     points it has.
 
     Args:
-        model: May be changed.
-        database: With features and matches.
+        model: The model; may be modified.
+        database: Database with features and matches.
         photos: Folder of the photos.
-        folder: For the work.
+        folder: Folder for intermediate files.
         options: Thresholds, threads and seed.
 
     Returns:
-        A model all of whose poses count; the one that was given, or what became of it.
+        A model in which all poses are reliable: the given one or its successor.
     """
     if not without_doubtful(model, database) or model.num_reg_images() < 2:
         return model
@@ -115,11 +115,11 @@ def mended(
 
 
 def without_doubtful(model: pycolmap.Reconstruction, database: str) -> int:
-    """Take out the photos whose poses do not count; say how many.
+    """Remove the photos with unreliable poses; return their number.
 
     Args:
-        model: Changed.
-        database: With the matches.
+        model: The model; modified.
+        database: Database with the matches.
     """
     before = model.num_reg_images()
     for _ in range(ROUNDS):

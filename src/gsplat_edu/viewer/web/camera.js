@@ -8,7 +8,7 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const plus = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
 
-// Turns a vector about an axis of length 1, by the right hand: Rodrigues' formula.
+// Rotates a vector about an axis of length 1 by the right-hand rule (Rodrigues' formula).
 function turned(vector, axis, angle) {
   const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
   const around = cross(axis, vector);
@@ -16,12 +16,12 @@ function turned(vector, axis, angle) {
   return vector.map((value, i) => value * cos + around[i] * sin + axis[i] * along);
 }
 
-// Most that a wide window enlarges the image beyond what fits: at most a fifth of its height is cropped.
+// Most that a wide window enlarges the image beyond fitting it: at most a fifth of its height is cropped.
 const MOST_CROPPED = 1.25;
 
-// What a camera shows, in a window of another shape: the middle of its image. A narrow window is filled, with the sides
-// cropped: above and below the image there is what no camera saw. A wide one keeps most of the height, since a square photo
-// of an object would lose its head and feet, and shows some more at the sides.
+// Fits a camera to a window of another shape around the centre of its image. A narrow window is filled and the sides
+// are cropped, since no camera saw anything above and below the image. A wide window keeps most of the height, since a
+// square photo of an object would lose its top and bottom, and shows some more at the sides.
 function fitted(camera, width, height) {
   const [across, down] = [width / camera.W, height / camera.H];
   const scale = across > down ? Math.min(across, MOST_CROPPED * down) : down;
@@ -37,13 +37,13 @@ function fitted(camera, width, height) {
   };
 }
 
-// The point at a depth that a camera sees at column u and row v.
+// The point at a given depth that a camera sees at column u and row v.
 function pointAt(camera, u, v, depth) {
   const ray = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1];
   return ray.reduce((at, step, i) => plus(at, camera.R[i], step * depth), camera.eye);
 }
 
-// Bounds of x/z and y/z in the Jacobian, as Camera.jacobian_bounds has them; without a limit, all a float holds.
+// Bounds of x/z and y/z in the Jacobian, as in Camera.jacobian_bounds; without a limit, the largest float.
 function ratioBounds(camera, limit) {
   if (limit === null) return { low: [-3e38, -3e38], high: [3e38, 3e38] };
   const bounds = (side) => [
@@ -53,16 +53,16 @@ function ratioBounds(camera, limit) {
   return { low: bounds(-1), high: bounds(1) };
 }
 
-// Where the visitor stands and looks, and the point that orbits go around.
+// The user's viewpoint and the pivot of orbits.
 class View {
-  // start: camera, pivot and up of the first view. eyes: where the capture's cameras stand.
+  // start: camera, pivot and up of the initial view. eyes: centres of the capture's cameras.
   constructor({ camera, pivot, up }, eyes) {
     this.start = camera;
     this.pivot = pivot;
     this.up = up;
     this.region = new Region(eyes);
     this.goTo(camera);
-    this.pace = this.distance; // flying covers it in two seconds
+    this.pace = this.distance; // flying covers this distance in two seconds
     this.region.around(this.focus);
     this.turn = this.region.turn();
   }
@@ -87,14 +87,14 @@ class View {
     return Math.hypot(...plus(this.focus, this.camera.eye, -1));
   }
 
-  // Lets orbits go around another point; the picture stays.
+  // Sets another pivot; the picture stays the same.
   orbitAround(point) {
     this.focus = point;
     this.allowed = null;
   }
 
-  // The camera's axes after turning the head by angles to the right and downwards; not over the zenith, where left and
-  // right change places.
+  // The camera's axes after turning to the right and down by given angles; never across the zenith, where left and
+  // right would swap.
   turnedHead(right, down) {
     const level = this.camera.R.map((row) => turned(row, this.up, -right));
     const R = level.map((row) => turned(row, level[0], -down));
@@ -102,18 +102,18 @@ class View {
     return steepness(R) < 0.999 || steepness(R) < steepness(level) ? R : level;
   }
 
-  // Turns the head.
+  // Turns the camera in place.
   look(right, down) {
     const { distance } = this;
     this.camera = { ...this.camera, R: this.turnedHead(right, down) };
     this.orbitAround(plus(this.camera.eye, this.camera.R[2], distance));
   }
 
-  // Turns about the focus, in steps so small that a fast drag is slowed down where a slow one is.
+  // Orbits in steps so small that a fast drag is damped as much as a slow one.
   orbit(right, down) {
     if (this.allowed === null) {
       this.region.around(this.focus);
-      // who has flown or panned outside is not held there
+      // the limit does not apply once the user has flown or panned outside
       this.allowed = Math.max(this.region.margin, this.region.distance(plus(this.camera.eye, this.focus, -1)));
     }
     const steps = Math.max(1, Math.ceil(Math.hypot(right, down) / ORBIT_STEP));
@@ -131,7 +131,7 @@ class View {
     this.camera = { ...this.camera, R, eye: plus(this.focus, around) };
   }
 
-  // Axes, and where the eye stands from the focus: turned with the axes.
+  // Axes, and the eye relative to the pivot, rotated with the axes.
   orbited(offset, right, down) {
     const R = this.turnedHead(right, down);
     const seen = this.camera.R.map((row) => dot(row, offset));
@@ -145,13 +145,13 @@ class View {
     this.orbitAround(shifted(this.focus));
   }
 
-  // Moves with the picture: a drag by so many pixels of a window whose camera is `shown`.
+  // Pans with the picture: dx, dy in pixels of a window whose camera is `shown`.
   pan(dx, dy, shown) {
     const depth = Math.abs(dot(this.camera.R[2], plus(this.focus, this.camera.eye, -1)));
     this.move([(-dx * depth) / shown.fx, (-dy * depth) / shown.fy, 0]);
   }
 
-  // Goes nearer to the focus (factor below 1) or farther.
+  // Moves closer to the pivot (factor below 1) or farther away.
   zoom(factor) {
     const distance = Math.min(Math.max(this.distance * factor, 1e-3 * this.pace), 1e3 * this.pace);
     const offset = plus(this.camera.eye, this.focus, -1);

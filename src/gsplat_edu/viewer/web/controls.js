@@ -1,14 +1,14 @@
-// Mouse, fingers and keys move the view.
+// Moves the view by mouse, touch and keyboard.
 "use strict";
 
 const WHEEL = 0.0015; // logarithm of the distance per pixel of scrolling
-const LINE = 16; // pixels, where a wheel counts in lines
-const PINCH = 8; // a pinch on a touchpad comes as a slow wheel with Ctrl
-const PACE = 0.5; // of the start's distance, per second
-const HURRY = 4; // with Shift
-const TAP = 10; // pixels that a finger may move in a tap
-const TAP_PAUSE = 400; // milliseconds between the two taps of a double one
-const TAP_APART = 30; // pixels between them
+const LINE = 16; // pixels per line, for wheels that count lines
+const PINCH = 8; // a pinch on a touchpad arrives as a slow wheel with Ctrl
+const PACE = 0.5; // initial distances per second
+const HURRY = 4; // factor with Shift
+const TAP = 10; // most pixels that a finger moves in a tap
+const TAP_PAUSE = 400; // most milliseconds between the taps of a double tap
+const TAP_APART = 30; // most pixels between them
 
 // Along (right, down, forward).
 const STEPS = {
@@ -21,8 +21,8 @@ const STEPS = {
 };
 
 class Controls {
-  // actions: moved() after every move, awake() where a held key is about to move, shown() for the camera on the screen,
-  // orbitAround(x, y) for a double click or tap, and what keys ask for: fly(), reset(), help(), step(by).
+  // actions: moved() after every move, awake() when a held key starts to move, shown() for the camera on the screen,
+  // orbitAround(x, y) for a double click or tap, and the keys' actions: fly(), reset(), help(), step(by).
   constructor(canvas, view, actions) {
     Object.assign(this, { canvas, view, actions, flying: false, pointers: new Map(), held: new Set(), hurried: false });
     this.lastTap = null;
@@ -34,7 +34,7 @@ class Controls {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     addEventListener("keydown", (event) => this.keyDown(event));
     addEventListener("keyup", (event) => this.keyUp(event));
-    addEventListener("blur", () => this.held.clear()); // nobody tells a page of keys let go elsewhere
+    addEventListener("blur", () => this.held.clear()); // a page does not see keys released elsewhere
   }
 
   press(event) {
@@ -53,7 +53,7 @@ class Controls {
     else this.lastTap = null;
   }
 
-  // Notes a click or tap, and acts on the second of two. The browser's own double click comes from no finger everywhere.
+  // Records a click or tap and acts on the second of two. Some browsers send no double click for fingers.
   tap({ clientX: x, clientY: y, timeStamp }) {
     const last = this.lastTap;
     const isSecond = last && timeStamp - last.timeStamp < TAP_PAUSE && Math.hypot(x - last.x, y - last.y) < TAP_APART;
@@ -75,7 +75,7 @@ class Controls {
     this.actions.moved();
   }
 
-  // Middle of the fingers, and how far apart two are.
+  // Midpoint of the fingers, and the distance between two.
   grip() {
     const [a, b = a] = this.pointers.values();
     return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, span: Math.hypot(a.x - b.x, a.y - b.y) };
@@ -99,7 +99,7 @@ class Controls {
     this.actions.moved();
   }
 
-  // Whoever flies is not held back by the point ahead.
+  // While flying, the pivot ahead does not limit the motion.
   zoom(factor) {
     if (this.flying) this.view.move([0, 0, (1 - factor) * this.view.distance]);
     else this.view.zoom(factor);
@@ -128,7 +128,7 @@ class Controls {
     this.held.delete(event.code);
   }
 
-  // Moves as the held keys say; returns whether there are any.
+  // Moves according to the held keys; returns whether any is held.
   advance(seconds) {
     const length = PACE * this.view.pace * seconds * (this.hurried ? HURRY : 1);
     for (const code of this.held) this.view.move(STEPS[code].map((step) => step * length));

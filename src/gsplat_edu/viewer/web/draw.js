@@ -1,18 +1,18 @@
-// Drawing with WebGL2: the splats, far to near, into an image of half floats, and that image onto the canvas.
+// Drawing with WebGL2: the splats, far to near, into a half-float image, which is then copied to the canvas.
 //
-// Eight bits are too few to blend a hundred faint splats into: each rounding would show. The renderer may stop where
-// less than 1e-4 of the light is left; here nothing stops, which nobody can see.
+// Eight bits are too few for blending a hundred faint splats: the rounding would be visible. The renderer may stop once
+// the transmittance is below 1e-4; drawing does not stop here, and the difference is invisible.
 "use strict";
 
-const SOLID = 0.15; // half the opacity of a pixel that shows a surface, at least
-const SURFACE_STEPS = 10; // halvings of the depth's logarithm, from a factor of 2: down to 0.07 %
+const SOLID = 0.15; // smallest half of the opacity of a pixel that shows a surface
+const SURFACE_STEPS = 10; // bisections of log depth, starting from a factor of 2: accurate to 0.07 %
 
 class Renderer {
   constructor(canvas, splats, facts) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
-    if (!gl) throw new Error("This page needs WebGL2, which this browser lacks or has switched off.");
+    if (!gl) throw new Error("This page needs WebGL2, which this browser does not support or has disabled.");
     if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
-      throw new Error("This page needs images of half floats, which this graphics processor cannot draw into.");
+      throw new Error("This page needs half-float render targets, which this graphics processor does not support.");
     }
     this.gl = gl;
     this.facts = facts;
@@ -28,7 +28,7 @@ class Renderer {
     gl.disable(gl.DITHER);
   }
 
-  // Puts an array into a texture, row by row.
+  // Copies an array into a texture, row by row.
   uploaded({ channels, texels, type }, values) {
     const gl = this.gl;
     const [stored, format, kind] = {
@@ -73,7 +73,7 @@ class Renderer {
     this.count = order.length;
   }
 
-  // Makes the image that is drawn into, where its size has changed.
+  // Creates the image to draw into if its size has changed.
   resize(width, height) {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
@@ -85,8 +85,8 @@ class Renderer {
     [this.width, this.height] = [width, height];
   }
 
-  // Draws the splats in the order that was set: image = alpha colour + (1 - alpha) image, at first the background;
-  // those up to a camera depth.
+  // Draws the splats up to a camera depth in the current order: image = alpha colour + (1 - alpha) image, starting with
+  // the background.
   draw(camera, settings, background = [...settings.background, 1], farthest = 3e38) {
     const gl = this.gl;
     this.resize(camera.W, camera.H);
@@ -124,12 +124,12 @@ class Renderer {
     gl.uniform2fv(place("ratio_high"), high);
   }
 
-  // Camera depth of what is seen at a pixel: where half of its opacity has been met. null where little is there. The
-  // image has to be drawn again afterwards.
+  // Camera depth of the visible surface at a pixel: where half of the pixel's opacity is reached; null if there is
+  // little. The image has to be drawn again afterwards.
   surface(camera, settings, column, row) {
     const gl = this.gl;
     const { near } = this.facts;
-    gl.enable(gl.SCISSOR_TEST); // so that only this pixel costs anything
+    gl.enable(gl.SCISSOR_TEST); // only this pixel is drawn
     gl.scissor(column, camera.H - 1 - row, 1, 1);
     const pixel = new Float32Array(4);
     const opacity = (farthest) => {
@@ -162,7 +162,7 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Gives the image as float32, RGB, first row on top.
+  // Returns the image as float32 RGB, first row on top.
   pixels() {
     const gl = this.gl;
     const { width, height } = this;

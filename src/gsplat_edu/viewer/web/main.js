@@ -1,9 +1,9 @@
-// The page: unpack, then draw whenever something has changed.
+// The page: unpacks the scene, then draws whenever something changes.
 "use strict";
 
-const SMOOTHING = 0.1; // share of the newest frame in the frame rate
-const REST = 400; // milliseconds without a frame after which nothing moves
-const LONGEST_STEP = 0.1; // seconds that a held key moves the view for at once, however long a frame took
+const SMOOTHING = 0.1; // weight of the newest frame in the frame rate
+const REST = 400; // milliseconds without a frame after which the view counts as still
+const LONGEST_STEP = 0.1; // most seconds of movement per frame for a held key, however long the frame took
 
 class Viewer {
   constructor(facts, splats) {
@@ -15,11 +15,11 @@ class Viewer {
     const eyes = facts.cameras.map(({ eye }) => eye);
     this.view = new View(facts.start, eyes);
     this.cameraIndex = facts.start.index;
-    this.exact = null; // the camera that setCamera was given, until somebody moves
+    this.exact = null; // the camera given to setCamera, until the user moves
     this.lost = false;
     this.frameAsked = 0;
-    this.lastFrame = 0; // 0 after a rest
-    this.smoothed = 0; // seconds a frame
+    this.lastFrame = 0; // 0 while the view is still
+    this.smoothed = 0; // seconds per frame
     const actions = this.actions();
     this.panel = new Panel(facts, actions);
     this.controls = new Controls(this.canvas, this.view, actions);
@@ -47,22 +47,22 @@ class Viewer {
     };
   }
 
-  // The camera of the next frame: the view's, in the window as it is.
+  // The camera of the next frame: the view's camera, fitted to the window.
   camera() {
     if (this.exact) return this.exact;
     const side = (length) => Math.max(1, Math.round(length * (window.devicePixelRatio || 1)));
     return fitted(this.view.camera, side(this.canvas.clientWidth), side(this.canvas.clientHeight));
   }
 
-  // For programs: draws with exactly this camera, whatever the window's size, and gives the picture as float32, RGB,
-  // the first row on top. The camera stays until somebody moves.
+  // For programs: draws with exactly this camera, regardless of the window's size, and returns float32 RGB with the
+  // first row on top. The camera stays until the user moves.
   async setCamera(camera) {
     this.exact = camera;
     await this.settled();
     return { width: camera.W, height: camera.H, pixels: this.renderer.pixels() };
   }
 
-  // Resolves when the picture is that of the camera, its splats in order.
+  // Resolves once the picture shows the current camera with its splats sorted.
   async settled() {
     const camera = this.camera();
     await this.sorter.sort(camera);
@@ -74,7 +74,7 @@ class Viewer {
     this.moved(this.facts.start.index);
   }
 
-  // Lets orbits go around what is seen at a place of the window, in CSS pixels; nothing changes where nothing is seen.
+  // Makes the visible surface at a window position (CSS pixels) the pivot; no change if nothing is visible there.
   orbitAround(x, y) {
     const camera = this.camera();
     const { left, top, width, height } = this.canvas.getBoundingClientRect();
@@ -93,7 +93,7 @@ class Viewer {
     this.moved(index);
   }
 
-  // Goes to the next camera, or to the first or last one where the view stands at none.
+  // Goes to the next or previous camera; to the first or last one if the view is at none.
   step(by) {
     const { length } = this.facts.cameras;
     const from = this.cameraIndex < 0 && by < 0 ? 0 : this.cameraIndex;
@@ -129,7 +129,7 @@ class Viewer {
     this.renderer.show();
   }
 
-  // Frames are drawn only while something moves: only then is there a rate.
+  // Frames are drawn only while something moves; otherwise there is no frame rate.
   time(now, seconds) {
     this.lastFrame = now;
     if (seconds) this.smoothed = this.smoothed ? (1 - SMOOTHING) * this.smoothed + SMOOTHING * seconds : seconds;
@@ -143,7 +143,7 @@ class Viewer {
 
   lose() {
     this.lost = true;
-    say("The graphics processor dropped this page; reload it.");
+    say("The graphics processor stopped drawing this page; reload it.");
   }
 }
 

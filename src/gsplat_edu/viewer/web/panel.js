@@ -1,4 +1,4 @@
-// What stands around the picture: facts, buttons, the capture's cameras, messages.
+// Everything around the picture: metadata, buttons, the capture's cameras, messages.
 "use strict";
 
 const POINT_SHOWN = 800; // milliseconds
@@ -35,7 +35,7 @@ class Panel {
     select.value = Math.min(this.facts.settings.sh_degree, this.facts.sh_degree);
     select.addEventListener("change", () => {
       actions.degree(Number(select.value));
-      select.blur(); // it would keep the keys to itself
+      select.blur(); // otherwise it would keep receiving the keys
     });
   }
 
@@ -49,7 +49,7 @@ class Panel {
       if (held_out) {
         const mark = document.createElement("small");
         mark.textContent = "held out";
-        mark.title = "This photo was not trained on; it judges the scene.";
+        mark.title = "Test view: this photo was not used for training.";
         button.append(" ", mark);
       }
       button.addEventListener("click", () => actions.goTo(index));
@@ -63,7 +63,7 @@ class Panel {
     element("cameras").querySelector("ol").append(...items);
   }
 
-  // Marks the camera that is shown; none where the view has been moved away from it.
+  // Highlights the current camera; none once the view has moved away from it.
   mark(index) {
     this.buttons.forEach((button, i) => button.setAttribute("aria-current", i === index));
     this.buttons[index]?.scrollIntoView({ block: "nearest" });
@@ -81,12 +81,12 @@ class Panel {
     element("rate").textContent = `${framesPerSecond.toFixed(0)} frames/s`;
   }
 
-  // Nothing is drawn while nothing moves: there is no rate.
+  // Nothing is drawn while the view is still, so there is no frame rate.
   atRest() {
     element("rate").textContent = "";
   }
 
-  // Shows for a moment where the point is that orbits go around.
+  // Shows the pivot for a moment.
   point(x, y) {
     const mark = element("point");
     [mark.style.left, mark.style.top] = [`${x}px`, `${y}px`];

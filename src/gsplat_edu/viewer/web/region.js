@@ -1,14 +1,14 @@
-// The directions that a scene was captured from, seen from the point that the view orbits around. A drag that leaves
-// them is slowed down: what lies beyond was on no photo.
+// The directions from which a scene was captured, as seen from the pivot. A drag beyond them is damped because no photo
+// shows what lies there.
 "use strict";
 
-const MOST_EYES = 300; // of cameras; more are thinned evenly
-const NEIGHBOURS = 3; // of each camera: the way to each of them counts as captured
-const STEPS_BETWEEN = 4; // parts of such a way
-const MARGIN = (5 * Math.PI) / 180; // that is free around the captured directions
+const MOST_EYES = 300; // cameras; more are subsampled evenly
+const NEIGHBOURS = 3; // per camera: directions on the way to each count as captured
+const STEPS_BETWEEN = 4; // steps on each such way
+const MARGIN = (5 * Math.PI) / 180; // undamped margin around the captured directions
 const WIDEST_MARGIN = Math.PI / 4;
-const SOFTNESS = (4 * Math.PI) / 180; // beyond it, a drag turns by 1/e as much for every such angle
-const COVERED = 1.5; // a drag across the window turns by this many times the captured angle
+const SOFTNESS = (4 * Math.PI) / 180; // beyond the margin, damping grows by a factor of e per this angle
+const COVERED = 1.5; // a drag across the window turns by this multiple of the captured angle
 const LEAST_TURN = Math.PI / 4;
 const MOST_TURN = Math.PI;
 
@@ -23,11 +23,11 @@ class Region {
     const every = Math.max(1, Math.ceil(eyes.length / MOST_EYES));
     this.eyes = eyes.filter((_, i) => i % every === 0);
     this.seen = []; // directions of the cameras
-    this.directions = []; // those, and some on the ways between them
+    this.directions = []; // these and interpolated ones
     this.margin = MARGIN;
   }
 
-  // Sets the point that directions are seen from.
+  // Sets the point from which directions are measured.
   around(centre) {
     const directions = this.eyes
       .map((eye) => plus(eye, centre, -1))
@@ -49,24 +49,24 @@ class Region {
         }
       }
     });
-    // sparse cameras leave more room between them
+    // sparse cameras get a wider margin
     const gaps = directions.map((a, i) => (nearest[i].length ? angleOf(dot(a, nearest[i][0])) : 0)).sort((a, b) => a - b);
     this.margin = Math.min(WIDEST_MARGIN, MARGIN + 0.5 * (gaps[gaps.length >> 1] ?? 0));
   }
 
-  // Angle between a direction and the nearest captured one; 0 where nothing is known of the cameras.
+  // Angle between a direction and the nearest captured one; 0 if there are no cameras.
   distance(offset) {
     if (!this.directions.length) return 0;
     const direction = unit(offset);
     return angleOf(this.directions.reduce((best, other) => Math.max(best, dot(direction, other)), -1));
   }
 
-  // What share of a turn is carried out that leads from one distance to a larger one.
+  // Fraction of a turn that is applied at a distance from the captured directions.
   share(distance, allowed) {
     return Math.exp(-Math.max(0, distance - allowed) / SOFTNESS);
   }
 
-  // Radians for a drag across the longer side of the window: narrow captures turn slowly.
+  // Radians per drag across the window's longer side: narrow captures turn slowly.
   turn() {
     if (!this.seen.length) return MOST_TURN;
     let widest = 1;

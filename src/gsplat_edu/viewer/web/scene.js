@@ -1,9 +1,9 @@
-// The scene as this file holds it: what page.py wrote, and nothing else, decides what is read here.
+// Reads the scene embedded in this file, in the format written by page.py.
 "use strict";
 
 const FACTS = JSON.parse(document.getElementById("facts").textContent);
 
-// Arrays of the blob, in its order; `page_data.py` lists the same.
+// Arrays of the binary data in their order; `page_data.py` has the same list.
 function layout(facts) {
   const coefficients = (facts.sh_degree + 1) ** 2;
   return [
@@ -15,8 +15,8 @@ function layout(facts) {
   ];
 }
 
-// Give the splats as typed arrays by name. The text is taken out of the page piece by piece, so that it and the
-// numbers are not in memory together.
+// Returns the splats as typed arrays by name. The text is removed from the page piece by piece, so that it and the
+// numbers are never in memory together.
 async function unpackSplats(facts) {
   const parts = layout(facts).map((part) => ({ ...part, length: facts.count * part.channels * part.texels }));
   const total = parts.reduce((sum, part) => sum + part.length * part.type.BYTES_PER_ELEMENT, 0);
@@ -32,7 +32,7 @@ async function unpackSplats(facts) {
 
 async function inflated(elements, total) {
   if (typeof DecompressionStream === "undefined") {
-    throw new Error("This browser cannot unpack the scene: it lacks DecompressionStream; use a newer one.");
+    throw new Error("This browser cannot unpack the scene: it lacks DecompressionStream; use a newer version.");
   }
   const waiting = [...elements];
   const packed = new ReadableStream({
@@ -52,9 +52,9 @@ async function inflated(elements, total) {
       filled += value.length;
     }
   } catch {
-    filled = -1; // what is wrong with it is of no use to whoever reads the message
+    filled = -1; // the details would not help the reader of the message
   }
-  if (filled !== total) throw new Error("The scene in this file is damaged; get the file again.");
+  if (filled !== total) throw new Error("The scene in this file is damaged; download or export the file again.");
   return bytes;
 }
 

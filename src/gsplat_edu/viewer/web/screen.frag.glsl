@@ -1,4 +1,4 @@
-// The finished image goes to the canvas, which rounds it to bytes.
+// Copies the finished image to the canvas, which rounds it to bytes.
 
 precision highp float;
 

@@ -1,8 +1,8 @@
-// Sorts splats by camera depth of the mean, far to near, in a thread of its own.
+// Sorts splats by camera depth of the mean, far to near, in its own thread.
 //
-// A positive float32 orders as its bits do, so two counting sorts of 16 bits each, the lower first, give the exact
-// order. Among equal depths the last one comes first: drawn one over the other, this is the renderer's order near to
-// far.
+// Positive float32 values sort like their bits, so two counting sorts of 16 bits each, low half first, give the exact
+// order. Among equal depths the last index comes first: drawn far to near, this matches the renderer's near-to-far
+// order.
 "use strict";
 
 let means, near, keys, byLow;
@@ -19,7 +19,7 @@ self.onmessage = ({ data }) => {
   self.postMessage({ order: order.buffer, count }, [order.buffer]);
 };
 
-// Fills the first entries of `order` and returns how many splats lie in front of the camera.
+// Fills the first entries of `order` and returns the number of splats in front of the camera.
 function sort(axis, eye, order) {
   const low = new Uint32Array(65536);
   const high = new Uint32Array(65536);
@@ -42,7 +42,7 @@ function sort(axis, eye, order) {
   return count;
 }
 
-// Turns counts into where each bucket begins.
+// Turns counts into the start of each bucket.
 function startsOf(counts) {
   let sum = 0;
   for (let b = 0; b < counts.length; ++b) {

@@ -1,9 +1,9 @@
-// The page's side of the sorting worker: one sort at a time, because there is one buffer, which travels to the worker
-// and back.
+// The page's side of the sorting worker. One sort runs at a time because a single buffer travels to the worker and
+// back.
 "use strict";
 
 class Sorter {
-  // onOrder(order) is told of every finished sort, before the next one can take the buffer away.
+  // onOrder(order) is called after each sort, before the next one takes the buffer away.
   constructor(means, near, onOrder) {
     const source = document.getElementById("sort-worker").textContent;
     const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
@@ -12,16 +12,16 @@ class Sorter {
     this.onOrder = onOrder;
     this.running = null;
     this.sorted = "";
-    const copy = means.slice(); // the worker keeps it
+    const copy = means.slice(); // transferred to the worker, which keeps it
     this.worker.postMessage({ means: copy, near }, [copy.buffer]);
   }
 
-  // Whether the order that is there was made for this camera.
+  // Whether the current order was made for this camera.
   fits(camera) {
     return this.sorted === Sorter.key(camera);
   }
 
-  // Depth is all that an order depends on.
+  // An order depends only on depth.
   static key(camera) {
     return JSON.stringify([camera.R[2], camera.eye]);
   }
@@ -30,7 +30,7 @@ class Sorter {
     while (this.running) await this.running;
     if (this.fits(camera)) return;
     this.running = new Promise((resolve, reject) => {
-      this.worker.onerror = () => reject(new Error("The thread that sorts the splats failed; reload the page."));
+      this.worker.onerror = () => reject(new Error("The sorting thread failed; reload the page."));
       this.worker.onmessage = ({ data }) => {
         this.order = data.order;
         this.sorted = Sorter.key(camera);

@@ -1,4 +1,4 @@
-// alpha = min(0.99, o exp(-d' Sigma2d^-1 d / 2)), nothing below 1/255; the colour is multiplied by it for blending.
+// alpha = min(0.99, o exp(-d' Sigma2d^-1 d / 2)), zero below 1/255; blending multiplies the colour by it.
 
 precision highp float;
 

@@ -4,15 +4,15 @@
 
 precision highp float;
 
-// A parameter per texture, a splat per texel; for sh a coefficient per texel.
+// One texture per parameter, one texel per splat; for sh, one texel per coefficient.
 uniform highp sampler2D means;
 uniform highp sampler2D log_scales;
 uniform highp isampler2D quats;
 uniform highp sampler2D logit_opacities;
 uniform highp sampler2D sh;
 uniform int texture_width;
-uniform int coefficients;  // that are stored
-uniform int degree;        // that is drawn
+uniform int coefficients;  // stored per splat
+uniform int degree;        // drawn
 
 uniform mat3 R;  // world to camera
 uniform vec3 eye;
@@ -22,7 +22,7 @@ uniform vec2 size;
 uniform vec2 ratio_low;  // bounds of x/z and y/z in the Jacobian
 uniform vec2 ratio_high;
 uniform bool antialiased;
-uniform float farthest;  // camera depth up to which splats are drawn
+uniform float farthest;  // largest camera depth that is drawn
 
 layout(location = 0) in uint splat;
 
@@ -30,8 +30,8 @@ flat out vec2 mean2d;  // px
 flat out vec3 conic;   // (A, B, C) of A dx² + 2 B dx dy + C dy²
 flat out vec4 paint;   // colour and opacity
 
-// The rasteriser places corners on a grid of 1/16 px or finer: no pixel of the rim may fall out by that. What is
-// outside the ellipse is discarded anyway.
+// The rasteriser snaps corners to a grid of 1/16 px or finer; the margin keeps it from losing pixels at the rim. Pixels
+// outside the ellipse are discarded anyway.
 const float SLACK = 0.125;
 
 ivec2 texel(int i) {
@@ -65,7 +65,7 @@ vec3 color(vec3 d) {
     return sum + C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(12);
 }
 
-// Half the width of the ellipse d' Sigma2d^-1 d = level across a direction.
+// Half the extent of the ellipse d' Sigma2d^-1 d = level along a direction.
 float reach(vec2 direction, float a, float b, float c, float level) {
     vec2 squares = direction * direction;
     float variance = a * squares.x + 2.0 * b * direction.x * direction.y + c * squares.y;
@@ -73,7 +73,7 @@ float reach(vec2 direction, float a, float b, float c, float level) {
 }
 
 void main() {
-    gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside, where nothing is to be drawn
+    gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside the clip volume unless the splat is visible
     ivec2 place = texel(int(splat));
     vec3 offset = texelFetch(means, place, 0).xyz - eye;
     vec3 p = R * offset;
@@ -110,8 +110,8 @@ void main() {
     paint = vec4(max(seen, 0.0), opacity);
     conic = vec3(c, -b, a) / det;
 
-    // Along the ellipse's long axis the quad is tightest. Any direction gives one that holds the ellipse, so that
-    // this one need not be exact.
+    // The quad is tightest along the ellipse's long axis. A quad in any direction contains the ellipse, so the axis
+    // need not be exact.
     float root = sqrt(0.25 * (a - c) * (a - c) + b * b);
     vec2 axis = a > c ? vec2(0.5 * (a - c) + root, b) : vec2(b, 0.5 * (c - a) + root);
     axis = root > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
@@ -119,6 +119,6 @@ void main() {
     vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
     vec2 pixel = mean2d + corner.x * reach(axis, a, b, c, level) * axis;
     pixel += corner.y * reach(across, a, b, c, level) * across;
-    vec2 device = 2.0 * (pixel + 0.5) / size - 1.0;  // pixel (0, 0) has its centre half a pixel inside the corner
+    vec2 device = 2.0 * (pixel + 0.5) / size - 1.0;  // the centre of pixel (0, 0) is half a pixel inside the corner
     gl_Position = vec4(device.x, -device.y, 0.0, 1.0);
 }

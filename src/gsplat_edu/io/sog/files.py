@@ -1,7 +1,7 @@
-"""The files of a SOG, in a zip or in a folder, and the pixels of its images.
+"""The files of a SOG, in a zip or a folder, and the pixels of its images.
 
-Nothing is believed before it is checked: entries of a zip are unpacked within limits, and an image's size is read from
-its header before a decoder sees it.
+All input is validated first: zip entries are decompressed within limits, and an image's size is read from its header
+before it is decoded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from PIL import Image
 
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import named_failure, written_aside
-from gsplat_edu.image_files import opened_image
+from gsplat_edu.image_files import UNDECODABLE, opened_image
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.ply_table import LFS_POINTER
 from gsplat_edu.reading import read_bytes
@@ -29,19 +29,19 @@ from gsplat_edu.reading import read_bytes
 META_NAME = "meta.json"
 
 META_LIMIT = 1 << 20
-"""Bytes of a meta.json: it has 20,000 or so."""
+"""Largest meta.json in bytes; a usual one has about 20,000."""
 
 MULTIPLE = 4
-"""Width and height of images are multiples of it."""
+"""Width and height of images are multiples of this."""
 
 MOST_SPARE = 4
 """An image may have this many times as many pixels as there are splats ..."""
 
 FREE_PIXELS = 1 << 16
-"""... or this many more: 256 x 256, so that small scenes may be in images of any usual size."""
+"""... or this many more: 256 x 256, so that small scenes may use images of any usual size."""
 
 EFFORT = {"quality": 75, "method": 4}
-"""How hard to look for small images: less makes them 10 % larger, more takes 50 times as long for 0.1 %."""
+"""Compression effort: less gives images 10 % larger, more takes 50 times as long for 0.1 %."""
 
 _UNZIPPABLE = (
     zipfile.BadZipFile,
@@ -55,26 +55,16 @@ _UNZIPPABLE = (
     OverflowError,
 )
 
-_UNDECODABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    RuntimeError,
-    OverflowError,
-    struct.error,
-)
-
 
 class Bundle:
-    """The files in a .sog.
+    """The files of a .sog.
 
     Args:
         path: The zip.
 
     Raises:
-        SceneFormatError: it is no zip.
-        OSError: it cannot be read.
+        SceneFormatError: the file is not a zip.
+        OSError: the file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -83,19 +73,19 @@ class Bundle:
         _check_pointer(path, data)
         self._size = len(data)
         if not data.startswith(b"PK"):
-            raise SceneFormatError(f"{path}: is not a SOG: it is no zip; check its name")
+            raise SceneFormatError(f"{path}: is not a SOG: it is not a zip; check its name")
         try:
-            with warnings.catch_warnings():  # of fields in the directory that are odd
+            with warnings.catch_warnings():  # about unusual fields in the directory
                 warnings.simplefilter("ignore")
                 self._zip = zipfile.ZipFile(io.BytesIO(data))
         except _UNZIPPABLE:
             raise SceneFormatError(f"{path}: is a damaged or truncated zip; get the file again") from None
 
     def read(self, name: str) -> bytes:
-        """Unpack a file; of several of one name the last.
+        """Decompress a file; of several with the same name, the last one.
 
         Raises:
-            SceneFormatError: it is not there, damaged, or larger than it can be.
+            SceneFormatError: the file is missing, damaged, or implausibly large.
         """
         entry = self._zip.NameToInfo.get(name)
         if entry is None:
@@ -107,18 +97,18 @@ class Bundle:
         check_expansion(self._path, entry.file_size, self._size)
         try:
             with self._zip.open(entry) as file:
-                # without a number a bomb would go off before it is cut
+                # the limit keeps a zip bomb from being decompressed in full
                 return file.read(entry.file_size)
         except _UNZIPPABLE:
             raise SceneFormatError(f"{self._path}: {name} in it is damaged; get the file again") from None
 
     def stored(self, names: Iterable[str]) -> int:
-        """Return the bytes of the zip."""
+        """Return the size of the zip in bytes."""
         return self._size
 
 
 class Folder:
-    """The files beside a meta.json, and itself.
+    """The files of a folder that contains a meta.json.
 
     Args:
         path: The meta.json.
@@ -131,8 +121,8 @@ class Folder:
         """Read a file.
 
         Raises:
-            SceneFormatError: it is not there, or a Git LFS pointer.
-            OSError: it cannot be read, or there is no meta.json.
+            SceneFormatError: the file is missing or a Git LFS pointer.
+            OSError: the file cannot be read, or meta.json is missing.
         """
         file = self._file(name)
         data = read_bytes(file)
@@ -140,7 +130,7 @@ class Folder:
         return data
 
     def stored(self, names: Iterable[str]) -> int:
-        """Return the bytes of some of the files."""
+        """Return the total size of some of the files in bytes."""
         return sum(self._file(name).stat().st_size for name in names)
 
     def _file(self, name: str) -> Path:
@@ -165,27 +155,27 @@ def _missing(path: Path, name: str) -> SceneFormatError:
 
 
 def write_bundle(path: Path, contents: Mapping[str, bytes]) -> None:
-    """Write files into a zip, stored, with no dates: the same bytes for the same files.
+    """Write files into an uncompressed zip without dates: equal files give equal bytes.
 
     Raises:
-        OSError: it cannot be written. What stood there before is untouched.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     with written_aside(path) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as bundle:
         for name, data in contents.items():
-            entry = zipfile.ZipInfo(name)  # of 1980
-            entry.create_system = 3  # on every system
+            entry = zipfile.ZipInfo(name)  # dated 1980
+            entry.create_system = 3  # the same on every system
             entry.external_attr = 0o644 << 16
             bundle.writestr(entry, data)
 
 
 def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
-    """Write files beside a meta.json, and itself: all aside, then renamed, it last.
+    """Write a meta.json and its files: all under temporary names, then renamed, meta.json last.
 
     Raises:
-        OSError: one cannot be written. What stood there before is untouched.
+        OSError: a file cannot be written. Existing files stay unchanged.
     """
     places = {name: path if name == META_NAME else path.with_name(name) for name in contents}
-    with ExitStack() as stack:  # which leaves what was entered first last
+    with ExitStack() as stack:  # exits in reverse order of entering
         asides = {name: stack.enter_context(written_aside(place)) for name, place in places.items()}
         for name, data in contents.items():
             with named_failure(places[name]):
@@ -193,11 +183,11 @@ def write_folder(path: Path, contents: Mapping[str, bytes]) -> None:
 
 
 def encode(values: UInt8[np.ndarray, "N C"], width: int | None = None) -> bytes:
-    """Write pixels as a lossless WebP, row by row; what is left of the last row is zero.
+    """Encode pixels as a lossless WebP, row by row; the rest of the last row is zero.
 
     Args:
         values: N pixels of 3 or 4 channels; colours are kept where alpha is 0.
-        width: Width, px; about the square root of N where None.
+        width: Width, px; None uses about the square root of N.
     """
     count, channels = values.shape
     columns = width or max(MULTIPLE, _up_to_multiple(np.sqrt(count)))
@@ -221,13 +211,13 @@ def check_size(path: Path, name: str, data: bytes, count: int) -> tuple[int, int
         path: Name of the scene, for messages.
         name: Name of the image, for messages.
         data: The image's bytes; nothing is decoded.
-        count: Splats.
+        count: Number of splats.
 
     Returns:
         Width and height, px.
 
     Raises:
-        SceneFormatError: it has not, or is no WebP.
+        SceneFormatError: the size does not fit, or the image is not a WebP.
     """
     width, height = size_of(path, name, data)
     if not count <= width * height <= MOST_SPARE * count + FREE_PIXELS:
@@ -241,7 +231,7 @@ def size_of(path: Path, name: str, data: bytes) -> tuple[int, int]:
     """Read width and height from a WebP's header, px.
 
     Raises:
-        SceneFormatError: it is no WebP.
+        SceneFormatError: the image is not a WebP.
     """
     kind, begin = data[12:16], data[20:30]
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(begin) == 10:
@@ -253,18 +243,18 @@ def size_of(path: Path, name: str, data: bytes) -> tuple[int, int]:
         if kind == b"VP8 " and begin[3:6] == b"\x9d\x01\x2a":
             width, height = struct.unpack("<HH", begin[6:10])
             return width & 0x3FFF, height & 0x3FFF
-    raise SceneFormatError(f"{path}: {name} is no WebP image; export the scene again")
+    raise SceneFormatError(f"{path}: {name} is not a WebP image; export the scene again")
 
 
 def decode(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "H W 4"]:
-    """Decode an image whose size has been checked.
+    """Decode an image after its size has been checked.
 
     Raises:
-        SceneFormatError: it is damaged.
+        SceneFormatError: the image is damaged.
     """
     try:
         with opened_image(data, formats=["WEBP"]) as image:
             pixels: UInt8[np.ndarray, "H W 4"] = np.asarray(image.convert("RGBA"))
-    except _UNDECODABLE:
+    except UNDECODABLE:
         raise SceneFormatError(f"{path}: {name} is a damaged WebP image; get the file again") from None
     return pixels

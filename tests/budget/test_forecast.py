@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.doctor.costs import (
+from gsplat_edu.budget.costs import (
     Facts,
     Footprint,
     Measurements,
@@ -18,8 +15,12 @@ from gsplat_edu.doctor.costs import (
     expected_counts,
     wanted_gaussians,
 )
-from gsplat_edu.doctor.forecast import forecast, predict, spelled_bytes, spelled_seconds
-from gsplat_edu.doctor.probe import probe, process_age, resident_bytes
+from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes, spelled_seconds
+from gsplat_edu.budget.probe import probe, resident_bytes
+from gsplat_edu.cli.process import process_age
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.train.config import recipe
@@ -90,7 +91,7 @@ def test_mcmc_is_expected_to_grow_as_it_does():
     shapes |= {"sh_rest": (100, 0, 3), "logit_opacities": (100,)}
     gaussians = Gaussians(**{name: torch.ones(*shape) for name, shape in shapes.items()}).trainable()
     strategy = MCMC(config, torch.Generator().manual_seed(0))
-    optimizer = Adam(gaussians, config.learning_rates)
+    optimizer = Adam(gaussians.tensors(), config.learning_rates)
     counts = []
     for iteration in range(400):
         counts.append(len(gaussians))

@@ -1,4 +1,4 @@
-"""What the meta.json of a SOG says, checked.
+"""The validated contents of a SOG's meta.json.
 
 Source: PlayCanvas' specification of SOG, section 2.
 """
@@ -15,46 +15,46 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.io.sog_palette import CODEBOOK, MOST_ENTRIES
-from gsplat_edu.io.sog_values import LARGEST_LOG, Range
+from gsplat_edu.io.sog.palette import CODEBOOK, MOST_ENTRIES
+from gsplat_edu.io.sog.values import LARGEST_LOG, Range
 from gsplat_edu.reading import parse_json
 
 VERSION = 2
 
 MOST_SPLATS = 1 << 26
-"""Splats of a scene that are believed and written: 67 million, in images of 8192 x 8192 pixels."""
+"""Most splats that are read and written: 67 million, in images of 8192 x 8192 pixels."""
 
 COEFFICIENTS = {1: 3, 2: 8, 3: 15}
-"""Coefficients per channel above degree 0, by degree; the specification says bands."""
+"""Coefficients per channel above degree 0, by degree; the specification calls degrees bands."""
 
 GENERATOR = "gsplat-edu"
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}", re.ASCII)
-"""A file's name that leads nowhere else: no slash, no drive, no leading dot."""
+"""A file name that stays inside the folder: no slash, no drive, no leading dot."""
 
 ANTIALIASED_MODEL = "antialiased"
 
 MODELS = ("default", ANTIALIASED_MODEL)
-"""Models of splats that say whether to render with antialiasing."""
+"""Splat models, which specify whether to render with antialiasing."""
 
 LARGEST_FLOAT = float(str(np.finfo(np.float32).max))
-"""Largest float32 in its fewest digits: a little more than itself, and read as it."""
+"""The shortest decimal form of the largest float32: slightly larger, but parsed as the same float32."""
 
 MEANS, QUATS = ("means_l.webp", "means_u.webp"), ("quats.webp",)
 SCALES, SH0 = ("scales.webp",), ("sh0.webp",)
 SHN = ("shN_centroids.webp", "shN_labels.webp")
-"""Names under which images are written; others may be read."""
+"""Names of written images; other names may be read."""
 
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """What is said of the palette of harmonics.
+    """Description of the palette of harmonics.
 
     Args:
-        entries: Entries of the palette.
+        entries: Number of entries in the palette.
         degree: Highest degree, 1 to 3.
-        codebook: (256,) what the bytes of the palette stand for.
-        files: Names of the images of entries and of labels.
+        codebook: (256,) values that the palette's bytes select.
+        files: Names of the images with entries and labels.
     """
 
     entries: int
@@ -70,17 +70,17 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class Meta:
-    """What a meta.json says.
+    """The contents of a meta.json.
 
     Args:
-        count: Splats.
+        count: Number of splats.
         span: Lowest and highest logarithm of each coordinate.
-        scales: (256,) logarithms of scales that bytes stand for.
-        sh0: (256,) coefficients of degree 0 that bytes stand for.
+        scales: (256,) logarithms of scales that bytes select.
+        sh0: (256,) coefficients of degree 0 that bytes select.
         harmonics: The palette; None for a scene of degree 0.
-        antialiased: Whether the scene was trained with antialiasing; None where it is not said.
-        up: Direction that is up, of length 1; None where it is not said.
-        means: Names of the images of low and of high bytes.
+        antialiased: Whether the scene was trained with antialiasing; None if unspecified.
+        up: Up direction, of length 1; None if unspecified.
+        means: Names of the images with low and high bytes.
         quats: Name of the image of rotations.
         log_scales: Name of the image of scales.
         colors: Name of the image of coefficients of degree 0 and opacities.
@@ -100,7 +100,7 @@ class Meta:
 
     @property
     def splat_images(self) -> tuple[str, ...]:
-        """Names of the images that have a pixel for each splat; labels of harmonics last."""
+        """Names of the images with a pixel per splat; labels of harmonics come last."""
         labels = self.harmonics.files[1:] if self.harmonics else ()
         return (*self.means, *self.quats, *self.log_scales, *self.colors, *labels)
 
@@ -110,18 +110,18 @@ class Meta:
         return (*self.splat_images, *(self.harmonics.files[:1] if self.harmonics else ()))
 
     def scene_bytes(self) -> int:
-        """Return the bytes that the scene takes in float32."""
+        """Return the size of the scene in float32, in bytes."""
         coefficients = self.harmonics.coefficients if self.harmonics else 0
         return 4 * self.count * (14 + 3 * coefficients)
 
 
 def to_json(meta: Meta) -> bytes:
-    """Write a meta.json: the same bytes for the same scene.
+    """Write a meta.json; equal scenes give equal bytes.
 
-    Numbers of codebooks have the fewest digits from which the same float32 is read. The direction that is up stands
-    in asset.extras.up, where other readers do not look. Antialiasing is said twice: by "antialias" of the
-    specification, and by "model", which PlayCanvas' splat-transform reads and writes since 3.2 and leaves out where
-    the model is the default.
+    Codebook values are written with the fewest digits that restore the same float32. The up direction is stored in
+        asset.extras.up, which other readers ignore. Antialiasing is stored twice: as "antialias" from the
+        specification, and as "model", which PlayCanvas' splat-transform reads and writes since 3.2 and omits for the
+        default model.
     """
     asset: dict[str, object] = {"generator": GENERATOR}
     if meta.up is not None:
@@ -158,21 +158,23 @@ def from_json(path: Path, data: bytes) -> Meta:
         data: The file's bytes.
 
     Raises:
-        SceneFormatError: it is no meta.json of version 2, or says what cannot be.
+        SceneFormatError: not a meta.json of version 2, or with impossible values.
     """
     try:
         document = parse_json(data, _no_number)
     except ValueError as error:
         reason = str(error).splitlines()[0][:80]
-        raise SceneFormatError(f"{path}: its metadata is no JSON ({reason}); get the file again") from None
+        raise SceneFormatError(f"{path}: its metadata is not JSON ({reason}); get the file again") from None
     if not isinstance(document, dict):
         _refuse(path, "no object")
     version = document.get("version")
     if version is None and _at(document, "means.shape") is not None:
-        version = 1  # which did not name itself
+        version = 1  # version 1 has no such key
     if isinstance(version, bool) or version != VERSION:
         said = f"version {version}" if type(version) is int and 0 < version < 1000 else "no version"
-        raise SceneFormatError(f"{path}: is SOG of {said}, but version 2 is read; export it as version 2")
+        raise SceneFormatError(
+            f"{path}: is SOG of {said}, but only version 2 is supported; export it as version 2"
+        )
     return _checked(path, document)
 
 
@@ -212,11 +214,11 @@ def _refuse(path: Path, what: str) -> NoReturn:
 
 
 def _no_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is no number of JSON")
+    raise ValueError(f"{text} is not a JSON number")
 
 
 def _at(document: object, key: str) -> object:
-    """Return what stands under a dotted key; None where nothing does."""
+    """Return the value at a dotted key; None if there is none."""
     for part in key.split("."):
         document = document.get(part) if isinstance(document, dict) else None
     return document
@@ -233,12 +235,12 @@ def _numbers(
         _refuse(path, f"no {length} numbers in {key}")
     for index, value in enumerate(found):
         if not _is_number(value, largest):
-            _refuse(path, f"no number, or one out of range, in {key}[{index}]")
+            _refuse(path, f"a value in {key}[{index}] that is not a number or is out of range")
     return np.array(found, dtype=np.float64)
 
 
 def _codebook(path: Path, document: dict[str, object], key: str) -> Float32[np.ndarray, "256"]:
-    """Read a codebook. Some were written of scenes with infinite numbers and start with null: it goes on downwards."""
+    """Read a codebook. Those of scenes with infinite values start with null, which is extrapolated downwards."""
     found = _at(document, key)
     lacks_first = isinstance(found, list) and len(found) == CODEBOOK and found[0] is None
     if isinstance(found, list) and lacks_first:
@@ -263,12 +265,12 @@ def _files(path: Path, document: dict[str, object], key: str, length: int) -> tu
         _refuse(path, f"no {length} file names in {key}")
     for name in found:
         if not isinstance(name, str) or not NAME.fullmatch(name):
-            _refuse(path, f"in {key} something that is no plain file name")
+            _refuse(path, f"an entry in {key} that is not a plain file name")
     return tuple(found)
 
 
 def _up(document: dict[str, object]) -> tuple[float, float, float] | None:
-    """Read the direction that we keep in asset.extras.up; None where somebody else keeps something else there."""
+    """Read the up direction from asset.extras.up; None if another program stores something else there."""
     found = _at(document, "asset.extras.up")
     if not (isinstance(found, list) and len(found) == 3 and all(_is_number(v, LARGEST_FLOAT) for v in found)):
         return None

@@ -1,7 +1,7 @@
 """What a training costs as arithmetic: memory and time of any number of Gaussians, pixels and iterations.
 
 Memory is counted by what has to lie there at once, on top of what the process holds; the constants were measured from
-outside on whole runs (benchmarks/RESULTS.md). Time is fitted to the steps that `gsplat_edu.doctor.probe` took.
+outside on whole runs (benchmarks/RESULTS.md). Time is fitted to the steps that `gsplat_edu.budget.probe` took.
 """
 
 from __future__ import annotations

@@ -1,22 +1,22 @@
-"""PlayCanvas' SOG, version 2: the scene as images, in a seventh of its size or, with many splats, a fifteenth.
+"""PlayCanvas' SOG, version 2: the scene as images, a seventh of the PLY's size, or a fifteenth with many splats.
 
-A .sog is a zip of a meta.json and WebP images, and the same files may lie in a folder, named by its meta.json. Every
-image but one has a pixel for each splat: the low and the high bytes of positions, rotations, scales, colours with
-opacities, labels of harmonics. Scales and colours are bytes that choose from codebooks of 256 numbers; labels choose
-from a palette of up to 65,536 sets of harmonics, which is an image of its own. `gsplat_edu.io.sog_values` has the
-positions and rotations, `gsplat_edu.io.sog_palette` the codebooks and the palette.
+A .sog is a zip of a meta.json and WebP images; the same files may also lie in a folder, identified by its meta.json.
+All images but one have a pixel per splat: low and high bytes of positions, rotations, scales, colours with opacities,
+labels of harmonics. Scales and colours are bytes that select from codebooks of 256 values; labels select from a palette
+of up to 65,536 sets of SH coefficients, which is the remaining image. `gsplat_edu.io.sog.values` handles positions and
+rotations, `gsplat_edu.io.sog.palette` the codebooks and the palette.
 
-Written splats stand in another order: along a Morton curve, so that neighbours in an image are neighbours in the scene
-and the images become small. Opacities are rounded to 1/255. A rotation keeps 8 bits a component; the one that turns
-nothing is not among them and comes back turned by half a degree. Where the palette holds all sets of harmonics, as
-it does for up to 1024 splats, only its codebook rounds.
+The writer sorts splats along a Morton curve, so that neighbours in an image are neighbours in the scene and the images
+compress well. Opacities are rounded to 1/255. Rotations keep 8 bits per component; the identity is not representable
+and comes back rotated by half a degree. If the palette holds all sets of coefficients, as for up to 1024 splats, only
+its codebook causes rounding.
 
-Axes are the scene's, as in a PLY: nothing is flipped. The specification's words say that y is up, but the files of
-PlayCanvas' own converter hold the numbers of the PLY that they were made from. A direction that is up is kept in a key
-of our own, which others do not read.
+Axes are the scene's, as in a PLY: nothing is flipped. The text of the specification says that y is up, but files of
+PlayCanvas' own converter hold the values of the source PLY. The up direction is stored in a key of our own, which other
+readers ignore.
 
-A scene without splats has images of 4 x 4 pixels, none of which counts. Images have to be WebP, lossless or not; the
-specification allows others. Version 1 is refused.
+A scene without splats has images of 4 x 4 unused pixels. Images must be WebP, lossless or lossy; the specification
+allows other formats. Version 1 is rejected.
 
 Source: PlayCanvas' specification of SOG; the reader and the writer of its splat-transform, for the axes, the
 order of the files and codebooks that start with null.
@@ -32,12 +32,12 @@ from jaxtyping import Float32, UInt8
 
 from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io import sog_files as files
 from gsplat_edu.io.quantize import byte_to_logit, check_expansion, logit_to_byte
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.io.sog_meta import MOST_SPLATS, SHN, Harmonics, Meta, from_json, to_json
-from gsplat_edu.io.sog_palette import MOST_ENTRIES, codebook, nearest_in_codebook, palette
-from gsplat_edu.io.sog_values import (
+from gsplat_edu.io.sog import files
+from gsplat_edu.io.sog.meta import MOST_SPLATS, SHN, Harmonics, Meta, from_json, to_json
+from gsplat_edu.io.sog.palette import MOST_ENTRIES, codebook, nearest_in_codebook, palette
+from gsplat_edu.io.sog.values import (
     FIRST_TAG,
     morton_order,
     pixels_to_quats,
@@ -48,30 +48,30 @@ from gsplat_edu.io.sog_values import (
 from gsplat_edu.validation import first_index
 
 PER_ROW = 64
-"""Entries of the palette in a row of its image, one pixel per coefficient."""
+"""Palette entries per row of its image, with one pixel per coefficient."""
 
 WEIGHT_RANGE = 20.0
-"""Logarithm of the weight of a splat, about that of the median, beyond which it no longer counts."""
+"""Largest difference between the logarithm of a splat's weight and the median; beyond it, the weight is clamped."""
 
 
 def read(path: Path) -> Scene:
     """Read a SOG.
 
     Args:
-        path: The .sog, or the meta.json of a SOG in a folder.
+        path: The .sog, or the meta.json of a SOG folder.
 
     Returns:
         The scene, float32, in this package's axes.
 
     Raises:
-        SceneFormatError: it is no SOG of version 2, or damaged.
-        OSError: it cannot be read.
+        SceneFormatError: the file is not a SOG of version 2, or is damaged.
+        OSError: the file cannot be read.
     """
     source: files.Files = files.Folder(path) if _in_folder(path) else files.Bundle(path)
     data = source.read(files.META_NAME)
     if len(data) > files.META_LIMIT:
         raise SceneFormatError(
-            f"{path}: its metadata has {len(data):,} bytes, which no scene's has; check its name"
+            f"{path}: its metadata has {len(data):,} bytes, too many for a scene; check its name"
         )
     meta = from_json(path, data)
     check_expansion(path, meta.scene_bytes(), source.stored((files.META_NAME, *meta.images)))
@@ -86,7 +86,7 @@ def read(path: Path) -> Scene:
     if (quats[:, 3] < FIRST_TAG).any():
         row = int(np.argmax(quats[:, 3] < FIRST_TAG))
         raise SceneFormatError(
-            f"{path}: splat {row}: its rotation is of a kind that SOG has not; it is damaged, get it again"
+            f"{path}: splat {row}: its rotation has an unknown encoding; the file is damaged, get it again"
         )
     gaussians = Gaussians(
         means=torch.from_numpy(steps_to_positions(low | high << 8, meta.span)),
@@ -115,8 +115,8 @@ def _read_harmonics(
     if (labels >= harmonics.entries).any():
         row = int(np.argmax(labels >= harmonics.entries))
         raise SceneFormatError(
-            f"{path}: splat {row}: its harmonics are number {labels[row]} of {harmonics.entries}; "
-            "it is damaged, get it again"
+            f"{path}: splat {row}: its label {labels[row]} exceeds the palette of {harmonics.entries}; "
+            "the file is damaged, get it again"
         )
     data = source.read(name)
     width, height = files.size_of(path, name, data)
@@ -132,16 +132,16 @@ def _read_harmonics(
 
 
 def write(path: Path, scene: Scene) -> None:
-    """Write a SOG. The splats are put in another order.
+    """Write a SOG. The splats are reordered.
 
     Args:
-        path: The .sog, or a meta.json, beside which the images are written.
+        path: The .sog, or a meta.json; the images are then written next to it.
         scene: The scene, in this package's axes.
 
     Raises:
-        ArgumentError: a parameter is NaN or infinite in float32, a quaternion has zero length, or there are
-            more than 67,108,864 splats.
-        OSError: it cannot be written. What stood there before is untouched.
+        ArgumentError: a parameter is NaN or infinite in float32, a quaternion has zero length, or there are more than
+            67,108,864 splats.
+        OSError: the file cannot be written. An existing file stays unchanged.
     """
     if len(scene.gaussians) > MOST_SPLATS:
         raise ArgumentError(
@@ -152,14 +152,14 @@ def write(path: Path, scene: Scene) -> None:
     zero = (gaussians.quats == 0).all(dim=1).numpy(force=True)
     if zero.any():
         raise ArgumentError(
-            f"quats{first_index(zero)}: has zero length, so it is no rotation; remove the splat"
+            f"quats{first_index(zero)}: has zero length, so it is not a rotation; remove the splat"
         )
     contents = _packed(Scene(gaussians, scene.antialiased, scene.up))
     (files.write_folder if _in_folder(path) else files.write_bundle)(path, contents)
 
 
 def _packed(scene: Scene) -> dict[str, bytes]:
-    """Return the files of a scene by their names, meta.json first."""
+    """Return the files of a scene by name, meta.json first."""
     values = {name: tensor.numpy(force=True) for name, tensor in scene.gaussians.tensors().items()}
     steps, span = positions_to_steps(values["means"])
     order = morton_order(steps)
@@ -184,9 +184,9 @@ def _packed(scene: Scene) -> dict[str, bytes]:
 
 
 def _weights(values: dict[str, Float32[np.ndarray, "..."]]) -> Float32[np.ndarray, " N"]:
-    """Weigh splats by what is seen of them: opacity times the geometric mean of their scales, within reason.
+    """Weight splats by their visibility: opacity times the geometric mean of their scales, clamped.
 
-    Measured on a trained scene of 15,105 splats: the palette's loss in a render falls by 2 dB.
+    On a trained scene of 15,105 splats this reduces the palette's loss in renders by 2 dB.
     """
     logs = values["log_scales"].mean(axis=1, dtype=np.float64)
     logs -= np.logaddexp(0.0, -values["logit_opacities"].astype(np.float64))
@@ -200,7 +200,7 @@ def _weights(values: dict[str, Float32[np.ndarray, "..."]]) -> Float32[np.ndarra
 def _packed_harmonics(
     sh_rest: Float32[np.ndarray, "N K 3"], degree: int, weights: Float32[np.ndarray, " N"]
 ) -> tuple[Harmonics | None, dict[str, bytes]]:
-    """Find a palette for the harmonics; for no splats it has an entry all the same, as the format asks for one."""
+    """Find a palette for the coefficients; without splats it still has one entry, as the format requires."""
     count, coefficients, _ = sh_rest.shape
     if degree == 0:
         return None, {}

@@ -1,10 +1,10 @@
-"""Few numbers for many, as SOG keeps them: codebooks of 256 numbers, palettes of vectors.
+"""Vector quantisation for SOG: codebooks of 256 values, palettes of vectors.
 
-A codebook starts with entries as dense as the cube root of the values' density, which is best where there are many
-entries (Panter and Dite 1951), and is mended by Lloyd's steps on the sorted values. A palette is clustered twice: the
-vectors into cells, then those of each cell into entries, which start at its vectors that are heavy and far from its
-middle. A million vectors take seconds so, and nothing is random or depends on the number of threads. Values that are
-few enough are kept as they are.
+A codebook starts with entries whose density is the cube root of the values' density, which is optimal for many entries
+(Panter and Dite 1951), and is refined by Lloyd's algorithm on the sorted values. A palette is clustered in two levels:
+the vectors into cells, then those of each cell into entries, which start at vectors with large weight and far from the
+cell's centre. This takes seconds for a million vectors; nothing is random or depends on the number of threads. If there
+are few enough values, they are stored exactly.
 """
 
 from __future__ import annotations
@@ -17,54 +17,54 @@ from scipy.sparse import csr_matrix
 from gsplat_edu.threads import one_thread
 
 CODEBOOK = 256
-"""Entries of a codebook: a byte chooses one."""
+"""Entries of a codebook, selected by a byte."""
 
 CODEBOOK_STEPS = 40
-"""Lloyd's steps of a codebook: on trained scenes the error no longer falls in its fourth digit."""
+"""Lloyd iterations of a codebook; on trained scenes the fourth digit of the error no longer changes."""
 
 MOST_SAMPLES = 65_536
-"""Quantiles between which the density of a codebook's values is measured."""
+"""Number of quantiles used to measure the density of a codebook's values."""
 
 CAPS = 64
-"""Times that the shares of gaps are capped: each time the sum of those that are too large falls to half or less."""
+"""Iterations of capping the shares of gaps; each one at least halves the sum of the excessive shares."""
 
 MOST_ENTRIES = 65_536
-"""Entries of a palette: 16 bits choose one."""
+"""Entries of a palette, selected by 16 bits."""
 
 ALL_KEPT = 1024
-"""Up to this many vectors a palette holds all of them: they take 45 KiB at most."""
+"""Up to this many vectors are all kept in the palette; they take at most 45 KiB."""
 
 PALETTE_STEPS = 4
-"""Lloyd's steps of a palette: twice as many change the error by less than half a per cent."""
+"""Lloyd iterations of a palette; twice as many change the error by less than half a per cent."""
 
 SAMPLES_PER_CELL = 64
-"""Vectors per cell that the cells are found from."""
+"""Vectors per cell used to find the cells."""
 
 AT_ONCE = 1 << 22
-"""Distances that are held at once."""
+"""Distances held in memory at once."""
 
 HASH = np.uint64(0x9E3779B97F4A7C15)
-"""An odd number with no pattern in its bits: 2^64 divided by the golden ratio."""
+"""2^64 divided by the golden ratio: an odd number whose bits have no pattern."""
 
 
 def codebook(values: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "256"]:
-    """Choose 256 numbers that stand for many, with a small mean square error.
+    """Choose 256 values that represent many values with a small mean square error.
 
     Args:
-        values: Any number of finite numbers.
+        values: Finite values, any number.
 
     Returns:
-        The entries, ascending. Where there are at most 256 different values, these, the largest repeated.
+        The entries, ascending. If there are at most 256 different values, these values, with the largest one repeated.
     """
     distinct, counts = np.unique(values.astype(np.float64), return_counts=True)
     if len(distinct) <= CODEBOOK:
         last = distinct[-1] if len(distinct) else 0.0
         return np.append(distinct, np.full(CODEBOOK - len(distinct), last)).astype(np.float32)
     samples = distinct[np.linspace(0, len(distinct) - 1, min(len(distinct), MOST_SAMPLES)).astype(np.int64)]
-    # between neighbouring samples the density is 1 / gap; its cube root integrates to gap^(2/3)
+    # the density between neighbouring samples is 1 / gap; its cube root integrates to gap^(2/3)
     shares = np.diff(samples) ** (2 / 3)
     for _ in range(CAPS):
-        # the gap in front of an outlier has nothing that more than one entry could stand for
+        # the gap before an outlier contains nothing that needs more than one entry
         shares = np.minimum(shares, shares.sum() / CODEBOOK)
     places = np.cumsum(np.append(0.0, shares))
     entries = np.interp((np.arange(CODEBOOK) + 0.5) / CODEBOOK * places[-1], places, samples)
@@ -81,14 +81,14 @@ def codebook(values: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "256"]:
 def nearest_in_codebook(
     values: Float32[np.ndarray, "*shape"], entries: Float32[np.ndarray, "256"]
 ) -> UInt8[np.ndarray, "*shape"]:
-    """Say of each value which entry of an ascending codebook is nearest.
+    """Return, for each value, the index of the nearest entry in an ascending codebook.
 
     Args:
-        values: Finite numbers.
+        values: Finite values.
         entries: The codebook.
 
     Returns:
-        The numbers of the entries.
+        The indices.
     """
     borders = (entries[1:].astype(np.float64) + entries[:-1]) / 2
     chosen: UInt8[np.ndarray, "*shape"] = np.searchsorted(borders, values).astype(np.uint8)
@@ -98,16 +98,16 @@ def nearest_in_codebook(
 def palette(
     vectors: Float32[np.ndarray, "N D"], weights: Float32[np.ndarray, " N"]
 ) -> tuple[Float32[np.ndarray, "P D"], Int64[np.ndarray, " N"]]:
-    """Choose few vectors that stand for many, with a small weighted mean square error.
+    """Choose vectors that represent many vectors with a small weighted mean square error.
 
     Args:
-        vectors: N finite vectors; neighbours in this order had better be neighbours in the scene.
-        weights: What an error of each counts, positive.
+        vectors: N finite vectors, preferably with neighbours in the scene next to each other.
+        weights: Weight of each vector's error, positive.
 
     Returns:
-        P entries, and for each vector the number of its entry. Up to 1024 different vectors, and as many as the
-        palette has entries, are all kept; else P is at most the largest power of 2 that is not above N, nor above
-        65,536.
+        P entries, and for each vector the index of its entry. If there are at most 1024 different vectors, or no more
+        than the palette has entries, all are kept; otherwise P is at most the largest power of 2 that exceeds neither N
+        nor 65,536.
     """
     count = len(vectors)
     size = count if count <= ALL_KEPT else min(MOST_ENTRIES, 1 << (count.bit_length() - 1))
@@ -115,7 +115,7 @@ def palette(
     kept = _distinct(vectors, size)
     if kept is not None:
         return kept
-    # squares of numbers near 1 neither over- nor underflow, and a power of 2 changes no bit of what is kept
+    # squares of values near 1 neither overflow nor underflow; scaling by a power of 2 preserves all bits
     scale = np.float32(2.0 ** np.floor(np.log2(np.abs(vectors).max().astype(np.float64))))
     entries, labels = _clustered(vectors / scale, weights, size)
     return entries * scale, labels
@@ -124,12 +124,12 @@ def palette(
 def _distinct(
     vectors: Float32[np.ndarray, "N D"], most: int
 ) -> tuple[Float32[np.ndarray, "P D"], Int64[np.ndarray, " N"]] | None:
-    """Return the different vectors in the order of their coming, and whose number each has; None if they are more."""
+    """Return the distinct vectors in order of appearance, and an index per vector; None for more than `most`."""
     keys = np.zeros(len(vectors), dtype=np.uint64)
     for column in np.ascontiguousarray(vectors.T).view(np.uint32):
         keys = keys * HASH + column
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    if len(first) > most or not np.array_equal(vectors[first][inverse], vectors):  # two may have one key
+    if len(first) > most or not np.array_equal(vectors[first][inverse], vectors):  # two may share one key
         return None
     order = np.argsort(first)
     rank = np.empty_like(order)
@@ -140,9 +140,9 @@ def _distinct(
 def _clustered(
     vectors: Float32[np.ndarray, "N D"], weights: Float32[np.ndarray, " N"], size: int
 ) -> tuple[Float32[np.ndarray, "P D"], Int64[np.ndarray, " N"]]:
-    """Cluster vectors in cells, and the vectors of each cell in entries: `size` in all, fewer than there are vectors.
+    """Cluster vectors into cells, and the vectors of each cell into entries: `size` in all, fewer than the vectors.
 
-    The entries of a cell start at its middle and at picks of its vectors.
+    The entries of a cell start at its centre and at selected vectors.
     """
     cells = int(np.sqrt(size))
     sample = _spread(len(vectors), min(len(vectors), SAMPLES_PER_CELL * cells))
@@ -164,7 +164,7 @@ def _clustered(
 
 
 def _picked(chances: Float64[np.ndarray, " N"], count: int) -> Bool[np.ndarray, " N"]:
-    """Pick `count` rows, fewer than there are, in proportion to their chances; those due more than once for sure."""
+    """Select `count` of the rows in proportion to their chances; rows with an expected count above 1 are always in."""
     chances = np.maximum(chances, 1e-30)
     sure: Bool[np.ndarray, " N"] = np.zeros(len(chances), dtype=bool)
     while True:
@@ -181,7 +181,7 @@ def _lloyd(
     weights: Float32[np.ndarray, " N"],
     entries: Float32[np.ndarray, "P D"],
 ) -> Float32[np.ndarray, "P D"]:
-    """Move entries to the weighted means of the points that are nearest to them, a few times."""
+    """Move entries to the weighted means of their nearest points, for a few iterations."""
     for _ in range(PALETTE_STEPS):
         labels = _nearest(points, entries)
         chosen = csr_matrix((weights, (labels, np.arange(len(points)))), shape=(len(entries), len(points)))
@@ -194,12 +194,12 @@ def _lloyd(
 def _nearest(
     points: Float32[np.ndarray, "N D"], entries: Float32[np.ndarray, "P D"]
 ) -> Int64[np.ndarray, " N"]:
-    """Say of each point which entry is nearest: |p - e|^2 is |e|^2 - 2 p e, but for what all entries share."""
+    """Return the index of the nearest entry for each point: |p - e|^2 is |e|^2 - 2 p e plus a common term."""
     squares = (entries * entries).sum(axis=1)
     labels = np.empty(len(points), dtype=np.int64)
     rows = max(1, AT_ONCE // len(entries))
     across = torch.from_numpy(np.ascontiguousarray(-2.0 * entries.T))
-    with one_thread():  # the bits of a product would depend on how many there are
+    with one_thread():  # the bits of a product would depend on the number of threads
         for begin in range(0, len(points), rows):
             distances = (torch.from_numpy(points[begin : begin + rows]) @ across).numpy()
             distances += squares
@@ -208,5 +208,5 @@ def _nearest(
 
 
 def _spread(count: int, picks: int) -> Int64[np.ndarray, " picks"]:
-    """Pick so many of `count` rows at equal distances."""
+    """Select `picks` of `count` rows at equal distances."""
     return np.arange(picks, dtype=np.int64) * count // picks

@@ -12,10 +12,11 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, wanted_gaussians
+from gsplat_edu.budget.deadline import Deadline
+from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes, spelled_seconds
+from gsplat_edu.budget.probe import probe, resident_bytes
 from gsplat_edu.data.dataset import load_dataset
-from gsplat_edu.doctor.costs import LATER, Facts, Footprint, Measurements, wanted_gaussians
-from gsplat_edu.doctor.forecast import Forecast, predict, spelled_bytes, spelled_seconds
-from gsplat_edu.doctor.probe import probe, process_age, resident_bytes
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
@@ -60,11 +61,16 @@ class Limits:
 
     Args:
         memory: Bytes at its peak, as the system counts the process; None for any.
-        seconds: From the start of the command to its end; None for any.
+        time: From the start of the command to its end; None for any.
     """
 
     memory: int | None = None
-    seconds: float | None = None
+    time: Deadline | None = None
+
+    @property
+    def seconds(self) -> float | None:
+        """The limit of time, from the start of the command to its end; None for any."""
+        return None if self.time is None else self.time.seconds
 
     def __str__(self) -> str:
         """Return the options that say so."""
@@ -79,7 +85,7 @@ class Plan:
 
     Args:
         options: The run with the chosen numbers.
-        by_time: Whether the iterations were chosen; `gsplat_edu.doctor.pace.Pace` then uses up what time is left.
+        by_time: Whether the iterations were chosen; `gsplat_edu.budget.pace.Pace` then uses up what time is left.
         forecast: What it is expected to take; None where nothing had to be chosen.
         sentences: What the user wants to know of it.
     """
@@ -210,7 +216,8 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
     dataset = load_dataset(options.data, reduced, points=options.points)
     measured = probe(dataset, request.config(length, first.factor, first.cap), options.backend)
     probed = tuple(factor for factor in factors if factor >= first.factor)
-    return choose(dataclasses.replace(request, factors=probed), measured, process_age())
+    spent = 0.0 if limits.time is None else limits.time.spent
+    return choose(dataclasses.replace(request, factors=probed), measured, spent)
 
 
 def choose(request: Request, measured: Measurements, spent: float) -> Plan:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-import time
 from collections import deque
 from collections.abc import Callable
 
-from gsplat_edu.doctor.costs import Facts
-from gsplat_edu.doctor.forecast import ending_seconds, saving_seconds
-from gsplat_edu.doctor.plan import flags
-from gsplat_edu.doctor.probe import judging_seconds, process_age
+from gsplat_edu.budget.costs import Facts
+from gsplat_edu.budget.deadline import Deadline
+from gsplat_edu.budget.forecast import ending_seconds, saving_seconds
+from gsplat_edu.budget.plan import flags
+from gsplat_edu.budget.probe import judging_seconds
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.config import RECIPE_ITERATIONS
 from gsplat_edu.train.events import Event, StepEvent
@@ -40,26 +40,22 @@ class Pace:
 
     Args:
         run: The run, whose dataset is loaded.
-        limit: Seconds.
-        extend: Whether the iterations were chosen for the limit, see `gsplat_edu.doctor.plan.Plan.by_time`.
+        deadline: The limit, and the clock that counts towards it.
+        extend: Whether the iterations were chosen for the limit, see `gsplat_edu.budget.plan.Plan.by_time`.
         say: Told, in sentences, what the user wants to know.
-        clock: Seconds since the command began; the age of this process where None.
     """
 
     def __init__(
         self,
         run: CaptureRun,
-        limit: float,
+        deadline: Deadline,
         *,
         extend: bool = False,
         say: Callable[[str], None] = lambda sentence: None,
-        clock: Callable[[], float] | None = None,
     ) -> None:
-        self._run, self._limit, self._extend, self._say = run, limit, extend, say
-        began = time.perf_counter() - process_age()
-        self._clock = clock or (lambda: time.perf_counter() - began)
+        self._run, self._deadline, self._extend, self._say = run, deadline, extend, say
         self._facts = Facts.of(run.dataset)
-        self._looks = [part * limit for part in LOOKS]
+        self._looks = [part * deadline.seconds for part in LOOKS]
         self._costs = deque[tuple[float, float]](maxlen=3)
         self._marks = deque[tuple[int, float]](maxlen=WINDOW)
         self._reserve = 0.0
@@ -67,7 +63,7 @@ class Pace:
 
     def over(self) -> bool:
         """Say whether training has to end now."""
-        late = self._clock() + self._reserve >= self._limit
+        late = self._deadline.left <= self._reserve
         if late and self._planned is not None:
             # What was planned is done: the run is complete where it stands.
             self._settle(self._run.trainer.iteration)
@@ -88,7 +84,7 @@ class Pace:
         """Take note of a step; measure where a look is due; lengthen the run where it ends early."""
         if not isinstance(event, StepEvent):
             return
-        now = self._clock()
+        now = self._deadline.spent
         self._marks.append((trainer.iteration, now))
         if self._looks and now >= self._looks[0]:
             self._looks = [moment for moment in self._looks if moment > now]
@@ -108,8 +104,8 @@ class Pace:
     def _lengthen(self, trainer: Trainer) -> None:
         (first, then), (done, now) = self._marks[0], self._marks[-1]
         self._look(trainer)
-        left = self._limit - self._reserve - self._clock()
-        if done == first or left < LEFT_OVER * self._limit:
+        left = self._deadline.left - self._reserve
+        if done == first or left < LEFT_OVER * self._deadline.seconds:
             return
         total = min(done + int(CAREFUL * left * (done - first) / (now - then)), RECIPE_ITERATIONS)
         if total <= done:

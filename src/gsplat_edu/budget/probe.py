@@ -7,7 +7,6 @@ import ctypes
 import dataclasses
 import functools
 import math
-import os
 import sys
 import tempfile
 import time
@@ -19,9 +18,9 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from gsplat_edu.camera import Camera, scaled_intrinsics
+from gsplat_edu.budget.costs import Measurements, Speed, expected_counts
+from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import Dataset, scene_extent
-from gsplat_edu.doctor.costs import Measurements, Speed, expected_counts
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import ImageScore, score_views
@@ -53,19 +52,8 @@ SPREAD = 1.2
 GROWN = (125_000, 250_000)
 """Gaussians that the probe grows the start to, at most: by several doublings, and by the first."""
 
-
 ASSUMED = 400 * 2**20
 """Bytes of a process that has loaded torch, on systems that cannot be asked."""
-
-
-def process_age() -> float:
-    """Return the seconds since this process began, where the system tells; else since Python's clock did."""
-    try:
-        fields = Path("/proc/self/stat").read_text("ascii", errors="replace").rpartition(")")[2].split()
-        up = float(Path("/proc/uptime").read_text("ascii").split()[0])
-        return max(up - int(fields[19]) / os.sysconf("SC_CLK_TCK"), 0.0)
-    except (OSError, ValueError, IndexError):
-        return time.process_time()
 
 
 def resident_bytes() -> int:
@@ -212,9 +200,9 @@ def _halved(view: View) -> View:
         for plane in (photo.image, photo.alpha, photo.mask)
     )
     H, W = -(-camera.H // 2), -(-camera.W // 2)
-    intrinsics = scaled_intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, W / camera.W, H / camera.H)
     assert image is not None  # a photo has one
-    return View(Camera(camera.R, camera.eye, *intrinsics, H, W), image, alpha=alpha, mask=mask)
+    small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(W, H))
+    return View(small, image, alpha=alpha, mask=mask)
 
 
 def judging_seconds(

@@ -1,7 +1,7 @@
-"""The numbers of a SOG that have no codebook, to bytes and back.
+"""Conversion between a SOG's values without codebook and bytes.
 
     position   v = sign(x) log(1 + |x|); 65535 (v - low) / (high - low), 16 bits a coordinate in two bytes
-    rotation   the three smaller of (w, x, y, z), 255 (q / sqrt 2 + 1/2), and 252 + the number of the largest
+    rotation   the three smaller of (w, x, y, z), 255 (q / sqrt 2 + 1/2), and 252 + the index of the largest
 
 Source: PlayCanvas' specification of SOG, sections 3.1 and 3.2.
 """
@@ -12,29 +12,29 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8, UInt16, UInt64
 
 STEPS = 65_535
-"""Steps of a coordinate between the lowest and the highest."""
+"""Steps from the lowest to the highest value of a coordinate."""
 
 FIRST_TAG = 252
-"""Alpha of a rotation whose w is the largest component."""
+"""Alpha of a rotation in which w is the largest component."""
 
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Components (w, x, y, z) that are stored, by the number of the one that is not."""
+"""Components of (w, x, y, z) that are stored, by the index of the omitted one."""
 
 LARGEST_LOG = float(np.log1p(np.finfo(np.float32).max)) + 1e-9
-"""Logarithm of the largest position that float32 has, and less than it takes to be rounded to infinity more."""
+"""Logarithm of the largest float32 position, plus a margin too small to round to infinity."""
 
 Range = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]
 """Lowest and highest logarithm of each coordinate."""
 
 
 def positions_to_steps(means: Float32[np.ndarray, "N 3"]) -> tuple[UInt16[np.ndarray, "N 3"], Range]:
-    """Round positions to the steps between the lowest and the highest of each coordinate.
+    """Quantise positions between the lowest and the highest value of each coordinate.
 
     Args:
         means: N positions, world units.
 
     Returns:
-        The steps, and the range they are of; zeros where there are no positions.
+        The steps and their range; zeros if there are no positions.
     """
     logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = (logs.min(axis=0), logs.max(axis=0)) if len(logs) else (np.zeros(3), np.zeros(3))
@@ -44,20 +44,20 @@ def positions_to_steps(means: Float32[np.ndarray, "N 3"]) -> tuple[UInt16[np.nda
 
 
 def steps_to_positions(steps: UInt16[np.ndarray, "N 3"], span: Range) -> Float32[np.ndarray, "N 3"]:
-    """Turn steps of a range, whose ends are within +-`LARGEST_LOG`, into positions, world units."""
+    """Convert steps of a range, whose ends are within +-`LARGEST_LOG`, to positions, world units."""
     low, high = span
     logs = low + (high - low) * (steps / STEPS)
     return (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
 
 
 def morton_order(steps: UInt16[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Order positions along a curve that keeps neighbours together: their bits taken in turn from z, y and x.
+    """Sort positions along a Morton curve, which interleaves the bits of z, y and x.
 
     Args:
         steps: N positions in steps.
 
     Returns:
-        Their numbers in that order; equal positions stay in theirs.
+        Their indices in that order; equal positions keep their order.
     """
     spread = steps.astype(np.uint64)
     for shift, mask in (
@@ -74,8 +74,8 @@ def morton_order(steps: UInt16[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
 
 
 def quats_to_pixels(quats: Float32[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:
-    """Turn quaternions (w, x, y, z) of any length but zero into pixels."""
-    scaled = quats.astype(np.float64)  # whose squares neither over- nor underflow
+    """Encode quaternions (w, x, y, z) of nonzero length as pixels."""
+    scaled = quats.astype(np.float64)  # whose squares neither overflow nor underflow
     unit = scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
     largest = np.abs(unit).argmax(axis=1)[:, None]
     unit *= np.where(np.take_along_axis(unit, largest, axis=1) < 0, -1.0, 1.0)
@@ -85,7 +85,7 @@ def quats_to_pixels(quats: Float32[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4
 
 
 def pixels_to_quats(pixels: UInt8[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
-    """Turn pixels, whose alpha is 252 to 255, into quaternions (w, x, y, z), the largest component positive."""
+    """Decode pixels, whose alpha is 252 to 255, to quaternions (w, x, y, z) with a positive largest component."""
     small = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
     largest = pixels[:, 3:].astype(np.int64) - FIRST_TAG
     quats = np.empty((len(pixels), 4))

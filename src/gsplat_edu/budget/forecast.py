@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import torch
 
+from gsplat_edu.budget.costs import Facts, Footprint, Measurements, expected_counts
+from gsplat_edu.budget.probe import probe
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
-from gsplat_edu.doctor.costs import Facts, Footprint, Measurements, expected_counts
-from gsplat_edu.doctor.probe import probe
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.train.config import TrainConfig
 

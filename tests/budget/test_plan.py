@@ -9,15 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from gsplat_edu.budget.costs import Facts, Footprint, Measurements, Speed
+from gsplat_edu.budget.deadline import Deadline
+from gsplat_edu.budget.pace import Pace
+from gsplat_edu.budget.plan import Limits, Request, choose, flags, plan, taken_up
 from gsplat_edu.cli.arguments import bytes_text, seconds_text
 from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import DataSettings
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.doctor.costs import Facts, Footprint, Measurements, Speed
-from gsplat_edu.doctor.pace import Pace
-from gsplat_edu.doctor.plan import Limits, Request, choose, flags, plan, taken_up
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions
@@ -59,7 +60,7 @@ def request(memory=None, seconds=None, given=(), factors=FACTORS, rescale=True, 
         config=recipe(iterations, rescale=rescale, **changes),
         data_settings=DataSettings(**settings),
     )
-    limits = Limits(None if memory is None else memory * MIB, seconds)
+    limits = Limits(None if memory is None else memory * MIB, None if seconds is None else Deadline(seconds))
     return Request(options, limits, frozenset(given), rescale, FACTS, factors)
 
 
@@ -201,7 +202,7 @@ def test_nothing_is_planned_without_need(tmp_path):
     """The capture is not there, so looking at it would fail: it is not looked at."""
     options = dataclasses.replace(OPTIONS, data=tmp_path / "nothing", time_limit=3.0)
     assert plan(options, Limits()).options is options
-    assert plan(options, Limits(seconds=3.0), ["iterations"]).options is options
+    assert plan(options, Limits(time=Deadline(3.0)), ["iterations"]).options is options
     with pytest.raises(ArgumentError, match="--backend torch"):
         plan(dataclasses.replace(options, backend="torch"), Limits(memory=2**30))
 
@@ -226,9 +227,18 @@ def trained(run, callbacks=(), stop=lambda: False):
 
 def test_a_capture_is_planned_from_its_files(capture, tmp_path):
     """The whole way: read, measure, choose. How fast this machine is decides the numbers, not that they hold."""
-    found = plan(dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), Limits(2**32, 3_600.0))
+    found = plan(
+        dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), Limits(2**32, Deadline(3_600.0))
+    )
     assert found.resolution is None and found.by_time and found.forecast.peak < 2**32
     assert found.max_gaussians > 200 and 50 <= found.iterations <= 30_000
+
+
+def test_what_was_spent_before_the_plan_counts(capture, tmp_path):
+    """An hour would do for any length; of its last second nothing is left to train in."""
+    late = Limits(time=Deadline(3_600.0, lambda: 3_599.0))
+    with pytest.raises(ArgumentError, match="--time-limit 1 h 0 min: is too short"):
+        plan(dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), late)
 
 
 def test_a_resumed_run_takes_the_numbers_of_its_config(capture, tmp_path):
@@ -237,11 +247,11 @@ def test_a_resumed_run_takes_the_numbers_of_its_config(capture, tmp_path):
     )
     trained(CaptureRun(begun))
     plain = dataclasses.replace(begun, config=recipe(), data_settings=DataSettings(), resume=True)
-    again = plan(plain, Limits(2**30, 100.0))
+    again = plan(plain, Limits(2**30, Deadline(100.0)))
     assert again.options.config == begun.config and again.resolution == 2 and not again.by_time
     assert CaptureRun(again.options).finished
     assert len(again.sentences) == 1 and "memory is not planned again" in again.sentences[0]
-    assert plan(plain, Limits(seconds=100.0)).sentences == ()
+    assert plan(plain, Limits(time=Deadline(100.0))).sentences == ()
     assert not CaptureRun(taken_up(plain, ["iterations"])).finished, (
         "more iterations than its own extend a run"
     )
@@ -278,7 +288,7 @@ class Clock:
 
 
 def paced(run, limit, clock, **settings):
-    pace = Pace(run, limit, clock=clock, **settings)
+    pace = Pace(run, Deadline(limit, clock), **settings)
     return trained(run, [clock, pace], pace.over), pace.outcome
 
 
@@ -340,7 +350,7 @@ RUN = """
 import sys
 from pathlib import Path
 from gsplat_edu.data.dataset import DataSettings
-from gsplat_edu.doctor.plan import Limits, plan
+from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.train.config import recipe
 config = recipe(150, rescale=False, densify_start=0, densify_every=5, densify_stop=120, grad_threshold=0.0)

@@ -1,0 +1,123 @@
+"""Notes about a capture: values with fields; `str` gives the sentence for the user."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class MissingPhotos:
+    """Photos that the capture lists but that have no file.
+
+    Args:
+        missing: Number of such photos.
+        total: Number of photos listed by the capture.
+        first: Name of the first one.
+    """
+
+    missing: int
+    total: int
+    first: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.missing} of {self.total} photos have no file: skipped, first {self.first}"
+
+
+@dataclass(frozen=True)
+class FilesOutside:
+    """Files outside the capture's folder that the capture refers to.
+
+    Args:
+        first: The first of them.
+        count: Number of such files.
+        folder: The capture's folder.
+    """
+
+    first: Path
+    count: int
+    folder: Path
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        more = f" and {self.count - 1} more files" if self.count > 1 else ""
+        verb = "lie" if more else "lies"
+        return f"{self.first}{more} {verb} outside of {self.folder}; the capture names {'them' if more else 'it'}"
+
+
+@dataclass(frozen=True)
+class UnclearMasks:
+    """Photos whose mask is ignored, because several photos share its bare name.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos listed by the capture.
+        first: Name of the first one.
+    """
+
+    photos: int
+    total: int
+    first: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.photos} of {self.total} photos have a mask whose bare name several photos share: ignored, "
+            f"first {self.first}; put masks into the same folders as the photos"
+        )
+
+
+@dataclass(frozen=True)
+class OtherModels:
+    """COLMAP models other than the one that is read.
+
+    Args:
+        folder: The folder that holds them.
+        read: Name of the one that is read.
+        others: Names of the others; at least one.
+    """
+
+    folder: Path
+    read: str
+    others: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        others = ", ".join(self.others)
+        return f"{self.folder} holds {len(self.others) + 1} models: {self.read} is read, {others} not"
+
+
+@dataclass(frozen=True)
+class UnusedSplit:
+    """A list of photos that is ignored because another list provides the test views.
+
+    Args:
+        unused: Name of the ignored file.
+        used: Name of the file with the test views.
+    """
+
+    unused: str
+    used: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.unused}: its photos are ignored; {self.used} provides the test views"
+
+
+@dataclass(frozen=True)
+class TwoLayouts:
+    """A folder that holds both a transforms.json and a COLMAP model.
+
+    Args:
+        folder: The folder.
+    """
+
+    folder: Path
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.folder} holds transforms.json and a COLMAP model: using the poses of transforms.json"
+
+
+Note = MissingPhotos | FilesOutside | UnclearMasks | OtherModels | UnusedSplit | TwoLayouts

@@ -1,0 +1,200 @@
+"""The backend cuda against an exact one, on a small scene, before it is trusted with a large one.
+
+A GPU, its driver and the compiler of the day may differ from everything the kernels were tested on. So the first use
+on a device renders one scene of 64 Gaussians and differentiates it, and compares both with float64 on the CPU. A pass
+is remembered in the user's cache folder, under the device's name and the versions of everything that takes part.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsplat_edu import kernels
+from gsplat_edu.camera import Camera
+from gsplat_edu.constants import ALPHA_MIN
+from gsplat_edu.files import written_aside
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.settings import RenderSettings
+
+IMAGE_BOUND = 1.1 * ALPHA_MIN
+"""Largest error of a pixel, relative to the brightest or 1. Where float32 rounds an alpha to the other side of 1/255,
+that Gaussian is missing from a pixel or added to it: at most 1/255 of its colour; a tenth more for all other rounding.
+tests/gpu has the same bound."""
+
+MEAN_BOUND = 1e-5
+"""Mean error of all pixels. Rounding alone gives about 1e-7; the few pixels that miss a Gaussian are not enough of them
+to matter, and a wrong formula moves most pixels."""
+
+GRADIENT_BOUND = 3e-4
+"""Largest error of a gradient, relative to the largest entry of its tensor: that of tests/gpu and tests/native."""
+
+SETTINGS = RenderSettings(background=(0.2, 0.5, 0.9), jacobian_limit=1.3)
+
+
+def cuda_failure(device: torch.device | None = None) -> str | None:
+    """Say what is wrong with the kernels of the backend cuda on a device; None where they are right.
+
+    The answer holds for the process, a pass for as long as device, driver and versions stay the same.
+
+    Args:
+        device: A CUDA device, the current one where None or without an index; or the CPU, under Triton's interpreter.
+    """
+    try:
+        if device is None or (device.type == "cuda" and device.index is None):
+            device = torch.device("cuda", torch.cuda.current_device())
+        return _failure(device)
+    except Exception as error:  # whatever a compiler or a driver comes up with: the CPU renders instead
+        first = str(error).strip().splitlines()
+        return f"they do not run ({type(error).__name__}: {first[0] if first else 'no message'})"
+
+
+@functools.cache
+def _failure(device: torch.device) -> str | None:
+    identity, passed = _identity(device), _passed()
+    if identity in passed:
+        return None
+    failure = difference(device)
+    if failure is None:
+        _remember([*passed, identity])
+    return failure
+
+
+def difference(device: torch.device) -> str | None:
+    """Render and differentiate the scene on a device, and compare with float64 on the CPU.
+
+    Args:
+        device: As for `cuda_failure`.
+
+    Returns:
+        What differs by more than its bound, and by how much; None where nothing does.
+    """
+    from gsplat_edu.render.triton.rasterize import render_triton
+
+    image, gradients = _differentiated(
+        scene(torch.float32).to(device), lambda g, bg: render_triton(g, CAMERA, SETTINGS, bg)
+    )
+    truth, expected = _differentiated(scene(torch.float64), _exact)
+    bright = max(1.0, float(truth.abs().max()))
+    error = (image - truth).abs()
+    worst, mean = float(error.max()) / bright, float(error.mean()) / bright
+    if not (worst <= IMAGE_BOUND and mean <= MEAN_BOUND):
+        return f"the image of a test scene is wrong by {worst:.1g} at worst and {mean:.1g} on average"
+    for name, true in expected.items():
+        off = float((gradients[name] - true).abs().max() / true.abs().max())
+        if not off <= GRADIENT_BOUND:
+            return f"the gradient of {name} is wrong by {off:.1g} of its largest entry on a test scene"
+    return None
+
+
+CAMERA = Camera(np.eye(3), (0.0, 0.0, -3.0), fx=44.0, fy=47.0, cx=23.1, cy=18.4, H=37, W=46)
+"""No multiple of a tile; the principal point is off the middle."""
+
+
+def scene(dtype: torch.dtype) -> Gaussians:
+    """Make 64 Gaussians around the origin with harmonics of degree 3 whose depths all differ.
+
+    Neither the near plane nor the tiles' stop comes into play: both would let rounding decide what is drawn.
+
+    Args:
+        dtype: Of the tensors; the numbers are those of float32.
+    """
+    n = 64
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    means = torch.rand(n, 3, generator=generator) * 1.6 - 0.8
+    means[:, 2] = torch.randperm(n, generator=generator) / n - 0.5
+    return Gaussians(
+        means=means,
+        quats=normal(n, 4),
+        log_scales=0.5 * normal(n, 3) - 2.3,
+        sh0=normal(n, 1, 3),
+        sh_rest=0.3 * normal(n, 15, 3),
+        logit_opacities=normal(n) - 1.5,
+    ).map(lambda tensor: tensor.to(dtype))
+
+
+def _exact(gaussians: Gaussians, background: Tensor) -> RenderOutput:
+    if kernels.REASON is None:
+        from gsplat_edu.render.cpu import render_cpu
+
+        return render_cpu(gaussians, CAMERA, SETTINGS, background)
+    from gsplat_edu.render.torch_reference import render_dense
+
+    return render_dense(gaussians, CAMERA, SETTINGS, background)
+
+
+def _differentiated(
+    gaussians: Gaussians, render: Callable[[Gaussians, Tensor], RenderOutput]
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the image, and the gradients of a loss that weighs every pixel of all three images at random."""
+    gaussians = gaussians.trainable()
+    background = torch.tensor(SETTINGS.background).to(gaussians.means).requires_grad_()
+    with torch.enable_grad():
+        out = render(gaussians, background)
+        assert out.depth is not None
+        generator = torch.Generator().manual_seed(1)
+        losses = [
+            (image * torch.randn(image.shape, generator=generator).to(image)).sum()
+            for image in (out.image, out.transmittance, out.depth)
+        ]
+        torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]
+    tensors = gaussians.tensors() | {"background": background}
+    exact = {name: tensor.grad.double().cpu() for name, tensor in tensors.items() if tensor.grad is not None}
+    return out.image.detach().double().cpu(), exact
+
+
+def _identity(device: torch.device) -> str:
+    """Name everything that a pass depends on: the device, its driver, the compiler, torch, and our kernels' source."""
+    if device.type == "cuda":
+        name, capability = torch.cuda.get_device_name(device), torch.cuda.get_device_capability(device)
+        on = f"{name}, {capability}, CUDA {torch.version.cuda}, driver {_driver()}"
+    else:
+        on = "interpreter"
+    source = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        source.update(path.read_bytes())
+    return f"{on}, torch {torch.__version__}, triton {version('triton')}, kernels {source.hexdigest()[:16]}"
+
+
+def _driver() -> str:
+    """Return the NVIDIA driver's version as the kernel module gives it; "unknown" where it gives none."""
+    try:
+        return Path("/sys/module/nvidia/version").read_text().strip()
+    except OSError:
+        return "unknown"
+
+
+def _memory() -> Path:
+    """Return the file that passes are remembered in."""
+    folder = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(folder) / "gsplat_edu" / "cuda_passed.json"
+
+
+def _passed() -> list[str]:
+    try:
+        found = json.loads(_memory().read_text())
+    except (OSError, ValueError, RecursionError):
+        return []  # the check runs again
+    return [entry for entry in found if isinstance(entry, str)] if isinstance(found, list) else []
+
+
+def _remember(identities: list[str]) -> None:
+    try:
+        with written_aside(_memory()) as path:
+            path.write_text(json.dumps(identities[-20:]))
+    except OSError:
+        pass  # the next process checks again

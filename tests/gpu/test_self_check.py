@@ -1,0 +1,92 @@
+"""The check that the backend cuda has to pass on a device before it is used there."""
+
+import pytest
+import torch
+
+from gsplat_edu import kernels
+from gsplat_edu.cli.main import main
+from gsplat_edu.errors import BackendUnavailableError, BackendWarning
+from gsplat_edu.io.ply import save_ply
+from gsplat_edu.render import backends, self_check
+from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.triton import rasterize
+
+
+@pytest.fixture(autouse=True)
+def empty_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    self_check._failure.cache_clear()
+    backends._warn_once.cache_clear()
+    yield tmp_path / "gsplat_edu/cuda_passed.json"
+    self_check._failure.cache_clear()
+
+
+def test_right_kernels_pass_once(device, empty_cache, monkeypatch):
+    assert self_check.cuda_failure(torch.device(device)) is None
+    assert "triton" in empty_cache.read_text()
+    self_check._failure.cache_clear()  # as a new process has it
+    monkeypatch.setattr(self_check, "difference", lambda device: "checked again")
+    assert self_check.cuda_failure(torch.device(device)) is None
+
+
+def test_a_pass_does_not_cover_other_kernels(device, empty_cache, monkeypatch):
+    empty_cache.parent.mkdir()
+    for content in ("{", "[" * 100_000, '{"a": 1}', '["another device"]', "[1]"):
+        empty_cache.write_text(content)
+        monkeypatch.setattr(self_check, "difference", lambda device: "checked again")
+        self_check._failure.cache_clear()
+        assert self_check.cuda_failure(torch.device(device)) == "checked again"
+
+
+def test_a_shifted_image_fails(device, empty_cache, monkeypatch):
+    right = rasterize._camera_row
+
+    def shifted(call, device):
+        row = right(call, device).clone()
+        row[torch.isclose(row, torch.tensor(23.1, device=row.device))] += 0.01
+        return row
+
+    monkeypatch.setattr(rasterize, "_camera_row", shifted)
+    assert "the image of a test scene is wrong by" in self_check.cuda_failure(torch.device(device))
+    assert not empty_cache.exists()
+
+
+@pytest.mark.parametrize("name", rasterize.RAW)
+def test_a_gradient_that_is_one_percent_too_large_fails(device, monkeypatch, name):
+    right = rasterize.render_triton
+
+    def wrong(gaussians, camera, settings, background):
+        def spoilt(tensor):
+            moved = tensor * 1.0
+            if tensor is gaussians.tensors()[name]:
+                moved.register_hook(lambda gradient: 1.01 * gradient)
+            return moved
+
+        return right(gaussians.map(spoilt), camera, settings, background)
+
+    monkeypatch.setattr(rasterize, "render_triton", wrong)
+    assert f"the gradient of {name} is wrong by 0.01" in self_check.cuda_failure(torch.device(device))
+
+
+@pytest.mark.skipif(kernels.REASON is None and torch.cuda.is_available(), reason="this machine has a GPU")
+def test_auto_takes_the_cpu_where_the_kernels_do_not_run(monkeypatch, tmp_path, capsys):
+    """torch's CPU build stands for a GPU whose driver fails: the first call of CUDA raises."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setenv("TRITON_INTERPRET", "0")
+    with pytest.warns(
+        BackendWarning, match=r"^the GPU is not used: its kernels failed their check on this GPU: "
+    ):
+        assert resolve_backend("auto") == "cpu"
+    with pytest.raises(BackendUnavailableError, match=r"^backend 'cuda': .*; the backend cpu needs no GPU$"):
+        resolve_backend("cuda")
+
+    backends._warn_once.cache_clear()
+    save_ply(tmp_path / "a.ply", self_check.scene(torch.float32))
+    out = tmp_path / "frames"
+    words = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--out", str(out)]
+    assert main(words) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith(
+        "gsplat-edu render: the GPU is not used: its kernels failed"
+    )
+    assert len(list(out.iterdir())) == 1

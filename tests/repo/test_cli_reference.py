@@ -1,0 +1,65 @@
+"""docs/CLI.md is what the parsers say, and `train --help` shows what a user needs."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from gsplat_edu.cli import main as command_line
+from gsplat_edu.cli.options import train
+
+ROOT = Path(__file__).parents[2]
+WRITTEN = (ROOT / "docs" / "CLI.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def reference():
+    spec = importlib.util.spec_from_file_location("reference", ROOT / "tools" / "build_cli_reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.reference
+
+
+@pytest.fixture
+def shown(capsys):
+    """Return the options at the beginning of a line of help."""
+
+    def run(*words):
+        with pytest.raises(SystemExit) as stop:
+            command_line.main(list(words))
+        assert stop.value.code == 0
+        return re.findall(r"^  (?:-h, )?(--[a-z0-9-]+)", capsys.readouterr().out, flags=re.MULTILINE)
+
+    return run
+
+
+def test_the_reference_of_the_command_line_is_current(reference):
+    assert reference() == WRITTEN, "run python tools/build_cli_reference.py"
+
+
+def test_a_changed_option_makes_it_stale(reference, monkeypatch):
+    monkeypatch.setattr(train, "FROM_SCENE", {"means_rate": 0.5})
+    assert "--means-rate is 0.5 unless given" in reference()
+    assert reference() != WRITTEN
+
+
+@pytest.mark.parametrize("command", command_line.COMMANDS)
+def test_every_option_is_in_the_reference(command, shown):
+    section = WRITTEN.split(f"\n## gsplat-edu {command}\n")[1].split("\n## ")[0]
+    options = shown(command, "--help-all" if command == "train" else "--help")
+    told = re.findall(r"^\| `(--[a-z0-9-]+)", section, flags=re.MULTILINE)
+    assert sorted(told) == sorted(set(options) - {"--help", "--help-all", "--debug"})
+
+
+def test_the_help_of_train_shows_about_twenty_options_and_the_rest_on_request(shown):
+    some, every = shown("train", "--help"), shown("train", "--help-all")
+    assert 15 <= len(some) <= 25 and set(some) < set(every)
+    assert {f"--{name.replace('_', '-')}" for name in train.COMMON} - {"--scene"} <= set(some)
+    assert len(every) > 50
+
+
+def test_an_option_that_help_hides_is_still_suggested(capsys):
+    with pytest.raises(SystemExit):
+        command_line.main(["train", "a", "--out", "b", "--grad-treshold", "1"])
+    assert "did you mean --grad-threshold?" in capsys.readouterr().err

@@ -1,0 +1,110 @@
+"""Which cases of the long tests a run takes: some of them, others for each commit, all of them in time."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import slices
+
+ROOT = Path(__file__).parents[2]
+
+
+class Case(SimpleNamespace):
+    """Collected tests are compared by identity."""
+
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
+
+
+def cases(name, mark, values):
+    """Make what `split` reads of collected tests: a name, a marker and the parameters."""
+    return [
+        Case(
+            nodeid=f"{name}[{i}]",
+            get_closest_marker=lambda wanted: mark.mark if mark and wanted == "sliced" else None,
+            callspec=SimpleNamespace(params={"value": value}),
+        )
+        for i, value in enumerate(values)
+    ]
+
+
+def names(items):
+    return [item.nodeid for item in items]
+
+
+def test_a_seed_draws_the_same_cases_and_all_seeds_draw_all_of_them():
+    items = cases("long", pytest.mark.sliced(3), range(12)) + cases("short", None, range(4))
+    drawn = [names(slices.split(items, seed)[0]) for seed in range(100)]
+    assert drawn[7] == names(slices.split(items, 7)[0])
+    for kept in drawn:
+        assert len(kept) == 3 + 4 and kept == [name for name in names(items) if name in kept], (
+            "in their order"
+        )
+        assert set(names(cases("short", None, range(4)))) <= set(kept)
+    # a case is missed by 100 seeds with a probability of 0.75**100, below 1e-12
+    assert set().union(*drawn) == set(names(items))
+    kept, left_out = slices.split(items, 7)
+    assert sorted(names(kept + left_out)) == sorted(names(items))
+
+
+def test_every_value_of_a_parameter_keeps_its_share():
+    items = cases("named", pytest.mark.sliced(1, by="value"), [True, False, True, True, False])
+    for seed in range(20):
+        assert sorted(item.callspec.params["value"] for item in slices.split(items, seed)[0]) == [False, True]
+
+
+@pytest.mark.parametrize(("mark", "count"), [(pytest.mark.sliced(0), 0), (pytest.mark.sliced, 4)])
+def test_a_test_may_wait_for_the_soak_or_never_be_cut(mark, count):
+    """sliced(0) runs in a soak only; sliced without a number cuts itself, by the files it reads."""
+    assert len(slices.split(cases("long", mark, range(4)), 1)[0]) == count
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+def test_the_seed_is_the_commits(tmp_path):
+    assert slices.commit_seed(tmp_path) == slices.WITHOUT_GIT
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@example.org"]
+    seeds = []
+    for words in (
+        ["init", "--quiet"],
+        *[["commit", "--quiet", "--allow-empty", "-m", str(i)] for i in range(2)],
+    ):
+        subprocess.run([*git, *words], check=True)
+        seeds.append(slices.commit_seed(tmp_path))
+    assert len(set(seeds)) == 3 and seeds[0] == slices.WITHOUT_GIT
+    found = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout
+    assert f"{seeds[2]:08x}" == found[:8]
+
+
+HOOKS = "from slices import pytest_collection_modifyitems, pytest_report_header, pytest_runtest_makereport\n"
+FAILING = """
+import pytest
+
+@pytest.mark.sliced(1)
+@pytest.mark.parametrize("case", range(5))
+def test_long(case):
+    assert case == 9
+"""
+
+
+@pytest.mark.own_process
+def test_a_failure_says_how_its_slice_is_drawn_again(tmp_path):
+    """pytest itself, with the hooks of this suite's conftest."""
+    (tmp_path / "test_failing.py").write_text(FAILING)
+    (tmp_path / "conftest.py").write_text(HOOKS)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:jaxtyping", str(tmp_path)]
+    paths = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=paths)
+    assert "1 failed, 4 deselected" in done.stdout, done.stdout + done.stderr
+    assert f"GSPLAT_EDU_SLICE={slices.SEED}" in done.stdout.partition("collected")[0], (
+        "a run says what it drew"
+    )
+    assert slices.HOW_TO_REPEAT in done.stdout
+
+
+def test_the_files_that_start_first_exist():
+    assert len(slices.FIRST) > 5 and [name for name in slices.FIRST if not (ROOT / name).is_file()] == []

@@ -1,0 +1,168 @@
+"""Short trainings whose every bit is known: run by tests/golden/test_training_bits.py, recorded by this file.
+
+    python tests/training_bits.py --record
+
+writes the hashes of every instruction set that this machine can run into tests/golden/training_bits.json. A change of
+the trainer that is meant to keep the numbers must keep the hashes; one that changes them records them again, and its
+commit says why.
+"""
+
+import argparse
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gsplat_edu import kernels
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.synthetic import sphere_capture
+from gsplat_edu.render.api import render
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.course import EXTENT, course_config
+from gsplat_edu.train.density.adc import AdaptiveDensityControl
+from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent, StepEvent
+from gsplat_edu.train.initialize import from_points, make_strategy, random_ball
+from gsplat_edu.train.trainer import Trainer, TrainResult
+
+RECORDS = Path(__file__).parent / "golden" / "training_bits.json"
+
+CAPABILITIES = {"v2": "default", "v3": "avx2", "v4": "avx512"}
+"""What torch uses on a machine whose best instruction set is this one of ours."""
+
+RENDER = functools.partial(render, backend="cpu")
+SCHEDULE = {"densify_start": 5, "densify_every": 10, "densify_stop": 100, "mcmc_stop": 100, "sh_every": 20}
+
+
+CAPTURE, SPHERE = functools.cache(procedural_capture), functools.cache(sphere_capture)
+
+
+def train_capture(config, events) -> tuple[Trainer, TrainResult]:
+    views, points, colors = CAPTURE(40, 6, splats=120)
+    start = from_points(points, colors, config)
+    density = make_strategy(config, 2.0, start)
+    watch = [lambda _, event: events.append(event)]
+    trainer = Trainer(start, views, config, render=RENDER, extent=2.0, density=density, callbacks=watch)
+    return trainer, trainer.run()
+
+
+def train_adc(events):
+    """Clone, split, prune by opacity, scale and size in the image; two resets; random backgrounds."""
+    numbers = {"reset_every": 40, "grad_threshold": 5e-5, "prune_screen_size": 40.0, "min_opacity": 0.02}
+    return train_capture(recipe(120, random_background=True, **numbers, **SCHEDULE), events)
+
+
+def train_mcmc(events):
+    """Relocate, grow up to the cap, add noise, regularise."""
+    numbers = {"max_gaussians": 150, "min_opacity": 0.4, "mcmc_growth": 1.1}
+    return train_capture(recipe(120, strategy="mcmc", **numbers, **SCHEDULE), events)
+
+
+def train_sphere(events):
+    """The course's run, shorter, with densifications more often, and a cap that cuts."""
+    config = course_config(iterations=120, max_gaussians=400)
+    config = dataclasses.replace(config, densify_every=20, densify_stop=100)
+    generator = torch.Generator().manual_seed(9)
+    start = random_ball(150, generator)
+    control = AdaptiveDensityControl(config, EXTENT, generator, start)
+    watch = [lambda _, event: events.append(event)]
+    views = SPHERE(40).train
+    trainer = Trainer(start, views, config, render=RENDER, extent=EXTENT, density=control, callbacks=watch)
+    return trainer, trainer.run()
+
+
+CASES: dict[str, Callable] = {"adc": train_adc, "mcmc": train_mcmc, "sphere": train_sphere}
+
+
+def took_part(name: str, events: list) -> bool:
+    """Say whether the density control that a case is about really happened in it."""
+    if name == "mcmc":
+        moved = [event for event in events if isinstance(event, RelocateEvent)]
+        return any(event.num_relocated for event in moved) and any(event.num_added for event in moved)
+    changed = [event for event in events if isinstance(event, DensifyEvent)]
+    densified = any(event.num_cloned or event.num_split_children for event in changed)
+    if name == "sphere":
+        return densified
+    resets = sum(isinstance(event, ResetEvent) for event in events)
+    return densified and resets == 2 and any(event.num_pruned for event in changed)
+
+
+def digest(name: str) -> str:
+    """Train, and return a hash of every parameter's bits, every loss and every count."""
+    events = []
+    trainer, result = CASES[name](events)
+    assert took_part(name, events), [event for event in events if not isinstance(event, StepEvent)]
+    found = hashlib.sha256()
+    found.update(np.array(result.losses, dtype=np.float64).tobytes())
+    found.update(np.array(result.counts, dtype=np.int64).tobytes())
+    for key, tensor in trainer.gaussians.tensors().items():
+        found.update(key.encode())
+        found.update(np.ascontiguousarray(tensor.numpy(force=True)).tobytes())
+    return found.hexdigest()
+
+
+def compiler() -> str:
+    """Return what compiled the native module, as its file says: another one may fuse other products and sums."""
+    data = Path(kernels.native().__file__).read_bytes()
+    found = re.search(rb"GCC: \([^)]*\) [\d.]+|clang version [\d.]+", data)
+    return found[0].decode() if found else sys.platform
+
+
+def arithmetic() -> str:
+    """Name what a training's bits depend on besides our own code: a new name is another machine, not a mistake.
+
+    The libraries' exponentials, roots, products of matrices and generators differ from one CPU to another. Their
+    results are part of the name, so a CPU that computes as a known one does is known too.
+    """
+    probe, rng = hashlib.sha256(), np.random.default_rng(0)
+    numbers = rng.normal(size=4099)
+    matrices = torch.from_numpy(rng.normal(size=(301, 3, 3)))
+    with torch.no_grad():
+        for tensor in (torch.from_numpy(numbers), torch.from_numpy(numbers).float()):
+            for function in (torch.exp, torch.sigmoid, torch.abs, torch.lgamma):
+                probe.update(function(tensor).numpy().tobytes())
+            for function in (torch.log, torch.sqrt, torch.rsqrt):
+                probe.update(function(tensor.abs() + 0.1).numpy().tobytes())
+            probe.update(tensor.sum().numpy().tobytes() + tensor.norm().numpy().tobytes())
+            probe.update(torch.cumsum(tensor, 0).numpy().tobytes())
+        for some in (matrices, matrices.float()):
+            probe.update((some @ some.mT).numpy().tobytes())
+        drawn = torch.randn(4099, generator=torch.Generator().manual_seed(0))
+        probe.update(drawn.numpy().tobytes())
+    for function in (np.exp, np.sin, np.arctan, np.log1p):
+        probe.update(function(np.abs(numbers)).tobytes())
+    probe.update((matrices.numpy() @ matrices.numpy()).tobytes())
+    capability = torch.backends.cpu.get_cpu_capability()
+    return f"{kernels.native().isa()}, {compiler()}, torch {capability} {probe.hexdigest()[:16]}"
+
+
+def recorded() -> dict[str, dict[str, str]]:
+    """Read the known hashes: by arithmetic, then by case."""
+    return json.loads(RECORDS.read_text())
+
+
+def record() -> None:
+    """Record this machine's hashes under every instruction set it has."""
+    found = recorded() if RECORDS.exists() else {}
+    for isa in kernels.native().isas():
+        env = {**os.environ, "GSPLAT_EDU_ISA": isa, "ATEN_CPU_CAPABILITY": CAPABILITIES[isa]}
+        done = subprocess.run([sys.executable, __file__], env=env, capture_output=True, check=True)
+        found |= json.loads(done.stdout)
+    RECORDS.write_text(json.dumps(dict(sorted(found.items())), indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Print the hashes of this process as JSON.")
+    parser.add_argument("--record", action="store_true", help="write those of every instruction set")
+    if parser.parse_args().record:
+        record()
+    else:
+        print(json.dumps({arithmetic(): {name: digest(name) for name in CASES}}))
