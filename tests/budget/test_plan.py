@@ -115,9 +115,9 @@ def test_the_milestones_stretch_with_the_iterations_that_were_chosen():
     stretched = recipe(config.iterations)
     assert config == dataclasses.replace(stretched, max_gaussians=config.max_gaussians)
     kept = chosen(None, 240.0, rescale=False).options.config
-    assert kept.densify_stop == 15_000 and kept.iterations < 15_000
+    assert kept.adc.densify_stop == 15_000 and kept.iterations < 15_000
     given = chosen(None, 240.0, given=["densify_stop"], densify_stop=900).options.config
-    assert given.densify_stop == 900 and given.sh_every == recipe(given.iterations).sh_every
+    assert given.adc.densify_stop == 900 and given.sh_every == recipe(given.iterations).sh_every
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def whole(capture, tmp_path_factory):
     """30 iterations in one go, by the milestones of 20."""
     short, words = recipe(20), []
     for name in ("means_rate_iterations", "sh_every", "densify_stop", "reset_every"):
-        words += [f"--{name.replace('_', '-')}", str(getattr(short, name))]
+        words += [f"--{name.replace('_', '-')}", str(short.flat()[name])]
     out = tmp_path_factory.mktemp("whole") / "egg"
     assert train(capture, out, "--iterations", "30", *words) == 0
     return out
@@ -91,7 +91,7 @@ def test_a_finished_run_is_extended_by_its_own_milestones(capture, finished, who
     assert ply(run, 30) == ply(whole, 30) != ply(finished, 20)
     config = RunFolder(run).read_config()
     assert config["history"] == [{"iteration": 20, "iterations_before": 20, "iterations": 30}]
-    assert config["train"]["densify_stop"] == recipe(20).densify_stop
+    assert config["train"]["densify_stop"] == recipe(20).adc.densify_stop
     metrics = RunFolder(run).read_metrics()
     assert metrics["iterations"] == 30
     assert [line["iteration"] for line in RunFolder(run).log() if "loss" in line] == [10, 20, 30]

@@ -53,7 +53,7 @@ def document(options: RunOptions) -> dict[str, Any]:
             "points": None if options.points is None else str(options.points.resolve()),
             "scene": None if options.scene is None else str(scene_file(options.scene).resolve()),
         },
-        "train": dataclasses.asdict(options.config),
+        "train": options.config.flat(),
         "render": dataclasses.asdict(options.render_settings),
         "backend": options.backend,
         "machine": machine_facts(),
