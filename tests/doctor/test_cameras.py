@@ -12,7 +12,6 @@ import pytest
 from doctor.rooms import replaced, room, turned, with_camera
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import read_capture
-from gsplat_edu.data.lens import straightened
 from gsplat_edu.doctor.cameras import check_away
 from gsplat_edu.doctor.finding import Severity
 from gsplat_edu.doctor.photos import Look
@@ -254,9 +253,8 @@ def test_no_pose_of_a_clean_capture_is_doubted(capture):
     read, look = read_capture(folder), Look(np.zeros((4, 4, 3), np.uint8), np.zeros(8))
     shots = []
     for frame in read.frames:
-        lens = straightened(frame.lens)
-        camera = Camera(frame.R, frame.eye, lens.fx, lens.fy, lens.cx, lens.cy, lens.H, lens.W)
-        shots.append(Shot(frame.name, frame.lens, (lens.W, lens.H), camera, look))
+        camera = Camera.posed(frame.R, frame.eye, frame.lens.undistorted())
+        shots.append(Shot(frame.name, frame.lens, (camera.W, camera.H), camera, look))
     points = np.zeros((0, 3)) if read.cloud is None else read.cloud.points
     assert check_away(Survey(folder, read.layout, tuple(shots), (), (), points, ())) == []
 

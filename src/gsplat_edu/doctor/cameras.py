@@ -188,18 +188,18 @@ def check_away(survey: Survey) -> list[Finding]:
     if doubtful:
         order = sorted(doubtful)
         names, reasons = tuple(survey.names[i] for i in order), tuple(doubtful[i] for i in order)
-        what = f"{len(names)} of {len(survey.shots)} cameras have poses with little support"
+        what = f"{len(names)} of {len(survey.shots)} cameras have doubtful poses"
         advice = "take out the cameras with doubtful poses: a wrong pose spoils the scene for all others"
         found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons))
     return found
 
 
 def _doubtful(survey: Survey, away: set[int]) -> dict[int, str]:
-    """Return the cameras whose poses have little support, and why.
+    """Return the cameras whose poses are doubtful, and why.
 
-    Where the capture says in which photos its points were found, these counts decide, alone where they are small, or
-    with an odd place or direction. Where it does not, cameras are named that stand apart from all others, or whose
-    pictures miss what the others look at.
+    If the capture says in which photos its points were found, a camera is named for a small count, or for a lower count
+    than most together with an odd position or direction. If it does not, a camera is named if it stands apart from all
+    others, or if its picture misses what the others look at; those in `away` are named elsewhere.
     """
     (distances, nearest), angles = _stands(survey.geometry), _past(survey.geometry)
     far = distances > FAR_AWAY
