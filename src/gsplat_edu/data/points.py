@@ -84,7 +84,7 @@ def finite_cloud(cloud: Cloud) -> tuple[Cloud, str]:
     if good.all():
         return cloud, ""
     note = (
-        f"ignored {np.count_nonzero(~good)} of {len(good)} points that are NaN, infinite or absurdly far away"
+        f"{np.count_nonzero(~good)} of {len(good)} points are NaN, infinite or absurdly far away: ignored"
     )
     return Cloud(cloud.points[good], cloud.colors[good]), note
 
