@@ -357,7 +357,10 @@ def test_a_bare_mask_that_two_images_share_is_not_used_and_told(text):
     dataset = load_dataset(text, EVERYTHING)
     masked = [view.name for view in dataset.train if view.read().mask is not None]
     assert masked == ["view_000.png"]
-    assert any("mask whose bare name several photos share" in n and "first a/view_000.png" in n for n in dataset.notes)
+    assert any(
+        "mask whose bare name several photos share" in n and "first a/view_000.png" in n
+        for n in dataset.notes
+    )
 
 
 @pytest.mark.parametrize("number", [7, 10, 11, 12, 13, 16, 17])

@@ -11,8 +11,10 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from gsplat_edu.files import written_aside
 
@@ -20,6 +22,10 @@ DPI = 150
 
 CURVE_POINTS = 400
 """Most points of a curve in a report; longer logs are averaged over stretches of equal length."""
+
+MOST_SHOWN, SHOWN_QUANTILE = 2.0, 0.95
+"""The curve of the speed is cut off at twice its 95 % quantile: a computer that was busy or asleep for a moment would
+flatten the rest."""
 
 SVG_FACTS = ("Creator", "Date", "Format", "Type")
 """Metadata that matplotlib writes into an SVG by default (dates and addresses); left out here."""
@@ -69,43 +75,72 @@ def curves_figure(losses: Sequence[float], counts: Sequence[int]) -> Figure:
     return figure
 
 
-def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
-    """Plot a run's log: loss, PSNR of evaluations, number of Gaussians, ms per iteration.
+def run_curve_figures(log: Sequence[Mapping[str, Any]]) -> list[Figure]:
+    """Plot a run's log: loss, PSNR of evaluations, number of Gaussians, ms per iteration, terms of the objective.
 
     Args:
-        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, ms. A key that no line has gets
-            no curve.
+        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, ms, terms. A key that no line has
+            gets no curve, and a single term, which is the loss, none of its own.
 
     Returns:
-        The figure; None if there is nothing to draw.
+        One figure for each curve; they share the range of iterations.
     """
     curves = []
     for key, title, label in RUN_CURVES:
-        pairs = [(line["iteration"], line[key]) for line in log if _drawable(line, key)]
-        if pairs:
-            curves.append((key, title, label, _thinned(np.array(pairs, dtype=np.float64))))
-    if not curves:
-        return None
-    rows = math.ceil(len(curves) / 2)
-    figure = Figure(figsize=(10, 2.9 * rows), layout="constrained")
-    grid = figure.subplots(rows, 2, squeeze=False).ravel()
-    for axes, (key, title, label, points) in zip(grid, curves, strict=False):
-        axes.plot(*points.T, linewidth=1.0, marker="o" if len(points) < 40 else "", markersize=3)
+        if (points := _points(log, key)) is not None:
+            curves.append((key, title, label, {"": points}))
+    if len(terms := _terms(log)) > 1:
+        curves.append(("terms", "terms of the objective", "weighted value", terms))
+    last = max((float(points[-1, 0]) for *_, lines in curves for points in lines.values()), default=0.0)
+    figures = []
+    for key, title, label, lines in curves:
+        figure = Figure(figsize=(5, 2.9), layout="constrained")
+        axes = figure.subplots()
+        for name, points in lines.items():
+            marker = "o" if len(points) < 40 else ""
+            axes.plot(*points.T, linewidth=1.0, marker=marker, markersize=3, label=name)
+        values = np.concatenate([points[:, 1] for points in lines.values()])
         axes.set(title=title, xlabel="iteration", ylabel=label)
+        axes.set_xlim(0.0, 1.03 * last if last > 0 else 1.0)
         axes.grid(alpha=0.3)
-        if key == "loss" and points[:, 1].min() > 0:
-            axes.set_yscale("log")
+        if len(lines) > 1:
+            axes.legend()
+        if key in ("loss", "terms") and values.min() > 0:
+            _decades(axes, values)
         if key in ("num_gaussians", "ms"):
             axes.set_ylim(0, None)
-    for axes in grid[len(curves) :]:
-        axes.axis("off")
-    return figure
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+        if key == "ms":
+            _cut_peaks(axes, title, values)
+        figures.append(figure)
+    return figures
 
 
-def svg_element(figure: Figure) -> str:
-    """Return a figure as an <svg> element for a web page. Equal figures give equal bytes."""
+def _decades(axes: Axes, values: Float[np.ndarray, " Q"]) -> None:
+    """Make the vertical axis logarithmic, with a few plain numbers: 0.2, not 2 x 10^-1."""
+    axes.set_yscale("log")
+    wide = values.max() > 10 * values.min()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 3) if wide else (1, 1.5, 2, 3, 5, 7)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _cut_peaks(axes: Axes, title: str, values: Float[np.ndarray, " Q"]) -> None:
+    """Cut off moments that were far slower than the rest, and say how slow they were."""
+    top, peak = MOST_SHOWN * float(np.quantile(values, SHOWN_QUANTILE)), float(values.max())
+    if 0.0 < top < peak:
+        axes.set(ylim=(0.0, top), title=f"{title} (peaks of up to {peak:,.0f} ms are cut off)")
+
+
+def svg_element(figure: Figure, name: str = "figure") -> str:
+    """Return a figure as an <svg> element for a web page. Equal figures and names give equal bytes.
+
+    Args:
+        figure: The figure.
+        name: Goes into the ids of its parts, which have to differ from those of another figure on the page.
+    """
     text = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": "gsplat_edu", "svg.fonttype": "path"}):
+    with mpl.rc_context({"svg.hashsalt": f"gsplat_edu {name}", "svg.fonttype": "path"}):
         FigureCanvasAgg(figure).figure.savefig(text, format="svg", metadata=dict.fromkeys(SVG_FACTS))
     drawing = text.getvalue()
     return drawing[
@@ -113,9 +148,23 @@ def svg_element(figure: Figure) -> str:
     ]  # without the XML and DOCTYPE lines, which do not belong inside a page
 
 
-def _drawable(line: Mapping[str, Any], key: str) -> bool:
-    pair = (line.get("iteration"), line.get(key))
-    return all(isinstance(value, int | float) and math.isfinite(value) for value in pair)
+def _points(log: Sequence[Mapping[str, Any]], key: str) -> Float[np.ndarray, "Q 2"] | None:
+    """Return iteration and value of the lines that have both; None where none has."""
+    pairs = [(line.get("iteration"), line.get(key)) for line in log]
+    finite = [pair for pair in pairs if all(isinstance(v, int | float) and math.isfinite(v) for v in pair)]
+    return _thinned(np.array(finite, dtype=np.float64)) if finite else None
+
+
+def _terms(log: Sequence[Mapping[str, Any]]) -> dict[str, Float[np.ndarray, "Q 2"]]:
+    """Return the points of every term of the objective that the log names."""
+    lines = [
+        (line.get("iteration"), terms) for line in log if isinstance(terms := line.get("terms"), Mapping)
+    ]
+    names = list(dict.fromkeys(name for _, terms in lines for name in terms))
+    found = {
+        name: _points([{"iteration": i, name: terms.get(name)} for i, terms in lines], name) for name in names
+    }
+    return {name: points for name, points in found.items() if points is not None}
 
 
 def _thinned(points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "Q 2"]:

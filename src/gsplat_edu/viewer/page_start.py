@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from gsplat_edu.camera import WORLD_UP, Camera
-from gsplat_edu.doctor.geometry import INWARD, Geometry
+from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
 from gsplat_edu.evaluate.paths import common_up, orbit_of_scene
 from gsplat_edu.io.scene import Scene
 
@@ -21,6 +21,10 @@ ORBIT = 4
 
 CENTRAL_PART = 0.5
 """Central fraction of a camera's image, along each side, that is searched for its subject."""
+
+
+MIDDLE_OF = 5
+"""Cameras from which they have a middle and an edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,29 @@ class Start:
     pivot: Float64[np.ndarray, "3"]
     up: Float64[np.ndarray, "3"]
     index: int
+
+
+def first_camera(cameras: Sequence[Camera], allowed: Sequence[int]) -> int:
+    """Choose the camera that a page starts at: the first one, unless it stands at the edge of what was photographed.
+
+    Cameras that look one way, as those of an aircraft over fields, see different places. From the first of them, often
+    at a corner, half of what a drag brings into view was in no photo. If it stands in their outer half, the camera
+    nearest to their middle takes its place.
+
+    Args:
+        cameras: Those of the capture, at least one.
+        allowed: Which of them a page may start at, at least one; in order.
+
+    Returns:
+        The index of a camera.
+    """
+    if len(cameras) < MIDDLE_OF or Geometry(cameras, np.zeros((0, 3))).arrangement != FORWARD:
+        return allowed[0]
+    eyes = np.stack([camera.eye for camera in cameras])
+    aside = np.linalg.norm(eyes - np.median(eyes, axis=0), axis=1)
+    if aside[allowed[0]] <= np.median(aside):
+        return allowed[0]
+    return min(allowed, key=lambda index: float(aside[index]))
 
 
 def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
