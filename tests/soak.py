@@ -59,7 +59,7 @@ def main(case, folder):
     )
     dataset = load_dataset(folder, settings)
     dataset.preload()
-    config = TrainConfig(
+    config = TrainConfig().changed(
         iterations=ITERATIONS,
         strategy=strategy,
         background=(1.0, 1.0, 1.0),

@@ -8,7 +8,6 @@ commit says why.
 """
 
 import argparse
-import dataclasses
 import functools
 import hashlib
 import json
@@ -69,7 +68,7 @@ def train_mcmc(events):
 def train_sphere(events):
     """The course's run, shorter, with densifications more often, and a cap that cuts."""
     config = course_config(iterations=120, max_gaussians=400)
-    config = dataclasses.replace(config, densify_every=20, densify_stop=100)
+    config = config.changed(densify_every=20, densify_stop=100)
     generator = torch.Generator().manual_seed(9)
     start = random_ball(150, generator)
     control = AdaptiveDensityControl(config, EXTENT, generator, start)

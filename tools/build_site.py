@@ -57,6 +57,7 @@ PUBLIC = {
         "gsplat_edu.render.api.render",
         "gsplat_edu.gaussians.Gaussians",
         "gsplat_edu.camera.Camera",
+        "gsplat_edu.intrinsics.Intrinsics",
         "gsplat_edu.render.settings.RenderSettings",
         "gsplat_edu.render.output.RenderOutput",
         "gsplat_edu.render.cpu.render_covariances",

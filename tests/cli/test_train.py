@@ -1,6 +1,5 @@
 """`gsplat-edu train`: options become a recipe, and bad input costs one line."""
 
-import dataclasses
 import json
 
 import pytest
@@ -11,7 +10,8 @@ from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
-from gsplat_edu.train.config import TrainConfig, recipe
+from gsplat_edu.runs.training import document
+from gsplat_edu.train.config import SETTINGS, TrainConfig, recipe
 
 
 def parsed(words):
@@ -52,16 +52,35 @@ def test_the_other_strategies_and_colours():
     assert options("--strategy", "none").config.strategy == "none"
     assert options("--background", "0.1", "0.2", "0.3").config.background == (0.1, 0.2, 0.3)
     late = options("--no-rescale", "--densify-start", "26000", "--densify-stop", "28000").config
-    assert late.densify_stop == 28_000, "the window of the other strategy is not looked at"
+    assert late.adc.densify_stop == 28_000, "the window of the other strategy is not looked at"
 
 
 def test_every_field_of_the_recipe_has_an_option(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help-all"])
     said = capsys.readouterr().out
-    for field in dataclasses.fields(TrainConfig):
+    for field in SETTINGS:
         assert f"--{field.name.replace('_', '-')}" in said, field.name
     assert "example: gsplat-edu train" in said
+
+
+def test_config_json_has_the_flat_names_of_older_runs():
+    """A run of `mcmc` as the version before nested settings wrote it; that it is resumed is checked key by key."""
+    older = {
+        "iterations": 700, "seed": 0, "means_rate": 0.00016, "means_rate_final": 1.6e-06, "means_rate_iterations": 700,
+        "quats_rate": 0.001, "scales_rate": 0.005, "sh0_rate": 0.0025, "sh_rest_rate": 0.000125, "opacities_rate": 0.05,
+        "adam_eps": 1e-15, "ssim_weight": 0.2, "sh_degree": 3, "sh_every": 23, "view_order": "shuffled",
+        "background": [1.0, 1.0, 1.0], "random_background": False, "antialiased": False, "jacobian_limit": 1.3,
+        "start_opacity": 0.1, "start_scale": 1.0, "strategy": "mcmc", "max_gaussians": 90, "over_cap": "strongest",
+        "densify_start": 12, "densify_stop": 350, "densify_every": 100, "grad_threshold": 0.0002, "percent_dense": 0.01,
+        "split_shrink": 1.6, "min_opacity": 0.005, "prune_scale": 0.1, "prune_screen_size": 0.0, "reset_every": 0,
+        "reset_opacity": 0.01, "mcmc_stop": 583, "mcmc_start_opacity": 0.5, "mcmc_start_scale": 0.1, "mcmc_growth": 1.1,
+        "mcmc_noise": 500000.0, "mcmc_opacity_weight": 0.01, "mcmc_scale_weight": 0.01,
+    }  # fmt: skip
+    words = "--iterations 700 --strategy mcmc --max-gaussians 90 --mcmc-growth 1.1 --white-background"
+    assert json.loads(json.dumps(document(options(*words.split()))["train"])) == older
+    config = TrainConfig().changed(**older | {"background": tuple(older["background"])})
+    assert config == options(*words.split()).config and config.mcmc.growth == 1.1
 
 
 @pytest.mark.parametrize(

@@ -267,6 +267,22 @@ def test_photos_decoded_at_once_are_limited_by_their_size(monkeypatch):
     assert ImageStore(0, []).workers == 64
 
 
+@pytest.mark.parametrize(
+    ("name", "mask", "background", "planes"),
+    [
+        ("a.png", None, (0.0, 0.0, 0.0), 3),
+        ("a.png", None, None, 4),
+        ("a.JPG", None, None, 3),
+        ("a.png", Path("m.png"), None, 5),
+        ("a.jpg", Path("m.png"), None, 4),
+    ],
+)
+def test_memory_for_photos_includes_alpha_that_is_kept(name, mask, background, planes):
+    """A random background is chosen at every step, so alpha is kept; a JPEG has none."""
+    source = PhotoFile(Path(name), mask, Lens(40, 20, 30.0, 30.0, 0.0, 0.0), 20, 10, background)
+    assert ImageStore(0, [source] * 3).needed == 3 * 20 * 10 * planes
+
+
 @pytest.mark.parametrize("resolution", [None, 2.0])
 def test_ready_made_sizes_are_the_photos_where_there_are_no_others(written, resolution):
     """Only images_2 and images_4: the real sizes decide, and no photo is halved twice."""

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.cli.doctor import _exposure_beforehand
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
-from gsplat_edu.doctor.finding import Finding, Severity
+from gsplat_edu.doctor.finding import Finding, Severity, diagnosis_lines
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.gaussians import Gaussians
@@ -289,3 +291,13 @@ def test_a_photo_that_the_scene_cannot_explain_is_not_said_to_be_fitted_all_the_
     found = {finding.name: finding for finding in examine_run(run).findings}
     assert poor.name in found["unexplained"].images
     assert found["exposure"].sentence == "1 of 12 photos"
+
+
+def test_that_exposure_was_not_compared_is_said(scene, tmp_path):
+    gaussians, views = scene
+    findings, why = _exposure_beforehand(tmp_path / "gone", Terminal())
+    assert findings == [] and "gone" in why
+    said = diagnosis_lines(examine_run(trained(gaussians, views, uncompared=why)))
+    (line,) = [line for line in said if line.startswith("exposure ")]
+    assert line.endswith(f"not between photos: {why}")
+    assert not any("not between" in line for line in diagnosis_lines(examine_run(trained(gaussians, views))))

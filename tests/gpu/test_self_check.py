@@ -51,6 +51,7 @@ def test_a_shifted_image_fails(device, empty_cache, monkeypatch):
     assert not empty_cache.exists()
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", rasterize.RAW)
 def test_a_gradient_that_is_one_percent_too_large_fails(device, monkeypatch, name):
     right = rasterize.render_triton
@@ -81,7 +82,7 @@ def test_auto_takes_the_cpu_where_the_kernels_do_not_run(monkeypatch, tmp_path, 
         resolve_backend("cuda")
 
     backends._warn_once.cache_clear()
-    save_ply(tmp_path / "a.ply", self_check.scene(torch.float32))
+    save_ply(tmp_path / "a.ply", self_check.check_scene(torch.float32))
     out = tmp_path / "frames"
     words = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--out", str(out)]
     assert main(words) == 0

@@ -61,7 +61,7 @@ def test_twenty_iterations_follow_the_native_backend(views, device):
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
 def test_strategies_run_and_checkpoints_change_backends(views, device, tmp_path, strategy):
-    config = TrainConfig(
+    config = TrainConfig().changed(
         iterations=24,
         strategy=strategy,
         max_gaussians=60,

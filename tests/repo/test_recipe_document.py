@@ -1,23 +1,51 @@
-"""docs/RECIPE.md names every field of the recipe with its default, and marks what is stretched."""
+"""The table of docs/RECIPE.md is written from the settings' metadata, and says what each is."""
 
 import dataclasses
-import re
+import importlib.util
 from pathlib import Path
 
-from gsplat_edu.train.config import MILESTONES, TrainConfig
+import pytest
 
-TEXT = (Path(__file__).parents[2] / "docs/RECIPE.md").read_text()
-# the first table; the one under "Starting from a trained scene" has other defaults
-ROWS = re.findall(
-    r"^\| `(\w+)` \| ([^|]+) \| ([^|]+) \|$", TEXT.split("## Starting from a trained scene")[0], re.M
-)
+from gsplat_edu.train.config import MILESTONES, ONLY_FOR, SETTINGS, AdcConfig, McmcConfig, TrainConfig
 
-
-def test_every_field_and_its_default():
-    assert [(name, default) for name, default, _ in ROWS] == [
-        (field.name, str(field.default)) for field in dataclasses.fields(TrainConfig)
-    ]
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs/RECIPE.md").read_text()
 
 
-def test_the_marked_ones_are_stretched():
-    assert {name for name, _, text in ROWS if "*" in text} == set(MILESTONES)
+@pytest.fixture(scope="module")
+def tool():
+    spec = importlib.util.spec_from_file_location("recipe_table", ROOT / "tools/build_recipe_table.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_table_is_current(tool):
+    assert tool.with_table(TEXT) == TEXT, "run python tools/build_recipe_table.py"
+    assert tool.table() in TEXT
+
+
+def test_a_changed_setting_makes_it_stale(tool, monkeypatch):
+    changed = [dataclasses.replace(SETTINGS[0], default=1), *SETTINGS[1:]]
+    monkeypatch.setattr(tool, "SETTINGS", changed)
+    assert tool.with_table(TEXT) != TEXT
+
+
+def test_every_field_is_a_setting_with_a_meaning():
+    """A field without metadata would have no option, no line in config.json and no row here."""
+    for kind, strategy in ((TrainConfig, None), (AdcConfig, "adc"), (McmcConfig, "mcmc")):
+        nested = {"adc", "mcmc"} if strategy is None else set()
+        names = {field.name for field in dataclasses.fields(kind)} - nested
+        found = {setting.field for setting in SETTINGS if setting.strategy == strategy}
+        assert found == names and all(f"    {name}: " in kind.__doc__ for name in names)
+    assert all(setting.help.endswith(".") for setting in SETTINGS)
+    assert len({setting.name for setting in SETTINGS}) == len(SETTINGS)
+
+
+def test_milestones_and_what_only_one_strategy_uses():
+    """Those that 2023 and 2024 give in iterations of 30,000; intervals are not among them."""
+    assert set(MILESTONES) == {
+        *("means_rate_iterations", "sh_every", "densify_start", "densify_stop", "reset_every", "mcmc_stop")
+    }
+    assert "mcmc_growth" in ONLY_FOR["mcmc"] and "densify_stop" in ONLY_FOR["adc"]
+    assert not {"densify_start", "min_opacity"} & {name for names in ONLY_FOR.values() for name in names}

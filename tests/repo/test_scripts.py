@@ -24,6 +24,7 @@ TRAININGS = {
 
 ELSEWHERE = {
     "build_cli_reference.py": "tests/repo/test_cli_reference.py",
+    "build_recipe_table.py": "tests/repo/test_recipe_document.py",
     "build_notebooks.py": "tests/repo/test_notebooks.py",
     "build_site.py": "tests/repo/test_site.py",
     "chapter_figures.py": "tests/repo/test_notebooks.py",

@@ -11,13 +11,13 @@ from gsplat_edu import Camera
 from gsplat_edu.gaussians import Gaussians, cov3d_t
 from gsplat_edu.render.api import render
 from gsplat_edu.render.torch_reference import eval_sh_t, render_t
-from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.surgery import replace, split_children
 from gsplat_edu.train.optimizer import Adam
 
 SMALL, LARGE = math.log(0.02), math.log(0.2)  # 1 % of the extent 3.0 is 0.03
-CONFIG = TrainConfig(densify_start=99, densify_stop=600, reset_every=0, over_cap="cut")
+CONFIG = recipe(densify_start=99, densify_stop=600, reset_every=0, over_cap="cut")
 EXTENT = 3.0
 
 
@@ -40,7 +40,7 @@ def controlled(hot, config=CONFIG):
     optimizer = Adam(gaussians.tensors(), {"means": 1e-3})
     optimizer.first["means"] = torch.arange(12.0, dtype=torch.float64).reshape(4, 3) + 1
     control = AdaptiveDensityControl(config, EXTENT, torch.Generator().manual_seed(0), gaussians)
-    control.norm_sums = torch.tensor(hot, dtype=torch.float64) * 2 * 1.01 * config.grad_threshold
+    control.norm_sums = torch.tensor(hot, dtype=torch.float64) * 2 * 1.01 * config.adc.grad_threshold
     control.times_visible = torch.full((4,), 2.0, dtype=torch.float64)
     return control, gaussians, optimizer
 

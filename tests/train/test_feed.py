@@ -49,8 +49,9 @@ def in_memory(count, **kinds):
 
 
 def draw(feed, background):
-    view, photo = feed.next()
-    return view, feed.target(view, photo, background)
+    draw = feed.next()
+    assert draw.view is feed.views[draw.index]
+    return draw.view, feed.target(draw, background)
 
 
 def drawn(feed, count, background=WHITE):

@@ -51,15 +51,16 @@ def test_the_defaults_are_the_papers():
         "mcmc_opacity_weight": 0.01,
         "mcmc_scale_weight": 0.01,
     }
-    assert {name: getattr(config, name) for name in expected} == expected
+    flat = config.flat()
+    assert {name: flat[name] for name in expected} == expected
 
 
 def test_milestones_are_stretched_and_intervals_are_not():
     short = recipe(7_000)
     factor = 7_000 / 30_000
     for name in MILESTONES:
-        assert getattr(short, name) == round(getattr(TrainConfig(), name) * factor), name
-    assert (short.densify_start, short.densify_stop, short.reset_every) == (117, 3_500, 700)
+        assert short.flat()[name] == round(TrainConfig().flat()[name] * factor), name
+    assert (short.densify_start, short.adc.densify_stop, short.adc.reset_every) == (117, 3_500, 700)
     assert short.densify_every == 100 and short.means_rate_iterations == 7_000
     assert recipe() == TrainConfig()
 
@@ -67,13 +68,13 @@ def test_milestones_are_stretched_and_intervals_are_not():
 def test_plain_numbers_on_request_and_explicit_ones_as_they_are():
     plain = recipe(7_000, rescale=False)
     assert plain == TrainConfig(iterations=7_000)
-    assert recipe(7_000, densify_stop=6_000).densify_stop == 6_000
+    assert recipe(7_000, densify_stop=6_000).adc.densify_stop == 6_000
 
 
 def test_short_runs_do_not_reset():
-    assert recipe(2_999).reset_every == 0 and recipe(2_999, rescale=False).reset_every == 0
-    assert recipe(3_000).reset_every == 300
-    assert recipe(2_999, reset_every=50).reset_every == 50
+    assert recipe(2_999).adc.reset_every == 0 and recipe(2_999, rescale=False).adc.reset_every == 0
+    assert recipe(3_000).adc.reset_every == 300
+    assert recipe(2_999, reset_every=50).adc.reset_every == 50
 
 
 def test_the_rate_of_the_means_falls_log_linearly():
@@ -114,7 +115,7 @@ def due(config, iterations):
 
 
 def test_what_is_due_when():
-    config = TrainConfig(prune_scale=0.0)
+    config = recipe(prune_scale=0.0)
     found = due(config, [0, 100, 500, 501, 600, 650, 700, 3_000, 6_000, 14_900, 15_000, 18_000])
     densified = [i for kind, i in found if kind is DensifyEvent]
     assert densified == [600, 700, 3_000, 6_000, 14_900]
@@ -122,7 +123,7 @@ def test_what_is_due_when():
 
 
 def test_white_resets_early_too():
-    white = TrainConfig(background=(1.0, 1.0, 1.0), prune_scale=0.0)
+    white = recipe(background=(1.0, 1.0, 1.0), prune_scale=0.0)
     found = due(white, [500, 501, 502, 3_000])
     assert [i for kind, i in found if kind is ResetEvent] == [500, 3_000]
     assert not [
@@ -131,7 +132,7 @@ def test_white_resets_early_too():
 
 
 def test_a_reset_lowers_opacities_and_forgets_their_moments_only():
-    config, gaussians = TrainConfig(prune_scale=0.0), scene()
+    config, gaussians = recipe(prune_scale=0.0), scene()
     optimizer = Adam(gaussians.tensors(), config.learning_rates)
     for moments in (optimizer.first, optimizer.second):
         for tensor in moments.values():
@@ -163,7 +164,7 @@ def test_large_gaussians_are_pruned_once_opacities_have_been_reset():
 
 def test_screen_size_prunes_only_on_request():
     for limit, left in ((0.0, 50), (20.0, 49)):
-        config, gaussians = TrainConfig(prune_scale=0.0, prune_screen_size=limit), scene()
+        config, gaussians = recipe(prune_scale=0.0, prune_screen_size=limit), scene()
         control = AdaptiveDensityControl(config, 1.0, torch.Generator(), gaussians)
         control.largest_radii[3] = 21.0
         changed, _ = control.update(3_100, gaussians, Adam(gaussians.tensors(), config.learning_rates))
@@ -173,7 +174,7 @@ def test_screen_size_prunes_only_on_request():
 @pytest.mark.parametrize("cap", [50, 53, 60])
 def test_the_strongest_come_first_where_room_is_scarce(cap):
     """Of 50 Gaussians 20 are due, half of them to be cloned and half to be split; each adds one."""
-    config, gaussians = TrainConfig(max_gaussians=cap, percent_dense=0.01), scene()
+    config, gaussians = recipe(max_gaussians=cap, percent_dense=0.01), scene()
     with torch.no_grad():
         gaussians.log_scales[:10] = math.log(0.001)
     control = AdaptiveDensityControl(config, 1.0, torch.Generator().manual_seed(0), gaussians)

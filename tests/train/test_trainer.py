@@ -1,4 +1,3 @@
-import dataclasses
 import functools
 
 import numpy as np
@@ -18,7 +17,7 @@ from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import View
 
 RENDER = functools.partial(render, backend="torch")
-SHORT = dataclasses.replace(course_config(iterations=12, max_gaussians=80), densify_stop=12, densify_every=4)
+SHORT = course_config(iterations=12, max_gaussians=80).changed(densify_stop=12, densify_every=4)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +110,7 @@ def test_one_gaussian_finds_one_spot(views):
 def test_a_scene_that_vanishes_does_not_stop_the_run(views):
     faint = random_ball(3, torch.Generator()).map(torch.clone)
     faint.logit_opacities.fill_(-9.0)
-    config = dataclasses.replace(course_config(iterations=4), densify_stop=3, densify_every=1)
+    config = course_config(iterations=4).changed(densify_stop=3, densify_every=1)
     control = AdaptiveDensityControl(config, EXTENT, torch.Generator(), faint)
     run = Trainer(faint, views, config, render=RENDER, density=control)
     assert run.run().counts == [3, 3, 0, 0]
@@ -132,7 +131,7 @@ def test_nothing_to_learn_from_is_refused(views):
         (lambda: TrainConfig(seed=-1), "seed"),
         (lambda: TrainConfig(means_rate=-1.0), "means_rate"),
         (lambda: TrainConfig(densify_every=0), "densify_every"),
-        (lambda: TrainConfig(densify_start=50, densify_stop=49), "densify_stop"),
+        (lambda: recipe(densify_start=50, densify_stop=49), "densify_stop"),
         (lambda: TrainConfig(strategy="best"), "strategy"),
         (lambda: TrainConfig(view_order="sorted"), "view_order"),
         (lambda: TrainConfig(background=(1.0, 1.0)), "background"),

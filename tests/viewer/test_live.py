@@ -196,7 +196,7 @@ def test_a_pause_is_not_counted_as_training(capture, tmp_path, monkeypatch):
     """The clock goes forward by an hour during the pause: the run takes less than that."""
     clock, ahead = time.perf_counter, []
     monkeypatch.setattr(time, "perf_counter", lambda: clock() + sum(ahead))
-    with training(capture, tmp_path / "run", "--iterations", "200") as made, Client(made.view) as client:
+    with training(capture, tmp_path / "run", "--iterations", "60") as made, Client(made.view) as client:
         client.move()
         client.press("Step")
         client.paused_at()

@@ -179,12 +179,12 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
     """
     cap = config.max_gaussians or sys.maxsize
     counts = np.full(config.iterations, min(points, cap), dtype=np.int64)
-    stop = {"adc": config.densify_stop, "mcmc": config.mcmc_stop}.get(config.strategy, 0)
+    stop = {"adc": config.adc.densify_stop, "mcmc": config.mcmc.stop}.get(config.strategy, 0)
     every = config.densify_every
     first, added = (config.densify_start // every + 1) * every, _added(points, pixels)
     for moment in range(first, min(stop, config.iterations), every):
         now = int(counts[moment])
-        grown = now + added if config.strategy == "adc" else int(config.mcmc_growth * now)
+        grown = now + added if config.strategy == "adc" else int(config.mcmc.growth * now)
         counts[moment + 1 :] = min(grown, cap)
     return counts
 
@@ -194,7 +194,7 @@ def wanted_gaussians(config: TrainConfig, points: int, pixels: float) -> int:
 
     Arguments as for `expected_counts`.
     """
-    window = min(config.densify_stop, config.iterations) - config.densify_start
+    window = min(config.adc.densify_stop, config.iterations) - config.densify_start
     return points + _added(points, pixels) * max(window // config.densify_every, 0)
 
 

@@ -152,9 +152,9 @@ class Request:
         """
         config = self.options.config
         if "iterations" not in self.given:
-            fresh = recipe(iterations, rescale=self.rescale)
-            stretched = {name: getattr(fresh, name) for name in MILESTONES if name not in self.given}
-            config = dataclasses.replace(config, iterations=iterations, **stretched)
+            fresh = recipe(iterations, rescale=self.rescale).flat()
+            scaled = {name: fresh[name] for name in MILESTONES if name not in self.given}
+            config = config.changed(iterations=iterations, **scaled)
         if "max_gaussians" in self.given:
             return config
         caps = [] if cap is None else [_rounded(cap)]
@@ -380,12 +380,12 @@ def flags(options: RunOptions, given: Collection[str] = (), *, photos: bool = Fa
         words.append(f"--max-gaussians {config.max_gaussians}")
     if "iterations" not in given:
         words.append(f"--iterations {config.iterations}")
-        stretched = recipe(config.iterations)
+        chosen, scaled = config.flat(), recipe(config.iterations).flat()
         idle = {name for key, names in ONLY_FOR.items() if key != config.strategy for name in names}
         words += [
-            f"--{name.replace('_', '-')} {getattr(config, name)}"
+            f"--{name.replace('_', '-')} {chosen[name]}"
             for name in MILESTONES
-            if name not in {*given, *idle} and getattr(config, name) != getattr(stretched, name)
+            if name not in {*given, *idle} and chosen[name] != scaled[name]
         ]
     return " ".join(words)
 
@@ -411,7 +411,7 @@ def taken_up(options: RunOptions, given: Collection[str]) -> RunOptions:
     try:
         return dataclasses.replace(
             options,
-            config=dataclasses.replace(options.config, **train),
+            config=options.config.changed(**train),
             data_settings=dataclasses.replace(options.data_settings, **data),
         )
     except ArgumentError as error:

@@ -171,8 +171,7 @@ def _trial(
                 torch.cuda.synchronize()
             moments.append(time.perf_counter())
 
-    plain = dataclasses.replace(
-        config,
+    plain = config.changed(
         iterations=PROBE_STEPS,
         sh_every=0,
         densify_start=PROBE_STEPS,

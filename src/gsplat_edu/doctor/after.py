@@ -71,6 +71,7 @@ class Trained:
         capture: The capture it was trained on; None where nobody knows.
         options: Further options of the training that a longer one should have, as words of a command.
         beforehand: What the doctor finds in the photos' exposure without looking at the scene.
+        uncompared: Why the photos' exposure was not compared; empty if it was.
     """
 
     path: Path
@@ -84,6 +85,7 @@ class Trained:
     capture: Path | None = None
     options: tuple[str, ...] = ()
     beforehand: Sequence[Finding] = ()
+    uncompared: str = ""
 
     @property
     def rising(self) -> bool | None:
@@ -183,6 +185,8 @@ def _facts(run: Trained) -> tuple[tuple[str, str], ...]:
             low = sorted(views, key=lambda view: view.psnr)[:NAMED]
             worst = ", ".join(f"{view.name} {view.psnr:.1f}" for view in low)
             facts.append((name, f"{len(views)} views, PSNR {_mean(views):.2f} dB; worst {worst}"))
+    if run.uncompared:
+        facts.append(("exposure", f"compared with the scene only, not between photos: {run.uncompared}"))
     return tuple(facts)
 
 

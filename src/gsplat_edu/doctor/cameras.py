@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.spatial import cKDTree
 
 from gsplat_edu.doctor.finding import Finding, Severity
-from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
+from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.text import short_number
@@ -64,8 +65,13 @@ FAR_AWAY = 8.0
 """A camera stands far away whose distance from the middle of all cameras is so many times what three quarters of them
 keep. At the ends of a walk it is 1.4 times, on an orbit 1."""
 
+APART = 2.0
+"""So does a camera that is farther than this from every other camera, in the same unit. Of 184 cameras of four captures
+the loneliest was 0.67 away from its neighbour, one of eleven photos."""
+
 PAST = math.radians(25.0)
-"""Least angle at which a camera looks past what the others look at, where it is supported badly too."""
+"""Least angle at which a camera looks past what the others look at, where it is supported badly too, or where that
+point is outside of its picture. The largest of 173 cameras of three captures that look at something is 22 degrees."""
 
 HOLE = math.radians(60.0)
 """Least gap of an orbit that is told: sides seen at more than 30 degrees to their normal are drawn out by half."""
@@ -170,8 +176,8 @@ def check_parallax(survey: Survey) -> list[Finding]:
 
 def check_away(survey: Survey) -> list[Finding]:
     """Find cameras whose pose is probably wrong: by where they look, where they stand, and what fixes them."""
-    away, doubtful = looking_away(survey.geometry), _doubtful(survey)
-    found = []
+    away = looking_away(survey.geometry)
+    doubtful, found = _doubtful(survey, away), list[Finding]()
     if named := away - doubtful.keys():
         names = tuple(survey.names[i] for i in sorted(named))
         what = f"{len(names)} of {len(survey.shots)} cameras point at something that hardly any other camera sees"
@@ -182,22 +188,30 @@ def check_away(survey: Survey) -> list[Finding]:
     if doubtful:
         order = sorted(doubtful)
         names, reasons = tuple(survey.names[i] for i in order), tuple(doubtful[i] for i in order)
-        what = f"{len(names)} of {len(survey.shots)} cameras have poses with little support"
+        what = f"{len(names)} of {len(survey.shots)} cameras have doubtful poses"
         advice = "take out the cameras with doubtful poses: a wrong pose spoils the scene for all others"
         found.append(Finding("doubtful poses", Severity.WARNING, what, advice, names, reasons))
     return found
 
 
-def _doubtful(survey: Survey) -> dict[int, str]:
-    """Return the cameras whose poses have little support, and why.
+def _doubtful(survey: Survey, away: set[int]) -> dict[int, str]:
+    """Return the cameras whose poses are doubtful, and why.
 
-    Where the capture says in which photos its points were found, these counts decide, alone where they are small, or
-    with an odd place or direction. Where it does not, only a camera very far from all others is named.
+    If the capture says in which photos its points were found, a camera is named for a small count, or for a lower count
+    than most together with an odd position or direction. If it does not, a camera is named if it stands apart from all
+    others, or if its picture misses what the others look at; those in `away` are named elsewhere.
     """
-    distances, angles = _from_the_middle(survey.geometry), _past(survey.geometry)
+    (distances, nearest), angles = _stands(survey.geometry), _past(survey.geometry)
     far = distances > FAR_AWAY
     if not any(survey.observed.values()):
-        return {int(i): f"{distances[i]:.0f} times as far as the others" for i in np.flatnonzero(far)}
+        far |= nearest > APART
+        return {
+            int(i): f"{distances[i]:.0f} times as far as the others"
+            if far[i]
+            else "looks past what the others look at"
+            for i in np.flatnonzero(far | (angles & _missing(survey.geometry)))
+            if far[i] or i not in away
+        }
     counts = np.array([survey.observed.get(name, 0) for name in survey.names])
     median = float(np.median(counts))
     few = (counts < SUPPORT) & (counts < SUPPORT_SHARE * median)
@@ -211,10 +225,22 @@ def _doubtful(survey: Survey) -> dict[int, str]:
     return found
 
 
-def _from_the_middle(geometry: Geometry) -> Float64[np.ndarray, " C"]:
-    """Return how far each camera stands from the middle of all, in distances that three quarters of them keep."""
+def _stands(geometry: Geometry) -> tuple[Float64[np.ndarray, " C"], Float64[np.ndarray, " C"]]:
+    """Return how far each camera is from the middle of all and from its nearest one.
+
+    The unit is the distance from the middle that three quarters of them keep.
+    """
     distances = np.linalg.norm(geometry.eyes - np.median(geometry.eyes, axis=0), axis=1)
-    return np.asarray(distances / max(float(np.quantile(distances, 0.75)), 1e-300))
+    kept = max(float(np.quantile(distances, 0.75)), 1e-300)
+    nearest = cKDTree(geometry.eyes).query(geometry.eyes, k=[2])[0][:, 0]
+    return np.asarray(distances / kept), np.asarray(nearest / kept)
+
+
+def _missing(geometry: Geometry) -> Bool[np.ndarray, " C"]:
+    """Say whose pictures miss the point that most cameras look at, if there is one."""
+    if geometry.centre is None:
+        return np.zeros(len(geometry.cameras), dtype=np.bool_)
+    return np.array([not inside(camera, geometry.centre[None])[0] for camera in geometry.cameras])
 
 
 def _past(geometry: Geometry) -> Bool[np.ndarray, " C"]:

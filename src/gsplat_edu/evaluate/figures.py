@@ -76,36 +76,42 @@ def curves_figure(losses: Sequence[float], counts: Sequence[int]) -> Figure:
 
 
 def run_curve_figures(log: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """Plot a run's log: loss, PSNR of evaluations, number of Gaussians, ms per iteration.
+    """Plot a run's log: loss, PSNR of evaluations, number of Gaussians, ms per iteration, terms of the objective.
 
     Args:
-        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, ms. A key that no line has gets
-            no curve.
+        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, ms, terms. A key that no line has
+            gets no curve, and a single term, which is the loss, none of its own.
 
     Returns:
         One figure for each curve; they share the range of iterations.
     """
     curves = []
     for key, title, label in RUN_CURVES:
-        pairs = [(line["iteration"], line[key]) for line in log if _drawable(line, key)]
-        if pairs:
-            curves.append((key, title, label, _thinned(np.array(pairs, dtype=np.float64))))
-    last = max((float(points[-1, 0]) for *_, points in curves), default=0.0)
+        if (points := _points(log, key)) is not None:
+            curves.append((key, title, label, {"": points}))
+    if len(terms := _terms(log)) > 1:
+        curves.append(("terms", "terms of the objective", "weighted value", terms))
+    last = max((float(points[-1, 0]) for *_, lines in curves for points in lines.values()), default=0.0)
     figures = []
-    for key, title, label, points in curves:
+    for key, title, label, lines in curves:
         figure = Figure(figsize=(5, 2.9), layout="constrained")
         axes = figure.subplots()
-        axes.plot(*points.T, linewidth=1.0, marker="o" if len(points) < 40 else "", markersize=3)
+        for name, points in lines.items():
+            marker = "o" if len(points) < 40 else ""
+            axes.plot(*points.T, linewidth=1.0, marker=marker, markersize=3, label=name)
+        values = np.concatenate([points[:, 1] for points in lines.values()])
         axes.set(title=title, xlabel="iteration", ylabel=label)
         axes.set_xlim(0.0, 1.03 * last if last > 0 else 1.0)
         axes.grid(alpha=0.3)
-        if key == "loss" and points[:, 1].min() > 0:
-            _decades(axes, points[:, 1])
+        if len(lines) > 1:
+            axes.legend()
+        if key in ("loss", "terms") and values.min() > 0:
+            _decades(axes, values)
         if key in ("num_gaussians", "ms"):
             axes.set_ylim(0, None)
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         if key == "ms":
-            _cut_peaks(axes, title, points[:, 1])
+            _cut_peaks(axes, title, values)
         figures.append(figure)
     return figures
 
@@ -142,9 +148,23 @@ def svg_element(figure: Figure, name: str = "figure") -> str:
     ]  # without the XML and DOCTYPE lines, which do not belong inside a page
 
 
-def _drawable(line: Mapping[str, Any], key: str) -> bool:
-    pair = (line.get("iteration"), line.get(key))
-    return all(isinstance(value, int | float) and math.isfinite(value) for value in pair)
+def _points(log: Sequence[Mapping[str, Any]], key: str) -> Float[np.ndarray, "Q 2"] | None:
+    """Return iteration and value of the lines that have both; None where none has."""
+    pairs = [(line.get("iteration"), line.get(key)) for line in log]
+    finite = [pair for pair in pairs if all(isinstance(v, int | float) and math.isfinite(v) for v in pair)]
+    return _thinned(np.array(finite, dtype=np.float64)) if finite else None
+
+
+def _terms(log: Sequence[Mapping[str, Any]]) -> dict[str, Float[np.ndarray, "Q 2"]]:
+    """Return the points of every term of the objective that the log names."""
+    lines = [
+        (line.get("iteration"), terms) for line in log if isinstance(terms := line.get("terms"), Mapping)
+    ]
+    names = list(dict.fromkeys(name for _, terms in lines for name in terms))
+    found = {
+        name: _points([{"iteration": i, name: terms.get(name)} for i, terms in lines], name) for name in names
+    }
+    return {name: points for name, points in found.items() if points is not None}
 
 
 def _thinned(points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "Q 2"]:

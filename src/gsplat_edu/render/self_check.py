@@ -82,9 +82,9 @@ def difference(device: torch.device) -> str | None:
     from gsplat_edu.render.triton.rasterize import render_triton
 
     image, gradients = _differentiated(
-        scene(torch.float32).to(device), lambda g, bg: render_triton(g, CAMERA, SETTINGS, bg)
+        check_scene(torch.float32).to(device), lambda g, bg: render_triton(g, CHECK_CAMERA, SETTINGS, bg)
     )
-    truth, expected = _differentiated(scene(torch.float64), _exact)
+    truth, expected = _differentiated(check_scene(torch.float64), _exact)
     bright = max(1.0, float(truth.abs().max()))
     error = (image - truth).abs()
     worst, mean = float(error.max()) / bright, float(error.mean()) / bright
@@ -97,11 +97,11 @@ def difference(device: torch.device) -> str | None:
     return None
 
 
-CAMERA = Camera(np.eye(3), (0.0, 0.0, -3.0), fx=44.0, fy=47.0, cx=23.1, cy=18.4, H=37, W=46)
+CHECK_CAMERA = Camera(np.eye(3), (0.0, 0.0, -3.0), fx=44.0, fy=47.0, cx=23.1, cy=18.4, H=37, W=46)
 """No multiple of a tile; the principal point is off the middle."""
 
 
-def scene(dtype: torch.dtype) -> Gaussians:
+def check_scene(dtype: torch.dtype) -> Gaussians:
     """Make 64 Gaussians around the origin with harmonics of degree 3 whose depths all differ.
 
     Neither the near plane nor the tiles' stop comes into play: both would let rounding decide what is drawn.
@@ -131,10 +131,10 @@ def _exact(gaussians: Gaussians, background: Tensor) -> RenderOutput:
     if kernels.REASON is None:
         from gsplat_edu.render.cpu import render_cpu
 
-        return render_cpu(gaussians, CAMERA, SETTINGS, background)
+        return render_cpu(gaussians, CHECK_CAMERA, SETTINGS, background)
     from gsplat_edu.render.torch_reference import render_dense
 
-    return render_dense(gaussians, CAMERA, SETTINGS, background)
+    return render_dense(gaussians, CHECK_CAMERA, SETTINGS, background)
 
 
 def _differentiated(

@@ -34,11 +34,16 @@ def _place(value: object) -> bool:
     return isinstance(value, list) and len(value) == 3 and all(map(_number, value))
 
 
+def _numbers(value: object) -> bool:
+    return isinstance(value, dict) and all(number is None or _number(number) for number in value.values())
+
+
 KINDS: Mapping[Check, str] = {
     _whole: "a whole number",
     _number: "a number",
     _text: "text",
     _section: "an object",
+    _numbers: "an object of numbers",
     _place: "three numbers",
 }
 """What messages call the values that each check accepts."""
@@ -58,6 +63,7 @@ CONFIG: Mapping[str, Check] = {
 LOG: Mapping[str, Check] = {
     "iteration": _whole,
     "num_gaussians": _whole,
+    "terms": _numbers,
     **dict.fromkeys(("loss", "psnr", "ssim", "ms", "seconds"), _number),
 }
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import torch
-from torch import Tensor
 
 from gsplat_edu.files import named_failure, written_aside
 from gsplat_edu.reading import parse_json, read_text
@@ -29,7 +28,7 @@ class LogWriter:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file: TextIO | None = None
-        self._losses: list[Tensor] = []
+        self._steps: list[StepEvent] = []
         self._last = 0.0
 
     def record(self, event: Event, seconds: float) -> None:
@@ -44,27 +43,31 @@ class LogWriter:
             kind = type(event).__name__.removesuffix("Event").lower()
             self.write({**dataclasses.asdict(event), "iteration": iteration, "event": kind})
             return
-        self._losses.append(event.loss_tensor)
+        self._steps.append(event)
         if iteration % STEPS_PER_LINE == 0:
-            count = len(self._losses)
+            count, names = len(self._steps), list(event.terms)
+            values = [[step.loss_tensor, *(step.terms[name] for name in names)] for step in self._steps]
+            # one wait for a GPU in ten steps
+            rows = torch.stack([torch.stack(row) for row in values]).tolist()
+            loss, *terms = (sum(column) / count for column in zip(*rows, strict=True))
             line = {
                 "iteration": iteration,
-                "loss": sum(torch.stack(self._losses).tolist()) / count,  # one wait for a GPU in ten steps
+                "loss": loss,
+                "terms": dict(zip(names, terms, strict=True)),
                 "num_gaussians": event.num_gaussians,
                 "ms": round(1e3 * (seconds - self._last) / count, 3),
                 "seconds": round(seconds, 3),
             }
             self.write(line)
-            self._losses, self._last = [], seconds
+            self._steps, self._last = [], seconds
 
     def write(self, line: dict[str, Any]) -> None:
         """Add a line; it is on its way to the disk when this returns."""
         if self._file is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("a", encoding="utf-8")
-        finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in line.items()}
         with named_failure(self.path):
-            self._file.write(json.dumps(finite, allow_nan=False) + "\n")
+            self._file.write(json.dumps(_finite(line), allow_nan=False) + "\n")
             self._file.flush()
 
     def cut(self, iteration: int, seconds: float = 0.0) -> None:
@@ -75,7 +78,7 @@ class LogWriter:
             seconds: Wall time of the training up to there.
         """
         self.close()
-        self._losses, self._last = [], seconds
+        self._steps, self._last = [], seconds
         if not self.path.exists():
             return
         kept = []
@@ -93,3 +96,10 @@ class LogWriter:
         if self._file is not None:
             self._file.close()
             self._file = None
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401
+    """Return what JSON can say: null for NaN and infinities, in objects too."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value

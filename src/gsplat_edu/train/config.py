@@ -1,13 +1,18 @@
-"""Every number of a training, named, with its source.
+"""Every number of a training, named, with its meaning and its source.
 
 The defaults are the recipe of Kerbl et al. 2023 ("2023" below) as its code runs it, and of Kheradmand et al. 2024
 for the strategy mcmc. Iterations count from 0: what happens "at iteration i" happens with or after step i + 1.
+
+`TrainConfig` holds what every run has, `AdcConfig` and `McmcConfig` what belongs to one strategy. Options of the
+command line, config.json and docs/RECIPE.md name all of them in one flat list, `SETTINGS`, made from fields' metadata.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
@@ -26,142 +31,304 @@ FROM_SCENE = {"means_rate": 1.6e-5, "sh_every": 0}
 """Defaults of a run that starts from a trained scene. Its Gaussians are about where they belong, so the means' rate
 starts at the geometric mean of the recipe's first and last; its harmonics are trained, so all of them are in use."""
 
+Check = Callable[[str, Any], object]
+"""Raises `ArgumentError`, which names the setting, if a value is out of its range."""
 
+Class = TypeVar("Class", bound=type)
+
+
+def _number(default: Any, check: Check, help: str, source: str = "", *, milestone: bool = False) -> Any:  # noqa: A002, ANN401
+    """Declare a setting: default, range, meaning, source, and whether `recipe` scales it with the run."""
+    metadata = {"check": check, "help": help, "source": source, "milestone": milestone}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def _whole(low: int, high: int | None = None) -> Check:
+    return lambda name, value: whole_number(name, value, low, high)
+
+
+def _positive(name: str, value: float) -> None:
+    in_range(name, value, 0.0, open_low=True)
+
+
+def _not_negative(name: str, value: float) -> None:
+    in_range(name, value, 0.0)
+
+
+def _fraction(name: str, value: float) -> None:
+    in_range(name, value, 0.0, 1.0)
+
+
+def _opacity(name: str, value: float) -> None:
+    in_range(name, value, 0.0, 1.0 - 1e-6, open_low=True)
+
+
+def _at_least_1(name: str, value: float | None) -> None:
+    if value is not None:
+        in_range(name, value, 1.0)
+
+
+def _cap(name: str, value: int | None) -> None:
+    if value is not None:
+        whole_number(name, value, 1)
+
+
+def _color(name: str, value: object) -> None:
+    float64_array(name, value, (3,))  # type: ignore[arg-type]
+
+
+def _one_of(names: tuple[str, ...]) -> Check:
+    return lambda name, value: one_of(name, value, names)
+
+
+def _flag(name: str, value: object) -> None:
+    """Take true and false."""
+
+
+def _documented(kind: Class) -> Class:
+    """Add the settings' meanings to a class's docstring, as its arguments."""
+    lines = [f"    {field.name}: {field.metadata['help']}" for field in fields(kind) if field.metadata]
+    kind.__doc__ = "\n".join([f"{(kind.__doc__ or '').rstrip()}", "", "Args:", *lines, ""])
+    return kind
+
+
+@_documented
+@dataclass(frozen=True)
+class AdcConfig:
+    """Settings of adaptive density control: clone, split, prune, reset."""
+
+    over_cap: str = _number(
+        "strongest",
+        _one_of(OVER_CAP),
+        'Which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with the largest'
+        ' gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors, clones,'
+        " children; the parent of dropped children is removed too (the course).",
+    )
+    densify_stop: int = _number(
+        15_000, _whole(0), "Densification ends before this iteration.", "2023", milestone=True
+    )
+    grad_threshold: float = _number(
+        2e-4,
+        _not_negative,
+        "Clone or split Gaussians whose mean image-plane gradient norm, in normalised device coordinates, exceeds"
+        " this.",
+        "2023",
+    )
+    percent_dense: float = _number(
+        0.01,
+        _not_negative,
+        "Fraction of the extent: Gaussians of a larger scale are split, smaller ones cloned.",
+        "2023",
+    )
+    split_shrink: float = _number(
+        1.6, _positive, "Divisor of the scales of the two children of a split.", "2023"
+    )
+    prune_scale: float = _number(
+        0.1,
+        _not_negative,
+        "Fraction of the extent: once opacities have been reset, Gaussians of a larger scale are pruned; 0 prunes"
+        " none.",
+        "2023",
+    )
+    prune_screen_size: float = _number(
+        0.0,
+        _not_negative,
+        "px: once opacities have been reset, Gaussians whose ellipse had a larger half axis in an image are pruned; 0"
+        " prunes none.",
+        "2023 has 20, which never took effect there",
+    )
+    reset_every: int = _number(
+        3_000,
+        _whole(0),
+        "Iterations between resets of the opacities while densifying; 0 never resets.",
+        "2023",
+        milestone=True,
+    )
+    reset_opacity: float = _number(0.01, _opacity, "Upper bound of opacities after a reset.", "2023")
+
+
+@_documented
+@dataclass(frozen=True)
+class McmcConfig:
+    """Settings of Markov chain Monte Carlo: relocate, grow, add noise, regularise."""
+
+    stop: int = _number(
+        25_000, _whole(0), "Relocation and growth end before this iteration.", "2024's code", milestone=True
+    )
+    start_opacity: float = _number(0.5, _opacity, "Opacity of the initial Gaussians.", "2024's code")
+    start_scale: float = _number(
+        0.1,
+        _positive,
+        "Factor on the initial scales, which are the root mean squared distance to 3 neighbours.",
+        "2024's code",
+    )
+    growth: float = _number(
+        1.05,
+        _at_least_1,
+        "Growth factor of the number of Gaussians per densification, up to the cap.",
+        "2024, section 4.3",
+    )
+    noise: float = _number(
+        5e5,
+        _not_negative,
+        "Noise on the means, relative to their learning rate.",
+        "2024, section 4.1: lambda_noise",
+    )
+    opacity_weight: float = _number(
+        0.01, _not_negative, "Weight of the mean opacity in the objective.", "2024, eq. 10: lambda_o"
+    )
+    scale_weight: float = _number(
+        0.01, _not_negative, "Weight of the mean scale in the objective.", "2024, eq. 10: lambda_Sigma"
+    )
+
+
+@_documented
 @dataclass(frozen=True)
 class TrainConfig:
     """One training run; see `recipe` for runs of other lengths than 30,000 iterations.
 
-    Args:
-        iterations: Number of training steps; each renders one view.
-        seed: Seed of the initial Gaussians, the view order, splits, relocations and noise.
-        means_rate: Initial learning rate of the means, times the scene's extent. (2023)
-        means_rate_final: Learning rate of the means from `means_rate_iterations` on, times the extent; log-linear
-            before. (2023)
-        means_rate_iterations: Iteration at which the learning rate of the means reaches its final value.
-        quats_rate: Learning rate of the quaternions. (2023)
-        scales_rate: Learning rate of the log scales. (2023)
-        sh0_rate: Learning rate of the degree-0 harmonic. (2023)
-        sh_rest_rate: Learning rate of the higher harmonics. (2023: a twentieth of `sh0_rate`)
-        opacities_rate: Learning rate of the logit opacities. (2023; newer forks use 2.5e-2)
-        adam_eps: Adam's epsilon. (2023)
-        ssim_weight: Weight k in the loss (1 - k) L1 + k (1 - SSIM). (2023, eq. 7)
-        sh_degree: Highest degree of spherical harmonics.
-        sh_every: Iterations between increases of the degree in use; 0 uses all degrees from the start. (2023)
-        view_order: "shuffled": each view once before any is repeated (2023); "random": drawn with replacement.
-        background: Background colour, RGB, 0 to 1.
-        random_background: Draw a new background colour for every iteration.
-        antialiased: Train for antialiased rendering, see `gsplat_edu.render.settings.RenderSettings`.
-        jacobian_limit: Clamp of the projection's Jacobian, in half fields of view (2023); None for no clamp.
-        start_opacity: Opacity of the initial Gaussians. (2023)
-        start_scale: Factor on the initial scales, which are the root mean squared distance to 3 neighbours.
-        strategy: "adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "none": fixed number.
-        max_gaussians: Cap on the number of Gaussians; None for no cap. mcmc requires one.
-        over_cap: adc: which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with
-            the largest gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors,
-            clones, children; the parent of dropped children is removed too (the course).
-        densify_start: Densification begins after this iteration. (2023; both strategies)
-        densify_stop: Densification ends before this iteration. (2023)
-        densify_every: Densify at iterations that are a multiple of this. (2023; 2024)
-        grad_threshold: adc: Gaussians whose mean gradient norm, in normalised device coordinates, exceeds this are
-            cloned or split. (2023)
-        percent_dense: adc: fraction of the extent; among these, larger Gaussians are split, smaller ones cloned. (2023)
-        split_shrink: adc: divisor of the scales of the two children of a split. (2023)
-        min_opacity: Gaussians below this opacity are pruned (2023) or relocated (2024).
-        prune_scale: adc: fraction of the extent; larger Gaussians are pruned after the first opacity reset; 0 prunes
-            none. (2023)
-        prune_screen_size: adc: Gaussians with a larger half axis in an image, px, are pruned after the first opacity
-            reset; 0 prunes none. (2023 has 20, but it never took effect there)
-        reset_every: adc: iterations between opacity resets while densifying; 0 for none. (2023)
-        reset_opacity: adc: upper bound of opacities after a reset. (2023)
-        mcmc_stop: mcmc: `densify_stop` of this strategy. (2024's code)
-        mcmc_start_opacity: mcmc: `start_opacity` of this strategy. (2024's code)
-        mcmc_start_scale: mcmc: `start_scale` of this strategy. (2024's code)
-        mcmc_growth: mcmc: growth factor of the number of Gaussians per densification, up to the cap. (2024, section
-            4.3)
-        mcmc_noise: mcmc: noise on the means, relative to their learning rate. (2024, section 4.1: lambda_noise)
-        mcmc_opacity_weight: mcmc: weight of the mean opacity in the loss. (2024, eq. 10: lambda_o)
-        mcmc_scale_weight: mcmc: weight of the mean scale in the loss. (2024, eq. 10: lambda_Sigma)
-
-    Raises:
-        ArgumentError: a value is outside its range; the message names it.
+    `adc` and `mcmc` hold the settings of the two strategies; only those of `strategy` are used. A value outside its
+    range raises `ArgumentError`, which names it.
     """
 
-    iterations: int = RECIPE_ITERATIONS
-    seed: int = 0
-    means_rate: float = 1.6e-4
-    means_rate_final: float = 1.6e-6
-    means_rate_iterations: int = 30_000
-    quats_rate: float = 1e-3
-    scales_rate: float = 5e-3
-    sh0_rate: float = 2.5e-3
-    sh_rest_rate: float = 2.5e-3 / 20
-    opacities_rate: float = 5e-2
-    adam_eps: float = 1e-15
-    ssim_weight: float = 0.2
-    sh_degree: int = SH_MAX_DEGREE
-    sh_every: int = 1_000
-    view_order: str = "shuffled"
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    random_background: bool = False
-    antialiased: bool = False
-    jacobian_limit: float | None = 1.3
-    start_opacity: float = 0.1
-    start_scale: float = 1.0
-    strategy: str = "adc"
-    max_gaussians: int | None = None
-    over_cap: str = "strongest"
-    densify_start: int = 500
-    densify_stop: int = 15_000
-    densify_every: int = 100
-    grad_threshold: float = 2e-4
-    percent_dense: float = 0.01
-    split_shrink: float = 1.6
-    min_opacity: float = 0.005
-    prune_scale: float = 0.1
-    prune_screen_size: float = 0.0
-    reset_every: int = 3_000
-    reset_opacity: float = 0.01
-    mcmc_stop: int = 25_000
-    mcmc_start_opacity: float = 0.5
-    mcmc_start_scale: float = 0.1
-    mcmc_growth: float = 1.05
-    mcmc_noise: float = 5e5
-    mcmc_opacity_weight: float = 0.01
-    mcmc_scale_weight: float = 0.01
+    iterations: int = _number(
+        RECIPE_ITERATIONS, _whole(1), "Number of training steps; each renders one view.", "2023"
+    )
+    seed: int = _number(
+        0,
+        _whole(0, 2**63 - 1),
+        "Seed of the view order, splits, relocations, noise, and of the choice of start points over the cap.",
+    )
+    means_rate: float = _number(
+        1.6e-4, _not_negative, "Initial learning rate of the means, times the scene's extent.", "2023"
+    )
+    means_rate_final: float = _number(
+        1.6e-6, _not_negative, "Final learning rate of the means; log-linear between, then constant.", "2023"
+    )
+    means_rate_iterations: int = _number(
+        30_000,
+        _whole(1),
+        "Iteration at which the learning rate of the means is final.",
+        "2023",
+        milestone=True,
+    )
+    quats_rate: float = _number(1e-3, _not_negative, "Learning rate of the quaternions.", "2023")
+    scales_rate: float = _number(5e-3, _not_negative, "Learning rate of the log scales.", "2023")
+    sh0_rate: float = _number(2.5e-3, _not_negative, "Learning rate of the degree-0 harmonic.", "2023")
+    sh_rest_rate: float = _number(
+        2.5e-3 / 20,
+        _not_negative,
+        "Learning rate of the higher harmonics: a twentieth of that of degree 0.",
+        "2023",
+    )
+    opacities_rate: float = _number(
+        5e-2, _not_negative, "Learning rate of the logit opacities.", "2023; newer forks use 0.025"
+    )
+    adam_eps: float = _number(
+        1e-15, _positive, "Adam's epsilon, the floor under the root of its second moment.", "2023"
+    )
+    ssim_weight: float = _number(0.2, _fraction, "k of the loss (1 - k) L1 + k (1 - SSIM).", "2023, eq. 7")
+    sh_degree: int = _number(
+        SH_MAX_DEGREE, _whole(0, SH_MAX_DEGREE), "Highest degree of spherical harmonics.", "2023"
+    )
+    sh_every: int = _number(
+        1_000,
+        _whole(0),
+        "Iterations between increases of the degree in use; 0 uses all degrees from the start.",
+        "2023",
+        milestone=True,
+    )
+    view_order: str = _number(
+        "shuffled",
+        _one_of(VIEW_ORDERS),
+        '"shuffled" shows each view once before any is repeated; "random" draws with replacement.',
+        "2023",
+    )
+    background: tuple[float, float, float] = _number(
+        (0.0, 0.0, 0.0), _color, "Background colour, RGB, 0 to 1.", "2023"
+    )
+    random_background: bool = _number(False, _flag, "Draw a new background colour for every iteration.")
+    antialiased: bool = _number(
+        False, _flag, "Train for antialiased rendering: Mip-Splatting's opacity factor.", "Yu et al. 2024"
+    )
+    jacobian_limit: float | None = _number(
+        1.3,
+        _at_least_1,
+        "Clamp of the projection's Jacobian, in half fields of view; none clamps nothing.",
+        "2023's code",
+    )
+    start_opacity: float = _number(0.1, _opacity, "Opacity of the initial Gaussians.", "2023")
+    start_scale: float = _number(
+        1.0,
+        _positive,
+        "Factor on the initial scales, which are the root mean squared distance to 3 neighbours.",
+        "2023",
+    )
+    strategy: str = _number(
+        "adc",
+        _one_of(STRATEGIES),
+        '"adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "none" keeps the number of Gaussians.',
+    )
+    max_gaussians: int | None = _number(None, _cap, "Cap on the number of Gaussians; mcmc requires one.")
+    densify_start: int = _number(
+        500, _whole(0), "Density control begins after this iteration.", "2023, 2024", milestone=True
+    )
+    densify_every: int = _number(
+        100,
+        _whole(1),
+        "Density control runs at the multiples of this, so first at 600; never scaled.",
+        "2023, 2024",
+    )
+    min_opacity: float = _number(
+        0.005,
+        _fraction,
+        "adc prunes Gaussians below this opacity, mcmc relocates them.",
+        "2023, 2024",
+    )
+    adc: AdcConfig = AdcConfig()
+    mcmc: McmcConfig = McmcConfig()
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("iterations", "means_rate_iterations", "densify_every"):
-            whole_number(name, getattr(self, name), 1)
-        for name in ("sh_every", "reset_every", "densify_start"):
-            whole_number(name, getattr(self, name), 0)
-        whole_number("seed", self.seed, 0, 2**63 - 1)
-        whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE)
-        for name, strategy in (("densify_stop", "adc"), ("mcmc_stop", "mcmc")):
-            whole_number(name, getattr(self, name), self.densify_start if strategy == self.strategy else 0)
-        if self.max_gaussians is not None:
-            whole_number("max_gaussians", self.max_gaussians, 1)
-        for name in _NOT_NEGATIVE:
-            in_range(name, getattr(self, name), 0.0)
-        for name in ("ssim_weight", "min_opacity"):
-            in_range(name, getattr(self, name), 0.0, 1.0)
-        for name in ("start_opacity", "mcmc_start_opacity", "reset_opacity"):
-            in_range(name, getattr(self, name), 0.0, 1.0 - 1e-6, open_low=True)
-        for name in ("start_scale", "mcmc_start_scale", "split_shrink", "adam_eps"):
-            in_range(name, getattr(self, name), 0.0, open_low=True)
-        in_range("mcmc_growth", self.mcmc_growth, 1.0)
-        if self.jacobian_limit is not None:
-            in_range("jacobian_limit", self.jacobian_limit, 1.0)
-        float64_array("background", self.background, (3,))
-        one_of("view_order", self.view_order, VIEW_ORDERS)
-        one_of("strategy", self.strategy, STRATEGIES)
-        one_of("over_cap", self.over_cap, OVER_CAP)
+        values = self.flat()
+        for setting in SETTINGS:
+            setting.check(setting.name, values[setting.name])
+        stop = {"adc": "densify_stop", "mcmc": "mcmc_stop"}.get(self.strategy)
+        if stop is not None:
+            whole_number(stop, values[stop], self.densify_start)
+
+    def flat(self) -> dict[str, Any]:
+        """Return every setting by its flat name, in the order of `SETTINGS`; config.json holds this."""
+        return {
+            setting.name: getattr(
+                self if setting.strategy is None else getattr(self, setting.strategy), setting.field
+            )
+            for setting in SETTINGS
+        }
+
+    def changed(self, **changes: Any) -> TrainConfig:  # noqa: ANN401
+        """Return a copy with other values of settings, given by their flat names.
+
+        Raises:
+            ArgumentError: a value is outside its range, or there is no such setting.
+        """
+        parts: dict[str | None, dict[str, Any]] = {None: {}, "adc": {}, "mcmc": {}}
+        by_name = {setting.name: setting for setting in SETTINGS}
+        for name, value in changes.items():
+            one_of("field", name, list(by_name))
+            parts[by_name[name].strategy][by_name[name].field] = value
+        return dataclasses.replace(
+            self,
+            adc=dataclasses.replace(self.adc, **parts["adc"]),
+            mcmc=dataclasses.replace(self.mcmc, **parts["mcmc"]),
+            **parts[None],
+        )
 
     @property
     def start(self) -> tuple[float, float]:
         """Opacity and scale factor of the start cloud, by strategy."""
         if self.strategy == "mcmc":
-            return self.mcmc_start_opacity, self.mcmc_start_scale
+            return self.mcmc.start_opacity, self.mcmc.start_scale
         return self.start_opacity, self.start_scale
 
     @property
@@ -177,56 +344,60 @@ class TrainConfig:
         }
 
 
-_NOT_NEGATIVE = (
-    "means_rate",
-    "means_rate_final",
-    "quats_rate",
-    "scales_rate",
-    "sh0_rate",
-    "sh_rest_rate",
-    "opacities_rate",
-    "grad_threshold",
-    "percent_dense",
-    "prune_scale",
-    "prune_screen_size",
-    "mcmc_noise",
-    "mcmc_opacity_weight",
-    "mcmc_scale_weight",
+@dataclass(frozen=True)
+class Setting:
+    """A number of the recipe, as options, config.json and docs/RECIPE.md know it.
+
+    Args:
+        name: Flat name: the field's own, with "mcmc_" in front of those of `McmcConfig`.
+        field: The field's name in its class.
+        strategy: The strategy whose settings hold it, and which alone uses it; None for `TrainConfig` itself.
+        default: Its default, that of 30,000 iterations.
+        help: What it means.
+        source: Where the default comes from; "" for ours.
+        milestone: Whether `recipe` scales it with the length of the run.
+        check: Raises if a value is out of range.
+    """
+
+    name: str
+    field: str
+    strategy: str | None
+    default: Any
+    help: str
+    source: str
+    milestone: bool
+    check: Check
+
+    @property
+    def meaning(self) -> str:
+        """What it means, as help and tables say it: in lower case, behind the strategy it belongs to."""
+        only = f"{self.strategy}: " if self.strategy else ""
+        return f"{only}{self.help[0].lower()}{self.help[1:].rstrip('.')}"
+
+
+def _settings(kind: type, strategy: str | None, prefix: str = "") -> list[Setting]:
+    return [
+        Setting(f"{prefix}{field.name}", field.name, strategy, field.default, **field.metadata)
+        for field in fields(kind)
+        if field.metadata
+    ]
+
+
+SETTINGS: tuple[Setting, ...] = (
+    *_settings(TrainConfig, None),
+    *_settings(AdcConfig, "adc"),
+    *_settings(McmcConfig, "mcmc", "mcmc_"),
 )
+"""Every number of the recipe."""
 
 ONLY_FOR = {
-    "adc": (
-        "over_cap",
-        "densify_stop",
-        "grad_threshold",
-        "percent_dense",
-        "split_shrink",
-        "prune_scale",
-        "prune_screen_size",
-        "reset_every",
-        "reset_opacity",
-    ),
-    "mcmc": (
-        "mcmc_stop",
-        "mcmc_start_opacity",
-        "mcmc_start_scale",
-        "mcmc_growth",
-        "mcmc_noise",
-        "mcmc_opacity_weight",
-        "mcmc_scale_weight",
-    ),
+    strategy: tuple(setting.name for setting in SETTINGS if setting.strategy == strategy)
+    for strategy in ("adc", "mcmc")
 }
-"""Fields that one strategy looks at and the others do not."""
+"""Settings that only one strategy uses."""
 
-MILESTONES = (
-    "means_rate_iterations",
-    "sh_every",
-    "densify_start",
-    "densify_stop",
-    "mcmc_stop",
-    "reset_every",
-)
-"""Fields that `recipe` stretches with the run; the interval of densification is not among them."""
+MILESTONES = tuple(setting.name for setting in SETTINGS if setting.milestone)
+"""Settings that `recipe` scales with the run; the interval of densification is not among them."""
 
 
 def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **changes: Any) -> TrainConfig:  # noqa: ANN401
@@ -237,20 +408,18 @@ def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **chang
 
     Args:
         iterations: Number of steps.
-        rescale: Stretch the milestones; False keeps the plain numbers of 30,000 iterations.
-        changes: Fields of `TrainConfig` that are set as they are.
+        rescale: Scale the milestones; False keeps the plain numbers of 30,000 iterations.
+        changes: Settings by their flat names, which are set as they are.
 
     Raises:
-        ArgumentError: a value is outside its range, or there is no such field.
+        ArgumentError: a value is outside its range, or there is no such setting.
     """
     whole_number("iterations", iterations, 1)
-    for name in changes:
-        one_of("field", name, [field.name for field in fields(TrainConfig)])
-    plain = TrainConfig()
-    stretched: dict[str, Any] = {}
+    scaled: dict[str, Any] = {}
     if rescale:
-        for name in MILESTONES:
-            stretched[name] = max(1, round(getattr(plain, name) * iterations / RECIPE_ITERATIONS))
+        for setting in SETTINGS:
+            if setting.milestone:
+                scaled[setting.name] = max(1, round(setting.default * iterations / RECIPE_ITERATIONS))
     if iterations < SHORT_RUN:
-        stretched["reset_every"] = 0
-    return TrainConfig(**{"iterations": iterations, **stretched, **changes})
+        scaled["reset_every"] = 0
+    return TrainConfig().changed(**{"iterations": iterations, **scaled, **changes})

@@ -44,7 +44,7 @@ def course_config(iterations: int = 800, seed: int = 9, max_gaussians: int = 160
         seed: Seed of the view order.
         max_gaussians: Cap on the number of Gaussians.
     """
-    return TrainConfig(
+    return TrainConfig().changed(
         iterations=iterations,
         seed=seed,
         max_gaussians=max_gaussians,

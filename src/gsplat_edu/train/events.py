@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
@@ -13,17 +14,19 @@ class StepEvent:
 
     Args:
         iteration: Counted from 0.
-        loss_tensor: () loss of the view before the step, where the Gaussians are.
+        loss_tensor: () the objective's term "photo" before the step, where the Gaussians are.
         num_gaussians: Gaussians that were rendered.
+        terms: () every term of the objective by name, likewise.
     """
 
     iteration: int
     loss_tensor: Tensor
     num_gaussians: int
+    terms: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
     def loss(self) -> float:
-        """Loss of the view before the step. Reading it waits for a GPU to come to it."""
+        """How far the render was from the photo before the step. Reading it waits for a GPU to come to it."""
         return float(self.loss_tensor)
 
 

@@ -25,6 +25,21 @@ Color = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
+class Draw:
+    """A view whose turn it is.
+
+    Args:
+        index: Which of the feed's views.
+        view: The view.
+        photo: Its photo; None if its target is kept on the GPU.
+    """
+
+    index: int
+    view: View
+    photo: Photo | None
+
+
+@dataclass(frozen=True, eq=False)
 class Target:
     """What the render of a view is compared with, on the Gaussians' device.
 
@@ -77,13 +92,8 @@ class ViewFeed:
         self._kept: dict[View, Target] = {}
         self._room = _free_bytes(device) if room is None else room
 
-    def next(self) -> tuple[View, Photo | None]:
-        """Draw a view, and begin to read the photo of the one after it.
-
-        Returns:
-            view: The view; it stays due if reading its photo fails.
-            photo: Its photo; None if its target is kept on the GPU.
-        """
+    def next(self) -> Draw:
+        """Draw a view, which stays due if reading its photo fails, and begin to read the photo of the one after it."""
         index = self._following()
         ahead, self._ahead = self._ahead, None
         view = self.views[index]
@@ -95,7 +105,7 @@ class ViewFeed:
         after = self.views[following]
         if after.on_disk and after not in self._kept:
             self._ahead = following, self._reader.submit(self._read, after)
-        return view, photo
+        return Draw(index, view, photo)
 
     def _read(self, view: View) -> Photo:
         """Read a photo and put it over the background if that is known; a photo in memory only once."""
@@ -107,14 +117,14 @@ class ViewFeed:
             self._flat[view] = flat
         return flat
 
-    def target(self, view: View, photo: Photo | None, background: Color) -> Target:
+    def target(self, draw: Draw, background: Color) -> Target:
         """Move what `next` returned to the Gaussians' device; keep it there if it will not change and there is room.
 
         Args:
-            view: The view.
-            photo: Its photo, or None.
+            draw: The view and its photo.
             background: Behind the photo where it is not opaque; the feed's own if it has one.
         """
+        view, photo = draw.view, draw.photo
         if photo is None:
             return self._kept[view]
         mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(self._device)

@@ -6,8 +6,8 @@ Chapter: 09_train_in_3d.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,17 +19,18 @@ from gsplat_edu.buffers import reused_buffers
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import photo_loss
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Event, StepEvent
-from gsplat_edu.train.feed import ViewFeed
+from gsplat_edu.train.feed import Draw, ViewFeed
+from gsplat_edu.train.objective import PHOTO, Objective, Rendered, make_objective, total
 from gsplat_edu.train.optimizer import MOMENTS, Adam
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_tensor_kind, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, sh_degree
+from gsplat_edu.train.view_model import Identity, ViewModel
 from gsplat_edu.views import View
 
 
@@ -45,8 +46,41 @@ class Renderer(Protocol):
 Callback = Callable[["Trainer", Event], None]
 """Is told of every step and every change of the Gaussians, with the trainer as it stands after it."""
 
+PARTS = ("gaussians", "view_model", *MOMENTS, "density")
+"""Parts of a checkpoint's tensors: the first word of their names."""
+
 BACKGROUND_STREAM = 1
 """Second word of the seed of the random backgrounds, so that they do not follow the view order."""
+
+
+Reduce = Callable[[Mapping[str, Tensor], int], None]
+"""Given all parameters and the number of views: turns the sums over the views, in each `grad`, into what is applied.
+Processes that share a step add up their sums here."""
+
+
+def mean_over_views(parameters: Mapping[str, Tensor], num_views: int) -> None:
+    """Divide every gradient by the number of views; that of one view is left as it is."""
+    if num_views > 1:
+        for parameter in parameters.values():
+            if parameter.grad is not None:
+                parameter.grad /= num_views
+
+
+@dataclass(frozen=True)
+class StepParts:
+    """The parts of a step that can be replaced.
+
+    Args:
+        objective: What is minimised; `make_objective` of the configuration where None.
+        view_model: What lies between a render and its loss.
+        reduce: Runs between the gradients of a step's views and their application.
+        adam: Moves one tensor by Adam's rule; by default the fastest kernel that takes it.
+    """
+
+    objective: Objective | None = None
+    view_model: ViewModel = field(default_factory=Identity)
+    reduce: Reduce = mean_over_views
+    adam: AdamKernel = adam_step
 
 
 @dataclass(frozen=True)
@@ -93,8 +127,8 @@ class _Losses:
 class Trainer:
     """Moves Gaussians until they look like the views.
 
-    Each iteration draws a view, renders it, takes a step of Adam down the loss and lets the density strategy
-    change the Gaussians.
+    Each step takes the gradients of the objective at the views it draws, reduces them to one, and applies that;
+    then the density strategy may change the Gaussians.
 
     Args:
         gaussians: Where to start; not changed.
@@ -104,7 +138,7 @@ class Trainer:
         extent: Size of the scene, world units: the means' learning rate is a fraction of it.
         density: The density strategy; None keeps the number of Gaussians.
         callbacks: Told of every step and every change, in this order.
-        adam: Moves one tensor by Adam's rule; by default the fastest kernel that takes it.
+        parts: What a step is made of beyond these; the recipe's where None.
 
     Raises:
         ArgumentError: there are no views, no Gaussians, or more Gaussians than the cap.
@@ -112,7 +146,7 @@ class Trainer:
     Attributes:
         gaussians: The Gaussians as they stand.
         iteration: Steps taken so far.
-        last: The last rendered image, its photo and its mask, for whoever wants to look.
+        last: The last image that was compared, its photo and its mask, for whoever wants to look.
         last_name: The name of their view.
     """
 
@@ -126,7 +160,7 @@ class Trainer:
         extent: float = 1.0,
         density: DensityStrategy | None = None,
         callbacks: Sequence[Callback] = (),
-        adam: AdamKernel = adam_step,
+        parts: StepParts | None = None,
     ) -> None:
         if not views:
             raise ArgumentError("views: is empty; give at least one view to learn from")
@@ -136,6 +170,7 @@ class Trainer:
             raise ArgumentError(
                 f"gaussians: are {len(gaussians)}, more than max_gaussians = {config.max_gaussians}; start with fewer"
             )
+        parts = parts or StepParts()
         self.gaussians = gaussians.trainable()
         self.config, self.extent, self.density = config, extent, density
         self.iteration = 0
@@ -144,16 +179,24 @@ class Trainer:
         self._render, self._callbacks = render, tuple(callbacks)
         behind, device = None if config.random_background else config.background, gaussians.means.device
         self._feed = ViewFeed(views, config.view_order, config.seed, behind, device)
-        self._groups, self._adam = gaussian_groups(config, extent), adam
-        self._optimizer = Adam(self.gaussians.tensors(), self._groups, adam)
+        self._parts, self._objective = parts, parts.objective or make_objective(config)
+        self._learned = dict(parts.view_model.parameters())
+        if taken := sorted(set(self._learned) & set(self.gaussians.tensors())):
+            raise ArgumentError(f"view_model: {taken[0]!r} is the name of a parameter of the Gaussians")
+        self._groups = gaussian_groups(config, extent) | dict(parts.view_model.groups())
+        self._optimizer = Adam(self.parameters(), self._groups, parts.adam)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
-    def run(self, stop: Callable[[], bool] = lambda: False) -> TrainResult:
+    def run(
+        self, stop: Callable[[], bool] = lambda: False, callbacks: Sequence[Callback] = ()
+    ) -> TrainResult:
         """Take the iterations that are left of the budget.
 
         Args:
-            stop: Asked after every iteration; the run ends when it says so, and can be taken up again.
+            stop: Asked after every iteration; the run ends when it says so, and can be resumed.
+            callbacks: Receive every event of this call, after those of the constructor.
         """
+        receivers = (*self._callbacks, *callbacks)
         losses, counts = _Losses(self.gaussians.means.detach()), []
         start = time.perf_counter()
         with reused_buffers():
@@ -161,52 +204,86 @@ class Trainer:
                 step = self._step()
                 losses.add(step.loss_tensor)
                 counts.append(step.num_gaussians)
-                self._tell(step)
+                self._tell(step, receivers)
                 if self.density is not None:
                     with one_thread():
                         changed = self.density.update(step.iteration, self.gaussians, self._optimizer)
                     self.gaussians, events = changed
                     for event in events:
-                        self._tell(event)
+                        self._tell(event, receivers)
                 if stop():
                     break
         return TrainResult(losses.read(), counts, time.perf_counter() - start)
 
     def _step(self) -> StepEvent:
-        iteration, config = self.iteration, self.config
-        view, photo = self._feed.next()
-        self.last_name = view.name
-        background = config.background
+        """Take one step: gradients of the views, reduce, apply."""
+        iteration, draws = self.iteration, self._draw()
+        terms = self.gradients(draws)
+        self._parts.reduce(self.parameters(), len(draws))
+        self.apply()
+        return StepEvent(iteration, terms[PHOTO], len(self.gaussians), terms)
+
+    def _draw(self) -> list[Draw]:
+        """Return the views of the next step: one, as the recipe has it. A batch draws more of them here."""
+        return [self._feed.next()]
+
+    def gradients(self, draws: Sequence[Draw]) -> dict[str, Tensor]:
+        """Add the gradients of the objective at these views to the parameters' `grad`.
+
+        Args:
+            draws: Views of the feed; density control observes each of them.
+
+        Returns:
+            () every term of the objective, its mean over the views.
+        """
+        found = []
+        for draw in draws:
+            rendered = self._rendered(draw)
+            found.append(self._objective.backward(rendered))
+            if self.density is not None:
+                with one_thread():
+                    self.density.observe(self.gaussians, rendered.output)
+            self.last = rendered.image.detach(), rendered.target.image, rendered.target.mask
+            self.last_name = draw.view.name
+        if len(found) == 1:
+            return found[0]
+        return {name: total([values[name] for values in found]) / len(found) for name in found[0]}
+
+    def _rendered(self, draw: Draw) -> Rendered:
+        """Render a view with the settings of the iteration, and put the view model behind it."""
+        config, background = self.config, self.config.background
         if config.random_background:
             background = tuple(self._backgrounds.uniform(size=3).tolist())
-        target = self._feed.target(view, photo, background)
         settings = RenderSettings(
             background=background,
-            sh_degree=sh_degree(config, iteration),
+            sh_degree=sh_degree(config, self.iteration),
             antialiased=config.antialiased,
             jacobian_limit=config.jacobian_limit,
-            depth=False,
+            depth=self._objective.needs_depth,
         )
-        output = self._render(self.gaussians, view.camera, settings=settings)
-        loss = photo_loss(output.image, target.image, target.mask, config.ssim_weight)
-        loss.backward()  # type: ignore[no-untyped-call]
-        if self.density is not None:
-            with one_thread():
-                self.density.observe(self.gaussians, output)
-        self._optimizer.schedule(iteration)
-        self._optimizer.step(self.gaussians.tensors())
-        self.last = output.image.detach(), target.image, target.mask
-        self.iteration += 1
-        return StepEvent(iteration, loss.detach(), len(self.gaussians))
+        target = self._feed.target(draw, background)
+        output = self._render(self.gaussians, draw.view.camera, settings=settings)
+        image = self._parts.view_model(draw.index, output.image)
+        return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 
-    def _tell(self, event: Event) -> None:
-        for callback in self._callbacks:
+    def apply(self) -> None:
+        """Step down the gradients that the parameters hold, at the rates of the iteration, and drop them."""
+        self._optimizer.schedule(self.iteration)
+        self._optimizer.step(self.parameters())
+        self.iteration += 1
+
+    def parameters(self) -> dict[str, Tensor]:
+        """Return all that is learned by name: the Gaussians' raw parameters and those of the view model."""
+        return self.gaussians.tensors() | self._learned
+
+    def _tell(self, event: Event, receivers: Sequence[Callback]) -> None:
+        for callback in receivers:
             callback(self, event)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return all that a run needs to go on later as if nothing had happened: tensors, and what JSON holds."""
         moments, steps = self._optimizer.state()
-        parts = {"gaussians": self.gaussians.tensors(), **moments}
+        parts = {"gaussians": self.gaussians.tensors(), "view_model": self._learned, **moments}
         numbers: dict[str, Any] = {
             "iteration": self.iteration,
             "steps": steps,
@@ -228,7 +305,7 @@ class Trainer:
         Raises:
             ArgumentError: it is not the state of such a trainer; names the entry. The trainer is as it was.
         """
-        parts: dict[str, dict[str, Tensor]] = {part: {} for part in ("gaussians", *MOMENTS, "density")}
+        parts: dict[str, dict[str, Tensor]] = {part: {} for part in PARTS}
         for key, tensor in tensors.items():
             part, _, name = key.partition(".")
             if part not in parts:
@@ -242,8 +319,12 @@ class Trainer:
             raise ArgumentError("steps: has to be the iteration")
         self._feed.check_state(given["feed"])
         check_numpy_generator("backgrounds", given["backgrounds"], self._backgrounds)
-        optimizer = Adam(gaussians.tensors(), self._groups, self._adam)
-        optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, gaussians.tensors())
+        learned = check_entries("view_model", parts["view_model"], tuple(self._learned))
+        for name, like in self._learned.items():
+            check_tensor_kind(f"view_model.{name}", learned[name], like.dtype, like.shape)
+        parameters = gaussians.tensors() | self._learned
+        optimizer = Adam(parameters, self._groups, self._parts.adam)
+        optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, parameters)
         if self.density is not None:  # the last that can fail
             if not isinstance(given["density"], dict):
                 raise ArgumentError("density: has to be an object")
@@ -256,6 +337,9 @@ class Trainer:
         elif parts["density"]:
             raise ArgumentError("density: is there, but this run has no density control")
         self.gaussians, self._optimizer, self.iteration = gaussians, optimizer, iteration
+        with torch.no_grad():
+            for name, parameter in self._learned.items():
+                parameter.copy_(learned[name])
         self._feed.load_state(given["feed"])
         self._backgrounds.bit_generator.state = given["backgrounds"]
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import inspect
-import re
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +11,21 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
-from gsplat_edu.train.config import FROM_SCENE, ONLY_FOR, RECIPE_ITERATIONS, STRATEGIES, TrainConfig, recipe
+from gsplat_edu.train.config import (
+    FROM_SCENE,
+    ONLY_FOR,
+    RECIPE_ITERATIONS,
+    SETTINGS,
+    STRATEGIES,
+    Setting,
+    TrainConfig,
+    recipe,
+)
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
 
 FOR_POINTS = ("start_opacity", "start_scale", "mcmc_start_opacity", "mcmc_start_scale")
-"""Fields of the recipe that only a start from points uses."""
+"""Settings that only a start from points uses."""
 
 COMMON = (
     *("out", "resume", "scene", "iterations", "time_limit", "max_memory", "strategy", "max_gaussians"),
@@ -29,7 +35,7 @@ COMMON = (
 """What `--help` shows; `--help-all` shows the other options too."""
 
 NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background")
-"""Fields of the recipe that have their options spelled out below; the others are made from `TrainConfig`."""
+"""Settings whose options are declared below; those of the others come from `SETTINGS`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,10 +69,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--antialiased", action="store_true", help="train for antialiased rendering (Mip-Splatting)"
     )
-    meanings = _meanings()
-    for field in fields(TrainConfig):
-        if field.name not in NAMED:
-            _add_field(group, field.name, field.default, meanings[field.name])
+    for setting in SETTINGS:
+        if setting.name not in NAMED:
+            _add_setting(group, setting)
 
 
 def _add_number(group: argparse._ActionsContainer, flag: str, text: str, default: int | None = None) -> None:
@@ -180,16 +185,10 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
     )
 
 
-def _meanings() -> dict[str, str]:
-    """Return the description of each field in the docstring of `TrainConfig`."""
-    text = (inspect.getdoc(TrainConfig) or "").partition("Args:")[2].partition("Raises:")[0]
-    entries = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
-    found = {name: " ".join(words.replace("`", "").split()).replace("%", "%%") for name, words in entries}
-    return {field.name: found.get(field.name, "") for field in fields(TrainConfig)}
-
-
-def _add_field(group: argparse._ArgumentGroup, name: str, default: object, meaning: str) -> None:
-    flag, text = f"--{name.replace('_', '-')}", f"{meaning.rstrip('.')} (default: {default})"
+def _add_setting(group: argparse._ArgumentGroup, setting: Setting) -> None:
+    name, default = setting.name, setting.default
+    flag = f"--{name.replace('_', '-')}"
+    text = f"{setting.meaning.replace('%', '%%')} (default: {default})"
     if isinstance(default, bool):
         group.add_argument(flag, action="store_true", default=None, help=text)
     elif isinstance(default, str):
@@ -268,10 +267,11 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
 
 def _config(arguments: argparse.Namespace) -> TrainConfig:
     changes: dict[str, Any] = {}
-    for field in fields(TrainConfig):
-        given = getattr(arguments, field.name, None)
-        if given is not None and field.name not in ("iterations", "background"):
-            changes[field.name] = None if field.name == "jacobian_limit" and given == "none" else given
+    for setting in SETTINGS:
+        name = setting.name
+        given = getattr(arguments, name, None)
+        if given is not None and name not in ("iterations", "background"):
+            changes[name] = None if name == "jacobian_limit" and given == "none" else given
     if arguments.white_background or arguments.background:
         changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
     for strategy, names in ONLY_FOR.items():

@@ -56,7 +56,7 @@ class AdaptiveDensityControl:
             return
         self.norm_sums[output.visible] += output.means2d_grad_norms()
         self.times_visible[output.visible] += 1
-        if self.config.prune_screen_size:
+        if self.config.adc.prune_screen_size:
             seen = self.largest_radii[output.visible]
             self.largest_radii[output.visible] = torch.maximum(seen, output.radii.amax(dim=-1))
 
@@ -64,17 +64,17 @@ class AdaptiveDensityControl:
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Clone, split, prune and reset where the schedule has it."""
         config, events = self.config, list[Change]()
-        self.is_over = iteration + 1 >= config.densify_stop
-        if iteration >= config.densify_stop:
+        self.is_over = iteration + 1 >= config.adc.densify_stop
+        if iteration >= config.adc.densify_stop:
             return gaussians, events
         if iteration > config.densify_start and iteration % config.densify_every == 0:
             gaussians, densified = self._densify(iteration, gaussians, optimizer)
             events.append(densified)
         if self._reset_is_due(iteration):
-            ceiling = math.log(config.reset_opacity / (1 - config.reset_opacity))
+            ceiling = math.log(config.adc.reset_opacity / (1 - config.adc.reset_opacity))
             gaussians.logit_opacities.clamp_(max=ceiling)
             optimizer.forget("logit_opacities")
-            events.append(ResetEvent(iteration, config.reset_opacity))
+            events.append(ResetEvent(iteration, config.adc.reset_opacity))
         return gaussians, events
 
     def _densify(
@@ -84,20 +84,20 @@ class AdaptiveDensityControl:
         pull = self.norm_sums / self.times_visible.clamp(min=1)
         size = gaussians.scales.amax(dim=-1)
         keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
-        if config.reset_every and iteration > config.reset_every:
-            if config.prune_scale:
-                keep &= size <= config.prune_scale * self.extent
-            if config.prune_screen_size:
-                keep &= self.largest_radii <= config.prune_screen_size
-        hot = keep & (pull > config.grad_threshold)
-        if config.over_cap == "strongest":
+        if config.adc.reset_every and iteration > config.adc.reset_every:
+            if config.adc.prune_scale:
+                keep &= size <= config.adc.prune_scale * self.extent
+            if config.adc.prune_screen_size:
+                keep &= self.largest_radii <= config.adc.prune_screen_size
+        hot = keep & (pull > config.adc.grad_threshold)
+        if config.adc.over_cap == "strongest":
             hot = self._within_cap(pull, hot, int(keep.sum()))
-        large = size > config.percent_dense * self.extent
+        large = size > config.adc.percent_dense * self.extent
         clone, split = hot & ~large, hot & large
 
         clones = gaussians.map(lambda tensor: tensor[clone])
         parents = gaussians.map(lambda tensor: tensor[split])
-        children = [split_children(parents, config.split_shrink, self.generator) for _ in range(2)]
+        children = [split_children(parents, config.adc.split_shrink, self.generator) for _ in range(2)]
         replaced = replace(gaussians, optimizer, keep & ~split, [clones, *children], config.max_gaussians)
         self._forget(replaced)
         counts = len(clones), 2 * len(parents), int((~keep).sum())
@@ -117,7 +117,7 @@ class AdaptiveDensityControl:
         return chosen
 
     def _reset_is_due(self, iteration: int) -> bool:
-        every = self.config.reset_every
+        every = self.config.adc.reset_every
         on_white = min(self.config.background) >= 1.0 and iteration == self.config.densify_start
         return bool(every) and iteration > 0 and (iteration % every == 0 or on_white)
 

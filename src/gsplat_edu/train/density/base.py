@@ -24,7 +24,7 @@ class DensityStrategy(Protocol):
     """
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
-        """Look at a render whose backward has run, before the optimiser steps; it may add to the gradients."""
+        """Look at a render whose backward has run, before the optimiser steps; a step shows every view it renders."""
         ...
 
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:

@@ -37,10 +37,10 @@ NOISE_THRESHOLD = 0.005
 
 
 class MCMC:
-    """Relocate the dead, grow up to the cap, add noise, regularise.
+    """Relocate the dead, grow up to the cap, add noise; `gsplat_edu.train.objective` has its regularisers.
 
     Args:
-        config: Window, growth, noise and weights; `max_gaussians` has to be set.
+        config: Window, growth and noise; `max_gaussians` has to be set.
         generator: Source of the places and of the noise.
 
     Raises:
@@ -52,23 +52,14 @@ class MCMC:
             raise ArgumentError("max_gaussians: mcmc grows up to a cap and needs one, for example 200000")
         self.config, self.generator, self.cap = config, generator, config.max_gaussians
 
-    @torch.no_grad()
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
-        """Add the gradients of the regularisers: weight_o mean(opacity) + weight_s mean(scale)."""
-        config, opacities, scales = self.config, gaussians.opacities, gaussians.scales
-        pulls = (
-            (gaussians.logit_opacities, config.mcmc_opacity_weight * opacities * (1 - opacities)),
-            (gaussians.log_scales, config.mcmc_scale_weight * scales),
-        )
-        for parameter, pull in pulls:
-            if parameter.grad is not None and parameter.numel():
-                parameter.grad += pull / parameter.numel()
+        """Do nothing: neither relocation nor growth asks for what the renders show."""
 
     @torch.no_grad()
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Relocate and grow where the schedule has it; add noise after every step."""
         config, events = self.config, list[Change]()
-        due = config.densify_start < iteration < config.mcmc_stop and iteration % config.densify_every == 0
+        due = config.densify_start < iteration < config.mcmc.stop and iteration % config.densify_every == 0
         if due and len(gaussians):
             dead = (gaussians.opacities <= config.min_opacity) | ~gaussians.finite_rows()
             num_relocated = self._relocate(gaussians, optimizer, torch.nonzero(dead)[:, 0])
@@ -92,7 +83,7 @@ class MCMC:
 
     def _grow(self, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, int]:
         count = len(gaussians)
-        num_added = max(min(self.cap, int(self.config.mcmc_growth * count)) - count, 0)
+        num_added = max(min(self.cap, int(self.config.mcmc.growth * count)) - count, 0)
         if not num_added:
             return gaussians, 0
         weights = torch.where(gaussians.finite_rows(), gaussians.opacities.double(), 0.0)
@@ -135,7 +126,7 @@ class MCMC:
         R, scales = unchecked_rotations(gaussians.quats.detach()), gaussians.scales
         wander = (R @ (scales.square() * (R.mT @ draw[..., None])[..., 0])[..., None])[..., 0]
         gate = torch.sigmoid(NOISE_SHARPNESS * (NOISE_THRESHOLD - gaussians.opacities))
-        means += (rate * self.config.mcmc_noise) * gate[:, None] * wander
+        means += (rate * self.config.mcmc.noise) * gate[:, None] * wander
 
     def state(self) -> State:
         """Return the generator."""

@@ -1,0 +1,195 @@
+"""What a step minimises: a sum of named terms, each a scalar that autograd can differentiate.
+
+A new term (depth, normals, a regulariser) is a class here and an entry in `make_objective`; the log, the report and the
+checkpoints need no change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.losses import photo_loss
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.threads import one_thread
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.feed import Draw, Target
+
+PHOTO = "photo"
+"""Name of the term that compares image and photo: what logs and progress call the loss."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One view of a step, rendered: what the terms of an objective look at.
+
+    Args:
+        gaussians: What was rendered, raw parameters.
+        draw: The view and its index.
+        output: The render: image, transmittance, depth where the settings ask for it.
+        image: (H, W, 3) the image behind the view model, which is what is compared.
+        target: The photo over the step's background, and its mask.
+        iteration: Counted from 0.
+    """
+
+    gaussians: Gaussians
+    draw: Draw
+    output: RenderOutput
+    image: Float[Tensor, "H W 3"]
+    target: Target
+    iteration: int
+
+
+@runtime_checkable
+class Term(Protocol):
+    """One summand of an objective. One that looks at `output.depth` has an attribute `needs_depth` that is true."""
+
+    def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
+        """Return the weighted value, differentiable in what the step learns."""
+        ...
+
+
+class Objective:
+    """The sum of named terms.
+
+    Args:
+        terms: The terms by name; "photo" among them.
+
+    Raises:
+        ArgumentError: there is no term "photo".
+    """
+
+    def __init__(self, terms: Mapping[str, Term]) -> None:
+        if PHOTO not in terms:
+            raise ArgumentError(f"terms: have to include {PHOTO!r}, which logs and progress call the loss")
+        self.terms = dict(terms)
+
+    @property
+    def needs_depth(self) -> bool:
+        """Whether a term looks at the render's depth, which is made only then."""
+        return any(getattr(term, "needs_depth", False) for term in self.terms.values())
+
+    def backward(self, rendered: Rendered) -> dict[str, Float[Tensor, ""]]:
+        """Add the gradients of the sum to those of its leaves, and return the value of every term, detached."""
+        values = {name: term(rendered) for name, term in self.terms.items()}
+        total(list(values.values())).backward()  # type: ignore[no-untyped-call]
+        return {name: value.detach() for name, value in values.items()}
+
+
+def total(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
+    """Return the sum of scalars, left to right."""
+    first, *others = values
+    for value in others:
+        first = first + value
+    return first
+
+
+def make_objective(config: TrainConfig) -> Objective:
+    """Make the objective that a configuration names: the photo, and the regularisers of its strategy.
+
+    (1 - k) L1 + k (1 - SSIM), and for mcmc + weight_o mean(opacity) + weight_s mean(scale)
+
+    Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
+    """
+    terms: dict[str, Term] = {PHOTO: PhotoTerm(config.ssim_weight)}
+    if config.strategy == "mcmc":
+        terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
+        terms["scale"] = MeanScale(config.mcmc.scale_weight)
+    return Objective(terms)
+
+
+@dataclass(frozen=True)
+class PhotoTerm:
+    """How far the image is from the photo: `gsplat_edu.losses.photo_loss`.
+
+    Args:
+        ssim_weight: k, 0 to 1.
+    """
+
+    ssim_weight: float
+
+    def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
+        """Return (1 - k) L1 + k (1 - SSIM)."""
+        target = rendered.target
+        return photo_loss(rendered.image, target.image, target.mask, self.ssim_weight)
+
+
+@dataclass(frozen=True)
+class MeanOpacity:
+    """Keeps opacities small, so that superfluous Gaussians die.
+
+    Args:
+        weight: lambda_o.
+    """
+
+    weight: float
+
+    def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
+        """Return weight mean(opacity)."""
+        value: Tensor = _MeanOpacity.apply(  # type: ignore[no-untyped-call]
+            rendered.gaussians.logit_opacities, self.weight
+        )
+        return value
+
+
+@dataclass(frozen=True)
+class MeanScale:
+    """Keeps scales small.
+
+    Args:
+        weight: lambda_Sigma.
+    """
+
+    weight: float
+
+    def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
+        """Return weight mean(scale)."""
+        value: Tensor = _MeanScale.apply(  # type: ignore[no-untyped-call]
+            rendered.gaussians.log_scales, self.weight
+        )
+        return value
+
+
+class _MeanOpacity(torch.autograd.Function):
+    """Weight mean(sigmoid(l)), with the gradient weight o (1 - o) / N.
+
+    Torch rounds a sigmoid by the number of its threads, so one thread computes it.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor, weight: float) -> Tensor:  # noqa: ANN401
+        with one_thread():
+            opacities = torch.sigmoid(logits)
+            ctx.save_for_backward(weight * opacities * (1 - opacities) / max(logits.numel(), 1))
+            return weight * opacities.sum() / max(logits.numel(), 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
+        (pull,) = ctx.saved_tensors
+        return pull * grad, None
+
+
+class _MeanScale(torch.autograd.Function):
+    """Weight mean(exp(l)), with the gradient weight exp(l) / N; on one thread, as above."""
+
+    @staticmethod
+    def forward(ctx: Any, log_scales: Tensor, weight: float) -> Tensor:  # noqa: ANN401
+        with one_thread():
+            pull = weight * torch.exp(log_scales) / max(log_scales.numel(), 1)
+            ctx.save_for_backward(pull)
+            return pull.sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
+        (pull,) = ctx.saved_tensors
+        return pull * grad, None

@@ -1,0 +1,238 @@
+"""The seams of a step: terms that are summed and named, a model of each view, views that are reduced before a step."""
+
+import json
+
+import pytest
+import torch
+
+from gsplat_edu import ArgumentError
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.evaluate.figures import run_curve_figures
+from gsplat_edu.render.api import render
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.log import LogWriter
+from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, make_objective
+from gsplat_edu.train.optimizer import ParameterGroup
+from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.views import View
+
+CONFIG = recipe(40, densify_start=2, densify_every=5, grad_threshold=5e-5, sh_degree=0)
+MCMC = recipe(20, strategy="mcmc", max_gaussians=60, sh_degree=0)
+
+
+class Gains:
+    """A brightness for each view, and one for all: a real view model, though a small one."""
+
+    def __init__(self, count):
+        self.gains = torch.ones(count).requires_grad_()
+
+    def parameters(self):
+        return {"gains": self.gains}
+
+    def groups(self):
+        return {"gains": ParameterGroup(0.02, eps=1e-8, per_gaussian=False)}
+
+    def __call__(self, index, image):
+        return image * self.gains[index]
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return procedural_capture(24, 4, splats=60)
+
+
+def trainer(capture, config, parts=None, callbacks=(), views=None):
+    start = from_points(*capture[1:], config)
+    return Trainer(
+        start,
+        views or capture[0],
+        config,
+        render=render,
+        extent=2.0,
+        density=make_strategy(config, 2.0, start),
+        callbacks=callbacks,
+        parts=parts,
+    )
+
+
+def grads(run):
+    return {name: tensor.grad.clone() for name, tensor in run.parameters().items() if tensor.numel()}
+
+
+def test_regularisers_are_the_papers(capture):
+    """Their values and gradients against autograd's of weight mean(opacity) + weight mean(scale)."""
+    run, seen = trainer(capture, MCMC), []
+    run._objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
+    run.gradients([run._feed.next()])
+    (rendered,) = seen
+    assert isinstance(rendered, Rendered) and rendered.iteration == 0
+    with_all = grads(run)
+    values = {name: term(rendered) for name, term in make_objective(MCMC).terms.items() if name != "photo"}
+    twin = run.gaussians.trainable()
+    expected = {"opacity": 0.01 * twin.opacities.mean(), "scale": 0.01 * twin.scales.mean()}
+    torch.testing.assert_close(values, expected)
+    for tensor in run.parameters().values():
+        tensor.grad = None
+    Objective({"photo": PhotoTerm(MCMC.ssim_weight)}).backward(
+        Rendered(run.gaussians, rendered.draw, *_again(run, rendered), rendered.target, 0)
+    )
+    sum(expected.values()).backward()
+    for name in ("logit_opacities", "log_scales"):
+        without = run.parameters()[name].grad
+        torch.testing.assert_close(with_all[name], without + getattr(twin, name).grad)
+    assert torch.equal(with_all["means"], run.gaussians.means.grad)
+
+
+def _again(run, rendered):
+    from gsplat_edu.render.settings import RenderSettings
+
+    settings = RenderSettings(sh_degree=0, jacobian_limit=1.3, depth=False)
+    output = render(run.gaussians, rendered.draw.view.camera, settings=settings)
+    return output, output.image
+
+
+def test_a_batch_is_reduced_to_the_mean_of_its_views(capture):
+    run = trainer(capture, CONFIG)
+    draws = [run._feed.next() for _ in range(3)]
+    assert len({draw.index for draw in draws}) == 3
+    single, losses = [], []
+    for draw in draws:
+        losses.append(run.gradients([draw])["photo"])
+        single.append(grads(run))
+        for tensor in run.parameters().values():
+            tensor.grad = None
+    terms = run.gradients(draws)
+    run._parts.reduce(run.parameters(), 3)
+    torch.testing.assert_close(terms["photo"], sum(losses) / 3)
+    for name, found in grads(run).items():
+        # Two sums of three float32 numbers in two orders: four roundings of the largest of them.
+        largest = float(torch.stack([each[name].abs() for each in single]).max())
+        expected = sum(each[name] for each in single) / 3
+        assert float((found - expected).abs().max()) <= 4 * 2**-24 * largest, name
+
+
+def test_what_is_applied_is_what_reduce_left(capture):
+    """A reduction that adds nothing up, as a process without work might: the parameters stay."""
+    seen = []
+
+    def nothing(parameters, num_views):
+        seen.append((sorted(parameters), num_views))
+        for parameter in parameters.values():
+            parameter.grad = None
+
+    run = trainer(capture, recipe(2, strategy="none", sh_degree=0), StepParts(reduce=nothing))
+    before = run.gaussians.map(torch.clone)
+    run.run()
+    for name, tensor in run.gaussians.tensors().items():
+        assert torch.equal(tensor, before.tensors()[name]), name
+    assert seen == [(sorted(before.tensors()), 1)] * 2
+
+
+def test_terms_are_summed_and_logged_by_name(capture, tmp_path):
+    class Transmittance:
+        def __call__(self, rendered):
+            return 0.5 * rendered.output.transmittance.mean()
+
+    objective = Objective({"photo": PhotoTerm(0.2), "empty": Transmittance()})
+    log, events = LogWriter(tmp_path / "log.jsonl"), []
+
+    def note(_, event):
+        events.append(event)
+        log.record(event, 1.0)
+
+    config = recipe(10, strategy="none", sh_degree=0)
+    run = trainer(capture, config, StepParts(objective=objective), [note])
+    plain = trainer(capture, config)
+    result = run.run()
+    assert result.losses[0] == plain.run().losses[0], "the loss is the photo's term"
+    assert not torch.equal(run.gaussians.logit_opacities, plain.gaussians.logit_opacities)
+    log.close()
+    (line,) = RunFolder(tmp_path).log()
+    means = {name: sum(float(event.terms[name]) for event in events) / 10 for name in ("photo", "empty")}
+    assert line["terms"] == pytest.approx(means, rel=1e-6) and line["loss"] == line["terms"]["photo"]
+    figures = run_curve_figures([line, {**line, "iteration": 20}])
+    (drawn,) = [f.axes[0] for f in figures if f.axes[0].get_title() == "terms of the objective"]
+    assert [text.get_text() for text in drawn.get_legend().get_texts()] == ["photo", "empty"]
+
+
+def test_a_term_on_depth_gets_it_and_moves_the_gaussians(capture):
+    """Weighted enough to count, the mean depth falls: Gaussians come nearer to the cameras or fade."""
+    found = []
+
+    class Depth:
+        needs_depth = True
+
+        def __call__(self, rendered):
+            value = rendered.output.depth.mean()
+            found.append(float(value.detach()))
+            return value
+
+    objective = Objective({"photo": PhotoTerm(0.2), "depth": Depth()})
+    trainer(capture, recipe(20, strategy="none", sh_degree=0), StepParts(objective=objective)).run()
+    assert found[-1] < 0.9 * found[0]
+
+
+def test_an_objective_needs_the_photo():
+    with pytest.raises(ArgumentError, match="^terms: .*photo"):
+        Objective({"depth": PhotoTerm(0.2)})
+
+
+def test_a_view_model_learns_how_the_photos_differ(capture):
+    """Two of the four photos are half as bright: their gains end near half of the others'."""
+    views, brightness = capture[0], [1.0, 0.5, 1.0, 0.5]
+    dimmed = [
+        View(view.camera, (view.read().image * factor).astype("uint8"), name=view.name)
+        for view, factor in zip(views, brightness, strict=True)
+    ]
+    model = Gains(4)
+    run = trainer(
+        capture, recipe(150, strategy="none", sh_degree=0), StepParts(view_model=model), views=dimmed
+    )
+    run.run()
+    gains = model.gains.detach()
+    ratio = float((gains[1] + gains[3]) / (gains[0] + gains[2]))
+    # 150 steps, 37 a gain, of at most 0.02 each: enough for 0.5. Untrained it is 1.
+    assert 0.4 < ratio < 0.65, gains
+
+
+@pytest.mark.parametrize("at", [3, 13])
+def test_a_view_model_is_resumed_with_the_same_bits_through_density_surgery(capture, tmp_path, at):
+    def make():
+        return trainer(capture, CONFIG, StepParts(view_model=Gains(4)))
+
+    whole, first, second = make(), make(), make()
+    whole.run()
+    assert len(whole.gaussians) != len(capture[1])
+    first.run(lambda: first.iteration >= at)
+    path = save_checkpoint(tmp_path, first, 1.0)
+    load_checkpoint(path, second)
+    second.run()
+    tensors, numbers = whole.state()
+    resumed, resumed_numbers = second.state()
+    assert json.dumps(numbers) == json.dumps(resumed_numbers) and tensors.keys() == resumed.keys()
+    assert {"view_model.gains", "first.gains", "second.gains"} <= tensors.keys()
+    for name, tensor in tensors.items():
+        assert torch.equal(tensor, resumed[name]), name
+
+
+def test_a_checkpoint_with_another_view_model_is_refused(capture, tmp_path):
+    from gsplat_edu.errors import CheckpointError
+
+    with_gains = trainer(capture, CONFIG, StepParts(view_model=Gains(4)))
+    path = save_checkpoint(tmp_path, with_gains, 0.0)
+    with pytest.raises(CheckpointError, match="view_model: 'gains' is not known"):
+        load_checkpoint(path, trainer(capture, CONFIG))
+    with pytest.raises(CheckpointError, match=r"view_model\.gains: is .*\(4,\), but has to be .*\(3,\)"):
+        load_checkpoint(path, trainer(capture, CONFIG, StepParts(view_model=Gains(3))))
+
+
+def test_a_view_model_cannot_take_the_name_of_a_parameter(capture):
+    class Greedy(Gains):
+        def parameters(self):
+            return {"means": self.gains}
+
+    with pytest.raises(ArgumentError, match="^view_model: 'means'"):
+        trainer(capture, CONFIG, StepParts(view_model=Greedy(4)))
