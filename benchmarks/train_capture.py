@@ -40,9 +40,9 @@ def train(options: argparse.Namespace, out: Path | None) -> None:
             with run.clock_stopped():
                 table[trainer.iteration] = measure(trainer.gaussians, run.dataset.train)
 
-    trainer = run.start(callbacks=[take_apart])
+    trainer = run.trainer
     table[0] = measure(trainer.gaussians, run.dataset.train)
-    run.train()
+    run.train(callbacks=[take_apart])
     table[trainer.iteration] = measure(trainer.gaussians, run.dataset.train)
     evaluation = run.finish()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

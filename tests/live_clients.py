@@ -53,15 +53,13 @@ class Training:
 
     def _train(self):
         try:
-            self.run.start(callbacks=[self.view.show])
-            self.run.train(self.stopped.is_set)
+            self.run.train(self.stopped.is_set, [self.view.show])
         except BaseException as error:
             self.failure = error
 
     @property
     def iteration(self):
-        trainer = getattr(self.run, "trainer", None)  # the view is up before the photos are read
-        return trainer.iteration if trainer else 0
+        return self.run.trainer.iteration
 
     def ended(self):
         """Wait for the end, which has to be a good one."""

@@ -2,12 +2,13 @@ import errno
 import os
 import stat
 import tempfile
+from pathlib import Path
 
 import pytest
 
 from gsplat_edu import ArgumentError
 from gsplat_edu.cli.arguments import run_command
-from gsplat_edu.files import check_writable, described, written_aside
+from gsplat_edu.files import check_writable, described, unreadable, written_aside
 
 
 def test_parents_are_made_and_the_file_appears_whole(tmp_path):
@@ -86,3 +87,12 @@ def test_the_command_line_prints_the_name_that_was_asked_for(tmp_path, capsys):
         f"gsplat-edu render: {tmp_path / 'file' / 'scene.ply'}: file exists; choose another place"
     )
     assert "Errno" not in error
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"), [(errno.EACCES, "check its permissions"), (errno.EIO, "check the file")]
+)
+def test_what_cannot_be_read_is_one_wording(number, advice):
+    error = OSError(number, os.strerror(number), "elsewhere")
+    assert unreadable(Path("a.bin"), error) == f"a.bin: cannot be read ({os.strerror(number)}); {advice}"
+    assert "cannot be read (gone); check the file" in unreadable(Path("a.bin"), OSError("gone"))

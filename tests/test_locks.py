@@ -93,7 +93,13 @@ def test_a_folder_that_was_made_and_left_empty_is_removed(tmp_path):
 
 def test_what_a_damaged_lock_says_is_not_printed(tmp_path):
     with locked("--out", tmp_path, "gsplat-edu train", pytest.fail):
-        for text in ('{"pid": "\x1b[31m", "host": "\n", "what": 1, "since": []}', "{", "7", "\xff" * 50):
+        for text in (
+            '{"pid": "\x1b[31m", "host": "\n", "what": 1, "since": []}',
+            "{",
+            "7",
+            "\xff" * 50,
+            "[" * 995,
+        ):
             (tmp_path / LOCK).write_text(text)
             with pytest.raises(ArgumentError, match="is in use by") as caught:
                 taken(tmp_path)

@@ -1,11 +1,14 @@
 """Properties of the image that hold for every scene, searched by hypothesis."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R, quat_to_R_batch, render_gaussians
+
+pytestmark = pytest.mark.sliced  # a soak looks for many more examples
 
 CAM = Camera(np.eye(3), (0, 0, 0), fx=20, fy=22, cx=9.3, cy=6.8, H=14, W=19)
 

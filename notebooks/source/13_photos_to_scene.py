@@ -114,7 +114,6 @@ def trained(data, out, iterations, **reading):
     options = RunOptions(WORK / data, WORK / out, config, settings, eval_every=0, save_every=0)
     before = time.perf_counter()
     job = CaptureRun(options)
-    job.start()
     loaded = time.perf_counter() - before
     job.train()
     before = time.perf_counter()

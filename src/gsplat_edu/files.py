@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import re
+import socket
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,7 +29,7 @@ def written_aside(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the folder cannot be created or written to. An existing file at `path` stays unchanged.
     """
-    prefix = f".{path.stem}.{os.getpid()}-"  # remove_leftovers checks whether this process is still running
+    prefix = f".{path.stem}.{_this_machine()}-{os.getpid()}-"  # remove_leftovers asks whether this process still runs
     with named_failure(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
@@ -73,6 +76,17 @@ def described(error: OSError) -> str:
     )
 
 
+def unreadable(path: Path, error: OSError) -> str:
+    """Describe why a file or folder cannot be read, in one line for the user.
+
+    Args:
+        path: The file or folder as the user knows it.
+        error: What the system reported.
+    """
+    advice = "check its permissions" if error.errno in (errno.EACCES, errno.EPERM) else "check the file"
+    return f"{path}: cannot be read ({error.strerror or error}); {advice}"
+
+
 _ADVICE = {
     errno.EACCES: "choose another place, or change its permissions",
     errno.EPERM: "choose another place, or change its permissions",
@@ -112,11 +126,27 @@ def named_in_utf8(path: Path) -> Iterator[Path]:
 
 _SURROGATE = re.compile("[\ud800-\udfff]")  # represents a byte that is not UTF-8 (PEP 383)
 
-_LEFTOVER = re.compile(r"\..*\.(\d+)-[a-z0-9_]{8}(?:\.[^.]+)?")  # temporary names of written_aside
+_LEFTOVER = re.compile(
+    r"\..*\.([0-9a-f]{8})-(\d+)-[a-z0-9_]{8}(?:\.[^.]+)?"
+)  # temporary names of written_aside
+
+ABANDONED = 24 * 3600.0
+"""Seconds without a change after which another machine's temporary file counts as left behind."""
+
+
+def _this_machine() -> str:
+    """Return eight characters for the machine, or the container on it, in which process numbers mean the same."""
+    try:
+        processes = os.readlink("/proc/self/ns/pid")  # noqa: PTH115 - a name, not a path
+    except OSError:  # not Linux
+        processes = ""
+    return hashlib.sha256(os.fsencode(f"{socket.gethostname()} {processes}")).hexdigest()[:8]
 
 
 def remove_leftovers(folder: Path, *, below: bool = True) -> None:
     """Remove temporary files of `written_aside` whose process was killed; keep those of running processes.
+
+    Whether a process of another machine still runs cannot be asked; its files go once they are a day old.
 
     Args:
         folder: The folder; it need not exist.
@@ -124,8 +154,17 @@ def remove_leftovers(folder: Path, *, below: bool = True) -> None:
     """
     for path in folder.rglob(".*") if below else folder.glob(".*"):
         match = _LEFTOVER.fullmatch(path.name)
-        if match and path.is_file() and not path.is_symlink() and not _runs(int(match[1])):
+        if match and path.is_file() and not path.is_symlink() and _is_leftover(path, match[1], int(match[2])):
             path.unlink(missing_ok=True)
+
+
+def _is_leftover(path: Path, machine: str, pid: int) -> bool:
+    if machine == _this_machine():
+        return not _runs(pid)
+    try:
+        return time.time() - path.stat().st_mtime > ABANDONED
+    except FileNotFoundError:  # its process has just renamed or removed it
+        return False
 
 
 def _runs(pid: int) -> bool:

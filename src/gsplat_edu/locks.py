@@ -126,7 +126,7 @@ def _holder(handle: int) -> str:
     try:
         facts = json.loads(os.read(handle, 1000))
         words = [re.sub(r"[^ -~]", "?", str(facts[key]))[:80] for key in ("what", "pid", "host", "since")]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return "another process"
     return "`{}`, process {} on {}, since {}".format(*words)
 

@@ -1,4 +1,4 @@
-"""Text that quotes names from files: safe forms for terminals, files and file names.
+"""Text for people: numbers and durations, and names from files in safe forms for terminals, files and file names.
 
 File names on Linux are bytes, and JSON text may contain unpaired surrogates. Python represents a byte that it cannot
 decode as a lone surrogate (PEP 383). No encoding accepts these, so a report could fail because of its title.
@@ -15,8 +15,32 @@ _SURROGATES = re.compile("[\ud800-\udfff]")
 _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
 """Characters that move the cursor, change colours, break a line or reverse the direction of text."""
 
+MOST_SPELLED = 1e12
+"""From this on `short_number` uses an exponent."""
+
 RAW_BYTES = 0xDC80, 0xDCFF
 """Lone surrogates that represent the bytes 0x80 to 0xFF."""
+
+
+def short_number(value: float, digits: int) -> str:
+    """Write a number with a few significant digits; a large one with all digits of its whole part, not 1e+03.
+
+    Args:
+        value: The number.
+        digits: Significant digits.
+    """
+    text = f"{value:.{digits}g}"
+    return f"{value:,.0f}" if "e+" in text and abs(value) < MOST_SPELLED else text
+
+
+def spelled_seconds(seconds: float) -> str:
+    """Write a duration: 12 s, 3 min 40 s, 2 h 5 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
 def legible(text: str) -> str:

@@ -15,7 +15,7 @@ from gsplat_edu.budget.costs import (
     expected_counts,
     wanted_gaussians,
 )
-from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes, spelled_seconds
+from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import probe, resident_bytes
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.data.dataset import DataSettings, load_dataset
@@ -23,6 +23,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.train.optimizer import Adam

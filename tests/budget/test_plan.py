@@ -21,7 +21,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.runs.training import CaptureRun, RunOptions
+from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import StepEvent
 
@@ -219,8 +219,7 @@ def options(capture, out, iterations=20, **changes):
 
 
 def trained(run, callbacks=(), stop=lambda: False):
-    run.start(callbacks=callbacks)
-    run.train(stop)
+    run.train(stop, callbacks)
     run.finish()
     return run.folder
 
@@ -249,12 +248,10 @@ def test_a_resumed_run_takes_the_numbers_of_its_config(capture, tmp_path):
     plain = dataclasses.replace(begun, config=recipe(), data_settings=DataSettings(), resume=True)
     again = plan(plain, Limits(2**30, Deadline(100.0)))
     assert again.options.config == begun.config and again.resolution == 2 and not again.by_time
-    assert CaptureRun(again.options).finished
+    assert is_finished(again.options)
     assert len(again.sentences) == 1 and "memory is not planned again" in again.sentences[0]
     assert plan(plain, Limits(time=Deadline(100.0))).sentences == ()
-    assert not CaptureRun(taken_up(plain, ["iterations"])).finished, (
-        "more iterations than its own extend a run"
-    )
+    assert not is_finished(taken_up(plain, ["iterations"])), "more iterations than its own extend a run"
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -331,7 +328,7 @@ def test_a_lengthened_run_that_is_cut_is_complete_all_the_same(capture, tmp_path
     # 250 s for 25, and (600 - 250 - reserve) / 40 more, for a reserve of less than 40 s; the last may run over
     assert folder.read_metrics()["iterations"] == folder.read_config()["train"]["iterations"] in (33, 34)
     assert "20 iterations were planned" in outcome
-    assert CaptureRun(dataclasses.replace(run.options, resume=True)).finished
+    assert is_finished(dataclasses.replace(run.options, resume=True))
 
 
 def test_a_run_that_was_not_planned_is_not_lengthened(capture, tmp_path):
@@ -357,7 +354,6 @@ config = recipe(150, rescale=False, densify_start=0, densify_every=5, densify_st
 options = RunOptions(Path(sys.argv[1]), Path(sys.argv[2]), config, DataSettings(), save_every=50, eval_every=50)
 chosen = plan(options, Limits(memory=int(sys.argv[3])), ["iterations"])
 run = CaptureRun(chosen.options)
-run.start()
 run.train()
 run.finish()
 """

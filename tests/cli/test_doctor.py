@@ -163,6 +163,7 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     renders = next(words for words in commands if words[0] == "render")
     assert command_line.main([*renders, "--frames", "2"]) == 0 and Path("orbit.mp4").is_file()
     longer = next(words for words in commands if "30000" in words)
+    assert "--strategy" not in longer, "a default"
     assert longer[longer.index("--resolution") + 1] == "40"
     assert longer[longer.index("--test-every") + 1] == "0", "0 is a value, too"
     assert longer[longer.index("--background") + 1 :][:3] == ["1", "1", "1"]

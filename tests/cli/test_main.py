@@ -1,9 +1,11 @@
 import re
+import signal
 from importlib.metadata import version
 
 import pytest
 
 from gsplat_edu.cli.main import COMMANDS, main
+from gsplat_edu.cli.train import interruptible
 
 TINY = ["demo", "--iters", "2", "--k0", "5", "--cap", "8", "--size", "8"]
 
@@ -14,6 +16,23 @@ def test_demo_writes_figure_curves_and_scene(tmp_path, capsys):
     assert "2/2" in printed, "the bar reached its end"
     assert re.search(r"held-out L1: init 0\.\d{4} -> final 0\.\d{4}", printed)
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["s.ply", "s.png", "s_curves.png"]
+
+
+def test_a_handler_that_python_did_not_install_is_no_obstacle(monkeypatch):
+    """`signal.signal` then returns None, which it does not take back."""
+    table = dict.fromkeys((signal.SIGINT, signal.SIGTERM))
+
+    def install(number, handler):
+        assert handler is not None
+        before, table[number] = table[number], handler
+        return before
+
+    monkeypatch.setattr(signal, "signal", install)
+    with interruptible() as interrupted:
+        assert not interrupted()
+        table[signal.SIGTERM](signal.SIGTERM, None)
+        assert interrupted()
+    assert table == dict.fromkeys(table, signal.SIG_DFL)
 
 
 def test_a_name_in_brackets_is_printed_as_it_is(tmp_path, capsys):
@@ -33,7 +52,7 @@ def test_the_seed_decides_the_run(tmp_path, capsys):
 def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
     arguments = ["demo", "--iters", "1", "--size", "8", "--k0", "5", "--out", str(tmp_path / "s.png")]
     assert main([*arguments, "--backend", "torch"]) == 0
-    assert "reduced: --cap 800 (the chapter's: --cap 1600)" in capsys.readouterr().out
+    assert "reduced to --cap 800 (the chapter uses --cap 1600)" in capsys.readouterr().out
     assert main(arguments) == 0
     assert "reduced" not in capsys.readouterr().out, "the kernels take the chapter's budget"
 

@@ -15,7 +15,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.evaluate.report import Report, write_report
 from gsplat_edu.runs.folder import image_file_names
-from gsplat_edu.text import as_file_name, legible, printable, write_text
+from gsplat_edu.text import as_file_name, legible, printable, short_number, write_text
 
 CHILD = """
 import os, sys
@@ -131,3 +131,21 @@ def test_a_bar_prints_names_as_they_are():
     """rich takes "[/x]" in a description for markup that ends what never began, and passes ESC on."""
     task = Task(TaskID(0), "checking [/x]\x1b[2J.ply", 1, 0, _get_time=lambda: 0.0)
     assert Field("{task.description}").render(task).plain == r"checking [/x]\x1b[2J.ply"
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (99.7, 2, "100"),  # a share in percent was "1e+02 %"
+        (1432.0, 3, "1,432"),
+        (-451234.6, 4, "-451,235"),
+        (0.0123, 2, "0.012"),
+        (819.23, 4, "819.2"),
+        (0.0, 4, "0"),
+        (3e38, 3, "3e+38"),
+        (float("nan"), 3, "nan"),
+        (float("inf"), 3, "inf"),
+    ],
+)
+def test_numbers_for_people_have_no_exponent_unless_they_are_absurd(value, digits, text):
+    assert short_number(value, digits) == text

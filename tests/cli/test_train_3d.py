@@ -31,7 +31,7 @@ def test_the_default_budget_trains_end_to_end(tmp_path):
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert (
-        "reduced: --iters 300 --cap 800 --size 64 (the chapter's: --iters 800 --cap 1600 --size 128)"
+        "reduced to --iters 300 --cap 800 --size 64 (the chapter uses --iters 800 --cap 1600 --size 128)"
         in lines[0]
     )
     assert re.fullmatch(r"iter    0  L1 0\.\d{4}  K 400", lines[1])

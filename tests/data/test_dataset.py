@@ -150,7 +150,7 @@ def test_points_of_another_file(written, tmp_path, small):
     dataset = load_dataset(written("colmap"), points=tmp_path / "p.ply")
     np.testing.assert_array_equal(dataset.points, [[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(dataset.colors, [[0.2, 0.4, 0.6]], atol=1e-12)
-    assert any("1 of 2 points that are NaN" in note for note in dataset.notes)
+    assert any("1 of 2 points are NaN" in note for note in dataset.notes)
     with pytest.raises(DatasetError, match=r"none\.ply"):
         load_dataset(written("colmap"), points=tmp_path / "none.ply")
 
@@ -265,6 +265,22 @@ def test_photos_decoded_at_once_are_limited_by_their_size(monkeypatch):
         assert ImageStore(0, [source]).workers == workers
         assert ImageStore(0, [source] * 3).needed == 3 * 20 * 10 * 3
     assert ImageStore(0, []).workers == 64
+
+
+@pytest.mark.parametrize(
+    ("name", "mask", "background", "planes"),
+    [
+        ("a.png", None, (0.0, 0.0, 0.0), 3),
+        ("a.png", None, None, 4),
+        ("a.JPG", None, None, 3),
+        ("a.png", Path("m.png"), None, 5),
+        ("a.jpg", Path("m.png"), None, 4),
+    ],
+)
+def test_memory_for_photos_includes_alpha_that_is_kept(name, mask, background, planes):
+    """A random background is chosen at every step, so alpha is kept; a JPEG has none."""
+    source = PhotoFile(Path(name), mask, Lens(40, 20, 30.0, 30.0, 0.0, 0.0), 20, 10, background)
+    assert ImageStore(0, [source] * 3).needed == 3 * 20 * 10 * planes
 
 
 @pytest.mark.parametrize("resolution", [None, 2.0])

@@ -72,7 +72,7 @@ def test_fox(real):
     assert dataset.layout == "transforms.json" and len(dataset.train) == 43 and len(dataset.test) == 7
     notes = " | ".join(dataset.notes)
     assert "17 of 67 photos have no file" in notes and "50 of 50 photos have lens distortion" in notes
-    assert "no points: 100,000 random" in notes
+    assert "no points: starting from 100,000 random" in notes
     photo = dataset.train[0].read()
     assert photo.image.shape == (1920, 1080, 3)
     assert photo.mask is None or photo.mask.mean() > 0.99
@@ -86,7 +86,7 @@ def test_the_foxs_colmap_model(real):
     dataset = load_dataset(real("fox/colmap9_opencv"), DataSettings(test_every=0))
     assert len(dataset.train) == 9 and len(dataset.points) == 1457
     assert share_in_sight(dataset).any(axis=0).mean() > 0.99
-    assert any("distorts" in note for note in dataset.notes)
+    assert any("distortion" in note for note in dataset.notes)
     assert dataset.train[0].image.shape == (1920, 1080, 3)
 
 

@@ -123,7 +123,7 @@ def test_what_is_no_transforms_json(tmp_path, content):
         ("k1", [1], r"view_004\.png: k1 is "),
         ("camera_model", "EQUIRECTANGULAR", r"view_004\.png: camera_model 'EQUIRECTANGULAR' is not"),
         ("camera_model", ["x"], r"view_004\.png: camera_model"),
-        ("mask_path", "no.png", r"view_004\.png: its mask .*no\.png is not there"),
+        ("mask_path", "no.png", r"view_004\.png: its mask .*no\.png does not exist"),
     ],
 )
 def test_what_cannot_be_used_names_the_frame_and_the_key(edited, key, value, message):
@@ -192,7 +192,7 @@ def test_distortion_words(one_photo):
     assert camera_of(one_photo(PIXELS, camera_model="PINHOLE")).fx == 30
     fisheye = camera_of(one_photo(PIXELS, camera_model="OPENCV_FISHEYE", k1=0.05))
     assert fisheye.fx == camera_of(one_photo(PIXELS, is_fisheye=True, k1=0.05)).fx != 30
-    assert any("distorts" in note for note in load_dataset(one_photo(PIXELS, k1=0.05)).notes)
+    assert any("distortion" in note for note in load_dataset(one_photo(PIXELS, k1=0.05)).notes)
 
 
 def test_blenders_parts(tmp_path, small):

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.cli.doctor import _exposure_beforehand
+from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
-from gsplat_edu.doctor.finding import Finding, Severity
+from gsplat_edu.doctor.finding import Finding, Severity, diagnosis_lines
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.gaussians import Gaussians
@@ -247,6 +249,17 @@ def test_a_short_training_is_not_fine(scene, reached, gain, severity, says):
     assert ("better photos" in advice) is (severity is not Severity.WARNING)
 
 
+def test_a_longer_training_says_how_long_it_takes_at_the_pace_of_this_one(scene):
+    """The command for 30,000 iterations stood there alone after 400 that took 0.8 s each: a day's work by surprise."""
+    gaussians, views = scene
+    log = [{"iteration": i, "ms": 50.0 if i <= 300 else 800.0} for i in range(10, 401, 10)]
+    run = trained(gaussians, views, reached=400, planned=400, log=log, capture=Path("a"))
+    (found,) = [finding for finding in examine_run(run).findings if finding.name == "short training"]
+    assert found.advice.startswith(
+        "train for longer (6 h 40 min or more at this run's pace): gsplat-edu train a "
+    )
+
+
 @pytest.mark.parametrize(("factor", "rising"), [(0.8, True), (1.0, False)])
 def test_without_test_views_the_loss_says_whether_it_still_falls(scene, factor, rising):
     gaussians, views = scene
@@ -266,3 +279,25 @@ def test_what_the_photos_show_before_training_is_not_gone_after_it(scene):
     assert (
         found.sentence.startswith("1 of 12 photos; the scene fits them") and "exposure" not in diagnosis.fine
     )
+
+
+def test_a_photo_that_the_scene_cannot_explain_is_not_said_to_be_fitted_all_the_same(scene):
+    """One screen said of the same two photos that they were far from the scene and that it fitted them."""
+    gaussians, views = scene
+    run = trained(gaussians, views)
+    poor = replace(run.train[0], psnr=run.train[0].psnr - 20.0)
+    before = Finding("exposure", Severity.WARNING, "1 of 12 photos", "fix it", (poor.name,), ("+0.4",))
+    run = replace(run, train=[poor, *run.train[1:]], beforehand=[before])
+    found = {finding.name: finding for finding in examine_run(run).findings}
+    assert poor.name in found["unexplained"].images
+    assert found["exposure"].sentence == "1 of 12 photos"
+
+
+def test_that_exposure_was_not_compared_is_said(scene, tmp_path):
+    gaussians, views = scene
+    findings, why = _exposure_beforehand(tmp_path / "gone", Terminal())
+    assert findings == [] and "gone" in why
+    said = diagnosis_lines(examine_run(trained(gaussians, views, uncompared=why)))
+    (line,) = [line for line in said if line.startswith("exposure ")]
+    assert line.endswith(f"not between photos: {why}")
+    assert not any("not between" in line for line in diagnosis_lines(examine_run(trained(gaussians, views))))

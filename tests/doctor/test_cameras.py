@@ -1,15 +1,24 @@
 """Faults of the cameras and the cloud, each at three severities."""
 
 import math
+import os
 import struct
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from doctor.rooms import replaced, room, turned, with_camera
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.dataset import read_capture
+from gsplat_edu.doctor.cameras import check_away
 from gsplat_edu.doctor.finding import Severity
+from gsplat_edu.doctor.photos import Look
 from gsplat_edu.doctor.support import observed_points
+from gsplat_edu.doctor.survey import Shot, Survey
+
+DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
 @pytest.fixture
@@ -97,7 +106,7 @@ def test_a_hole_in_an_orbit(diagnosed, orbit, missing, name):
     assert [f.name for f in found] == ([name] if name else [])
     if name == "hole":
         assert found[0].severity is Severity.WARNING
-        assert f"no camera in {15 * (missing + 1)} degrees" in found[0].sentence
+        assert f"a gap of {15 * (missing + 1)} degrees" in found[0].sentence
         assert views[4].name in found[0].advice and views[5 + missing].name in found[0].advice
     elif name:
         assert found[0].severity is Severity.NOTE, "a thing on a wall has no back"
@@ -213,6 +222,41 @@ def test_a_camera_that_looks_past_with_few_points_is_named(named, orbit):
     found = named(spoiled, points, lambda folder: with_tracks(folder, low))
     assert found["doubtful poses"] == (f"{views[5].name} (60 points, looks past what the others look at)",)
     assert "doubtful poses" not in named(spoiled, points, lambda folder: with_tracks(folder, COUNTS))
+
+
+@pytest.mark.parametrize(("times", "is_named"), [(2.5, False), (4, True), (20, True)])
+def test_without_counts_a_camera_that_stands_apart_is_named(named, orbit, times, is_named):
+    """The unit is what three quarters keep: four units from the middle are three from the nearest camera."""
+    views, _ = orbit
+    spoiled = replaced(views, {7: with_camera(views[7], eye=times * views[7].camera.eye)})
+    (told,) = named(spoiled).get("doubtful poses", ("",))
+    assert bool(told) == is_named
+    assert told.endswith(f"{views[7].name} ({times:.0f} times as far as the others)") or not is_named
+
+
+@pytest.mark.parametrize(("degrees", "is_named"), [(20, False), (35, True)])
+def test_without_counts_a_camera_whose_picture_misses_the_subject_is_named(named, orbit, degrees, is_named):
+    views, _ = orbit
+    spoiled = replaced(views, {i: turned(views[i], degrees) for i in (3, 12)})
+    found = named(spoiled).get("doubtful poses", ())
+    assert [name.rpartition("/")[2] for name in found] == [
+        f"{views[i].name} (looks past what the others look at)" for i in (3, 12) if is_named
+    ]
+
+
+@pytest.mark.parametrize("capture", ["fox", "snowmiku97", "truck11"])
+def test_no_pose_of_a_clean_capture_is_doubted(capture):
+    """As if nothing said in which photos the points were found; no photo is decoded."""
+    folder = DATA / capture
+    if not folder.is_dir():
+        pytest.skip(f"{capture} is not on this machine; see GSPLAT_EDU_DATA")
+    read, look = read_capture(folder), Look(np.zeros((4, 4, 3), np.uint8), np.zeros(8))
+    shots = []
+    for frame in read.frames:
+        camera = Camera.posed(frame.R, frame.eye, frame.lens.undistorted())
+        shots.append(Shot(frame.name, frame.lens, (camera.W, camera.H), camera, look))
+    points = np.zeros((0, 3)) if read.cloud is None else read.cloud.points
+    assert check_away(Survey(folder, read.layout, tuple(shots), (), (), points, ())) == []
 
 
 def test_found_points_are_read_from_text_as_well(tmp_path):

@@ -16,6 +16,7 @@ LAYOUTS = ("orbit", "forward", "outward", "walk")
 procedural_capture = functools.cache(procedural.procedural_capture)
 
 
+@pytest.mark.sliced(1, by="layout")
 @pytest.mark.parametrize("with_points", [True, False])
 @pytest.mark.parametrize(
     ("layout", "size", "count", "height"),
@@ -27,6 +28,7 @@ def test_a_clean_room_gets_no_warning(named, layout, size, count, height, with_p
     assert named(views, points if with_points else None) == {}
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize("with_points", [True, False])
 @pytest.mark.parametrize(
     ("size", "count", "height"), [(48, 12, None), (64, 24, None), (80, 36, None), (72, 18, 128)]
@@ -44,6 +46,7 @@ def test_nor_does_blenders_layout(tmp_path):
     assert [f for f in diagnosis.findings if f.severity > Severity.NOTE] == []
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_how_the_cameras_stand_is_recognised(diagnosed, layout):
     views, points = room(layout, 128)

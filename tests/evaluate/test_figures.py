@@ -1,7 +1,9 @@
 import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 
-from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
+from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, run_curve_figures, save_figure
 
 
 def test_panels_show_the_images_given_clipped(tmp_path):
@@ -30,3 +32,32 @@ def test_curves_are_labelled_and_hold_the_numbers():
     for axes in (loss, count):
         assert axes.get_title() and axes.get_xlabel() and axes.get_ylabel()
     assert loss.get_yscale() == "log"
+
+
+def test_the_curves_of_a_run_share_their_iterations_and_survive_a_busy_moment():
+    """One evaluation at iteration 5,000 stood on an axis from 4,800 to 5,200; one pause flattened all speeds."""
+    log = [{"iteration": 50 * i, "loss": 1.0 / i, "ms": 20.0 + i % 3} for i in range(1, 101)]
+    log[40]["ms"] = 6000.0
+    log.append({"iteration": 5000, "psnr": 30.0})
+    loss, psnr, speed = (figure.axes[0] for figure in run_curve_figures(log))
+    assert loss.get_xlim() == psnr.get_xlim() == speed.get_xlim()
+    assert psnr.get_xlim()[0] == 0 and 5000 < psnr.get_xlim()[1] < 5200
+    assert speed.get_ylim() == (0, 44) and "up to 6,000 ms are cut off" in speed.get_title()
+    ((even,),) = [f.axes for f in run_curve_figures([{"iteration": i, "ms": 20.0 + i % 3} for i in (1, 2)])]
+    assert even.get_title() == "speed" and even.get_ylim()[1] > 22
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.1, 0.29), (0.002, 0.4), (0.05, 0.06)])
+def test_the_loss_has_plain_numbers_on_its_axis(low, high):
+    """A short run's loss was labelled 2.75 x 10^-1, 2.5 x 10^-1 and so on."""
+    log = [{"iteration": i, "loss": low * (high / low) ** (i / 10)} for i in range(11)]
+    (figure,) = run_curve_figures(log)
+    FigureCanvasAgg(figure).draw()
+    axis, view = figure.axes[0].yaxis, figure.axes[0].get_ylim()
+    texts = [
+        label.get_text()
+        for place, label in zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=True)
+        if view[0] <= place <= view[1]
+    ]
+    assert 1 <= len(texts) <= 8 and all(float(text) > 0 for text in texts), "numbers, not formulas"
+    assert not any(label.get_text() for label in axis.get_ticklabels(minor=True))

@@ -9,6 +9,7 @@ from PIL import Image
 
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.evaluate.images import NOT_WRITTEN, save_png, side_by_side, write_frames
+from gsplat_edu.files import written_aside
 
 
 def colour(height, width, rgb):
@@ -93,15 +94,26 @@ def test_a_folder_may_have_a_dot_in_its_name(tmp_path):
 def test_leftovers_of_killed_writers_go_and_other_files_stay(tmp_path):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    stale = [f".v.{gone.pid}-abcd1234.mp4", f".frame_0001.{gone.pid}-a_b_c_d1.png", f".x.{gone.pid}-00000000"]
+    with written_aside(tmp_path / "x") as aside:
+        machine = aside.name.split(".")[2].split("-")[0]
+    (tmp_path / "x").unlink()
+    other = "0" * 8 if machine != "0" * 8 else "1" * 8
+    stale = [
+        f".v.{machine}-{gone.pid}-abcd1234.mp4",
+        f".frame_0001.{machine}-{gone.pid}-a_b_c_d1.png",
+        f".x.{machine}-{gone.pid}-00000000",
+        f".old.{other}-{os.getppid()}-abcd1234.mp4",
+    ]
     kept = [
-        f".v.{os.getppid()}-abcd1234.mp4",
-        f"v.{gone.pid}-abcd1234.mp4",
+        f".v.{machine}-{os.getppid()}-abcd1234.mp4",
+        f".v.{other}-{gone.pid}-abcd1234.mp4",  # no such process here, but perhaps there
+        f"v.{machine}-{gone.pid}-abcd1234.mp4",
         ".v.original.mp4",
         ".v.12-ab.mp4",
     ]
     for name in (*stale, *kept):
         (tmp_path / name).write_text("")
+    os.utime(tmp_path / stale[3], (0, 0))
     (tmp_path / "below").mkdir()
     (tmp_path / "below" / stale[0]).write_text("not in this folder")
     write_frames(tmp_path / "v.mp4", [colour(4, 4, (0, 0, 0))])

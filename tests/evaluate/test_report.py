@@ -1,5 +1,6 @@
 import base64
 import io
+import re
 import shlex
 import shutil
 from html.parser import HTMLParser
@@ -9,7 +10,7 @@ import pytest
 from PIL import Image
 
 import gsplat_edu.evaluate.report as report_module
-from gsplat_edu.evaluate.figures import run_curves_figure, svg_element
+from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, summarize
 from gsplat_edu.evaluate.report import SCRIPT, Picture, Report, machine_facts, verdict, write_report
 
@@ -84,7 +85,7 @@ def test_a_page_is_whole_and_needs_nothing_else(tmp_path):
     assert "link" not in page.tags and not page.handlers
     assert page.references and all(r.startswith(("data:", "#")) for r in page.references)
     assert "url(http" not in path.read_text("utf-8")
-    assert page.tags.count("svg") == 1 and page.tags.count("img") == 3 * 8
+    assert page.tags.count("svg") == 4 and page.tags.count("img") == 3 * 8
     for said in (
         "<run> & co",
         "a<b>\"c'&d",
@@ -134,7 +135,7 @@ def test_differences_are_bright_enough_to_see_and_say_by_how_much(step, times):
 def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
     """The evaluation at the end is in the metrics, not in the log."""
     drawn = []
-    monkeypatch.setattr(report_module, "run_curves_figure", drawn.append)
+    monkeypatch.setattr(report_module, "run_curve_figures", lambda log: drawn.append(log) or [])
     log = [{"iteration": i, "loss": 0.1} for i in (1, 2, 3)] + [{"iteration": 2, "psnr": 20.0}]
     metrics = {"test": {"psnr": 25.0, "num_images": 1}, "iterations": 3}
     for lines in (log, [*log, {"iteration": 3, "psnr": 24.0}]):
@@ -272,7 +273,7 @@ def test_every_kind_of_number_has_its_own_curve():
         {"iteration": i, "loss": 1.0 + i, "psnr": 20.0 + i, "num_gaussians": 300 + i, "ms": 4.0 + i}
         for i in (1, 2)
     ]
-    panels = run_curves_figure(log).axes
+    panels = [axes for figure in run_curve_figures(log) for axes in figure.axes]
     assert [axes.get_title() for axes in panels] == [
         "training loss",
         "held-out views",
@@ -283,12 +284,11 @@ def test_every_kind_of_number_has_its_own_curve():
 
 
 def test_curves_are_of_what_the_log_has():
-    assert run_curves_figure([]) is None
-    assert run_curves_figure([{"iteration": 1, "loss": None}, {"loss": 2.0}]) is None
+    assert run_curve_figures([]) == run_curve_figures([{"iteration": 1, "loss": None}, {"loss": 2.0}]) == []
     log = [{"iteration": i, "loss": 0.0, "psnr": float("nan")} for i in range(5000)]  # no logarithm of zero
     log[7]["num_gaussians"] = 40
-    figure = run_curves_figure(log)
-    drawn = {axes.get_title(): axes.lines[0].get_xydata() for axes in figure.axes if axes.lines}
+    every = [axes for figure in run_curve_figures(log) for axes in figure.axes]
+    drawn = {axes.get_title(): axes.lines[0].get_xydata() for axes in every}
     assert list(drawn) == ["training loss", "density control"]
     np.testing.assert_array_equal(drawn["density control"], [[7, 40]])
     thinned = drawn["training loss"]
@@ -297,7 +297,10 @@ def test_curves_are_of_what_the_log_has():
 
 def test_a_drawing_stands_in_a_page_and_is_repeatable():
     log = [{"iteration": i, "loss": 1.0 / (i + 1)} for i in range(5000)]
-    first, second = (svg_element(run_curves_figure(log)) for _ in range(2))
+    first, second = (svg_element(*run_curve_figures(log)) for _ in range(2))
+    other = svg_element(*run_curve_figures(log), name="other")
+    ids, others = (set(re.findall(r'id="(p[0-9a-f]{10})"', text)) for text in (first, other))
+    assert ids and others and not ids & others, "a clip of one drawing would cut the other"
     assert first == second and first.startswith("<svg") and len(first) < 100_000
 
 

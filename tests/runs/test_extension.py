@@ -1,5 +1,6 @@
 """Longer than it was begun, from another scene, from photos that changed: what a run makes of it."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -13,14 +14,15 @@ from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.errors import CheckpointError, DatasetError
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.runs.training import CaptureRun, is_finished
 from gsplat_edu.train.config import TrainConfig, recipe
+from gsplat_edu.train.events import StepEvent
 
 BASE = ["--eval-every", "0", "--save-every", "5", "--densify-start", "1", "--densify-every", "4"]
 BASE += ["--grad-threshold", "5e-5"]
@@ -99,9 +101,45 @@ def test_a_finished_run_is_extended_by_its_own_milestones(capture, finished, who
     assert "is finished, 30 iterations; nothing to do" in capsys.readouterr().out.replace("\n", " ")
 
 
+def test_an_extended_run_of_mcmc_gives_the_bytes_of_one_run_with_its_milestones(capture, tmp_path):
+    """Both relocate (opacities start at 0.5) and grow up to the end of the shorter schedule, then only add noise."""
+
+    def mcmc(out, *words):
+        numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--min-opacity", "0.45", *BASE[:-2], *words]
+        assert main(["train", str(capture), "--out", str(tmp_path / out), *numbers]) == 0
+
+    short = recipe(20).flat()
+    names = ("means_rate_iterations", "sh_every", "mcmc_stop")
+    given = [word for name in names for word in (f"--{name.replace('_', '-')}", str(short[name]))]
+    mcmc("extended", "--iterations", "20")
+    mcmc("extended", "--iterations", "30", "--resume")
+    mcmc("whole", "--iterations", "30", *given)
+    assert ply(tmp_path / "extended", 30) == ply(tmp_path / "whole", 30) != ply(tmp_path / "extended", 20)
+    moved = [line for line in RunFolder(tmp_path / "extended").log() if line.get("event") == "relocate"]
+    assert moved[-1]["iteration"] <= 17 and any(line["num_relocated"] for line in moved)
+    assert set(RunFolder(tmp_path / "extended").log()[-1]["terms"]) == {"photo", "opacity", "scale"}
+
+
+def test_a_run_is_complete_once_it_is_constructed(capture, tmp_path):
+    """A program that holds one may look at it, save it, train it in pieces and finish it, in this order."""
+    chosen, heard = options(capture, tmp_path / "run", "--iterations", "6"), []
+    assert not is_finished(chosen)
+    held = CaptureRun(chosen)
+    assert (held.trainer.iteration, held.seconds, len(held.dataset.train)) == (0, 0.0, VIEWS - 1)
+    assert held.save().name == "iteration_0.safetensors"
+    assert held.train(lambda: held.trainer.iteration >= 2, [lambda trainer, event: heard.append(event)])
+    with pytest.raises(CheckpointError, match="holds a run already"):
+        CaptureRun(chosen)
+    resumed = CaptureRun(dataclasses.replace(chosen, resume=True))
+    assert resumed.trainer.iteration == 2 == len([event for event in heard if isinstance(event, StepEvent)])
+    assert not held.train() and held.seconds > 0.0
+    held.finish()
+    assert is_finished(dataclasses.replace(chosen, resume=True))
+
+
 def test_an_interrupted_extension_gives_the_same_bytes(capture, whole, run):
     capture_run = CaptureRun(_taken_up(capture, run, "--iterations", "30", "--resume"))
-    trainer = capture_run.start()
+    trainer = capture_run.trainer
     assert capture_run.train(lambda: trainer.iteration >= 23)
     assert RunFolder(run).read_metrics()["iterations"] == 20, "it was not finished"
     assert train(capture, run, "--resume") == 0, "the new length stands in config.json"
@@ -111,7 +149,7 @@ def test_an_interrupted_extension_gives_the_same_bytes(capture, whole, run):
 def test_an_unfinished_run_is_extended_and_no_run_is_shortened(capture, whole, tmp_path, capsys):
     out = tmp_path / "run"
     first = CaptureRun(options(capture, out, "--iterations", "20"))
-    trainer = first.start()
+    trainer = first.trainer
     first.train(lambda: trainer.iteration >= 7)
     assert train(capture, out, "--iterations", "19", "--resume") == 2
     error = capsys.readouterr().err
@@ -142,7 +180,7 @@ def test_a_run_starts_from_a_run(capture, finished, tmp_path, capsys):
     assert config["data"]["scene"] == str(RunFolder(finished).scene(20))
     assert (config["train"]["sh_every"], config["train"]["means_rate"]) == (0, 1.6e-5)
     first = CaptureRun(options(capture, tmp_path / "x", "--iterations", "4", "--from", str(finished)))
-    trainer = first.start()
+    trainer = first.trainer
     loaded = load_ply(RunFolder(finished).scene(20))
     for name, tensor in loaded.tensors().items():
         assert torch.equal(trainer.gaussians.tensors()[name].detach(), tensor), name
@@ -156,7 +194,7 @@ def test_a_run_from_a_scene_is_resumed_with_it_or_without_its_name(capture, fini
     scene.write_bytes(ply(finished, 20))
     out = tmp_path / "run"
     first = CaptureRun(options(capture, out, "--iterations", "8", "--from", str(scene)))
-    trainer = first.start()
+    trainer = first.trainer
     first.train(lambda: trainer.iteration >= 5)
     shutil.copytree(out, tmp_path / "other")
     assert train(capture, out, "--iterations", "8", "--resume") == 0
@@ -202,7 +240,7 @@ def test_scenes_of_other_degrees_origins_and_broken_splats(capture, finished, tm
         ),
         say := _Said(),
     )
-    trainer = run.start()
+    trainer = run.trainer
     assert len(trainer.gaussians) == len(near) - 2 and "2 of" in say.text and "left out" in say.text
     assert "up to degree 1 are stored; the others start at zero" in say.text
     assert trainer.gaussians.sh_rest.shape[1] == 8
@@ -226,18 +264,15 @@ class _Said:
 
 def test_antialiasing_that_does_not_match_is_told(capture, finished, tmp_path):
     gaussians = load_ply(RunFolder(finished).scene(20))
-    for antialiased, words, says in (
+    cases = (
         (True, [], "was trained with antialiasing, this run trains without"),
         (False, ["--antialiased"], "was trained without antialiasing, this run trains with"),
         (True, ["--antialiased"], None),
-    ):
-        path = tmp_path / "scene.glb"
+    )
+    for i, (antialiased, words, says) in enumerate(cases):
+        path, out = tmp_path / "scene.glb", tmp_path / f"run{i}"
         write_scene(path, Scene(gaussians, antialiased))
-        run = CaptureRun(
-            options(capture, tmp_path / "run", "--iterations", "2", "--from", str(path), *words),
-            say := _Said(),
-        )
-        run._start_cloud()
+        CaptureRun(options(capture, out, "--iterations", "2", "--from", str(path), *words), say := _Said())
         assert (says in say.text) if says else ("was trained" not in say.text)
 
 
@@ -294,7 +329,7 @@ def test_a_photo_that_changed_before_a_resume_is_named(capture, tmp_path, capsys
 def test_an_older_run_resumes_by_the_older_check(capture, whole, tmp_path, capsys):
     out = tmp_path / "run"
     first = CaptureRun(options(capture, out, "--iterations", "6"))
-    trainer = first.start()
+    trainer = first.trainer
     first.train(lambda: trainer.iteration >= 3)
     RunFolder(out).photos.unlink()
     config = RunFolder(out).read_config()
@@ -323,7 +358,7 @@ def test_a_photo_that_changes_in_mid_run_ends_it_with_its_state_saved(capture, t
             os.utime(photo)  # which is no change
         return False
 
-    trainer = run.start()
+    trainer = run.trainer
     with pytest.raises(
         DatasetError, match=r"view_00\d\.png: has changed since it was first read; .* saved after"
     ) as e:

@@ -85,7 +85,7 @@ def test_the_saved_scene_gives_the_same_images_to_the_bit(capture, tmp_path):
     words = ["train", str(capture), "--out", str(tmp_path / "run"), *SHORT, "--antialiased"]
     parsed = build_parser(words).parse_args(words)
     run = CaptureRun(options_from(parsed))
-    trainer = run.start()
+    trainer = run.trainer
     run.train()
     run.finish()
     scene = read_scene(run.folder.latest_scene()[0])
@@ -293,7 +293,7 @@ def test_gaussians_that_are_not_finite_are_left_out(capture, tmp_path):
     words = [word for word in words if word not in ("--densify-stop", "35", "--grad-threshold", "5e-5")]
     said = []
     run = CaptureRun(options_from(build_parser(words).parse_args(words)), said.append)
-    trainer = run.start()
+    trainer = run.trainer
     with torch.no_grad():
         trainer.gaussians.means[3, 0] = math.nan
         trainer.gaussians.sh_rest[5, 0, 0] = math.inf

@@ -344,6 +344,7 @@ def test_a_camera_per_photo_and_lower_thresholds(done, tmp_path):
         photos=str(work / "photos"),
         out=str(tmp_path),
         attempt=asdict(way),
+        shared={},
         threads=1,
         seed=0,
     )["models"]

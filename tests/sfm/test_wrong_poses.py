@@ -45,26 +45,26 @@ def _lens(camera, focal, W, H):
 
 @pytest.fixture(scope="module")
 def sizes(colmap, tmp_path_factory):
-    """13 photos of one size and 5 others, with few features and a path that tells little of the focal length."""
+    """9 photos of one size and 5 others, with few features and a path that tells little of the focal length."""
     photos = {}
-    for i in range(18):
-        size = (240, 320) if i == 11 else (320, 240)
-        camera = box_camera(1.3 * i / 18, 0.6, size)
+    for i in range(14):
+        size = (240, 320) if i == 8 else (320, 240)
+        camera = box_camera(1.1 * i / 14, 0.6, size)
         photo = photograph_box(camera), camera
-        if i == 4:
+        if i == 3:
             photo = resized(*photo, 0.5)
-        elif i == 7:
+        elif i == 5:
             photo = cropped(*photo, 200, 150)
-        elif i == 9:
-            photo = cropped(*photo, 160, 120)  # the size of the fourth, of another lens
-        elif i == 14:
+        elif i == 7:
+            photo = cropped(*photo, 160, 120)  # the size of the third, of another lens
+        elif i == 11:
             photo = cropped(*photo, 240, 240)
         photos[f"{i:02d}.jpg"] = photo
     return captured(tmp_path_factory.mktemp("sizes"), photos, max_features=300)
 
 
 def test_photos_of_other_sizes_have_the_lens_of_the_main_ones_scaled_or_cropped(sizes):
-    assert len(sizes.found) >= 16
+    assert len(sizes.found) >= 12
     alignment = align_cameras(sizes.found, sizes.truth)
     # A twentieth of the distance, and five degrees: with the wrong focal length it is ten times as much.
     assert alignment.moved.max() < 0.05 and alignment.turned.max() < 5
@@ -74,16 +74,17 @@ def test_photos_of_other_sizes_have_the_lens_of_the_main_ones_scaled_or_cropped(
 
 def test_two_lenses_of_one_size_are_not_taken_for_one(sizes):
     missing = set(sizes.truth) - set(sizes.found)
-    assert missing & {"04.jpg", "09.jpg"} or not missing
+    assert missing <= {"03.jpg", "07.jpg"}
     assert all(name in sizes.said for name in missing)
+    assert not missing or "no single focal length explains them" in sizes.said
 
 
 @pytest.fixture(scope="module")
 def two_sides(colmap, tmp_path_factory):
     """Photos all around, those of the left and right too blurred and too plain to hold the sides together."""
     photos, rng = {}, np.random.default_rng(1)
-    for i in range(24):
-        angle = 2 * math.pi * i / 24
+    for i in range(18):
+        angle = 2 * math.pi * i / 18
         camera = box_camera(angle, 0.45 + 0.15 * math.sin(3 * angle))
         pixels = photograph_box(camera).astype(float)
         if abs(math.sin(angle)) > 0.8:
@@ -94,7 +95,7 @@ def two_sides(colmap, tmp_path_factory):
 
 
 def test_kept_poses_are_right_and_photos_with_too_little_are_named(two_sides):
-    assert 5 <= len(two_sides.found) < 24
+    assert 5 <= len(two_sides.found) < 18
     alignment = align_cameras(two_sides.found, two_sides.truth)
     assert alignment.moved.max() < 0.05 and alignment.turned.max() < 5
     assert "share too little with them" in two_sides.said and "left out" in two_sides.said

@@ -7,7 +7,7 @@ import torch
 
 from gsplat_edu import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.evaluate.figures import run_curves_figure
+from gsplat_edu.evaluate.figures import run_curve_figures
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.log import LogWriter
@@ -153,8 +153,8 @@ def test_terms_are_summed_and_logged_by_name(capture, tmp_path):
     (line,) = RunFolder(tmp_path).log()
     means = {name: sum(float(event.terms[name]) for event in events) / 10 for name in ("photo", "empty")}
     assert line["terms"] == pytest.approx(means, rel=1e-6) and line["loss"] == line["terms"]["photo"]
-    axes = run_curves_figure([line, {**line, "iteration": 20}]).axes
-    (drawn,) = [one for one in axes if one.get_title() == "terms of the objective"]
+    figures = run_curve_figures([line, {**line, "iteration": 20}])
+    (drawn,) = [f.axes[0] for f in figures if f.axes[0].get_title() == "terms of the objective"]
     assert [text.get_text() for text in drawn.get_legend().get_texts()] == ["photo", "empty"]
 
 

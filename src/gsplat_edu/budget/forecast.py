@@ -10,6 +10,7 @@ from gsplat_edu.budget.costs import Facts, Footprint, Measurements, expected_cou
 from gsplat_edu.budget.probe import probe
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.runs.training import RunOptions
+from gsplat_edu.text import short_number, spelled_seconds
 from gsplat_edu.train.config import TrainConfig
 
 SAVING = 4e8
@@ -60,7 +61,7 @@ class Forecast:
     def lines(self) -> list[str]:
         """Say it: time, memory, and how sure that is."""
         parts = ", ".join(f"{name} {spelled_seconds(s)}" for name, s in self.seconds.items() if s >= 0.5)
-        first, last = (f"{1e3 * s:.3g}" for s in self.steps)
+        first, last = (short_number(1e3 * s, 3) for s in self.steps)
         grown = " to ".join(f"{count:,}" for count in dict.fromkeys(self.gaussians))
         held = ", ".join(f"{name} {spelled_bytes(size)}" for name, size in self.memory.items())
         return [
@@ -76,16 +77,6 @@ class Forecast:
 def spelled_bytes(size: float) -> str:
     """Write a size: 1.25 GiB, 204 MiB."""
     return f"{size / 2**30:.3g} GiB" if size >= 2**30 else f"{size / 2**20:.0f} MiB"
-
-
-def spelled_seconds(seconds: float) -> str:
-    """Write a duration: 12 s, 3 min 40 s, 2 h 5 min."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
 def predict(

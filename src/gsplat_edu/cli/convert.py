@@ -121,4 +121,4 @@ def _similarity(text: str) -> Similarity:
         raise ArgumentError(f"--transform: {text}: {error}") from None
     except (ValueError, argparse.ArgumentTypeError):
         pass
-    raise ArgumentError(f"--transform: cannot parse {text!r}; give {MOVES}")
+    raise ArgumentError(f"--transform: {text!r} cannot be read; give {MOVES}")

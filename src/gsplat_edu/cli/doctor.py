@@ -26,7 +26,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.train.config import RECIPE_ITERATIONS, recipe
+from gsplat_edu.train.config import RECIPE_ITERATIONS, TrainConfig, recipe
 
 EXIT_HOPELESS = 1
 """Exit code if training would be pointless."""
@@ -106,6 +106,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
     capture = arguments.dataset or Path(config["data"]["path"])
+    beforehand, uncompared = _exposure_beforehand(capture, console)
     trained = Trained(
         folder.path,
         gaussians,
@@ -117,7 +118,8 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         log=folder.log(),
         capture=capture,
         options=_options(config),
-        beforehand=_exposure_beforehand(capture, console),
+        beforehand=beforehand,
+        uncompared=uncompared,
     )
     return examine_run(trained), view_lines(trained) if arguments.all_views else ()
 
@@ -132,7 +134,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--test-every": (data.get("test_every"),),
         "--points": (data.get("points"),),
         "--from": (data.get("scene"),),
-        "--strategy": (train.get("strategy"),),
+        "--strategy": (None if train.get("strategy") == TrainConfig.strategy else train.get("strategy"),),
         "--max-gaussians": (train.get("max_gaussians"),),
         "--background": background if any(background) else (None,),
     }
@@ -144,15 +146,21 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
     return (*words, *(flag for flag, key in flags.items() if train.get(key)))
 
 
-def _exposure_beforehand(capture: Path, console: Console) -> list[Finding]:
-    """Check the photos' exposure as before training; report nothing if they cannot be compared."""
+def _exposure_beforehand(capture: Path, console: Console) -> tuple[list[Finding], str]:
+    """Check the photos' exposure as before training.
+
+    Returns:
+        The findings, and why there are none to expect: empty if the photos were compared.
+    """
     with _bar(console) as bar:
         task = bar.add_task("photos", total=None)
         try:
             survey = prepare(capture, lambda done, total: bar.update(task, completed=done, total=total))
-        except DatasetError:
-            return []
-        return check_exposure(survey) if len(survey.shots) > 1 else []
+        except DatasetError as error:
+            return [], str(error)
+        if len(survey.shots) < 2:
+            return [], "fewer than two photos can be read"
+        return check_exposure(survey), ""
 
 
 def _bar(console: Console) -> Progress:

@@ -19,6 +19,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import SOG_META, format_of, read_scene, stored_bytes
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.text import short_number
 
 PERCENTILES = (1, 25, 50, 75, 99)
 
@@ -171,7 +172,7 @@ def _dataset_facts(path: Path) -> list[Fact]:
         ("photos", f"{len(views)}: {_counted(sizes)}"),
         ("cameras", _counted(lenses)),
         ("split", f"{len(dataset.train)} for training, {len(dataset.test)} held out"),
-        ("extent", f"{scene_extent(cameras):.4g} world units"),
+        ("extent", f"{short_number(scene_extent(cameras), 4)} world units"),
         ("positions", _bounds(eyes)),
         ("points", f"{len(dataset.points):,}"),
     ]
@@ -197,7 +198,9 @@ def _counted(counter: Counter[str], most: int = 3) -> str:
 
 def _bounds(points: Float[np.ndarray, "N 3"]) -> str:
     low, high = points.min(axis=0) + 0.0, points.max(axis=0) + 0.0  # no -0
-    return ", ".join(f"{n} {a:.4g} to {b:.4g}" for n, a, b in zip("xyz", low, high, strict=True))
+    return ", ".join(
+        f"{n} {short_number(a, 4)} to {short_number(b, 4)}" for n, a, b in zip("xyz", low, high, strict=True)
+    )
 
 
 def _log_histogram(values: Float[np.ndarray, "..."]) -> str:
@@ -219,4 +222,4 @@ def _histogram(values: Float[np.ndarray, "..."], edges: Float[np.ndarray, " B"],
 
 def _percentiles(values: Float[np.ndarray, "..."]) -> str:
     quantiles: Sequence[float] = np.percentile(values, PERCENTILES).tolist()
-    return ", ".join(f"{value:.4g}" for value in quantiles)
+    return ", ".join(short_number(value, 4) for value in quantiles)

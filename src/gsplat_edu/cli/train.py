@@ -30,13 +30,13 @@ from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.evaluation import Evaluation
-from gsplat_edu.runs.training import CaptureRun, RunOptions
+from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import needs_poses
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
-from gsplat_edu.viewer.serve import exposure
+from gsplat_edu.viewer.serve import LOOPBACK, exposure, free_port
 
 LINES = 20
 """Number of progress lines if there is no terminal for a progress bar."""
@@ -69,9 +69,16 @@ def _run(
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
     chosen = _planned(arguments, deadline, console, say)
     with interruptible() as interrupted, ExitStack() as closing:
-        capture = CaptureRun(chosen.options, say)
-        if capture.finished:
+        options = chosen.options
+        if is_finished(options):
+            say(f"{options.out}: is finished, {options.config.iterations} iterations; nothing to do")
             return
+        host = arguments.view_host or LOOPBACK
+        if live is not None:
+            port = live.PORT if arguments.view_port is None else arguments.view_port
+            free_port(host, port, live.NAMES)  # before the run writes anything
+        with _bar(console, "") as bar:
+            capture = CaptureRun(options, say, _photos(bar, interrupted))
         callbacks: list[Callback] = []
         ends = interrupted
         if deadline is not None:
@@ -80,14 +87,13 @@ def _run(
             ends = functools.partial(_either, interrupted, pace.over)
         view = None
         if live is not None:
-            host, port = arguments.view_host or live.LOOPBACK, arguments.view_port
-            view = live.LiveView(capture, interrupted, host, live.PORT if port is None else port)
+            view = live.LiveView(capture, interrupted, host, port)
             closing.enter_context(view)
             say(f"live view: {view.url}")
             if warning := exposure(host, "sees the training and can pause it", token=True):
                 say(warning)
         with _bar(console, "{task.fields[state]}") as bar:
-            _train(capture, bar, interrupted, ends, callbacks if view is None else [*callbacks, view.show])
+            _train(capture, bar, ends, callbacks if view is None else [*callbacks, view.show])
         if interrupted():
             raise KeyboardInterrupt(
                 f"interrupted after {capture.trainer.iteration} iterations;"
@@ -197,13 +203,11 @@ def _live(arguments: argparse.Namespace) -> ModuleType | None:
 def _train(
     capture: CaptureRun,
     bar: Progress,
-    interrupted: Callable[[], bool],
     ends: Callable[[], bool],
     callbacks: Sequence[Callback],
 ) -> None:
-    iterations = capture.options.config.iterations
-    photos = bar.add_task("photos", total=None, state="")
-    task = bar.add_task("training", total=iterations, state="", visible=False)
+    iterations, begun = capture.options.config.iterations, capture.trainer.iteration
+    task = bar.add_task("training", total=iterations, completed=begun, state="")
 
     def show(trainer: Trainer, event: Event) -> None:
         if not isinstance(event, StepEvent):
@@ -219,15 +223,19 @@ def _train(
             figures += f", {event.num_gaussians} Gaussians"
             bar.console.print(f"iteration {trainer.iteration}/{iterations}: {figures}", soft_wrap=True)
 
+    capture.train(ends, [show, *callbacks])
+
+
+def _photos(bar: Progress, interrupted: Callable[[], bool]) -> Callable[[int, int], None]:
+    """Return what shows how many photos have been read."""
+    task = bar.add_task("photos", total=None)
+
     def loaded(done: int, total: int) -> None:
         if interrupted():
             raise KeyboardInterrupt("interrupted while loading photos; nothing was written")
-        bar.update(photos, completed=done, total=total)
+        bar.update(task, completed=done, total=total)
 
-    trainer = capture.start(loaded, [show, *callbacks])
-    bar.remove_task(photos)
-    bar.reset(task, total=iterations, completed=trainer.iteration, visible=True)
-    capture.train(ends)
+    return loaded
 
 
 def _short(name: str) -> str:
@@ -274,4 +282,5 @@ def interruptible() -> Iterator[Callable[[], bool]]:
         yield lambda: came
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            # None stands for a handler that Python did not install and cannot put back
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

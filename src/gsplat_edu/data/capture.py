@@ -17,6 +17,7 @@ from gsplat_edu.data.images import PhotoFile, image_size
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
 from gsplat_edu.errors import DatasetError
+from gsplat_edu.files import unreadable
 
 ROTATION_SLACK = 1e-2
 """Largest entry of R R' - I that is accepted as a rotation written with few digits."""
@@ -178,7 +179,7 @@ def entries(folder: Path) -> list[Path]:
     try:
         return sorted(folder.iterdir())
     except OSError as error:
-        raise DatasetError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from None
+        raise DatasetError(unreadable(folder, error)) from None
 
 
 def find_photo(path: Path) -> Path | None:

@@ -35,6 +35,7 @@ from gsplat_edu.data.capture import (
 from gsplat_edu.data.lens import Lens, lens_of
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels, UnclearMasks
 from gsplat_edu.errors import DatasetError
+from gsplat_edu.files import unreadable
 from gsplat_edu.gaussian_math import quat_to_R
 from gsplat_edu.reading import read_bytes, read_text
 from gsplat_edu.text import legible
@@ -344,7 +345,7 @@ class _Binary:
         try:
             self.data = read_bytes(path)
         except OSError as error:
-            raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+            raise DatasetError(unreadable(path, error)) from None
         (self.count,) = self.take(struct.Struct("<Q"))
         if self.count * smallest > len(self.data) - self.at:
             raise self.corrupt(f"its header declares {self.count} entries, more than the file can contain")
@@ -423,7 +424,7 @@ def _lines(path: Path) -> list[str]:
     try:
         return read_text(path, errors="surrogateescape").split("\n")
     except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+        raise DatasetError(unreadable(path, error)) from None
 
 
 def _malformed(path: Path, number: int, expected: str) -> DatasetError:

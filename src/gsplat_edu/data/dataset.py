@@ -231,7 +231,7 @@ def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
     if uneven:
         lens = uneven[0].lens
         notes.append(
-            f"{len(uneven)} of {len(frames)} cameras have very different focal lengths, first {lens.fx:.4g} and "
+            f"{len(uneven)} of {len(frames)} cameras have fx and fy that differ widely, first {lens.fx:.4g} and "
             f"{lens.fy:.4g} px: the calibration may be wrong"
         )
     return notes

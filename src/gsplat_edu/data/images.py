@@ -145,8 +145,8 @@ class ImageStore:
 
     def __init__(self, budget: int, sources: Sequence[PhotoFile]) -> None:
         self.budget = budget
-        self.needed = sum(source.W * source.H * (3 if source.mask is None else 4) for source in sources)
-        """Bytes needed for all photos, from their sizes and masks; alpha is known only after decoding."""
+        self.needed = sum(source.W * source.H * _planes(source) for source in sources)
+        """Bytes that all photos take at most; whether a photo that may have alpha does is known once it is decoded."""
         largest = max((source.lens.W * source.lens.H for source in sources), default=1)
         self.workers = max(1, min(os.cpu_count() or 1, AT_ONCE // largest))
         """Number of photos to decode at once."""
@@ -181,6 +181,12 @@ class ImageStore:
                 self._kept[source] = photo
                 self._nbytes += photo.nbytes
         return photo
+
+
+def _planes(source: PhotoFile) -> int:
+    """Return the bytes that a pixel of a photo takes: its colour, its mask and, if it is kept, its alpha."""
+    alpha = source.background is None and source.path.suffix.lower() not in (".jpg", ".jpeg")
+    return 3 + (source.mask is not None) + alpha
 
 
 def _undistorted(

@@ -34,6 +34,7 @@ from gsplat_edu.data.lens import Lens, lens_of
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.errors import DatasetError
+from gsplat_edu.files import unreadable
 from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.text import as_file_name, legible
 
@@ -107,7 +108,7 @@ def read_json(path: Path) -> dict[str, Any]:
             f"{path}, line {error.lineno} column {error.colno}: is not JSON ({error.msg}); repair the file"
         ) from None
     except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+        raise DatasetError(unreadable(path, error)) from None
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: is not JSON (not UTF-8 text); repair the file") from None
     except ValueError as error:

@@ -14,6 +14,7 @@ from gsplat_edu.doctor.looks import EXPOSURE
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import RECIPE_ITERATIONS
 
 POOR = 20.0
@@ -70,6 +71,7 @@ class Trained:
         capture: The capture it was trained on; None where nobody knows.
         options: Further options of the training that a longer one should have, as words of a command.
         beforehand: What the doctor finds in the photos' exposure without looking at the scene.
+        uncompared: Why the photos' exposure was not compared; empty if it was.
     """
 
     path: Path
@@ -83,6 +85,7 @@ class Trained:
     capture: Path | None = None
     options: tuple[str, ...] = ()
     beforehand: Sequence[Finding] = ()
+    uncompared: str = ""
 
     @property
     def rising(self) -> bool | None:
@@ -153,7 +156,17 @@ def _train_longer(run: Trained) -> str:
     name = f"{run.path.resolve().name}_{RECIPE_ITERATIONS}"
     length = ("--iterations", str(RECIPE_ITERATIONS))
     words = command("train", run.capture, *length, *run.options, "--out", new_run(name))
-    return f"train for longer: {words}"
+    return f"train for longer{_at_its_pace(run)}: {words}"
+
+
+def _at_its_pace(run: Trained) -> str:
+    """Say what the recipe's length takes if an iteration takes what the last ones took: on a slow computer, hours."""
+    late = [ms for iteration, ms in _pairs(run.log, "ms", run.reached) if iteration > 0.75 * run.reached]
+    if not late:
+        return ""
+    return (
+        f" ({spelled_seconds(1e-3 * RECIPE_ITERATIONS * float(np.median(late)))} or more at this run's pace)"
+    )
 
 
 def view_lines(run: Trained) -> list[str]:
@@ -172,6 +185,8 @@ def _facts(run: Trained) -> tuple[tuple[str, str], ...]:
             low = sorted(views, key=lambda view: view.psnr)[:NAMED]
             worst = ", ".join(f"{view.name} {view.psnr:.1f}" for view in low)
             facts.append((name, f"{len(views)} views, PSNR {_mean(views):.2f} dB; worst {worst}"))
+    if run.uncompared:
+        facts.append(("exposure", f"compared with the scene only, not between photos: {run.uncompared}"))
     return tuple(facts)
 
 
@@ -201,7 +216,7 @@ def _length(run: Trained) -> list[Finding]:
 def _fit(run: Trained) -> list[Finding]:
     if not run.train or _mean(run.train) >= POOR:
         return []
-    what = f"the views of training have {_mean(run.train):.1f} dB in the mean: not even they are explained"
+    what = f"the training views reach only {_mean(run.train):.1f} dB in the mean: the scene does not explain even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
     advice = f"check poses and intrinsics{place}"
     return [Finding("poor fit", Severity.WARNING, what, advice)]
@@ -214,7 +229,7 @@ def _outliers(run: Trained) -> list[Finding]:
     low.sort(key=lambda view: view.psnr)
     names = tuple(view.name for view in low)
     scores = tuple(f"{view.psnr:.1f} dB" for view in low)
-    what = f"{len(low)} of {len(run.train) + len(run.test)} photos, far from what the scene shows"
+    what = f"{len(low)} of {len(run.train) + len(run.test)} photos differ widely from what the scene shows"
     advice = f"look at {names[0]} beside its render: blurred, badly posed, in shadow? then train without it"
     return [Finding("unexplained", Severity.WARNING, what, advice, names, scores)]
 
@@ -236,8 +251,10 @@ def _gap(run: Trained) -> list[Finding]:
     gap = _mean(run.train) - _mean(run.test)
     if gap < OVERFITTED:
         return []
-    what = f"test views are {gap:.1f} dB below those of training: the scene knows its {len(run.train)} photos by heart"
-    advice = "take more photos, from between those there are; with these, stop earlier or cap --max-gaussians"
+    what = f"test views are {gap:.1f} dB below the training views: the scene has memorised its {len(run.train)} photos"
+    advice = (
+        "take more photos between the existing ones; with these, stop earlier or set a lower --max-gaussians"
+    )
     return [Finding("overfitted", Severity.WARNING, what, advice)]
 
 
@@ -248,13 +265,16 @@ def _exposure(run: Trained) -> list[Finding]:
     off = sorted((v for v in views if abs(v.stops - usual) > JUMP), key=lambda v: -abs(v.stops - usual))
     names = tuple(view.name for view in off)
     stops = tuple(f"{view.stops - usual:+.1f}" for view in off)
-    what = f"{counted(len(off), 'photo')}, in stops against the scene"
+    what = f"{counted(len(off), 'photo')} brighter or darker than the scene, in stops"
     advice = "take out the photos whose exposure jumps, or make them even: the scene explains them with fog"
     found = [Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops)] if off else []
     # A scene that fits photos of differing exposure hides that they differ: what the photos themselves show counts too.
     hidden = "the scene fits them all the same, by fog or by colours that change with the view"
+    unexplained = {view.name for views in (run.train, run.test) for view in _far_below(views)}
     found += [
-        replace(before, sentence=f"{before.sentence}; {hidden}")
+        before
+        if unexplained & set(before.images)
+        else replace(before, sentence=f"{before.sentence}; {hidden}")
         for before in run.beforehand
         if before.name != EXPOSURE or not before.images or not set(before.images) <= set(names)
     ]
@@ -267,7 +287,7 @@ def _floaters(run: Trained) -> list[Finding]:
         return []
     names = tuple(view.name for view in veiled)
     shares = tuple(f"{100 * view.veiled:.0f} %" for view in veiled)
-    what = f"{counted(len(veiled), 'view')} through splats that hang close to the camera"
+    what = f"{counted(len(veiled), 'view')} with splats that hang close to the camera"
     advice = "start from real points, not random ones, and leave out exposure jumps; convert --crop cuts away the rest"
     return [Finding("floaters", Severity.WARNING, what, advice, names, shares)]
 

@@ -21,6 +21,7 @@ from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, 
 from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.looks import check_blur, check_exposure, check_twins
 from gsplat_edu.doctor.survey import Survey
+from gsplat_edu.text import short_number
 
 Check = Callable[[Survey], list[Finding]]
 
@@ -91,7 +92,7 @@ def _stand(survey: Survey) -> str:
         "forward": "look one way",
         "free": "look here and there",
     }[geometry.arrangement]
-    return f"{said}; {geometry.depth:.3g} world units from what they see"
+    return f"{said}; {short_number(geometry.depth, 3)} world units from what they see"
 
 
 def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:

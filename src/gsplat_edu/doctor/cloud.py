@@ -6,6 +6,7 @@ import numpy as np
 
 from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.survey import Survey
+from gsplat_edu.text import short_number
 
 FAR = 20.0
 """Distance from the middle of the cloud, in the distance that four fifths of its points keep, from which a point is far
@@ -30,13 +31,13 @@ def check_cloud(survey: Survey) -> list[Finding]:
     distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     far = float(np.mean(distances > FAR * np.quantile(distances, 0.8)))
     if far > FAR_SHARE:
-        what = f"{100 * far:.2g} % of the points lie far outside the scene"
+        what = f"{short_number(100 * far, 2)} % of the points lie far outside the scene"
         advice = "remove the points far outside: they become splats that nothing holds in place"
         found.append(Finding("far points", Severity.WARNING, what, advice))
     unseen = float(np.mean(~survey.geometry.in_sight.any(axis=0)))
     if unseen > UNSEEN_SHARE:
-        what = f"{100 * unseen:.2g} % of the points lie in no camera's picture, behind all or beside"
-        advice = "check that points and poses belong together: points found from photos are seen in them"
+        what = f"{short_number(100 * unseen, 2)} % of the points lie in no camera's picture"
+        advice = "check that the points belong to these poses: a point found from photos is visible in some of them"
         found.append(Finding("unseen points", Severity.WARNING, what, advice))
     if len(points) < FEW_POINTS:
         what = f"{len(points)} points are few to start from"

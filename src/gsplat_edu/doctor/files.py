@@ -29,8 +29,8 @@ def check_usable(survey: Survey) -> list[Finding]:
             Finding(
                 "few photos",
                 Severity.WARNING,
-                f"{count} photos are few; between them a scene is guessed",
-                f"take more photos: 30 and more, and {FEW} at least, with most of each picture seen in the next",
+                f"{count} photos are few: the scene between them is guessed",
+                f"take more photos: at least {FEW}, better 30 or more, each sharing most of its picture with the next",
             )
         ]
     return []

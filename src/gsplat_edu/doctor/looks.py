@@ -103,7 +103,7 @@ def check_blur(survey: Survey) -> list[Finding]:
     if not worst_first:
         return []
     names = tuple(survey.names[i] for i in worst_first)
-    what = f"{len(names)} of {len(losses)} photos, by the detail that their neighbours show"
+    what = f"{len(names)} of {len(losses)} photos show less detail than their neighbours"
     advice = f"take out or retake the blurred photos, first {names[0]}: a scene learns their blur"
     return [Finding("blurred", Severity.WARNING, what, advice, names)]
 
@@ -208,17 +208,17 @@ def check_exposure(survey: Survey) -> list[Finding]:
     if len(jumping := [i for i in np.argsort(-np.abs(light)) if abs(light[i]) > unsure * JUMP]):
         names = tuple(survey.names[i] for i in jumping)
         stops = tuple(f"{light[i]:+.1f}" for i in jumping)
-        what = f"{len(names)} of {len(light)} photos, in stops against neighbours that see the same"
+        what = f"{len(names)} of {len(light)} photos are brighter or darker than neighbours that see the same, in stops"
         advice = f"look at {names[0]}: did the exposure jump, or your shadow fall on the scene? fix it or leave it out"
         found.append(Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops))
     elif (share := gains.differing(unsure * JUMP)) > DIFFERING:
-        what = f"{100 * share:.0f} % of neighbours differ by more than {unsure * JUMP:.1f} stops: photos in a row"
-        advice = "fix the exposure while you take photos: part of them is brighter than the rest"
+        what = f"{100 * share:.0f} % of consecutive photos differ by more than {unsure * JUMP:.1f} stops"
+        advice = "fix the exposure while you take photos: some are brighter than the rest"
         found.append(Finding(EXPOSURE, Severity.WARNING, what, advice))
     if len(tinted := [i for i in np.argsort(-tint) if tint[i] > unsure * TINT]):
         names = tuple(survey.names[i] for i in tinted)
-        what = f"{len(names)} of {len(tint)} photos, against neighbours that see the same"
-        advice = "fix the white balance while you take photos, or take out those of another tint"
+        what = f"{len(names)} of {len(tint)} photos have another tint than neighbours that see the same"
+        advice = "fix the white balance while you take photos, or take out the photos with another tint"
         found.append(Finding("white balance", Severity.WARNING, what, advice, names))
     return found
 

@@ -11,8 +11,10 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from gsplat_edu.files import written_aside
 
@@ -20,6 +22,10 @@ DPI = 150
 
 CURVE_POINTS = 400
 """Most points of a curve in a report; longer logs are averaged over stretches of equal length."""
+
+MOST_SHOWN, SHOWN_QUANTILE = 2.0, 0.95
+"""The curve of the speed is cut off at twice its 95 % quantile: a computer that was busy or asleep for a moment would
+flatten the rest."""
 
 SVG_FACTS = ("Creator", "Date", "Format", "Type")
 """Metadata that matplotlib writes into an SVG by default (dates and addresses); left out here."""
@@ -69,7 +75,7 @@ def curves_figure(losses: Sequence[float], counts: Sequence[int]) -> Figure:
     return figure
 
 
-def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
+def run_curve_figures(log: Sequence[Mapping[str, Any]]) -> list[Figure]:
     """Plot a run's log: loss, PSNR of evaluations, number of Gaussians, ms per iteration, terms of the objective.
 
     Args:
@@ -77,7 +83,7 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
             gets no curve, and a single term, which is the loss, none of its own.
 
     Returns:
-        The figure; None if there is nothing to draw.
+        One figure for each curve; they share the range of iterations.
     """
     curves = []
     for key, title, label in RUN_CURVES:
@@ -85,33 +91,56 @@ def run_curves_figure(log: Sequence[Mapping[str, Any]]) -> Figure | None:
             curves.append((key, title, label, {"": points}))
     if len(terms := _terms(log)) > 1:
         curves.append(("terms", "terms of the objective", "weighted value", terms))
-    if not curves:
-        return None
-    rows = math.ceil(len(curves) / 2)
-    figure = Figure(figsize=(10, 2.9 * rows), layout="constrained")
-    grid = figure.subplots(rows, 2, squeeze=False).ravel()
-    for axes, (key, title, label, lines) in zip(grid, curves, strict=False):
+    last = max((float(points[-1, 0]) for *_, lines in curves for points in lines.values()), default=0.0)
+    figures = []
+    for key, title, label, lines in curves:
+        figure = Figure(figsize=(5, 2.9), layout="constrained")
+        axes = figure.subplots()
         for name, points in lines.items():
-            axes.plot(
-                *points.T, linewidth=1.0, marker="o" if len(points) < 40 else "", markersize=3, label=name
-            )
+            marker = "o" if len(points) < 40 else ""
+            axes.plot(*points.T, linewidth=1.0, marker=marker, markersize=3, label=name)
+        values = np.concatenate([points[:, 1] for points in lines.values()])
         axes.set(title=title, xlabel="iteration", ylabel=label)
+        axes.set_xlim(0.0, 1.03 * last if last > 0 else 1.0)
         axes.grid(alpha=0.3)
         if len(lines) > 1:
             axes.legend()
-        if key in ("loss", "terms") and min(points[:, 1].min() for points in lines.values()) > 0:
-            axes.set_yscale("log")
+        if key in ("loss", "terms") and values.min() > 0:
+            _decades(axes, values)
         if key in ("num_gaussians", "ms"):
             axes.set_ylim(0, None)
-    for axes in grid[len(curves) :]:
-        axes.axis("off")
-    return figure
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+        if key == "ms":
+            _cut_peaks(axes, title, values)
+        figures.append(figure)
+    return figures
 
 
-def svg_element(figure: Figure) -> str:
-    """Return a figure as an <svg> element for a web page. Equal figures give equal bytes."""
+def _decades(axes: Axes, values: Float[np.ndarray, " Q"]) -> None:
+    """Make the vertical axis logarithmic, with a few plain numbers: 0.2, not 2 x 10^-1."""
+    axes.set_yscale("log")
+    wide = values.max() > 10 * values.min()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 3) if wide else (1, 1.5, 2, 3, 5, 7)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _cut_peaks(axes: Axes, title: str, values: Float[np.ndarray, " Q"]) -> None:
+    """Cut off moments that were far slower than the rest, and say how slow they were."""
+    top, peak = MOST_SHOWN * float(np.quantile(values, SHOWN_QUANTILE)), float(values.max())
+    if 0.0 < top < peak:
+        axes.set(ylim=(0.0, top), title=f"{title} (peaks of up to {peak:,.0f} ms are cut off)")
+
+
+def svg_element(figure: Figure, name: str = "figure") -> str:
+    """Return a figure as an <svg> element for a web page. Equal figures and names give equal bytes.
+
+    Args:
+        figure: The figure.
+        name: Goes into the ids of its parts, which have to differ from those of another figure on the page.
+    """
     text = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": "gsplat_edu", "svg.fonttype": "path"}):
+    with mpl.rc_context({"svg.hashsalt": f"gsplat_edu {name}", "svg.fonttype": "path"}):
         FigureCanvasAgg(figure).figure.savefig(text, format="svg", metadata=dict.fromkeys(SVG_FACTS))
     drawing = text.getvalue()
     return drawing[

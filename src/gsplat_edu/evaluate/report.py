@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from gsplat_edu.content_policy import content_policy, policy_element
-from gsplat_edu.evaluate.figures import run_curves_figure, svg_element
+from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
 from gsplat_edu.files import written_aside
 from gsplat_edu.text import write_text
@@ -74,7 +74,9 @@ figure .pair, figure .difference { flex: 1 1 320px; min-width: 0; } figure img {
 .pair input { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; opacity: 0; cursor: ew-resize;
   touch-action: pan-y; }
 .pair:focus-within { outline: 3px solid #06c; outline-offset: 2px; }
-figcaption { font-size: .9rem; } svg { width: 100%; min-width: 600px; height: auto; } .quiet { color: #666; }
+.curves { display: grid; gap: 8px; grid-template-columns: repeat(auto-fill, minmax(min(100%, 400px), 1fr)); }
+.curves svg { width: 100%; height: auto; }
+figcaption { font-size: .9rem; } .quiet { color: #666; }
 @media (max-width: 600px) { th, td { padding-right: .6rem; } }
 """
 
@@ -178,14 +180,14 @@ def write_report(path: Path, report: Report) -> None:
     Raises:
         OSError: the file cannot be written. An existing file stays unchanged.
     """
-    figure = run_curves_figure(_with_last(report.log, report.metrics))
-    curves = svg_element(figure) if figure else ""
+    figures = run_curve_figures(_with_last(report.log, report.metrics))
+    curves = "".join(svg_element(figure, str(number)) for number, figure in enumerate(figures))
     config = {key: value for key, value in report.config.items() if key != "machine"}
     sections = [
         f'<p class="verdict">{html.escape(verdict(report.metrics, report.scores))}</p>\n',
         _page_link(path, report.metrics.get("exports")),
         _headline(report.metrics),
-        _section("Curves", _table(curves) if curves else ""),
+        _section("Curves", f'<div class="curves">{curves}</div>\n' if curves else ""),
         _views(report.scores, report.pictures),
         _exports(report.metrics.get("exports")),
         _section("Notes", _list(report.notes)),

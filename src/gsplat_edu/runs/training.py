@@ -64,12 +64,64 @@ Export = Callable[[Source], list[dict[str, Any]]]
 """Writes a scene elsewhere too, and says what it wrote: "path", "psnr" and more of each file."""
 
 
+def _checked_folder(options: RunOptions) -> RunOptions:
+    """Check the folder against what is asked for; return the options with the scene that a resumed run began with."""
+    folder = options.folder
+    if folder.exists():
+        if not options.resume:
+            raise CheckpointError(
+                f"--out: {folder.path} holds a run already; add --resume to continue it, or name another folder"
+            )
+        options = _with_scene(options)
+        check_options(folder, document(options))
+        return options
+    check_folder("--out", folder.path)
+    if list_checkpoints(folder.checkpoints):
+        raise CheckpointError(
+            f"--out: {folder.path} holds checkpoints of a run whose config.json is gone; name another folder"
+        )
+    return options
+
+
+def _with_scene(options: RunOptions) -> RunOptions:
+    """Refuse to resume a run from points with a scene; without --from, the scene of its config.json is used."""
+    data = options.folder.read_config().get("data")
+    stored = data.get("scene") if isinstance(data, dict) else None
+    if stored is None and options.scene is not None:
+        raise CheckpointError(
+            f"--resume: {options.folder.path} was begun from points, not --from {options.scene};"
+            " leave that out, or name another --out"
+        )
+    if stored is not None and options.scene is None and not list_checkpoints(options.folder.checkpoints):
+        return dataclasses.replace(options, scene=Path(str(stored)))
+    return options
+
+
+def is_finished(options: RunOptions) -> bool:
+    """Say whether the folder holds this run with all of its iterations, and its evaluation: nothing is left to do.
+
+    Raises:
+        CheckpointError: the folder holds a run that is not to be resumed, or another one.
+        OSError: the folder cannot be written to.
+    """
+    folder = _checked_folder(options).folder
+    done = folder.read_metrics().get("iterations", 0) if folder.exists() else 0
+    if not isinstance(done, int):
+        raise CheckpointError(f"{folder.metrics}: iterations: is no number; mend or remove the file")
+    return done >= options.config.iterations
+
+
 class CaptureRun:
-    """A run of training on a capture. Its folder is not locked; see `gsplat_edu.locks.locked`.
+    """A run of training on a capture, ready to train: its photos are read, and the last checkpoint is loaded.
+
+    It is complete once it is constructed, so any program can hold it: `train` takes the iterations that are left,
+    `finish` writes the scene and evaluates it. `is_finished` says beforehand whether anything is left to do. The
+    folder is not locked; see `gsplat_edu.locks.locked`.
 
     Args:
         options: The run.
-        say: Told, in sentences, what the user wants to know.
+        say: Receives, in sentences, what the user wants to know.
+        progress: Receives how many photos of how many have been read.
 
     Raises:
         CheckpointError: the folder holds a run that is not to be resumed, or another one.
@@ -78,78 +130,46 @@ class CaptureRun:
         OSError: the folder cannot be written to.
 
     Attributes:
-        finished: The run was complete already; there is nothing to do.
-        dataset: The capture; not there where the run is finished.
-        trainer: The training; there after `start`.
+        options: The run, with the scene it began with where it is resumed.
+        folder: Its folder.
+        dataset: The capture.
+        trainer: The training.
+        seconds: Wall time of the training up to the last time `train` ended.
     """
 
-    def __init__(self, options: RunOptions, say: Callable[[str], None] = lambda sentence: None) -> None:
-        self.options, self.folder, self._say = options, options.folder, say
+    def __init__(
+        self,
+        options: RunOptions,
+        say: Callable[[str], None] = lambda sentence: None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self.options, self.folder, self._say = _checked_folder(options), options.folder, say
+        self._say_what_is_resumed()
         self.seconds = 0.0
-        self.finished = self._prepare_folder()
-        if self.finished:
-            return
+        self._began: float | None = None  # while it trains: the moment that its seconds count from
         self.dataset = load_dataset(options.data, options.data_settings, points=options.points)
         for note in self.dataset.notes:
             say(note)
+        self.dataset.preload(progress)
+        gaussians = self._begin()
+        self._log = LogWriter(self.folder.log_file)
+        self.trainer = self._trainer(gaussians)
+        self._take_up()
+        self._extend()
 
-    def _prepare_folder(self) -> bool:
-        """Check the folder against what is asked for; say whether its run is finished."""
-        options, folder = self.options, self.folder
-        if folder.exists():
-            if not options.resume:
-                raise CheckpointError(
-                    f"--out: {folder.path} holds a run already; add --resume to continue it, or name another folder"
-                )
-            self._check_start()
-            check_options(folder, document(options))
-            if (before := folder.read_config().get("backend")) != options.backend:
-                self._say(
-                    f"{folder.path}: was begun on the backend {before}; {options.backend} rounds differently"
-                )
-            done = folder.read_metrics().get("iterations", 0)
-            if not isinstance(done, int):
-                raise CheckpointError(f"{folder.metrics}: iterations: is no number; mend or remove the file")
-            if done >= options.config.iterations:
-                self._say(f"{folder.path}: is finished, {done} iterations; nothing to do")
-                return True
-            return False
-        check_folder("--out", folder.path)
-        if list_checkpoints(folder.checkpoints):
-            raise CheckpointError(
-                f"--out: {folder.path} holds checkpoints of a run whose config.json is gone; name another folder"
+    def _say_what_is_resumed(self) -> None:
+        folder, options = self.folder, self.options
+        if not folder.exists():
+            if options.resume:
+                self._say(f"{folder.path}: holds no run to resume; starting at the beginning")
+        elif (before := folder.read_config().get("backend")) != options.backend:
+            self._say(
+                f"{folder.path}: was begun on the backend {before}; {options.backend} rounds differently"
             )
-        if options.resume:
-            self._say(f"{folder.path}: holds no run to resume; starting at the beginning")
-        return False
 
-    def _check_start(self) -> None:
-        """Refuse to resume a run from points with a scene; without --from, the scene of its config.json is used."""
-        data = self.folder.read_config().get("data")
-        stored = data.get("scene") if isinstance(data, dict) else None
-        if stored is None and self.options.scene is not None:
-            raise CheckpointError(
-                f"--resume: {self.folder.path} was begun from points, not --from {self.options.scene};"
-                " leave that out, or name another --out"
-            )
-        if (
-            stored is not None
-            and self.options.scene is None
-            and not list_checkpoints(self.folder.checkpoints)
-        ):
-            self.options = dataclasses.replace(self.options, scene=Path(str(stored)))
-
-    def start(
-        self, progress: Callable[[int, int], None] | None = None, callbacks: Sequence[Callback] = ()
-    ) -> Trainer:
-        """Read the photos, make the trainer, and load the last checkpoint where there is one.
-
-        Args:
-            progress: Told how many photos of how many have been read.
-            callbacks: Told of every step and every change.
-        """
+    def _begin(self) -> Gaussians:
+        """Make the Gaussians to start from; write what decides the run, or compare it with what was written."""
         options, dataset, folder = self.options, self.dataset, self.folder
-        dataset.preload(progress)
         gaussians, digest = self._start_cloud()
         if folder.exists():
             remove_leftovers(folder.path)
@@ -164,21 +184,21 @@ class CaptureRun:
             folder.write_photos(photo_digests(dataset))
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
             folder.write_config(document(options) | facts | ({"start": digest} if digest else {}))
+        return gaussians
+
+    def _trainer(self, gaussians: Gaussians) -> Trainer:
+        options, dataset = self.options, self.dataset
         extent = scene_extent([view.camera for view in dataset.train])
         gaussians = gaussians.to(device_of(options.backend))
-        self._log = LogWriter(folder.log_file)
-        self.trainer = Trainer(
+        return Trainer(
             gaussians,
             dataset.train,
             options.config,
             render=functools.partial(render, backend=options.backend),
             extent=extent,
             density=make_strategy(options.config, extent, gaussians),
-            callbacks=[self._record, *callbacks],
+            callbacks=[self._record],
         )
-        self._take_up()
-        self._extend()
-        return self.trainer
 
     def _start_cloud(self) -> tuple[Gaussians, str | None]:
         """Make the Gaussians that training starts from, and a digest of them if they come from a scene."""
@@ -220,11 +240,12 @@ class CaptureRun:
             self._say(f"{self.folder.path}: holds no checkpoint; starting at the beginning")
         self._log.cut(self.trainer.iteration, self.seconds)
 
-    def train(self, stop: Callable[[], bool] = lambda: False) -> bool:
+    def train(self, stop: Callable[[], bool] = lambda: False, callbacks: Sequence[Callback] = ()) -> bool:
         """Take the iterations that are left, and save where they ended.
 
         Args:
             stop: Asked after every iteration; the run is saved and can be resumed when it says so.
+            callbacks: Receive every step and every change, after the log.
 
         Returns:
             Whether `stop` ended it.
@@ -242,7 +263,7 @@ class CaptureRun:
 
         try:
             if limit is None or self.seconds < limit:
-                self.trainer.run(ends)
+                self.trainer.run(ends, callbacks)
         except DatasetError as error:
             if whole != self.trainer.iteration:
                 raise  # in the middle of an iteration: the last checkpoint is the state to resume from
@@ -252,7 +273,7 @@ class CaptureRun:
             ) from None
         finally:
             self._log.close()
-        self.seconds = self._elapsed()
+        self.seconds, self._began = self._elapsed(), None
         self.save()
         return asked
 
@@ -313,10 +334,11 @@ class CaptureRun:
         """Leave what the block does out of the run's seconds: a measurement, or a person looking at it."""
         before = time.perf_counter()
         yield
-        self._began += time.perf_counter() - before
+        if self._began is not None:
+            self._began += time.perf_counter() - before
 
     def _elapsed(self) -> float:
-        return time.perf_counter() - self._began
+        return self.seconds if self._began is None else time.perf_counter() - self._began
 
     def _record(self, trainer: Trainer, event: Event) -> None:
         self._log.record(event, self._elapsed())

@@ -21,14 +21,14 @@ MANY_PHOTOS = 400
 """Photos beyond which the global mapper comes first: the incremental one's time grows with their square."""
 
 ENOUGH_FOR_FREE = 20
-"""Photos of each camera from which placing them with a freer lens is tried: from so many on, held-out photos judge what
-of it stays (`gsplat_edu.sfm.engine.lenses.WITNESSES`)."""
+"""Photos per camera from which placing them with a freer lens is tried: fewer are not divided into halves that judge a
+lens (`gsplat_edu.sfm.engine.lenses.WITNESSES`)."""
 
 MAIN = 0.5
-"""Share of the photos that are of one size from which the others follow those (`gsplat_edu.sfm.engine.kin`)."""
+"""Share of the photos that have one size from which the others follow their lens (`gsplat_edu.sfm.engine.kin`)."""
 
 OWN = 10
-"""Photos of one size from which their focal length is their own matter."""
+"""Photos of one size from which they have a camera of their own, as in `gsplat_edu.sfm.engine.kin`."""
 
 SAME = 0.5
 """Share of the connected photos from which two ways that agree are believed."""
@@ -48,7 +48,7 @@ class Attempt:
     Args:
         mapper: "incremental" (Schönberger and Frahm 2016) or "global" (Pan et al. 2024, GLOMAP).
         model: COLMAP's camera model.
-        free: Photos are placed with a freer lens than they are begun with otherwise.
+        free: Photos are placed with a freer lens; it is then dropped, and held-out photos judge what is refined.
         per_photo: Every photo has a camera of its own.
         loose: Lower thresholds.
     """

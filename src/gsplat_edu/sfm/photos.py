@@ -18,7 +18,7 @@ from PIL import ExifTags, Image
 from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, is_file
 from gsplat_edu.data.images import AT_ONCE, decode
 from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import written_aside
+from gsplat_edu.files import unreadable, written_aside
 from gsplat_edu.image_files import SPELLED, UNDECODABLE, is_image, opened_image
 from gsplat_edu.sfm.masks import MASK_ENDING, counting, find_masks, turn_mask, upright_masks, write_mask
 from gsplat_edu.views import Photo
@@ -178,7 +178,7 @@ def fingerprint(files: Sequence[Path], source: Path) -> str:
                 file.seek(max(0, size - PEEK))
                 ends += file.read(PEEK)
         except OSError as error:
-            raise DatasetError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+            raise DatasetError(unreadable(path, error)) from None
         name = Path(os.path.relpath(path, source)).as_posix()
         digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape") + ends)
     return digest.hexdigest()

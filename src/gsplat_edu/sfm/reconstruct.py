@@ -221,21 +221,21 @@ class _Run:
         return {"summary": summary, "photos": [asdict(photo) for photo in photos], "unreadable": unreadable}
 
     def _note_masks(self, files: Sequence[Path], photos: Sequence[PhotoFacts]) -> None:
-        """Say which masks are not used, and which of two ways to lie was assumed."""
+        """Say which masks are not used, and which might be upright although they are not taken to be."""
         for folder in unused_folders(files, find_masks(files)):
             self._say(
                 f"{folder}: not used, none of its images is named like a photo (PHOTO.png or PHOTO.jpg.png)"
             )
         stored = stored_mask(self.folder / "photos", "").parent
-        open_ = [
+        unknown = [
             photo.name
             for photo in photos
             if photo.mask and photo.turns and (photo.turns == 2 or photo.W == photo.H)
             if Path(photo.mask).parent != stored
         ]
-        if open_:
+        if unknown:
             self._say(
-                f"masks taken as the photos are stored, not upright, which their sizes leave open: {listed(open_)}"
+                f"masks taken to be stored like their photos, not upright (sizes do not tell): {listed(unknown)}"
             )
 
     def _features(self) -> dict[str, Any]:
@@ -322,8 +322,8 @@ class _Run:
         summary = f"{count} of {total} photos have a pose ({model['way']})"
         unclear = len(set(model["unclear"]) - set(model["names"]))
         if left := total - count - unclear:
-            others = "the other one shares" if left == 1 else f"the other {left} share"
-            summary += f"; {others if not unclear else f'{left} others share'} too little with them"
+            others = f"{left} more" if unclear else f"the other {left}" if left > 1 else "the other one"
+            summary += f"; {others} share{'s' * (left == 1)} too little with them"
         if unclear:
             summary += f"; the focal length of {unclear} of another size is unclear"
         return model | {"summary": summary}

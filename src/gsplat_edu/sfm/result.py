@@ -74,7 +74,7 @@ def build_capture(
     folder: Path,
     progress: Callable[[str, int, int], None],
 ) -> dict[str, Any]:
-    """Write images/, masks/ where a photo needs one, and sparse/0 into folder/result.
+    """Write images/, masks/ where a photo has one, and sparse/0 into folder/result.
 
     Args:
         model: As `gsplat_edu.sfm.mapping.map_photos` returns it.
@@ -102,9 +102,8 @@ def build_capture(
         lens = lenses[pose.camera].scaled(photo.W, photo.H)
         pinhole = lens.undistorted().turned(photo.turns)
         entries.append(Undistorted(photo, name, lens, pinhole))
-        R = quat_to_R(pose.quat)
-        upright_R = np.linalg.matrix_power(QUARTER, photo.turns) @ R
-        cameras.append(Camera.posed(upright_R, -R.T @ pose.shift, pinhole))
+        R, turn = quat_to_R(pose.quat), np.linalg.matrix_power(QUARTER, photo.turns)
+        cameras.append(Camera.posed(turn @ R, -R.T @ pose.shift, pinhole))
     cloud = read_points(found)
     if cloud is None:
         raise DatasetError(f"{found}: holds no points; the photos show too little in common")
@@ -122,11 +121,10 @@ def build_capture(
     )
     unclear = set(model["unclear"]) - placed
     doubtful = set(model["doubtful"]) - placed - unclear
-    out = [photo for photo in photos if photo.copy not in placed]
+    others = {photo.copy for photo in photos} - placed - unclear - doubtful
+    kinds = {"left_out": others, "unclear": unclear, "doubtful": doubtful}
     return facts | {
-        "left_out": [photo.name for photo in out if photo.copy not in doubtful | unclear],
-        "unclear": [photo.name for photo in out if photo.copy in unclear],
-        "doubtful": [photo.name for photo in out if photo.copy in doubtful],
+        kind: [photo.name for photo in photos if photo.copy in copies] for kind, copies in kinds.items()
     }
 
 

@@ -100,9 +100,9 @@ class AdcConfig:
     over_cap: str = _number(
         "strongest",
         _one_of(OVER_CAP),
-        'What to do if more Gaussians are due than the cap has room for: "strongest" clones and splits only those with'
-        ' the largest gradients; "cut" appends clones and children to the survivors and drops the end of the list, so'
-        " that a parent may go without its children (the course).",
+        'Which Gaussians are cloned or split if the cap leaves too little room. "strongest": those with the largest'
+        ' gradients; "cut": all, and what exceeds the cap is dropped from the end of the order survivors, clones,'
+        " children; the parent of dropped children is removed too (the course).",
     )
     densify_stop: int = _number(
         15_000, _whole(0), "Densification ends before this iteration.", "2023", milestone=True
@@ -121,7 +121,7 @@ class AdcConfig:
         "2023",
     )
     split_shrink: float = _number(
-        1.6, _positive, "Factor by which the two children of a split are smaller than their parent.", "2023"
+        1.6, _positive, "Divisor of the scales of the two children of a split.", "2023"
     )
     prune_scale: float = _number(
         0.1,
@@ -144,9 +144,7 @@ class AdcConfig:
         "2023",
         milestone=True,
     )
-    reset_opacity: float = _number(
-        0.01, _opacity, "A reset lowers opacities to at most this, and clears their moments.", "2023"
-    )
+    reset_opacity: float = _number(0.01, _opacity, "Upper bound of opacities after a reset.", "2023")
 
 
 @_documented
@@ -167,13 +165,13 @@ class McmcConfig:
     growth: float = _number(
         1.05,
         _at_least_1,
-        "Each relocation multiplies the number of Gaussians by this, up to the cap.",
+        "Growth factor of the number of Gaussians per densification, up to the cap.",
         "2024, section 4.3",
     )
     noise: float = _number(
         5e5,
         _not_negative,
-        "Noise on the means, times their learning rate.",
+        "Noise on the means, relative to their learning rate.",
         "2024, section 4.1: lambda_noise",
     )
     opacity_weight: float = _number(
@@ -193,7 +191,9 @@ class TrainConfig:
     range raises `ArgumentError`, which names it.
     """
 
-    iterations: int = _number(RECIPE_ITERATIONS, _whole(1), "Number of steps; each renders one view.", "2023")
+    iterations: int = _number(
+        RECIPE_ITERATIONS, _whole(1), "Number of training steps; each renders one view.", "2023"
+    )
     seed: int = _number(
         0,
         _whole(0, 2**63 - 1),
@@ -214,19 +214,19 @@ class TrainConfig:
     )
     quats_rate: float = _number(1e-3, _not_negative, "Learning rate of the quaternions.", "2023")
     scales_rate: float = _number(5e-3, _not_negative, "Learning rate of the log scales.", "2023")
-    sh0_rate: float = _number(
-        2.5e-3, _not_negative, "Learning rate of the constant spherical harmonic.", "2023"
-    )
+    sh0_rate: float = _number(2.5e-3, _not_negative, "Learning rate of the degree-0 harmonic.", "2023")
     sh_rest_rate: float = _number(
         2.5e-3 / 20,
         _not_negative,
-        "Learning rate of the higher harmonics: a twentieth of the constant one's.",
+        "Learning rate of the higher harmonics: a twentieth of that of degree 0.",
         "2023",
     )
     opacities_rate: float = _number(
         5e-2, _not_negative, "Learning rate of the logit opacities.", "2023; newer forks use 0.025"
     )
-    adam_eps: float = _number(1e-15, _positive, "Floor under the root of Adam's second moment.", "2023")
+    adam_eps: float = _number(
+        1e-15, _positive, "Adam's epsilon, the floor under the root of its second moment.", "2023"
+    )
     ssim_weight: float = _number(0.2, _fraction, "k of the loss (1 - k) L1 + k (1 - SSIM).", "2023, eq. 7")
     sh_degree: int = _number(
         SH_MAX_DEGREE, _whole(0, SH_MAX_DEGREE), "Highest degree of spherical harmonics.", "2023"
@@ -234,20 +234,20 @@ class TrainConfig:
     sh_every: int = _number(
         1_000,
         _whole(0),
-        "Iterations after which the degree in use rises by one; 0 uses all from the start.",
+        "Iterations between increases of the degree in use; 0 uses all degrees from the start.",
         "2023",
         milestone=True,
     )
     view_order: str = _number(
         "shuffled",
         _one_of(VIEW_ORDERS),
-        '"shuffled" shows each view once before any comes again; "random" draws with replacement.',
+        '"shuffled" shows each view once before any is repeated; "random" draws with replacement.',
         "2023",
     )
     background: tuple[float, float, float] = _number(
         (0.0, 0.0, 0.0), _color, "Background colour, RGB, 0 to 1.", "2023"
     )
-    random_background: bool = _number(False, _flag, "Draw another background for every iteration.")
+    random_background: bool = _number(False, _flag, "Draw a new background colour for every iteration.")
     antialiased: bool = _number(
         False, _flag, "Train for antialiased rendering: Mip-Splatting's opacity factor.", "Yu et al. 2024"
     )

@@ -187,12 +187,16 @@ class Trainer:
         self._optimizer = Adam(self.parameters(), self._groups, parts.adam)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
-    def run(self, stop: Callable[[], bool] = lambda: False) -> TrainResult:
+    def run(
+        self, stop: Callable[[], bool] = lambda: False, callbacks: Sequence[Callback] = ()
+    ) -> TrainResult:
         """Take the iterations that are left of the budget.
 
         Args:
-            stop: Asked after every iteration; the run ends when it says so, and can be taken up again.
+            stop: Asked after every iteration; the run ends when it says so, and can be resumed.
+            callbacks: Receive every event of this call, after those of the constructor.
         """
+        receivers = (*self._callbacks, *callbacks)
         losses, counts = _Losses(self.gaussians.means.detach()), []
         start = time.perf_counter()
         with reused_buffers():
@@ -200,13 +204,13 @@ class Trainer:
                 step = self._step()
                 losses.add(step.loss_tensor)
                 counts.append(step.num_gaussians)
-                self._tell(step)
+                self._tell(step, receivers)
                 if self.density is not None:
                     with one_thread():
                         changed = self.density.update(step.iteration, self.gaussians, self._optimizer)
                     self.gaussians, events = changed
                     for event in events:
-                        self._tell(event)
+                        self._tell(event, receivers)
                 if stop():
                     break
         return TrainResult(losses.read(), counts, time.perf_counter() - start)
@@ -272,8 +276,8 @@ class Trainer:
         """Return all that is learned by name: the Gaussians' raw parameters and those of the view model."""
         return self.gaussians.tensors() | self._learned
 
-    def _tell(self, event: Event) -> None:
-        for callback in self._callbacks:
+    def _tell(self, event: Event, receivers: Sequence[Callback]) -> None:
+        for callback in receivers:
             callback(self, event)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -30,7 +30,7 @@ from gsplat_edu.reading import parse_json, read_bytes
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.viewer import page_data
-from gsplat_edu.viewer.page_start import start_of
+from gsplat_edu.viewer.page_start import first_camera, start_of
 
 FORMAT = "gsplat-edu page"
 VERSION = 1
@@ -172,8 +172,10 @@ def _facts(
     settings: RenderSettings,
     held_out: Collection[str],
 ) -> dict[str, Any]:
-    first = next((i for i, (name, _) in enumerate(views) if name not in held_out), 0)
-    start = start_of(scene, [camera for _, camera in views], first)
+    cameras = [camera for _, camera in views]
+    trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
+    first = first_camera(cameras, trained or range(len(views))) if views else 0
+    start = start_of(scene, cameras, first)
     return {
         "format": FORMAT,
         "version": VERSION,

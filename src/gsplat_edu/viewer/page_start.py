@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from gsplat_edu.camera import WORLD_UP, Camera
-from gsplat_edu.doctor.geometry import INWARD, Geometry
+from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
 from gsplat_edu.evaluate.paths import common_up, orbit_of_scene
 from gsplat_edu.io.scene import Scene
 
@@ -21,6 +21,14 @@ ORBIT = 4
 
 CENTRAL_PART = 0.5
 """Central fraction of a camera's image, along each side, that is searched for its subject."""
+
+
+MIDDLE_OF = 5
+"""Cameras from which they have a middle and an edge."""
+
+EDGE = 1.25
+"""A camera stands at the edge if it is this many times as far from the middle of all as their median is. In a closed
+ring all are about equally far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +46,31 @@ class Start:
     pivot: Float64[np.ndarray, "3"]
     up: Float64[np.ndarray, "3"]
     index: int
+
+
+def first_camera(cameras: Sequence[Camera], allowed: Sequence[int]) -> int:
+    """Choose the camera that a page starts at: the first one, unless it stands at the edge of what was photographed.
+
+    Beyond the edge of a flight over fields, or of an arc around something, there is nothing that a photo saw; a window
+    wider than the photo shows it at once, and a drag soon does. A camera at such an edge, as the first one often is,
+    gives way to the one nearest to the middle. A walk through rooms starts where it started.
+
+    Args:
+        cameras: Those of the capture, at least one.
+        allowed: Which of them a page may start at, at least one; in order.
+
+    Returns:
+        The index of a camera.
+    """
+    if len(cameras) < MIDDLE_OF:
+        return allowed[0]
+    if Geometry(cameras, np.zeros((0, 3))).arrangement not in (FORWARD, INWARD):
+        return allowed[0]
+    eyes = np.stack([camera.eye for camera in cameras])
+    aside = np.linalg.norm(eyes - np.median(eyes, axis=0), axis=1)
+    if aside[allowed[0]] <= EDGE * np.median(aside):
+        return allowed[0]
+    return min(allowed, key=lambda index: float(aside[index]))
 
 
 def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
