@@ -150,7 +150,7 @@ def test_points_of_another_file(written, tmp_path, small):
     dataset = load_dataset(written("colmap"), points=tmp_path / "p.ply")
     np.testing.assert_array_equal(dataset.points, [[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(dataset.colors, [[0.2, 0.4, 0.6]], atol=1e-12)
-    assert any("1 of 2 points that are NaN" in note for note in dataset.notes)
+    assert any("1 of 2 points are NaN" in note for note in dataset.notes)
     with pytest.raises(DatasetError, match=r"none\.ply"):
         load_dataset(written("colmap"), points=tmp_path / "none.ply")
 

@@ -281,6 +281,18 @@ def test_what_the_photos_show_before_training_is_not_gone_after_it(scene):
     )
 
 
+def test_a_photo_that_the_scene_cannot_explain_is_not_said_to_be_fitted_all_the_same(scene):
+    """One screen said of the same two photos that they were far from the scene and that it fitted them."""
+    gaussians, views = scene
+    run = trained(gaussians, views)
+    poor = replace(run.train[0], psnr=run.train[0].psnr - 20.0)
+    before = Finding("exposure", Severity.WARNING, "1 of 12 photos", "fix it", (poor.name,), ("+0.4",))
+    run = replace(run, train=[poor, *run.train[1:]], beforehand=[before])
+    found = {finding.name: finding for finding in examine_run(run).findings}
+    assert poor.name in found["unexplained"].images
+    assert found["exposure"].sentence == "1 of 12 photos"
+
+
 def test_that_exposure_was_not_compared_is_said(scene, tmp_path):
     gaussians, views = scene
     findings, why = _exposure_beforehand(tmp_path / "gone", Terminal())

@@ -36,7 +36,7 @@ from gsplat_edu.sfm.source import needs_poses
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
-from gsplat_edu.viewer.serve import exposure
+from gsplat_edu.viewer.serve import LOOPBACK, exposure, free_port
 
 LINES = 20
 """Number of progress lines if there is no terminal for a progress bar."""
@@ -73,6 +73,10 @@ def _run(
         if is_finished(options):
             say(f"{options.out}: is finished, {options.config.iterations} iterations; nothing to do")
             return
+        host = arguments.view_host or LOOPBACK
+        if live is not None:
+            port = live.PORT if arguments.view_port is None else arguments.view_port
+            free_port(host, port, live.NAMES)  # before the run writes anything
         with _bar(console, "") as bar:
             capture = CaptureRun(options, say, _photos(bar, interrupted))
         callbacks: list[Callback] = []
@@ -83,8 +87,7 @@ def _run(
             ends = functools.partial(_either, interrupted, pace.over)
         view = None
         if live is not None:
-            host, port = arguments.view_host or live.LOOPBACK, arguments.view_port
-            view = live.LiveView(capture, interrupted, host, live.PORT if port is None else port)
+            view = live.LiveView(capture, interrupted, host, port)
             closing.enter_context(view)
             say(f"live view: {view.url}")
             if warning := exposure(host, "sees the training and can pause it", token=True):

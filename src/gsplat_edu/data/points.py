@@ -83,9 +83,7 @@ def finite_cloud(cloud: Cloud) -> tuple[Cloud, str]:
     good = np.all(np.abs(cloud.points) < MAX_COORDINATE, axis=1)
     if good.all():
         return cloud, ""
-    note = (
-        f"ignored {np.count_nonzero(~good)} of {len(good)} points that are NaN, infinite or absurdly far away"
-    )
+    note = f"{np.count_nonzero(~good)} of {len(good)} points are NaN, infinite or absurdly far away: ignored"
     return Cloud(cloud.points[good], cloud.colors[good]), note
 
 

@@ -265,13 +265,16 @@ def _exposure(run: Trained) -> list[Finding]:
     off = sorted((v for v in views if abs(v.stops - usual) > JUMP), key=lambda v: -abs(v.stops - usual))
     names = tuple(view.name for view in off)
     stops = tuple(f"{view.stops - usual:+.1f}" for view in off)
-    what = f"{counted(len(off), 'photo')}, in stops against the scene"
+    what = f"{counted(len(off), 'photo')} brighter or darker than the scene, in stops"
     advice = "take out the photos whose exposure jumps, or make them even: the scene explains them with fog"
     found = [Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops)] if off else []
     # A scene that fits photos of differing exposure hides that they differ: what the photos themselves show counts too.
     hidden = "the scene fits them all the same, by fog or by colours that change with the view"
+    unexplained = {view.name for views in (run.train, run.test) for view in _far_below(views)}
     found += [
-        replace(before, sentence=f"{before.sentence}; {hidden}")
+        before
+        if unexplained & set(before.images)
+        else replace(before, sentence=f"{before.sentence}; {hidden}")
         for before in run.beforehand
         if before.name != EXPOSURE or not before.images or not set(before.images) <= set(names)
     ]

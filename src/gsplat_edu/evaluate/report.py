@@ -74,7 +74,8 @@ figure .pair, figure .difference { flex: 1 1 320px; min-width: 0; } figure img {
 .pair input { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; opacity: 0; cursor: ew-resize;
   touch-action: pan-y; }
 .pair:focus-within { outline: 3px solid #06c; outline-offset: 2px; }
-.curves { display: flex; flex-wrap: wrap; gap: 8px; } .curves svg { flex: 1 1 320px; min-width: 0; height: auto; }
+.curves { display: grid; gap: 8px; grid-template-columns: repeat(auto-fill, minmax(min(100%, 400px), 1fr)); }
+.curves svg { width: 100%; height: auto; }
 figcaption { font-size: .9rem; } .quiet { color: #666; }
 @media (max-width: 600px) { th, td { padding-right: .6rem; } }
 """

@@ -26,6 +26,10 @@ CENTRAL_PART = 0.5
 MIDDLE_OF = 5
 """Cameras from which they have a middle and an edge."""
 
+EDGE = 1.25
+"""A camera stands at the edge if it is this many times as far from the middle of all as their median is. In a closed
+ring all are about equally far."""
+
 
 @dataclass(frozen=True, eq=False)
 class Start:
@@ -47,9 +51,9 @@ class Start:
 def first_camera(cameras: Sequence[Camera], allowed: Sequence[int]) -> int:
     """Choose the camera that a page starts at: the first one, unless it stands at the edge of what was photographed.
 
-    Cameras that look one way, as those of an aircraft over fields, see different places. From the first of them, often
-    at a corner, half of what a drag brings into view was in no photo. If it stands in their outer half, the camera
-    nearest to their middle takes its place.
+    Beyond the edge of a flight over fields, or of an arc around something, there is nothing that a photo saw; a window
+    wider than the photo shows it at once, and a drag soon does. A camera at such an edge, as the first one often is,
+    gives way to the one nearest to the middle. A walk through rooms starts where it started.
 
     Args:
         cameras: Those of the capture, at least one.
@@ -58,11 +62,13 @@ def first_camera(cameras: Sequence[Camera], allowed: Sequence[int]) -> int:
     Returns:
         The index of a camera.
     """
-    if len(cameras) < MIDDLE_OF or Geometry(cameras, np.zeros((0, 3))).arrangement != FORWARD:
+    if len(cameras) < MIDDLE_OF:
+        return allowed[0]
+    if Geometry(cameras, np.zeros((0, 3))).arrangement not in (FORWARD, INWARD):
         return allowed[0]
     eyes = np.stack([camera.eye for camera in cameras])
     aside = np.linalg.norm(eyes - np.median(eyes, axis=0), axis=1)
-    if aside[allowed[0]] <= np.median(aside):
+    if aside[allowed[0]] <= EDGE * np.median(aside):
         return allowed[0]
     return min(allowed, key=lambda index: float(aside[index]))
 

@@ -14,8 +14,7 @@ SUPPORT = 30
 
 STEADY = 15
 """Of these, points that two photos with a counting pose see as well. A point that only one other photo sees says
-nothing about how far apart the two photos stand: half the support may be of that kind. The more points two photos see,
-the fewer are needed: 23 that two see are as good as 30 of which two see 15, for each has twice the equations."""
+nothing about how far apart the two photos stand: half the support may be of that kind."""
 
 SPREAD = 0.02
 """Least standard deviation of the support in the photo, along any direction, as a share of the longer side. Points on a
@@ -39,10 +38,6 @@ one lens it is about 1.1. Cameras in wrong places absorb that in their focal len
 four equal sides. In between is a zoom that was used within its range."""
 
 
-Seen = tuple[np.ndarray, np.ndarray]
-"""What a photo sees of a model: numbers of points (n,), and their places (n, 2) px."""
-
-
 class Agreement(NamedTuple):
     """How many verified matches agree with the poses, by photo."""
 
@@ -64,8 +59,7 @@ def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
     """Find the photos whose poses do not count.
 
     A pose counts if `SUPPORT` points, spread over the photo, fix it to photos whose poses count; `STEADY` of them have
-    to be seen by two such photos, and fewer points do if two photos see more of them. The photos that count hang
-    together by photos that share at least `STEADY` points with those before them; of several parts the largest counts.
+    to be seen by two such photos. The first two are those that share the most points.
 
     Args:
         model: The model.
@@ -74,54 +68,52 @@ def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
         How many points fix the pose to the others, by the numbers of the photos.
     """
     seen = {image: _observations(model, image) for image in sorted(model.reg_image_ids())}
-    longest = {image: _longest(model, image) for image in seen}
     size = 1 + max((int(points.max()) for points, _ in seen.values() if len(points)), default=0)
-    good = set(seen)
-    while True:
-        good = _core(seen, good, longest, size)
-        parts = _parts(seen, good, size)
-        if len(parts) < 2:
+    best = set[int]()
+    left = set(seen)
+    while len(left) > len(best):
+        grown = _grown(seen, left, size, model)
+        if len(grown) > len(best):
+            best = grown
+        if not grown:
             break
-        good = max(parts, key=len)
-    count = _counts(seen, good, size)
-    return {image: int((count[seen[image][0]] > 0).sum()) for image in sorted(set(seen) - good)}
+        left -= grown
+    count = _counts(seen, best, size)
+    return {image: int((count[seen[image][0]] > 0).sum()) for image in sorted(set(seen) - best)}
 
 
-def _core(seen: dict[int, Seen], images: set[int], longest: dict[int, int], size: int) -> set[int]:
-    """Return the photos that support one another: others go until all that are left are supported."""
+def _grown(
+    seen: dict[int, tuple[np.ndarray, np.ndarray]], left: set[int], size: int, model: pycolmap.Reconstruction
+) -> set[int]:
+    """Start with the two photos that share the most points, and add what they and the added ones support."""
+    first = max(sorted(left), key=lambda image: len(seen[image][0]))
+    count = _counts(seen, {first}, size)
+    shared = {image: int(count[seen[image][0]].sum()) for image in sorted(left - {first})}
+    second = max(shared, key=lambda image: shared[image], default=first)
+    if second == first or shared[second] < SUPPORT:
+        return {first}
+    grown = {first, second}
     while True:
-        count = _counts(seen, images, size)
-        kept = {i for i in images if _supported(count[seen[i][0]] - 1, seen[i][1], longest[i])}
-        if kept == images:
-            return kept
-        images = kept
-
-
-def _parts(seen: dict[int, Seen], images: set[int], size: int) -> list[set[int]]:
-    """Divide photos into parts that hang together: a photo belongs to a part with which it shares `STEADY` points."""
-    parts, left = list[set[int]](), set(images)
-    while left:
-        part = {max(sorted(left), key=lambda image: len(seen[image][0]))}
-        while True:
-            count = _counts(seen, part, size)
-            added = {i for i in left - part if (count[seen[i][0]] > 0).sum() >= STEADY}
-            if not added:
-                break
-            part |= added
-        parts.append(part)
-        left -= part
-    return parts
+        count = _counts(seen, grown, size)
+        added = {
+            image
+            for image in sorted(left - grown)
+            if _supported(count[seen[image][0]], seen[image][1], _longest(model, image))
+        }
+        if not added:
+            return grown
+        grown |= added
 
 
 def _supported(count: np.ndarray, places: np.ndarray, longest: int) -> bool:
-    """Say whether points fix a pose, given how many other counting photos see each."""
-    if np.minimum(count, 2).sum() < SUPPORT + STEADY or (count > 1).sum() < STEADY:
+    """Say whether points fix a pose, given how many counting photos see each."""
+    if (count > 0).sum() < SUPPORT or (count > 1).sum() < STEADY:
         return False
     covariance = np.cov(places[count > 0].T)
     return bool(np.sqrt(max(float(np.linalg.eigvalsh(covariance)[0]), 0.0)) >= SPREAD * longest)
 
 
-def _counts(seen: dict[int, Seen], images: set[int], size: int) -> np.ndarray:
+def _counts(seen: dict[int, tuple[np.ndarray, np.ndarray]], images: set[int], size: int) -> np.ndarray:
     """Count, for each point, the photos of a set that see it."""
     count = np.zeros(size, np.int64)
     for image in images:
