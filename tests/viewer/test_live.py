@@ -1,7 +1,6 @@
 """The live view: cameras, clients of its WebSocket, and trainings whose bits it does not change."""
 
 import math
-import socket
 import threading
 import time
 
