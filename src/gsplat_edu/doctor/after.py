@@ -219,6 +219,8 @@ def _fit(run: Trained) -> list[Finding]:
     what = f"the training views reach only {_mean(run.train):.1f} dB in the mean: the scene does not explain even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
     advice = f"check poses and intrinsics{place}"
+    if run.reached < RECIPE_ITERATIONS and run.rising:  # which alone may explain it
+        advice = f"train for longer first; if they stay there, {advice}"
     return [Finding("poor fit", Severity.WARNING, what, advice)]
 
 
