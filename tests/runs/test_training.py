@@ -413,7 +413,7 @@ def test_a_file_in_the_place_of_the_folder(capture, tmp_path, capsys):
     assert capsys.readouterr().err.count("\n") == 2
 
 
-@pytest.mark.parametrize(("strategy", "cap"), [("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 320)])
+@pytest.mark.parametrize(("strategy", "cap"), [("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 240)])
 def test_the_cap_holds_from_the_first_iteration_to_the_last(capture, tmp_path, strategy, cap):
     """The start cloud has more points than the lower cap."""
     options = [*LONG[2:], "--iterations", "150", "--strategy", strategy, "--max-gaussians", str(cap)]
