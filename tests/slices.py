@@ -50,7 +50,7 @@ FIRST = (
     "tests/repo/test_site.py",
     "tests/gpu/test_loss.py",
     "tests/train/test_memory.py",
-    "tests/doctor/test_looks.py",
+    "tests/doctor/test_appearance.py",
     "tests/native/test_gradients.py",
     "tests/golden/test_chapter_trajectory.py",
     "tests/cli/test_sfm.py",

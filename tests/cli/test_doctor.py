@@ -82,7 +82,7 @@ def test_hopeless_captures_end_with_1(doctor, capture, tmp_path):
     _, views, points, colors = capture
     write_transforms(tmp_path / "a", [View(views[0].camera, view.image, name=view.name) for view in views])
     code, said = doctor(tmp_path / "a")
-    assert code == 1 and "fatal      no parallax: all cameras stand at one place" in said
+    assert code == 1 and "fatal      no parallax: all cameras are at one place" in said
     assert "what to do:\n  1. walk while you take the photos" in said and "forecast" not in said
 
     write_colmap(tmp_path / "b", views, points, colors)
@@ -251,7 +251,7 @@ def test_truck11(doctor):
     for words in (
         "11 photos are few",
         "fx is 1198 px and fy 501.4",
-        "9.5 % of the points lie in no camera's picture",
+        "9.5 % of the points lie outside every camera's view",
     ):
         assert words in said, words
 

@@ -14,7 +14,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import read_capture
 from gsplat_edu.doctor.cameras import check_away
 from gsplat_edu.doctor.finding import Severity
-from gsplat_edu.doctor.photos import Look
+from gsplat_edu.doctor.photos import PhotoStats
 from gsplat_edu.doctor.support import observed_points
 from gsplat_edu.doctor.survey import Shot, Survey
 
@@ -92,7 +92,7 @@ def test_cameras_that_look_away(named, layout, degrees, is_named, with_points):
     views, points = room(layout, 96)
     points = points[np.abs(points).max(axis=1) < 4.5] if layout == "orbit" else points  # the ball alone
     spoiled = replaced(views, {5: turned(views[5], degrees), 16: turned(views[16], -degrees)})
-    found = named(spoiled, points if with_points else None).get("look away", ())
+    found = named(spoiled, points if with_points else None).get("facing away", ())
     ends = tuple(name.rpartition("/")[2] for name in found)
     assert ends == ((views[5].name, views[16].name) if is_named else ())
 
@@ -220,7 +220,7 @@ def test_a_camera_that_looks_past_with_few_points_is_named(named, orbit):
     spoiled = replaced(views, {5: turned(views[5], 35)})
     low = [*COUNTS[:5], 60, *COUNTS[6:]]
     found = named(spoiled, points, lambda folder: with_tracks(folder, low))
-    assert found["doubtful poses"] == (f"{views[5].name} (60 points, looks past what the others look at)",)
+    assert found["doubtful poses"] == (f"{views[5].name} (60 points, points away from the common subject)",)
     assert "doubtful poses" not in named(spoiled, points, lambda folder: with_tracks(folder, COUNTS))
 
 
@@ -240,7 +240,7 @@ def test_without_counts_a_camera_whose_picture_misses_the_subject_is_named(named
     spoiled = replaced(views, {i: turned(views[i], degrees) for i in (3, 12)})
     found = named(spoiled).get("doubtful poses", ())
     assert [name.rpartition("/")[2] for name in found] == [
-        f"{views[i].name} (looks past what the others look at)" for i in (3, 12) if is_named
+        f"{views[i].name} (points away from the common subject)" for i in (3, 12) if is_named
     ]
 
 
@@ -250,11 +250,11 @@ def test_no_pose_of_a_clean_capture_is_doubted(capture):
     folder = DATA / capture
     if not folder.is_dir():
         pytest.skip(f"{capture} is not on this machine; see GSPLAT_EDU_DATA")
-    read, look = read_capture(folder), Look(np.zeros((4, 4, 3), np.uint8), np.zeros(8))
+    read, stats = read_capture(folder), PhotoStats(np.zeros((4, 4, 3), np.uint8), np.zeros(8))
     shots = []
     for frame in read.frames:
         camera = Camera.posed(frame.R, frame.eye, frame.lens.undistorted())
-        shots.append(Shot(frame.name, frame.lens, (camera.W, camera.H), camera, look))
+        shots.append(Shot(frame.name, frame.lens, (camera.W, camera.H), camera, stats))
     points = np.zeros((0, 3)) if read.cloud is None else read.cloud.points
     assert check_away(Survey(folder, read.layout, tuple(shots), (), (), points, ())) == []
 

@@ -50,7 +50,5 @@ def test_nor_does_blenders_layout(tmp_path):
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_how_the_cameras_stand_is_recognised(diagnosed, layout):
     views, points = room(layout, 128)
-    said = {"orbit": "in their middle", "forward": "one way", "outward": "outwards", "walk": "one way"}[
-        layout
-    ]
+    said = {"orbit": "common centre", "forward": "one way", "outward": "outwards", "walk": "one way"}[layout]
     assert said in dict(diagnosed(views, points).facts)["cameras"]

@@ -67,7 +67,7 @@ def test_a_jpeg_cut_short_is_named_too(tmp_path, orbit):
     survey = prepare(tmp_path)
     (refused,) = survey.refused
     assert refused.name == "images/view_004.jpg" and refused.reason.startswith("image file is truncated")
-    assert {max(shot.look.thumbnail.shape) for shot in survey.shots} == {128}
+    assert {max(shot.stats.thumbnail.shape) for shot in survey.shots} == {128}
     assert {shot.size for shot in survey.shots} == {(2400, 1800)}, "the size is the file's"
 
 

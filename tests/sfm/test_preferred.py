@@ -152,4 +152,4 @@ def test_doctor_names_the_wrong_poses_of_the_global_model(models):
     far = [label for label in finding.labels if "times as far as the others" in label]
     assert len(far) == 7
     sound = examine(prepare(models.root / "incremental")).findings
-    assert not [f for f in sound if f.name in ("doubtful poses", "look away")]
+    assert not [f for f in sound if f.name in ("doubtful poses", "facing away")]

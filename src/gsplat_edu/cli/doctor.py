@@ -15,9 +15,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
+from gsplat_edu.doctor.appearance import check_exposure
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosis_lines, table_lines
-from gsplat_edu.doctor.looks import check_exposure
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.errors import ArgumentError, DatasetError

@@ -1,1 +1,1 @@
-"""What is wrong with a capture before training, and with a scene after it, in plain words."""
+"""Diagnose problems of a capture before training and of a scene after it."""

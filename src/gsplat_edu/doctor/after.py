@@ -1,4 +1,4 @@
-"""The doctor after training: photos the scene cannot explain, overfitting, floaters, odd splats."""
+"""Checks of a trained run: views the scene does not explain, overfitting, floaters, faint and huge splats."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from gsplat_edu.doctor.appearance import EXPOSURE
 from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, command, counted, new_run
-from gsplat_edu.doctor.looks import EXPOSURE
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.gaussians import Gaussians
@@ -18,60 +18,59 @@ from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import RECIPE_ITERATIONS
 
 POOR = 20.0
-"""Mean PSNR of the training views, dB, below which a scene explains nothing well: a tenth of the range is wrong in the
-mean. Three captures had 27 to 32 after 2,000 iterations."""
+"""Warn when the training views' mean PSNR is below this, dB: 20 dB is an RMS error of a tenth of the range. Three
+captures had 27 to 32 after 2,000 iterations."""
 
 UNEXPLAINED = 3.0
-"""Decibels below the median of its split from which a view may be one the scene cannot explain: twice the squared
-error."""
+"""Warn about a view whose PSNR is this far below the median of its split, dB: 3 dB is twice the squared error."""
 
 UNEXPLAINED_SPREAD = 3.0
-"""It has to be so many standard deviations below as well, by the median absolute deviation."""
+"""The view must also be this many standard deviations below (sigma from the median absolute deviation)."""
 
 RISING = 0.1
-"""Decibels that the test views' PSNR has to gain over the last quarter of a training for longer ones to be advised."""
+"""Advise longer training if the test views' PSNR rose by at least this in the last quarter of the run, dB."""
 
 FALLING = 0.97
-"""A loss still falls if its mean over the last tenth of a training is below this times that of the tenth that ends a
-quarter before the end. Used where no views were held out."""
+"""The loss is still falling if its mean over the last tenth of the iterations is below this times its mean between
+65 % and 75 % of them. Used if no views were held out."""
 
 JUMP = 0.5
-"""Difference of a photo's brightness to the scene's from which it is told, stops. Photos in which half the scene is in
+"""Warn when a photo is brighter or darker than the scene by more than this, stops. Photos with half the scene in
 shadow stay below 0.2."""
 
 VEILED = 0.02
-"""Share of a view's pixels that near splats cover from which it is told: a spot a seventh as wide and high."""
+"""Warn when near splats cover more than this share of a view's pixels: a spot a seventh as wide and high."""
 
 FAINT = 0.02
-"""Opacity of splats that hardly show: five steps of a byte on white."""
+"""Splats below this opacity are hardly visible: they change a white 8-bit pixel by five levels."""
 
 FAINT_SHARE = 0.4
-"""Share of such splats from which it is told. Three runs of 2,000 iterations had 0.1 to 0.33."""
+"""Report faint splats when their share exceeds this. Three runs of 2,000 iterations had 0.1 to 0.33."""
 
 HUGE_SHARE = 0.01
-"""Share of splats that reach farther than the cameras are spread from which it is told; a sky needs a few."""
+"""Warn when the share of splats larger than the cameras' extent exceeds this; a sky needs a few."""
 
 SPREAD_TO_NORMAL = 1.4826
-"""A normal distribution's standard deviation over its median absolute deviation."""
+"""Standard deviation of a normal distribution divided by its median absolute deviation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A run's scene, measured.
+    """A run's scene and its residuals.
 
     Args:
         path: The run's folder.
         gaussians: The scene.
-        extent: How far the cameras are spread, world units.
-        train: Residuals of the views it was trained on.
-        test: Residuals of the views held out.
-        reached: Iterations that were taken.
-        planned: Iterations that were meant to be taken; None where the run does not say.
-        log: Lines of the run's log.
-        capture: The capture it was trained on; None where nobody knows.
-        options: Further options of the training that a longer one should have, as words of a command.
-        beforehand: What the doctor finds in the photos' exposure without looking at the scene.
-        uncompared: Why the photos' exposure was not compared; empty if it was.
+        extent: Extent of the camera positions, world units (`scene_extent`).
+        train: Residuals of the training views.
+        test: Residuals of the held-out views.
+        reached: Completed iterations.
+        planned: Planned iterations; None if the run does not record them.
+        log: Entries of the run's log.jsonl.
+        capture: The capture it was trained on; None if unknown.
+        options: Further training options to repeat in an advised longer run, as command-line words.
+        beforehand: Findings about exposure from the photos alone.
+        uncompared: Why the exposure of the photos was not compared; empty if it was.
     """
 
     path: Path
@@ -89,7 +88,7 @@ class Trained:
 
     @property
     def rising(self) -> bool | None:
-        """Whether the scene was still getting better when the training ended; None where nothing says so."""
+        """Whether the scene was still improving when training ended; None if the log does not show it."""
         scores = _pairs(self.log, "psnr", self.reached)
         if self.test:
             scores = [pair for pair in scores if pair[0] < self.reached] + [(self.reached, _mean(self.test))]
@@ -105,7 +104,7 @@ class Trained:
 
 
 def _pairs(log: Sequence[Mapping[str, Any]], key: str, reached: int) -> list[tuple[int, float]]:
-    """Return iteration and value of the lines that have both, in order."""
+    """Return (iteration, value) of the log entries that have both, in order."""
     pairs = ((line.get("iteration"), line.get(key)) for line in log)
     return sorted(
         (i, float(v)) for i, v in pairs if isinstance(i, int) and i <= reached and isinstance(v, int | float)
@@ -113,7 +112,7 @@ def _pairs(log: Sequence[Mapping[str, Any]], key: str, reached: int) -> list[tup
 
 
 def examine_run(run: Trained) -> Diagnosis:
-    """Say what is wrong with a scene and what to do about it.
+    """Run all checks on a trained scene.
 
     Args:
         run: The scene and its residuals.
@@ -137,17 +136,17 @@ def examine_run(run: Trained) -> Diagnosis:
 
 
 def _otherwise(run: Trained) -> tuple[str, ...]:
-    """Return advice for scenes with little to mend."""
+    """Return advice for scenes with few problems."""
     longer = run.reached < RECIPE_ITERATIONS and run.rising is not False
     return (
-        f"look at it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}",
+        f"view it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}",
         f"a smaller file: {command('convert', run.path, 'scene.spz', '--min-opacity', str(FAINT))}",
         _train_longer(run) if longer else f"a better scene needs better photos{_what_photos_lack(run)}",
     )
 
 
 def _what_photos_lack(run: Trained) -> str:
-    return "" if run.capture is None else f"; what these lack: {command('doctor', run.capture)}"
+    return "" if run.capture is None else f"; to check these: {command('doctor', run.capture)}"
 
 
 def _train_longer(run: Trained) -> str:
@@ -160,7 +159,7 @@ def _train_longer(run: Trained) -> str:
 
 
 def _at_its_pace(run: Trained) -> str:
-    """Say what the recipe's length takes if an iteration takes what the last ones took: on a slow computer, hours."""
+    """Estimate how long the recipe takes at the speed of the last iterations: hours on a slow computer."""
     late = [ms for iteration, ms in _pairs(run.log, "ms", run.reached) if iteration > 0.75 * run.reached]
     if not late:
         return ""
@@ -170,7 +169,7 @@ def _at_its_pace(run: Trained) -> str:
 
 
 def view_lines(run: Trained) -> list[str]:
-    """Return a line for each view, the worst first."""
+    """Return one line per view, worst first."""
     views = [(view, split) for split, views in (("test", run.test), ("train", run.train)) for view in views]
     ordered = sorted(views, key=lambda entry: entry[0].psnr)
     return [
@@ -197,14 +196,14 @@ def _mean(views: Sequence[Residual]) -> float:
 def _length(run: Trained) -> list[Finding]:
     if run.planned is not None and run.reached < run.planned:
         what = f"the scene is that of iteration {run.reached:,} of {run.planned:,}"
-        advice = "let the training finish: repeat its command with --resume"
+        advice = "finish the training: repeat its command with --resume"
         return [Finding("unfinished", Severity.WARNING, what, advice)]
     if run.reached >= RECIPE_ITERATIONS:
         return []
     what = f"{run.reached:,} iterations; the recipe has {RECIPE_ITERATIONS:,}"
     if run.rising is False:
         held = "the test views' PSNR no longer rises" if run.test else "the loss no longer falls"
-        advice = f"more iterations alone will not help much, better photos may{_what_photos_lack(run)}"
+        advice = f"more iterations alone will not help much; better photos may{_what_photos_lack(run)}"
         return [Finding("short training", Severity.NOTE, f"{what}, but {held}", advice)]
     if run.rising:
         what += ", and " + (
@@ -216,11 +215,11 @@ def _length(run: Trained) -> list[Finding]:
 def _fit(run: Trained) -> list[Finding]:
     if not run.train or _mean(run.train) >= POOR:
         return []
-    what = f"the training views reach only {_mean(run.train):.1f} dB in the mean: the scene does not explain even those"
+    what = f"the training views reach only {_mean(run.train):.1f} dB on average: the scene does not fit even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
     advice = f"check poses and intrinsics{place}"
-    if run.reached < RECIPE_ITERATIONS and run.rising:  # which alone may explain it
-        advice = f"train for longer first; if they stay there, {advice}"
+    if run.reached < RECIPE_ITERATIONS and run.rising:  # too few iterations may be the only cause
+        advice = f"train for longer first; if they do not improve, {advice}"
     return [Finding("poor fit", Severity.WARNING, what, advice)]
 
 
@@ -231,13 +230,13 @@ def _outliers(run: Trained) -> list[Finding]:
     low.sort(key=lambda view: view.psnr)
     names = tuple(view.name for view in low)
     scores = tuple(f"{view.psnr:.1f} dB" for view in low)
-    what = f"{len(low)} of {len(run.train) + len(run.test)} photos differ widely from what the scene shows"
-    advice = f"look at {names[0]} beside its render: blurred, badly posed, in shadow? then train without it"
+    what = f"{len(low)} of {len(run.train) + len(run.test)} photos differ strongly from their renders"
+    advice = f"compare {names[0]} with its render: if it is blurred, in shadow or has a wrong pose, train without it"
     return [Finding("unexplained", Severity.WARNING, what, advice, names, scores)]
 
 
 def _far_below(views: Sequence[Residual]) -> list[Residual]:
-    """Return the views far below the median of all, by a measure that a few of them do not move."""
+    """Return the views far below the median PSNR, by a measure that is robust to a few outliers."""
     if len(views) < 4:
         return []
     values = np.array([view.psnr for view in views])
@@ -253,25 +252,25 @@ def _gap(run: Trained) -> list[Finding]:
     gap = _mean(run.train) - _mean(run.test)
     if gap < OVERFITTED:
         return []
-    what = f"test views are {gap:.1f} dB below the training views: the scene has memorised its {len(run.train)} photos"
-    advice = (
-        "take more photos between the existing ones; with these, stop earlier or set a lower --max-gaussians"
-    )
+    what = f"test views are {gap:.1f} dB below the training views: the scene overfits its {len(run.train)} photos"
+    advice = "take more photos between the existing ones; with the present ones, stop earlier or lower --max-gaussians"
     return [Finding("overfitted", Severity.WARNING, what, advice)]
 
 
 def _exposure(run: Trained) -> list[Finding]:
     views = (*run.train, *run.test)
-    # A scene that is not finished is too dark for all of them.
+    # The render of an unfinished scene is too dark in every view.
     usual = float(np.median([view.stops for view in views])) if views else 0.0
     off = sorted((v for v in views if abs(v.stops - usual) > JUMP), key=lambda v: -abs(v.stops - usual))
     names = tuple(view.name for view in off)
     stops = tuple(f"{view.stops - usual:+.1f}" for view in off)
     what = f"{counted(len(off), 'photo')} brighter or darker than the scene, in stops"
-    advice = "take out the photos whose exposure jumps, or make them even: the scene explains them with fog"
+    advice = (
+        "remove the photos whose exposure jumps, or equalise them: the scene reproduces the jumps with fog"
+    )
     found = [Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops)] if off else []
-    # A scene that fits photos of differing exposure hides that they differ: what the photos themselves show counts too.
-    hidden = "the scene fits them all the same, by fog or by colours that change with the view"
+    # A scene that fits photos of differing exposure hides the difference, so findings from the photos alone count too.
+    hidden = "the scene fits them nevertheless, with fog or view-dependent colours"
     unexplained = {view.name for views in (run.train, run.test) for view in _far_below(views)}
     found += [
         before
@@ -289,8 +288,8 @@ def _floaters(run: Trained) -> list[Finding]:
         return []
     names = tuple(view.name for view in veiled)
     shares = tuple(f"{100 * view.veiled:.0f} %" for view in veiled)
-    what = f"{counted(len(veiled), 'view')} with splats that hang close to the camera"
-    advice = "start from real points, not random ones, and leave out exposure jumps; convert --crop cuts away the rest"
+    what = f"{counted(len(veiled), 'view')} with splats floating close to the camera"
+    advice = "start from real points instead of random ones, and remove exposure jumps; convert --crop removes the rest"
     return [Finding("floaters", Severity.WARNING, what, advice, names, shares)]
 
 
@@ -298,21 +297,24 @@ def _splats(run: Trained) -> list[Finding]:
     if not len(run.gaussians):
         return [
             Finding(
-                "splats", Severity.WARNING, "the scene is empty", "train again; the log says when splats went"
+                "splats",
+                Severity.WARNING,
+                "the scene is empty",
+                "train again; the log shows when splats were removed",
             )
         ]
     found = []
     faint = float((run.gaussians.opacities < FAINT).double().mean())
     if faint > FAINT_SHARE:
-        what = (
-            f"{100 * faint:.0f} % of the splats have an opacity below {FAINT}: they cost time and hardly show"
+        what = f"{100 * faint:.0f} % of the splats have an opacity below {FAINT}: they cost time and are hardly visible"
+        advice = (
+            f"remove faint splats: {command('convert', run.path, 'scene.ply', '--min-opacity', str(FAINT))}"
         )
-        advice = f"leave out faint splats: {command('convert', run.path, 'scene.ply', '--min-opacity', str(FAINT))}"
         found.append(Finding("faint splats", Severity.NOTE, what, advice))
     sizes = run.gaussians.scales.amax(dim=1)
     huge = float(((sizes > run.extent) & (run.gaussians.opacities >= FAINT)).double().mean())
     if huge > HUGE_SHARE:
-        what = f"{100 * huge:.1f} % of the splats are larger than the cameras' spread: they stand for haze"
-        advice = "look for exposure jumps and for a sky; start points far outside become such splats too"
+        what = f"{100 * huge:.1f} % of the splats are larger than the cameras' extent and look like haze"
+        advice = "check the photos for exposure jumps and sky; distant start points become such splats too"
         found.append(Finding("huge splats", Severity.WARNING, what, advice))
     return found

@@ -1,4 +1,4 @@
-"""The doctor before training: all checks of a capture, and what they say together.
+"""Run all checks of a capture before training and combine them into one diagnosis.
 
 Chapter: 13_photos_to_scene.
 """
@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from gsplat_edu.data.notes import MissingPhotos
+from gsplat_edu.doctor.appearance import check_blur, check_duplicates, check_exposure
 from gsplat_edu.doctor.cameras import (
     check_away,
     check_coverage,
@@ -19,7 +20,6 @@ from gsplat_edu.doctor.cameras import (
 from gsplat_edu.doctor.cloud import check_cloud
 from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
 from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
-from gsplat_edu.doctor.looks import check_blur, check_exposure, check_twins
 from gsplat_edu.doctor.survey import Survey
 from gsplat_edu.text import short_number
 
@@ -29,7 +29,7 @@ OF_FILES: tuple[tuple[str, Check], ...] = (
     ("enough photos", check_usable),
     ("files", check_readable),
 )
-"""Checks that need no photo, the most harmful faults first."""
+"""Checks that need no usable photo, most harmful faults first."""
 
 OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("parallax", check_parallax),
@@ -39,16 +39,16 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("sharpness", check_blur),
     ("exposure", check_exposure),
     ("coverage", check_coverage),
-    ("duplicates", check_twins),
+    ("duplicates", check_duplicates),
     ("cloud", check_cloud),
 )
-"""Checks that compare views: there have to be two."""
+"""Checks that compare views; they need at least two."""
 
 OF_LISTS: tuple[tuple[str, Check], ...] = (
     ("poses", check_poses),
     ("missing photos", check_missing),
 )
-"""Checks of what is not there; most captures do without."""
+"""Checks for missing photos and poses; they rarely matter."""
 
 
 def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
@@ -56,7 +56,7 @@ def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
 
     Args:
         survey: The capture, prepared.
-        options: What the user wants to train with, as words of a command; the command that is recommended has them.
+        options: The user's training options, as command-line words; the recommended command repeats them.
     """
     checks = [*OF_FILES, *(OF_VIEWS if len(survey.shots) > 1 else ()), *OF_LISTS]
     findings, fine = list[Finding](), list[str]()
@@ -79,31 +79,31 @@ def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
     cloud = f"{len(survey.points):,} points" if len(survey.points) else "no points"
     facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
     if len(survey.shots) > 1:
-        facts.append(("cameras", _stand(survey)))
+        facts.append(("cameras", _arrangement(survey)))
     # `check_missing` reports the photos that have no file
     return (*facts, *(("", str(note)) for note in survey.notes if not isinstance(note, MissingPhotos)))
 
 
-def _stand(survey: Survey) -> str:
+def _arrangement(survey: Survey) -> str:
     geometry = survey.geometry
-    said = {
-        "inward": "look at something in their middle",
-        "outward": "look outwards",
-        "forward": "look one way",
-        "free": "look here and there",
+    arrangement = {
+        "inward": "point at a common centre",
+        "outward": "point outwards",
+        "forward": "point one way",
+        "free": "point in various directions",
     }[geometry.arrangement]
-    return f"{said}; {short_number(geometry.depth, 3)} world units from what they see"
+    return f"{arrangement}; {short_number(geometry.depth, 3)} world units from their subject"
 
 
 def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:
-    """Return advice for captures with little to mend."""
+    """Return advice for captures with few problems."""
     place = survey.path.resolve()
     name = place.name if place.is_dir() else place.parent.name  # transforms.json is in its capture's folder
     out, short = new_run(name), new_run(f"{name}_3000")
     cloud = (
         ()
         if len(survey.points)
-        else ("start points help: add those of structure from motion with --points X.ply",)
+        else ("start points help: add points from structure from motion with --points X.ply",)
     )
     trial = (
         "a short run shows in minutes whether the poses are right: "
@@ -113,5 +113,5 @@ def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:
         f"train: {command('train', survey.path, *options, '--out', out)}",
         *cloud,
         *(() if options else trial),
-        f"judge the run afterwards: {command('doctor', out)}",
+        f"check the run afterwards: {command('doctor', out)}",
     )

@@ -1,4 +1,4 @@
-"""Checks of the files: photos missing, damaged or without a pose, and too few of them."""
+"""Checks of the files: missing or damaged photos, photos without a pose, and too few photos."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from gsplat_edu.doctor.finding import Finding, Severity, counted, listed
 from gsplat_edu.doctor.survey import Survey
 
 FEW = 12
-"""Photos below which a scene is told to be seen by few: a turn of as many has 30 degrees between neighbours, about as
-far as features are matched."""
+"""Warn about fewer photos than this: on an orbit of 12, neighbours are 30 degrees apart, about the limit of feature
+matching."""
 
 UNPOSED = 0.1
-"""Share of photos without a pose from which it is a warning: some always fail, a tenth is a part of the scene."""
+"""Warn when this share of the photos has no pose. A few always fail, but a tenth is a part of the scene."""
 
 
 def check_usable(survey: Survey) -> list[Finding]:
-    """Find captures with no photo, one, or few that can be trained on."""
+    """Find captures with too few usable photos."""
     count, total = len(survey.shots), len(survey.shots) + len(survey.refused)
     if count < 2:
-        what = f"{count} of {total} photos can be used, and a scene needs several views of it"
+        what = f"{count} of {total} photos can be used, but a scene needs several views"
         return [
             Finding(
                 "usable", Severity.FATAL, what, "take or copy the photos again: training needs at least two"
@@ -30,20 +30,20 @@ def check_usable(survey: Survey) -> list[Finding]:
                 "few photos",
                 Severity.WARNING,
                 f"{count} photos are few: the scene between them is guessed",
-                f"take more photos: at least {FEW}, better 30 or more, each sharing most of its picture with the next",
+                f"take more photos: at least {FEW}, better 30 or more, each sharing most of its view with the next",
             )
         ]
     return []
 
 
 def check_missing(survey: Survey) -> list[Finding]:
-    """Find photos that the capture lists and that are not there."""
+    """Find photos that the capture lists but that do not exist."""
     return [
         Finding(
             "missing",
             Severity.WARNING,
             f"{counted(note.missing, 'missing image')} of {note.total} listed, first {note.first}",
-            "copy the missing photos to where the capture lists them, or go on without them",
+            "copy the missing photos to where the capture lists them, or train without them",
         )
         for note in survey.notes
         if isinstance(note, MissingPhotos)
@@ -51,7 +51,7 @@ def check_missing(survey: Survey) -> list[Finding]:
 
 
 def check_readable(survey: Survey) -> list[Finding]:
-    """Find photos that cannot be decoded, or that do not fit their camera: training would refuse the capture."""
+    """Find photos that cannot be decoded or do not fit their camera; training refuses such a capture."""
     if not survey.refused:
         return []
     names = [photo.name for photo in survey.refused]
@@ -61,22 +61,22 @@ def check_readable(survey: Survey) -> list[Finding]:
             "unusable",
             Severity.WARNING,
             f"{len(names)} of {len(survey.shots) + len(names)} photos ({reasons})",
-            f"copy {listed(names)} again, calibrate again or take them out: training refuses the capture as it is",
+            f"copy {listed(names)} again, recalibrate or remove them: training refuses the capture as it is",
             tuple(names),
         )
     ]
 
 
 def check_poses(survey: Survey) -> list[Finding]:
-    """Find photos that have no pose."""
+    """Find photos without a pose."""
     if not survey.unposed:
         return []
     total = len(survey.unposed) + len(survey.shots) + len(survey.refused)
-    grave = len(survey.unposed) >= UNPOSED * total
+    serious = len(survey.unposed) >= UNPOSED * total
     return [
         Finding(
             "no pose",
-            Severity.WARNING if grave else Severity.NOTE,
+            Severity.WARNING if serious else Severity.NOTE,
             f"{len(survey.unposed)} of {total} photos in the folder, not used",
             "find poses for the photos that have none: more overlap with their neighbours, or another matching",
             survey.unposed,

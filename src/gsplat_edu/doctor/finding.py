@@ -1,4 +1,4 @@
-"""What the doctor finds: a sentence, what to do about it, and how much it matters."""
+"""Findings of the doctor: what is wrong, how serious it is, and what to do about it."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from enum import IntEnum
 from pathlib import Path
 
 ADVICE = 3
-"""Pieces of advice a diagnosis ends with: more than three are not followed."""
+"""Number of pieces of advice at the end of a diagnosis; users do not follow more than three."""
 
 NAMED = 3
-"""Images that a sentence names; the others are counted."""
+"""Number of images that a finding names; the others are counted."""
 
 
 class Severity(IntEnum):
-    """How much a finding matters."""
+    """How serious a finding is."""
 
     NOTE = 1
-    """Worth knowing; nothing has to be done."""
+    """Worth knowing; no action needed."""
     WARNING = 2
-    """Training works, but the scene suffers."""
+    """Training works, but the scene gets worse."""
     FATAL = 3
     """Training is pointless."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found.
+    """One problem.
 
     Args:
         name: One or two words.
-        severity: How much it matters.
-        sentence: What was found, with numbers.
+        severity: How serious it is.
+        sentence: The problem, with numbers.
         advice: What to do about it.
-        images: Names of the images concerned; none where it is the whole capture.
-        values: What was measured of each of these images, in words; empty where there is nothing to add.
+        images: Names of the affected images; empty if the whole capture is affected.
+        values: A measured value for each of these images, as text; empty if there is none.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Finding:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """The images' names, each with its value in brackets where there are values."""
+        """The names of the images, each followed by its value in brackets if there are values."""
         if not self.values:
             return self.images
         return tuple(f"{name} ({value})" for name, value in zip(self.images, self.values, strict=True))
@@ -56,13 +56,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that was found.
+    """The result of all checks.
 
     Args:
-        facts: Names and values that say what was looked at.
-        findings: In the order of the checks, the most harmful kind first.
+        facts: (name, value) pairs that describe the capture or run.
+        findings: In the order of the checks, most harmful kind first.
         fine: Names of the checks that found nothing.
-        otherwise: Advice to end with where warnings give fewer than three; the first is what comes next.
+        otherwise: Advice to fill up with if the warnings give fewer than three pieces; the first is the next step.
     """
 
     facts: tuple[tuple[str, str], ...]
@@ -77,12 +77,12 @@ class Diagnosis:
 
     @property
     def ranked(self) -> list[Finding]:
-        """The findings, the gravest first; equally grave ones in the order of the checks."""
+        """The findings, most serious first; equally serious ones in the order of the checks."""
         return sorted(self.findings, key=lambda finding: -finding.severity)
 
     @property
     def advice(self) -> list[str]:
-        """The three most useful pieces of advice: of warnings, what comes next, of notes; no sentence twice."""
+        """The three most useful pieces of advice: for warnings, then the next step, then for notes; no duplicates."""
         grave = [finding.advice for finding in self.ranked if finding.severity > Severity.NOTE]
         slight = [finding.advice for finding in self.findings if finding.severity is Severity.NOTE]
         given = grave if self.hopeless else [*grave, *self.otherwise[:1], *slight, *self.otherwise[1:]]
@@ -90,8 +90,8 @@ class Diagnosis:
 
 
 def command(*words: str | Path) -> str:
-    """Write a command of ours so that it can be pasted into a shell, whatever the names of files hold."""
-    # a file whose name begins with a dash would be taken for an option
+    """Return a gsplat-edu command quoted for the shell, safe for any file name."""
+    # a file name that begins with a dash would be parsed as an option
     spelled = [
         f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word) for word in words
     ]
@@ -99,7 +99,7 @@ def command(*words: str | Path) -> str:
 
 
 def new_run(name: str) -> Path:
-    """Propose a folder for a run, out/NAME or out/NAME_2 and so on: one that is not there yet."""
+    """Propose a new folder for a run: the first of out/NAME, out/NAME_2, ... that does not exist."""
     proposed, copy = Path("out") / name, 2
     while proposed.exists():
         proposed, copy = Path("out") / f"{name}_{copy}", copy + 1
@@ -107,35 +107,35 @@ def new_run(name: str) -> Path:
 
 
 def counted(number: int, word: str) -> str:
-    """Write a number and its noun: 1 pair, 2 pairs."""
+    """Return a number with its noun: 1 pair, 2 pairs."""
     return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
 def listed(names: Sequence[str]) -> str:
-    """Name the first images of a list, and count the others."""
+    """Name the first images of a list and count the others."""
     shown = ", ".join(names[:NAMED])
     return shown if len(names) <= NAMED else f"{shown} and {len(names) - NAMED} more"
 
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return a diagnosis as lines of text, up to its advice, which `advice_lines` gives."""
+    """Return a diagnosis as lines of text, without its advice (see `advice_lines`)."""
     rows = [*diagnosis.facts]
-    rows += [(finding.severity.name.lower(), _told(finding)) for finding in diagnosis.ranked]
+    rows += [(finding.severity.name.lower(), _described(finding)) for finding in diagnosis.ranked]
     if diagnosis.fine:
         rows.append(("fine", ", ".join(diagnosis.fine)))
     return table_lines(rows)
 
 
 def advice_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return the advice as lines of text, numbered."""
+    """Return the advice as numbered lines."""
     return ["what to do:", *(f"  {number}. {text}" for number, text in enumerate(diagnosis.advice, 1))]
 
 
 def table_lines(rows: Iterable[tuple[str, str]]) -> list[str]:
-    """Return names and values as lines, the values below one another."""
+    """Return (name, value) pairs as lines with the values aligned."""
     return [f"{name:<10} {value}".rstrip() for name, value in rows]
 
 
-def _told(finding: Finding) -> str:
+def _described(finding: Finding) -> str:
     images = f": {listed(finding.labels)}" if finding.images else ""
     return f"{finding.name}: {finding.sentence}{images}"

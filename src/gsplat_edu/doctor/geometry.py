@@ -1,4 +1,4 @@
-"""What cameras see of one another's subject: sample points, shared views, neighbours, how the cameras stand."""
+"""Geometry of a capture: how the cameras are arranged, and how much of their views they share."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ from gsplat_edu.data.dataset import scene_extent
 from gsplat_edu.evaluate.following import point_nearest_most_axes
 
 SAMPLES = 300
-"""Points that stand for what a camera sees: the median of as many ratios is known to a tenth of their spread."""
+"""Sample points per camera: enough to know a median of ratios to a tenth of their spread."""
 
 GRID = (20, 15)
-"""Columns and rows of the rays that stand for it where there is no cloud: as many."""
+"""Columns and rows of the sample rays if there is no cloud: `SAMPLES` in total."""
 
 MOST_POINTS = 20_000
-"""Points of a cloud that are looked at: every n-th of a larger one, so that a thousand cameras take seconds."""
+"""Larger clouds are subsampled to this size (every n-th point), so that a thousand cameras take seconds."""
 
 CELLS = 16
-"""Cells along an image's longer side in which points are told to be hidden by others."""
+"""Cells along the image's longer side for the occlusion test."""
 
 BEHIND = 1.15
-"""A point farther than this times the nearest tenth of its cell is taken for hidden."""
+"""A point is occluded if its depth exceeds this multiple of the 10th percentile in its cell."""
 
 CANDIDATES = 32
-"""Cameras, nearest in place and direction, among which neighbours are looked for."""
+"""Neighbours are chosen among this many cameras, nearest in position and direction."""
 
 NEIGHBOURS = 8
-"""Most neighbours an image is compared with: enough for a median, few enough to be near."""
+"""Maximum number of neighbours per camera: enough for a median, few enough to be near."""
 
 SHARED = 0.25
-"""Least share of what a camera sees that a neighbour sees too, from a direction not too different."""
+"""A neighbour must see at least this weighted share of what the camera sees."""
 
 LEVEL = 4
-"""Power of the cosine between optical axes that shares are multiplied by: 0.56 at 30 degrees, 0.06 at 60."""
+"""Shares are weighted by this power of the cosine between the optical axes: 0.56 at 30 degrees, 0.06 at 60."""
 
 CLOSE = 0.1
-"""A centre nearer than this times the extent of the cameras is where they stand, not what they look at."""
+"""A centre nearer than this multiple of the cameras' extent lies among the cameras and is not their subject."""
 
 INWARD, OUTWARD, FORWARD, FREE = "inward", "outward", "forward", "free"
 
 MOST = 0.7
-"""Share of the cameras that makes an arrangement what it is called."""
+"""An arrangement needs at least this share of the cameras."""
 
 FORWARD_SPREAD = math.radians(20.0)
-"""Largest median angle to the mean viewing direction of cameras that are said to look one way."""
+"""Cameras face one way if their median angle to the mean viewing direction is below this."""
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Cameras, and the cloud of their capture.
+    """The cameras and points of a capture, with derived quantities computed on first use.
 
     Args:
         cameras: At least one.
-        points: (N, 3) the capture's own points, world units; none where it has none.
+        points: (N, 3) the capture's own points, world units; N is 0 if it has none.
     """
 
     cameras: Sequence[Camera]
@@ -67,53 +67,53 @@ class Geometry:
 
     @cached_property
     def eyes(self) -> Float64[np.ndarray, "C 3"]:
-        """(C, 3) where the cameras stand."""
+        """(C, 3) camera positions."""
         return np.stack([camera.eye for camera in self.cameras])
 
     @cached_property
     def axes(self) -> Float64[np.ndarray, "C 3"]:
-        """(C, 3) where they look, unit length."""
+        """(C, 3) viewing directions, unit length."""
         return np.stack([camera.R[2] for camera in self.cameras])
 
     @cached_property
     def some_points(self) -> Float64[np.ndarray, "n 3"]:
-        """(n, 3) at most 20,000 of the points, evenly over the list."""
+        """(n, 3) at most 20,000 of the points, evenly spaced in the list."""
         return self.points[:: max(1, -(-len(self.points) // MOST_POINTS))]
 
     @cached_property
     def centre(self) -> Float64[np.ndarray, "3"] | None:
-        """(3,) the point nearest to the optical axes of most cameras, which most have in front; None if there is none.
+        """(3,) the point nearest to most optical axes, if it is in front of most cameras; otherwise None.
 
-        `gsplat_edu.evaluate.following.point_nearest_most_axes` says how it is found.
+        See `gsplat_edu.evaluate.following.point_nearest_most_axes`.
         """
         centre = point_nearest_most_axes(self.cameras)
         return centre if centre is not None and np.mean(self.ahead(centre) > 0) >= MOST else None
 
     def angles_to(self, point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, " C"]:
-        """Return the angle between each optical axis and the direction of a point, radians."""
+        """Return the angle between each optical axis and the direction to a point, radians."""
         lengths = np.maximum(np.linalg.norm(point - self.eyes, axis=1), 1e-300)
         return np.asarray(np.arccos(np.clip(self.ahead(point) / lengths, -1.0, 1.0)))
 
     def ahead(self, point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, " C"]:
-        """Return how far a point lies in front of each camera, world units."""
+        """Return the depth of a point in each camera, world units."""
         return np.asarray(np.sum((point - self.eyes) * self.axes, axis=1))
 
     @cached_property
     def angles_to_mean(self) -> Float64[np.ndarray, " C"]:
-        """(C,) angle between each optical axis and the direction of their median, radians."""
+        """(C,) angle between each optical axis and their median direction, radians."""
         mean = np.median(self.axes, axis=0)
         cosines = self.axes @ mean / max(float(np.linalg.norm(mean)), 1e-300)
         return np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
     @cached_property
     def in_sight(self) -> Bool[np.ndarray, "C n"]:
-        """(C, n) which of `some_points` lies in which camera's picture, hidden or not."""
+        """(C, n) whether each of `some_points` projects into each camera's image; occlusion is ignored."""
         rows = [inside(camera, self.some_points) for camera in self.cameras]
         return np.stack(rows)
 
     @cached_property
     def depth(self) -> float:
-        """How far what is looked at lies from the cameras, as far as anything says so; world units."""
+        """Estimated depth of the subject, from the points, the common centre or the cameras' extent; world units."""
         depths = [
             float(np.median(camera.world_to_cam(self.some_points[seen])[:, 2]))
             for camera, seen in zip(self.cameras, self.in_sight, strict=True)
@@ -127,12 +127,12 @@ class Geometry:
 
     @cached_property
     def spread(self) -> float:
-        """Largest distance of a camera from the mean of all, in depths of what they look at."""
+        """Largest distance of a camera from the mean position, divided by the subject's depth."""
         return float(np.linalg.norm(self.eyes - self.eyes.mean(axis=0), axis=1).max()) / self.depth
 
     @cached_property
     def arrangement(self) -> str:
-        """How the cameras stand: around something, looking out, looking one way, or none of these."""
+        """Arrangement of the cameras: `INWARD`, `OUTWARD`, `FORWARD`, or `FREE` if it is none of these."""
         if np.median(self.angles_to_mean) < FORWARD_SPREAD:
             return FORWARD
         if self.centre is not None and np.mean([_holds(c, self.centre) for c in self.cameras]) >= MOST:
@@ -142,7 +142,7 @@ class Geometry:
 
     @cached_property
     def samples(self) -> tuple[Float64[np.ndarray, "_ 3"], ...]:
-        """For each camera points that stand for what it sees, world units; none where it sees no point of the cloud."""
+        """Sample points of what each camera sees, world units; empty if it sees no point of the cloud."""
         if not len(self.points):
             return tuple(self._on_rays(camera) for camera in self.cameras)
         found = []
@@ -152,7 +152,7 @@ class Geometry:
         return tuple(found)
 
     def _on_rays(self, camera: Camera) -> Float64[np.ndarray, "n 3"]:
-        """Return points on a grid of rays, at the depth of what is looked at."""
+        """Return points on a grid of rays, at the subject's depth."""
         u, v = np.meshgrid(
             (np.arange(GRID[0]) + 0.5) * camera.W / GRID[0] - 0.5,
             (np.arange(GRID[1]) + 0.5) * camera.H / GRID[1] - 0.5,
@@ -164,10 +164,10 @@ class Geometry:
 
     @cached_property
     def shares(self) -> tuple[dict[int, float], ...]:
-        """For each camera the others near it, the nearest first, with the share of what it sees that they see too.
+        """For each camera, its nearest cameras in order and the share of its view that each of them also sees.
 
-        Near is |e_i - e_j| / depth + angle between the optical axes. A share is multiplied by the fourth power of that
-        angle's cosine, for two sides of a thing are not the same.
+        The distance is |e_i - e_j| / depth + the angle between the optical axes. Shares are multiplied by the fourth
+        power of that angle's cosine, since two sides of an object look different.
         """
         return tuple(self._shares(i) for i in range(len(self.cameras)))
 
@@ -184,7 +184,7 @@ class Geometry:
     def _seen_by(
         self, rows: Int64[np.ndarray, " r"], points: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, " r"]:
-        """Return the share of points in the picture of each of some cameras; `inside`, for all at once."""
+        """Return the share of points inside the image of each given camera; a vectorised `inside`."""
         x, y, z = np.moveaxis(
             (points - self.eyes[rows, None]) @ self._rotations[rows].transpose(0, 2, 1), -1, 0
         )
@@ -203,7 +203,7 @@ class Geometry:
 
     @cached_property
     def neighbours(self) -> tuple[Int64[np.ndarray, "..."], ...]:
-        """For each camera the nearest that see the same: at most 8, each with a share of a quarter."""
+        """For each camera, at most 8 nearest cameras that share at least a quarter of its view."""
         found = []
         for shares in self.shares:
             good = [j for j, share in shares.items() if share >= SHARED]
@@ -212,14 +212,14 @@ class Geometry:
 
 
 def inside(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Say which points lie in front of a camera and inside its picture.
+    """Return which points lie in front of a camera and inside its image.
 
     Args:
         camera: The camera.
         points: (n, 3) world units.
     """
     u, v, z = camera.project(camera.world_to_cam(points))
-    # what lies behind has NaN for u and v, which compares as outside
+    # points behind the camera have NaN for u and v, and comparisons with NaN are false
     return np.asarray(
         (z > 0) & (u > -0.5) & (u < camera.W - 0.5) & (v > -0.5) & (v < camera.H - 0.5), dtype=np.bool_
     )
@@ -230,7 +230,7 @@ def _holds(camera: Camera, point: Float64[np.ndarray, "3"]) -> bool:
 
 
 def _unhidden(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " m"]:
-    """Return the points that are probably not behind others: near the front ones of their cell of the image."""
+    """Return the points that are probably visible: those near the front of their image cell."""
     u, v, z = camera.project(camera.world_to_cam(points))
     size = max(camera.W, camera.H) / CELLS
     cell = np.floor((v + 0.5) / size).astype(np.int64) * CELLS + np.floor((u + 0.5) / size).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Photos as the doctor looks at them: decoded small, measured once, and only a thumbnail kept."""
+"""Decode each photo at a reduced size, measure it once, and keep only a thumbnail."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from gsplat_edu.image_files import UNDECODABLE, opened_image
 from gsplat_edu.views import Photo
 
 WORK_SIDE = 1024
-"""Longest side of a photo while its sharpness is measured, px: blur that is gone at this size costs a scene little, and
-photos of one subject by different cameras become comparable."""
+"""Longest side at which sharpness is measured, px. Blur that is invisible at this size hardly harms a scene, and photos
+from different cameras become comparable."""
 
 THUMBNAIL_SIDE = 128
-"""Longest side of what is kept of a photo, px: 50 kB, so that thousands fit into memory."""
+"""Longest side of the thumbnail that is kept, px: 50 kB, so that thousands fit into memory."""
 
 JPEG_ONLY = 64_000_000
-"""JPEGs up to so many pixels are decoded at a half, a quarter or an eighth of their size; Pillow warns of larger ones
-before it has been told to."""
+"""JPEGs up to this many pixels are decoded at 1/2, 1/4 or 1/8 of their size. For larger ones Pillow warns before the
+reduced size can be requested."""
 
 FINE, COARSE = 1.0, 4.0
-"""Standard deviations at which gradients are taken, px of a photo of 1024. A step loses energy as 1 / sigma; a blur of
-b px leaves sqrt((16 + b²) / (1 + b²)) as the ratio of the two, 4 where there is none, whatever the step's height."""
+"""Sigmas of the Gaussians before gradients are taken, px of a photo of 1024 px. The energy of a step edge falls as
+1 / sigma. A blur of b px makes their ratio sqrt((16 + b²) / (1 + b²)), 4 without blur, at any step height."""
 
 ANGLES = np.arange(8) * math.pi / 8
-"""Directions along which gradients are taken, radians: shaking the camera blurs along one of them only."""
+"""Directions of the gradients, radians: camera shake blurs along one of them only."""
 
 FLAT = 1e-2
-"""Energy that is added to both scales, grey levels² per px²: below it there is nothing but rounding."""
+"""Added to the energy of both scales, grey levels² per px²: smaller energies are rounding error."""
 
 GAMMA = 2.2
-"""Bytes are about proportional to light to the power of 1 / 2.2."""
+"""Pixel values are roughly proportional to light^(1 / 2.2)."""
 
 DARK, BRIGHT = 8.0, 247.0
-"""Values of bytes outside of which a colour counts as clipped: ratios mean nothing there."""
+"""Pixel values outside this range count as clipped: their ratios are meaningless."""
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What is kept of a photo.
+class PhotoStats:
+    """Thumbnail and measurements of a photo.
 
     Args:
         thumbnail: (h, w, 3) RGB, undistorted, at most 128 px long.
@@ -56,16 +56,16 @@ class Look:
     detail: Float64[np.ndarray, "8"]
 
 
-def look_at_photo(path: Path, lens: Lens, mask: Path | None = None) -> Look:
+def measure_photo(path: Path, lens: Lens, mask: Path | None = None) -> PhotoStats:
     """Decode a photo and measure it.
 
     Args:
         path: The image file.
         lens: The camera that took it, at the file's size.
-        mask: Its mask; it is decoded too, because training would.
+        mask: Its mask, decoded only to check that training can read it.
 
     Raises:
-        DatasetError: the photo or its mask cannot be decoded, or the lens cannot be straightened.
+        DatasetError: the photo or its mask cannot be decoded, or the lens cannot be undistorted.
     """
     if mask is not None:
         decode_mask(mask)
@@ -75,18 +75,18 @@ def look_at_photo(path: Path, lens: Lens, mask: Path | None = None) -> Look:
     if lens.distorts and min(h, w) > 1:
         columns, rows, _ = undistortion(lens.scaled(w, h), slice(0, h))
         small = cv2.remap(small, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return Look(np.asarray(small, dtype=np.uint8), detail_of(pixels))
+    return PhotoStats(np.asarray(small, dtype=np.uint8), detail_of(pixels))
 
 
 def detail_of(pixels: UInt8[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "8"]:
-    """Measure how much fine detail a photo has for the coarse detail it has.
+    """Measure a photo's fine detail relative to its coarse detail.
 
     Args:
         pixels: (H, W, 3) RGB.
 
     Returns:
-        ln (E_fine + c) / (E_coarse + c) for each of eight directions, E the mean squared slope of the grey image
-        along it, after smoothing.
+        ln((E_fine + c) / (E_coarse + c)) for each of eight directions, where E is the mean squared slope of the
+        smoothed grey image along that direction.
     """
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
     fine, coarse = _energy(gray, FINE), _energy(gray, COARSE)
@@ -94,7 +94,7 @@ def detail_of(pixels: UInt8[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "8"]:
 
 
 def _energy(gray: Float32[np.ndarray, "H W"], sigma: float) -> Float64[np.ndarray, "8"]:
-    """Return the mean squared slope along each direction: c² xx + 2 c s xy + s² yy of the structure tensor."""
+    """Return the mean squared slope in each direction: c² xx + 2 c s xy + s² yy, with structure tensor xx, xy, yy."""
     smooth = cv2.GaussianBlur(gray, (0, 0), sigma)
     gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
@@ -104,9 +104,9 @@ def _energy(gray: Float32[np.ndarray, "H W"], sigma: float) -> Float64[np.ndarra
 
 
 def _decoded(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """Decode a photo, JPEGs at no more than twice the working size or a half; transparent ones over black.
+    """Decode a photo; JPEGs at a reduced size, no smaller than the working size; transparent photos over black.
 
-    Pillow decodes, as for training: what it cannot read here it cannot read there.
+    Pillow decodes here as it does in training, so that both refuse the same files.
     """
     W, H = image_size(path)
     if path.suffix.lower() in (".jpg", ".jpeg") and W * H <= JPEG_ONLY:
@@ -116,7 +116,7 @@ def _decoded(path: Path) -> UInt8[np.ndarray, "H W 3"]:
                     file.draft("RGB", (WORK_SIDE, WORK_SIDE))
                     return np.array(file.convert("RGB"))
         except UNDECODABLE:
-            pass  # `decode` tells what is wrong with it
+            pass  # `decode` reports the problem
     image, alpha = decode(path)
     return image if alpha is None else np.asarray(Photo(image, alpha).over((0.0, 0.0, 0.0)))
 

@@ -1,4 +1,4 @@
-"""A trained scene looked at from its cameras: how well each photo is explained, and what hangs in front of the lens."""
+"""Compare a trained scene with its photos: PSNR, brightness, and floaters in front of each camera."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from gsplat_edu.validation import ArrayLike
 from gsplat_edu.views import View
 
 SOLID = 0.5
-"""Share of a pixel's light that splats have to stop for it to have a depth."""
+"""A pixel has a depth if its splats block more than this share of the light."""
 
 NEAR = 0.1
-"""Splats nearer than this share of a view's median depth hang in front of the lens: what was photographed does not."""
+"""Splats nearer than this share of a view's median depth are floaters: real subjects are not that close."""
 
 VEIL = 0.2
-"""Opacity of the near splats from which a pixel is covered: colours behind shift by a fifth."""
+"""A pixel is covered if the near splats' opacity exceeds this: the colour behind changes by a fifth."""
 
 Progress = Callable[[int, int], None]
-"""Is told how many views are done, and how many there are."""
+"""Called with (views done, total)."""
 
 
 @dataclass(frozen=True)
 class Residual:
-    """How far a scene is from one photo.
+    """Difference between a scene and one photo.
 
     Args:
-        name: What the capture calls the view.
+        name: The view's name in the capture.
         psnr: dB.
-        stops: How much brighter the photo is than the render, median over pixels; negative where it is darker.
-        veiled: Share of the pixels that splats close to the camera cover.
+        stops: How much brighter the photo is than the render, median over pixels; negative if it is darker.
+        veiled: Share of the pixels covered by splats close to the camera.
     """
 
     name: str
@@ -56,11 +56,11 @@ def residuals(
     """Render views and compare them with their photos.
 
     Args:
-        gaussians: The scene, in the frame of the cameras.
-        views: Cameras and photos. A view in which no pixel counts is left out.
+        gaussians: The scene, in the cameras' world coordinates.
+        views: Cameras and photos. Views whose mask excludes every pixel are skipped.
         render: Renders Gaussians from a camera, with depth, over `background`.
-        background: (3,) what photos that are not opaque are put over.
-        progress: Is told of every view.
+        background: (3,) RGB behind transparent photos.
+        progress: Called after every view.
 
     Returns:
         In the order of the views.
@@ -84,7 +84,7 @@ def residuals(
 
 
 def _veiled(gaussians: Gaussians, view: View, output: RenderOutput, render: Renderer) -> float:
-    """Return the share of a view that splats much nearer than the rest of it cover."""
+    """Return the share of a view covered by splats much nearer than the rest."""
     if output.depth is None:
         return 0.0
     stopped = 1.0 - output.transmittance
@@ -106,7 +106,7 @@ def _stops(
     image: Float64[np.ndarray, "H W 3"],
     mask: Bool[np.ndarray, "H W"] | None,
 ) -> float:
-    """Return the median of log2(photo / render) in light; 0 where nearly all is cut off."""
+    """Return the median of log2(photo / render) in linear light; 0 if nearly all pixels are clipped."""
     dark, bright = DARK / 255.0, BRIGHT / 255.0
     good = np.all((np.minimum(photo, image) > dark) & (np.maximum(photo, image) < bright), axis=2)
     good = good if mask is None else good & mask

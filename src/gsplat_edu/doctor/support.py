@@ -1,4 +1,4 @@
-"""What fixes each camera's pose: how many points of the capture its photo was found to show."""
+"""Support of each camera's pose: the number of the capture's points observed in its photo."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _OBSERVED = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 
 
 def observed_points(capture: Path) -> dict[str, int]:
-    """Count the points that COLMAP found in each photo.
+    """Count the points that COLMAP observed in each photo.
 
     Args:
         capture: Folder with a COLMAP model.
 
     Returns:
-        The counts by the names that frames of the capture have; none if there is no model or it cannot be read.
+        Counts by frame name; empty if there is no model or it cannot be read.
     """
     model = find_model(capture)
     if model is None:
@@ -36,7 +36,7 @@ def observed_points(capture: Path) -> dict[str, int]:
             return dict(_binary(read_bytes(model / "images.bin")))
         return dict(_text(read_bytes(model / "images.txt")))
     except (OSError, ValueError, IndexError, struct.error, DatasetError):
-        return {}  # whoever reads the poses says what is wrong with the file
+        return {}  # the reader of the poses reports the problem
 
 
 def _binary(data: bytes) -> Iterator[tuple[str, int]]:

@@ -1,4 +1,4 @@
-"""A capture prepared for examination: poses read, every photo looked at once, nothing refused before it is told."""
+"""Prepare a capture for the checks: read its poses, measure every photo once, and collect unusable photos."""
 
 from __future__ import annotations
 
@@ -19,58 +19,58 @@ from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
 from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.doctor.geometry import Geometry
-from gsplat_edu.doctor.photos import Look, look_at_photo
+from gsplat_edu.doctor.photos import PhotoStats, measure_photo
 from gsplat_edu.doctor.support import observed_points
 from gsplat_edu.errors import DatasetError
 
 WORKERS = 2
-"""Photos decoded at once: each may take 40 MB for a moment, or all its pixels where it is no JPEG."""
+"""Photos decoded at the same time: a JPEG briefly takes up to 40 MB, other formats their full size."""
 
 Progress = Callable[[int, int], None]
-"""Is told how many photos are done, and how many there are."""
+"""Called with (photos done, total)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A photo that could be read, with its camera.
+    """A readable photo with its camera.
 
     Args:
-        name: What the capture calls it.
-        lens: Its camera as the capture states it.
+        name: Its name in the capture.
+        lens: Its camera as given by the capture.
         size: Width and height of the file, px.
-        camera: The pinhole it becomes, at the size of the thumbnail.
-        look: What was measured.
+        camera: The undistorted pinhole camera at the thumbnail's size.
+        stats: Its thumbnail and measurements.
     """
 
     name: str
     lens: Lens
     size: tuple[int, int]
     camera: Camera
-    look: Look
+    stats: PhotoStats
 
 
 class Refused(NamedTuple):
     """A photo that cannot be used."""
 
     name: str
-    """What the capture calls it."""
+    """Its name in the capture."""
     reason: str
-    """Why, in a few words: `DatasetError.reason`."""
+    """The reason in a few words: `DatasetError.reason`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What the checks look at.
+    """Input of the checks.
 
     Args:
         path: The capture.
         layout: "COLMAP", "transforms.json" or "Blender".
-        shots: Photos that could be read, sorted by name.
-        refused: Photos that could not, sorted by name.
-        unposed: Names of files in the folders of the photos that have no pose.
-        points: (N, 3) the capture's own points, world units; none where it has none.
-        notes: What the reader of the layout noted.
-        observed: How many points were found in each photo, by the names of the shots; empty where nothing says so.
+        shots: Readable photos, sorted by name.
+        refused: Unusable photos, sorted by name.
+        unposed: Names of photos in the same folders that have no pose.
+        points: (N, 3) the capture's own points, world units; N is 0 if it has none.
+        notes: Notes of the capture's reader.
+        observed: Number of points observed in each photo, by shot name; empty if unknown.
     """
 
     path: Path
@@ -84,24 +84,24 @@ class Survey:
 
     @property
     def names(self) -> list[str]:
-        """Names of the photos that could be read."""
+        """Names of the readable photos."""
         return [shot.name for shot in self.shots]
 
     @cached_property
     def geometry(self) -> Geometry:
-        """What the cameras see; there has to be a shot."""
+        """Geometry of the cameras; needs at least one shot."""
         return Geometry([shot.camera for shot in self.shots], self.points)
 
 
 def prepare(path: Path, progress: Progress | None = None) -> Survey:
-    """Read a capture and look at its photos, a few at a time.
+    """Read a capture and measure its photos, a few at a time.
 
     Args:
         path: Folder or transforms.json, as for `gsplat_edu.data.dataset.load_dataset`.
-        progress: Is told how far it got, from the calling thread.
+        progress: Called with (photos done, total) in the calling thread.
 
     Raises:
-        DatasetError: nothing of that kind is there, or its poses cannot be read. A photo that cannot be is no error.
+        DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
     capture = read_capture(path)
     frames = sorted(capture.frames, key=lambda frame: frame.name)
@@ -131,15 +131,15 @@ def prepare(path: Path, progress: Progress | None = None) -> Survey:
 
 
 def _shot(frame: Frame) -> Shot | Refused:
-    """Measure a photo, or return why it cannot be used."""
+    """Measure a photo, or return the reason why it cannot be used."""
     try:
         source, camera, _ = photo_file(frame, None, (0.0, 0.0, 0.0))
-        look = look_at_photo(source.path, source.lens, source.mask)
+        stats = measure_photo(source.path, source.lens, source.mask)
     except DatasetError as error:
         return Refused(frame.name, error.reason)
-    h, w = look.thumbnail.shape[:2]
+    h, w = stats.thumbnail.shape[:2]
     small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(w, h))
-    return Shot(frame.name, frame.lens, (camera.W, camera.H), small, look)
+    return Shot(frame.name, frame.lens, (camera.W, camera.H), small, stats)
 
 
 def _points(capture: Capture) -> Float64[np.ndarray, "N 3"]:
@@ -149,9 +149,9 @@ def _points(capture: Capture) -> Float64[np.ndarray, "N 3"]:
 
 
 def _unposed(capture: Capture) -> tuple[str, ...]:
-    """List the photos beside those with a pose that have none themselves.
+    """List the photos without a pose in the folders of the posed ones.
 
-    Blender's scenes are left out: their poses were made with the photos, and depth maps lie beside these.
+    Blender captures are skipped: every photo has a pose, and depth maps lie beside the photos.
     """
     if capture.layout == "Blender":
         return ()

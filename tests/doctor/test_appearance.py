@@ -111,7 +111,7 @@ def reencoded(image, quality):
     return np.array(Image.open(buffer))
 
 
-TWINS = {
+DUPLICATES = {
     "moved by 8 px": (lambda image: np.roll(image, 8, axis=1), False),
     "written again": (lambda image: reencoded(image, 85), True),
     "the same": (lambda image: image, True),
@@ -119,11 +119,11 @@ TWINS = {
 
 
 @pytest.mark.sliced(2)
-@pytest.mark.parametrize("how", TWINS)
+@pytest.mark.parametrize("how", DUPLICATES)
 def test_photos_there_twice(named, how):
     """Photo 9 is photo 8 again, once under its own pose and once under that of photo 8."""
     views, points = room("orbit", 160)
-    change, is_named = TWINS[how]
+    change, is_named = DUPLICATES[how]
     copy = with_photo(views[9], change(views[8].image))
     told = (f"{views[8].name} and {views[9].name}",) if is_named else ()
     assert named(replaced(views, {9: copy}), points).get("same photo", ()) == told

@@ -1,7 +1,7 @@
-"""Checks of the pixels: blurred photos, photos there twice, and jumps of exposure or white balance.
+"""Checks of the pixels: blurred photos, duplicates, and jumps of exposure or white balance.
 
-Each photo is compared with its neighbours, which see the same: what a wall lacks in detail, the photo beside it lacks
-too.
+Each photo is compared with neighbours that see the same subject. A photo of a plain wall has little detail, but so do
+its neighbours.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from gsplat_edu.doctor.cameras import looking_away
+from gsplat_edu.doctor.cameras import facing_away
 from gsplat_edu.doctor.finding import Finding, Severity, counted
 from gsplat_edu.doctor.geometry import inside
 from gsplat_edu.doctor.photos import BRIGHT, COARSE, DARK, GAMMA, WORK_SIDE
@@ -24,77 +24,76 @@ EXPOSURE = "exposure"
 """Name of findings about brightness, before and after training."""
 
 ENOUGH = 3
-"""Neighbours from which a photo is compared with them; with fewer, with all photos."""
+"""A photo with fewer neighbours than this is compared with all photos instead."""
 
 BLUR = 0.3
-"""Loss of detail, in natural logarithms of energy along one direction, from which a photo is blurred. Of 158 photos of
-three captures two are above it, and blurred to the eye; one at 0.29 is so slightly. Being drawn along a line of 8 px
-of 1024 costs 0.4 to 0.8, of 4 px 0.1 to 0.3."""
+"""A photo is blurred if it loses more detail than this: natural logarithm of gradient energy in one direction. Two of
+158 photos of three captures exceed it and are visibly blurred; one at 0.29 is slightly blurred. Motion blur of 8 px
+in 1024 costs 0.4 to 0.8, blur of 4 px 0.1 to 0.3."""
 
 BLUR_SPREAD = 3.0
-"""The loss has to be so many standard deviations of the capture's too, those measured on the sharper half."""
+"""The loss must also exceed 3 sigma, with sigma estimated from the sharper half of the capture."""
 
 CHANCE = 3.5
-"""The loss has to be so many times sqrt(2 / n) as well, the standard deviation of the logarithm of a mean of n squares:
-the largest of eight directions and some hundred photos. n is the photo's area over that which its coarse gradients are
-smoothed over, 4 pi 4²; from 500 px on this is below the limit above."""
+"""The loss must also exceed this multiple of sqrt(2 / n), the standard deviation of the logarithm of a mean of n
+squares: the expected maximum over eight directions and some hundred photos. n is the photo's area divided by the
+smoothing area of its coarse gradients, 4 pi 4². For photos of 500 px and more, this limit is below `BLUR`."""
 
-TWIN = 0.05
-"""Root mean squared difference of two photos, 32 px long and of unit contrast, below which they are one. Written again
-as a JPEG of quality 50 a photo differs by 0.02, a small and finely textured one by 0.04; shifted by a hundredth of its
-width, by 0.2. The least between two photos of three captures, two frames of a film, was 0.12."""
+DUPLICATE = 0.05
+"""Two photos are duplicates if their RMS difference is below this, at 32 px and unit contrast. Saving a photo again as
+a JPEG of quality 50 changes it by 0.02 (0.04 if it is small and finely textured); a shift by a hundredth of its width,
+by 0.2. The smallest difference in three captures was 0.12, between two video frames."""
 
-TWIN_SIDE = 32
+DUPLICATE_SIDE = 32
 
-TWIN_MOTION = 0.015
-"""Shift between two photos by their poses, in widths of the image, up to which equal pixels do not contradict them:
-those hide a shift of 0.003, and poses are not exact."""
+DUPLICATE_MOTION = 0.015
+"""Duplicates contradict their poses if these imply a shift above this, in image widths. Equal pixels can hide a shift
+of 0.003, and poses are not exact."""
 
 SAME_POSE = 1e-4
-"""Distance of two cameras, in depths of what they look at, and angle between them, radians, below which they are one:
-a tenth of a pixel of 1000."""
+"""Two poses are equal if their positions differ by less than this multiple of the subject's depth, and their rotations
+by less than this in radians: a tenth of a pixel in 1000."""
 
 JUMP = 0.4
-"""Difference to the neighbours from which exposure jumps, stops: a grey of 128 becomes 113, an error of 25 dB. Of 97
-photos of a phone that exposed each by itself 94 stay below 0.3."""
+"""Exposure jumps if it differs from the neighbours' by more than this, stops: a grey of 128 becomes 113, an error of
+25 dB. Of 97 phone photos with automatic exposure, 94 stay below 0.3."""
 
 DIFFERING = 0.08
-"""Share of pairs of neighbours that may differ by a jump before exposure is said to: photos that are dark in a row
-agree with one another. fox has 0.006, snowmiku97 0.035, every third of the photos dark by 1.5 stops 0.125 and more."""
+"""Warn when more than this share of neighbouring pairs differs by a jump: dark photos in a row agree with one another.
+fox has 0.006, snowmiku97 0.035; darkening every third photo by 1.5 stops gives 0.125 and more."""
 
 ORDINARY = 16.0
-"""Quarters of the pairs differ by less than 0.03 stops in captures of phones and by 0.07 where half of a scene shines
-through the other: what is a jump lies far beyond."""
+"""A jump must exceed this multiple of the pairs' first quartile. That quartile is 0.03 stops in phone captures and 0.07
+if half of the scene is semi-transparent; jumps are much larger."""
 
 TINT = 0.25
-"""Difference of one channel to the mean of the three from which the white balance jumps, stops: half as much, since
-hues are seen sooner and a phone strays by 0.1."""
+"""White balance jumps if one channel differs from the mean of the three by more than this, stops. The limit is lower
+than `JUMP` because hue differences are more visible; a phone varies by 0.1."""
 
 ON_RAYS = 1.5
-"""Both limits are multiplied by this where there are no points: photos are compared where they roughly show the same
-thing."""
+"""Factor on both limits if the capture has no points, since the compared places then match only roughly."""
 
 AGREEING = 0.75
-"""Share of the neighbours that have to say the same, by half of it at least: one edge of a shadow is no exposure."""
+"""This share of the neighbours must show at least half of the difference, so that a shadow's edge does not count."""
 
 PAIRS = 20
-"""Points seen by both from which two photos are compared."""
+"""Two photos are compared if they share at least this many points."""
 
 MISMATCH = 0.8
-"""Median deviation of the ratios of two photos, stops, from which they show different things there."""
+"""Two photos show different things if their ratios' median absolute deviation exceeds this, stops."""
 
 TINT_MISMATCH = 0.3
-"""The same for a channel against the mean of the three: things differ less in hue than in brightness."""
+"""The same limit for a channel relative to the mean of the three: surfaces differ less in hue than in brightness."""
 
 SMOOTH = 1.0
-"""Standard deviation thumbnails are smoothed with, px: points and poses are off by about as much."""
+"""Sigma of the blur applied to thumbnails, px: about the error of points and poses."""
 
 SMOOTH_ON_RAYS = 2.5
-"""The same where there are no points and the subject's depth is taken to be the same everywhere."""
+"""The same if the capture has no points, so that a constant depth is assumed."""
 
 
 def check_blur(survey: Survey) -> list[Finding]:
-    """Find photos with less fine detail than their neighbours, along any direction."""
+    """Find photos with less fine detail than their neighbours in some direction."""
     losses = detail_losses(survey)
     middle = float(np.median(losses))
     sharper = middle - float(np.quantile(losses, 0.16))
@@ -104,24 +103,24 @@ def check_blur(survey: Survey) -> list[Finding]:
         return []
     names = tuple(survey.names[i] for i in worst_first)
     what = f"{len(names)} of {len(losses)} photos show less detail than their neighbours"
-    advice = f"take out or retake the blurred photos, first {names[0]}: a scene learns their blur"
+    advice = f"remove or retake the blurred photos, first {names[0]}: the scene learns their blur"
     return [Finding("blurred", Severity.WARNING, what, advice, names)]
 
 
 def _chance(shot: Shot) -> float:
-    """Return the loss that chance may give a photo of its size."""
+    """Return the largest loss that chance explains for a photo of this size."""
     W, H = shot.size
     share = min(1.0, WORK_SIDE / max(W, H))
     return CHANCE * math.sqrt(2.0 * (4.0 * math.pi * COARSE**2) / (W * H * share * share))
 
 
 def detail_losses(survey: Survey) -> Float64[np.ndarray, " C"]:
-    """Return by how much each photo's detail is below the median of its neighbours', where most is lost.
+    """Return each photo's loss of detail relative to the median of its neighbours, in the worst direction.
 
     Returns:
         Natural logarithms of energy; 0 for a photo like its neighbours.
     """
-    detail = np.stack([shot.look.detail for shot in survey.shots])
+    detail = np.stack([shot.stats.detail for shot in survey.shots])
     losses = np.empty(len(detail))
     for i, near in enumerate(survey.geometry.neighbours):
         others = near if len(near) >= ENOUGH else np.delete(np.arange(len(detail)), i)
@@ -129,32 +128,34 @@ def detail_losses(survey: Survey) -> Float64[np.ndarray, " C"]:
     return losses
 
 
-def check_twins(survey: Survey) -> list[Finding]:
-    """Find photos that are there twice, and poses that two photos have."""
-    twins, poses = _twins(survey), _same_poses(survey)
+def check_duplicates(survey: Survey) -> list[Finding]:
+    """Find duplicate photos, and different photos with the same pose."""
+    duplicates, poses = _duplicates(survey), _same_poses(survey)
     names = survey.names
     found = []
-    if moved := [(i, j) for i, j in twins if _motion(survey, i, j) > TWIN_MOTION]:
+    if moved := [(i, j) for i, j in duplicates if _motion(survey, i, j) > DUPLICATE_MOTION]:
         named = tuple(f"{names[i]} and {names[j]}" for i, j in moved)
-        what = f"{counted(len(moved), 'pair')} of photos that are nearly the same, but with poses that differ"
-        advice = "take out one photo of each pair that shows the same: one of the two poses is wrong"
+        what = f"{counted(len(moved), 'pair')} of nearly identical photos with different poses"
+        advice = "remove one photo of each identical pair with different poses: one of the poses is wrong"
         found.append(Finding("same photo", Severity.WARNING, what, advice, named))
-    if copies := [pair for pair in twins if pair not in moved]:
+    if copies := [pair for pair in duplicates if pair not in moved]:
         named = tuple(f"{names[i]} and {names[j]}" for i, j in copies)
-        what = f"{counted(len(copies), 'pair')} of photos that are nearly the same, from one place"
-        advice = "take out one photo of each such pair: if one of them is for testing, it tests nothing"
+        what = f"{counted(len(copies), 'pair')} of nearly identical photos from one place"
+        advice = (
+            "remove one photo of each duplicate pair: a test photo with a duplicate in training tests nothing"
+        )
         found.append(Finding("duplicates", Severity.WARNING, what, advice, named))
-    if apart := sorted(poses - set(twins)):
+    if apart := sorted(poses - set(duplicates)):
         named = tuple(f"{names[i]} and {names[j]}" for i, j in apart)
-        what = f"{counted(len(apart), 'pair')} of photos that show different things"
-        advice = "look at the photos that share a pose: something moved between them, or a pose is wrong"
+        what = f"{counted(len(apart), 'pair')} of different photos with the same pose"
+        advice = "check the photos that share a pose: something moved between them, or a pose is wrong"
         found.append(Finding("same pose", Severity.WARNING, what, advice, named))
     return found
 
 
-def _twins(survey: Survey) -> list[tuple[int, int]]:
-    """Return the pairs of photos of nearly the same pixels; each photo with the first that it is like."""
-    signatures = [_signature(shot.look.thumbnail.astype(np.float32)) for shot in survey.shots]
+def _duplicates(survey: Survey) -> list[tuple[int, int]]:
+    """Return the pairs of nearly identical photos; each photo is paired with the earlier one most like it."""
+    signatures = [_signature(shot.stats.thumbnail.astype(np.float32)) for shot in survey.shots]
     by_size: dict[int, list[int]] = {}
     for i, signature in enumerate(signatures):
         by_size.setdefault(signature.size, []).append(i)
@@ -163,13 +164,13 @@ def _twins(survey: Survey) -> list[tuple[int, int]]:
         table = np.stack([signatures[i] for i in alike])
         for k in range(1, len(alike)):
             distances = np.sqrt(np.mean(np.square(table[:k] - table[k]), axis=1))
-            if distances.min() < TWIN:
+            if distances.min() < DUPLICATE:
                 pairs.append((alike[int(np.argmin(distances))], alike[k]))
     return pairs
 
 
 def _motion(survey: Survey, i: int, j: int) -> float:
-    """Return how far what one picture shows has moved in another, median, in widths; infinite if it is not there."""
+    """Return the median shift of photo i's sample points in photo j, in image widths; infinite if none is visible."""
     one, other = survey.geometry.cameras[i], survey.geometry.cameras[j]
     points = survey.geometry.samples[i]
     if not inside(other, points).any():
@@ -179,9 +180,9 @@ def _motion(survey: Survey, i: int, j: int) -> float:
 
 
 def _signature(thumbnail: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " n"]:
-    """Return a photo as a few numbers with mean 0 and spread 1, whatever its exposure."""
+    """Return a small version of a photo normalised to mean 0 and contrast 1, independent of exposure."""
     h, w = thumbnail.shape[:2]
-    share = min(1.0, TWIN_SIDE / max(h, w))
+    share = min(1.0, DUPLICATE_SIDE / max(h, w))
     size = max(1, round(w * share)), max(1, round(h * share))
     small = cv2.resize(thumbnail, size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
     small = small - small.mean(axis=0)
@@ -189,7 +190,7 @@ def _signature(thumbnail: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "
 
 
 def _same_poses(survey: Survey) -> set[tuple[int, int]]:
-    """Return the pairs of cameras that stand at one place and look one way."""
+    """Return the pairs of cameras with the same pose."""
     geometry, pairs = survey.geometry, set[tuple[int, int]]()
     rotations = np.stack([camera.R for camera in geometry.cameras])
     for i in range(1, len(rotations)):
@@ -200,7 +201,7 @@ def _same_poses(survey: Survey) -> set[tuple[int, int]]:
 
 
 def check_exposure(survey: Survey) -> list[Finding]:
-    """Find photos brighter, darker or of another tint than their neighbours, at what both see."""
+    """Find photos whose brightness or tint differs from their neighbours' at shared points."""
     gains = Gains(survey)
     unsure = 1.0 if len(survey.points) else ON_RAYS
     light, tint = gains.light, gains.tint
@@ -209,25 +210,25 @@ def check_exposure(survey: Survey) -> list[Finding]:
         names = tuple(survey.names[i] for i in jumping)
         stops = tuple(f"{light[i]:+.1f}" for i in jumping)
         what = f"{len(names)} of {len(light)} photos are brighter or darker than neighbours that see the same, in stops"
-        advice = f"look at {names[0]}: did the exposure jump, or your shadow fall on the scene? fix it or leave it out"
+        advice = f"check {names[0]}: did the exposure jump, or did your shadow fall on the scene? correct or remove it"
         found.append(Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops))
     elif (share := gains.differing(unsure * JUMP)) > DIFFERING:
         what = f"{100 * share:.0f} % of consecutive photos differ by more than {unsure * JUMP:.1f} stops"
-        advice = "fix the exposure while you take photos: some are brighter than the rest"
+        advice = "lock the exposure while you take photos: some are brighter than the rest"
         found.append(Finding(EXPOSURE, Severity.WARNING, what, advice))
     if len(tinted := [i for i in np.argsort(-tint) if tint[i] > unsure * TINT]):
         names = tuple(survey.names[i] for i in tinted)
         what = f"{len(names)} of {len(tint)} photos have another tint than neighbours that see the same"
-        advice = "fix the white balance while you take photos, or take out the photos with another tint"
+        advice = "lock the white balance while you take photos, or remove the photos with another tint"
         found.append(Finding("white balance", Severity.WARNING, what, advice, names))
     return found
 
 
 class Gains:
-    """How bright photos are against their neighbours.
+    """Brightness and tint of each photo relative to its neighbours.
 
-    Colours are compared at the points that stand for what a camera sees, where they fall in both photos: the median of
-    the ratio over the points, and of that over the neighbours.
+    Colours are compared at the camera's sample points that are visible in both photos. The result is the median ratio
+    over the points, then the median over the neighbours.
 
     Args:
         survey: The capture.
@@ -237,40 +238,40 @@ class Gains:
         self._survey = survey
         sigma = SMOOTH if len(survey.points) else SMOOTH_ON_RAYS
         self._smooth = [
-            cv2.GaussianBlur(shot.look.thumbnail.astype(np.float32), (0, 0), sigma) for shot in survey.shots
+            cv2.GaussianBlur(shot.stats.thumbnail.astype(np.float32), (0, 0), sigma) for shot in survey.shots
         ]
 
     @cached_property
     def light(self) -> Float64[np.ndarray, " C"]:
-        """(C,) how much brighter a photo is, stops; 0 where it cannot be compared or its neighbours disagree."""
+        """(C,) how much brighter each photo is, stops; 0 if it cannot be compared or its neighbours disagree."""
         return np.array([_agreed(_medians(pairs, MISMATCH)) for pairs in self._light])
 
     @cached_property
     def tint(self) -> Float64[np.ndarray, " C"]:
-        """(C,) largest difference of a channel to the mean of the three, stops; 0 as for light."""
+        """(C,) largest difference of a channel from the mean of the three, stops; 0 as for `light`."""
         by_channel = [[_agreed(_medians(pairs, TINT_MISMATCH)) for pairs in self._tint(c)] for c in range(3)]
         return np.asarray(np.abs(by_channel).max(axis=0))
 
     def differing(self, limit: float) -> float:
-        """Return the share of pairs of neighbours whose brightness differs by more than a limit, stops.
+        """Return the share of neighbouring pairs whose brightness differs by more than a limit, stops.
 
-        Where neighbours differ anyhow, the limit is `ORDINARY` times what the more equal quarter of them does.
+        The limit is at least `ORDINARY` times the pairs' first quartile.
         """
         pairs = np.abs(np.concatenate([np.zeros(0), *(_medians(pairs, MISMATCH) for pairs in self._light)]))
         return float(np.mean(pairs > max(limit, ORDINARY * np.quantile(pairs, 0.25)))) if len(pairs) else 0.0
 
     @property
     def _light(self) -> Iterator[list[Float64[np.ndarray, "..."]]]:
-        """For each photo, and each neighbour, by how much each point is brighter, stops."""
+        """For each photo and neighbour, how much brighter each point is, stops."""
         return ([ratios.mean(axis=1) for ratios in pairs] for pairs in self._ratios)
 
     def _tint(self, channel: int) -> Iterator[list[Float64[np.ndarray, "..."]]]:
-        """The same for one channel against the mean of the three."""
+        """The same for one channel relative to the mean of the three."""
         return ([ratios[:, channel] - ratios.mean(axis=1) for ratios in pairs] for pairs in self._ratios)
 
     @cached_property
     def _ratios(self) -> tuple[list[Float64[np.ndarray, "_ 3"]], ...]:
-        away = looking_away(self._survey.geometry)  # what is wrong with those is another matter
+        away = facing_away(self._survey.geometry)  # another check reports these
         return tuple([] if i in away else self._against_neighbours(i) for i in range(len(self._smooth)))
 
     def _against_neighbours(self, i: int) -> list[Float64[np.ndarray, "_ 3"]]:
@@ -284,7 +285,7 @@ class Gains:
         return found
 
     def _colors(self, i: int, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """Look points up in a photo; NaN where they fall outside or the colour is cut off."""
+        """Sample a photo at points; NaN if a point is outside the image or its colour is clipped."""
         if not len(points):
             return np.zeros((0, 3))
         image, camera = self._smooth[i], self._survey.geometry.cameras[i]
@@ -301,7 +302,7 @@ class Gains:
 
 
 def _agreed(values: Float64[np.ndarray, " n"]) -> float:
-    """Return the median of what neighbours say, where most of them say at least half of it."""
+    """Return the neighbours' median if most of them show at least half of it, otherwise 0."""
     if len(values) < ENOUGH:
         return 0.0
     median = float(np.median(values))
@@ -309,7 +310,7 @@ def _agreed(values: Float64[np.ndarray, " n"]) -> float:
 
 
 def _medians(pairs: Sequence[Float64[np.ndarray, "..."]], mismatch: float) -> Float64[np.ndarray, " m"]:
-    """Return the median of each pair of photos that show the same."""
+    """Return the median of each pair of photos that show the same thing."""
     return np.array([np.median(ratios) for ratios in pairs if _deviation(ratios) < mismatch])
 
 
