@@ -307,7 +307,7 @@ def test_time_that_is_left_is_used_and_the_numbers_give_the_same_bits(capture, t
     stored = folder.read_config()["train"]
     assert stored["iterations"] == total and stored["means_rate_iterations"] == 20, "milestones stay"
     assert f"20 iterations were planned, {total} fitted" in outcome
-    words = outcome.split("the same again: ")[1].split()
+    words = outcome.split("to repeat the run: ")[1].split()
     fixed = ["--save-every", "0", "--eval-every", "0"]
     assert main(["train", str(capture), "--out", str(tmp_path / "again"), *fixed, *words]) == 0
     scenes = [RunFolder(tmp_path / name).latest_scene()[0].read_bytes() for name in ("run", "again")]

@@ -1,1 +1,1 @@
-"""What a training costs on this machine, and how a limit of time or memory is kept."""
+"""Forecast the cost of a training on this machine, and keep limits of time and memory."""

@@ -1,7 +1,7 @@
-"""What a training costs as arithmetic: memory and time of any number of Gaussians, pixels and iterations.
+"""Cost model of a training: memory and time for any number of Gaussians, pixels and iterations.
 
-Memory is counted by what has to lie there at once, on top of what the process holds; the constants were measured from
-outside on whole runs (benchmarks/RESULTS.md). Time is fitted to the steps that `gsplat_edu.budget.probe` took.
+Memory is the sum of everything held at the same time, added to the process's own; the constants were measured from
+outside on whole runs (benchmarks/RESULTS.md). Time is fitted to the steps measured by `gsplat_edu.budget.probe`.
 """
 
 from __future__ import annotations
@@ -19,52 +19,53 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.train.config import TrainConfig
 
 GROWTH = (0.005, 0.08)
-"""adc: Gaussians that a densification adds, for each pixel of a photo and for each start point. Whole trainings added
-3,100 (snowmiku97, 3,000 iterations), 4,100 (7,000), 5,500 (7,000, not rescaled) and 3,900 (1,200 at half size), where
-this says 5,700 and 3,000; fox 3,500, where it says 5,000. Scenes of many small things ask for several times as many."""
+"""adc: Gaussians added per densification, for each pixel of a photo and for each start point. The model gives 5,700 for
+snowmiku97 and 3,000 at half size; whole trainings added 3,100 (3,000 iterations), 4,100 (7,000), 5,500 (7,000, not
+rescaled) and 3,900 (1,200, half size). For fox it gives 5,000; 3,500 were added. Scenes with much fine detail need
+several times as many."""
 
 FEW_POINTS = 30_000
-"""Start points beyond these do not make a scene ask for more."""
+"""Start points beyond this number do not increase the growth."""
 
 COPIES = 8
-"""Sizes of the parameters that a Gaussian takes at the peak: parameters, gradients, two moments, the copies that
-density control makes of them, and the holes those leave behind."""
+"""Peak memory of a Gaussian as a multiple of its parameters: parameters, gradients, two moments, the copies that
+density control makes, and fragmentation."""
 
 PER_GAUSSIAN = 100
-"""Bytes of a Gaussian in the renderer's buffers, and in the statistics of density control."""
+"""Bytes per Gaussian in the renderer's buffers and in the statistics of density control."""
 
 PER_PAIR = 75
-"""Bytes of a pair of Gaussian and tile: the pair, its gradients' slot, a quarter for growth, and what was too small."""
+"""Bytes per pair of Gaussian and tile: the pair, its gradient slot, a quarter for growth, and outgrown buffers."""
 
 TRAINED_PAIRS = 5
-"""Pairs per Gaussian of a trained scene; those of benchmarks/RESULTS.md have 3.4 to 5.0."""
+"""Pairs per Gaussian in a trained scene; those in benchmarks/RESULTS.md have 3.4 to 5.0."""
 
 PER_PIXEL = 180
-"""Bytes that judging takes for a pixel: images of float64 and their differences. A training step takes fewer."""
+"""Bytes per pixel during evaluation: float64 images and their differences. A training step takes fewer."""
 
 DECODING = 10
-"""Bytes that decoding takes for a pixel of the file (`gsplat_edu.data.images.AT_ONCE`)."""
+"""Bytes per pixel of the file during decoding (`gsplat_edu.data.images.AT_ONCE`)."""
 
 PICTURE_BYTES = 250_000
-"""Of a test view in the report, until that is written."""
+"""Bytes per test view held for the report until it is written."""
 
 LATER = 150 * 2**20
-"""Bytes that a process grows by once it trains and judges, whatever the scene: code, threads, arenas."""
+"""Growth of the process once it trains and evaluates, bytes, for any scene: code, threads, allocator arenas."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What of a capture decides the cost.
+    """Properties of a capture that determine the cost.
 
     Args:
-        train: Views to train on.
-        test: Views that are held out.
-        points: Start points.
-        pixels: Of a view, the mean.
+        train: Number of training views.
+        test: Number of held-out views.
+        points: Number of start points.
+        pixels: Mean pixels of a view.
         largest: Pixels of the largest view.
-        full: Pixels of the largest photo as it is decoded, before it is made smaller.
-        photo_bytes: Of all photos in memory.
-        workers: Photos decoded at once.
+        full: Pixels of the largest photo as decoded, before it is downscaled.
+        photo_bytes: Bytes of all photos in memory.
+        workers: Number of photos decoded at the same time.
     """
 
     train: int
@@ -78,11 +79,11 @@ class Facts:
 
     @classmethod
     def of(cls, dataset: Dataset, full: Dataset | None = None) -> Facts:
-        """Take the facts of a dataset.
+        """Collect the facts of a dataset.
 
         Args:
-            dataset: The capture at the size it is trained at.
-            full: The same at the size of its files; None where that is the same.
+            dataset: The capture at training size.
+            full: The capture at the size of its files; None if that is the training size.
         """
         sizes, decoded = (
             [v.camera.W * v.camera.H for v in (*d.train, *d.test)] for d in (dataset, full or dataset)
@@ -99,7 +100,7 @@ class Facts:
         )
 
     def smaller(self, factor: float) -> Facts:
-        """Return the facts with both sides of every view divided by a factor."""
+        """Return the facts with width and height of every view divided by a factor."""
         area = factor * factor
         return dataclasses.replace(
             self,
@@ -123,7 +124,7 @@ class Speed:
 
     @classmethod
     def fitted(cls, steps: Sequence[tuple[float, float, float]]) -> Speed:
-        """Fit it to (Gaussians, pixels, seconds) of measured steps, by least squares with no part below zero."""
+        """Fit measured steps (Gaussians, pixels, seconds) by non-negative least squares."""
         table = np.array(steps, dtype=np.float64)
         columns = np.stack([np.ones(len(table)), table[:, 1], table[:, 0]], axis=1)
         scale = columns.max(axis=0)
@@ -133,18 +134,18 @@ class Speed:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What `probe` found.
+    """Measurements of `gsplat_edu.budget.probe.probe`.
 
     Args:
         backend: The backend that rendered.
-        speed: Of an iteration.
+        speed: Time of an iteration.
         read: Seconds to read a photo.
-        score: Seconds to score a view, for each of its pixels.
-        picture: Seconds to write a test view's pictures, for each of its pixels.
-        pairs: Pairs of Gaussian and tile of the start, in a view.
-        resident: Bytes the process held before it trained.
-        settled: Bytes it held after the probe, what was freed given back.
-        noise: How far the times of equal steps lay apart, as a factor.
+        score: Seconds per pixel to score a view.
+        picture: Seconds per pixel to write a test view's pictures.
+        pairs: Pairs of Gaussian and tile in one view of the start scene.
+        resident: Bytes held by the process before training.
+        settled: Bytes held after the probe, with freed memory returned to the system.
+        noise: Spread of the times of equal steps, as a factor.
     """
 
     backend: str
@@ -159,23 +160,23 @@ class Measurements:
 
     @property
     def process(self) -> int:
-        """Bytes of the process without scene and photos, once it has trained and judged.
+        """Bytes of the process without scene and photos, once it has trained and evaluated.
 
-        A GPU's driver takes what it takes. Of what the kernels keep after a probe nothing is lost to the run.
+        On a GPU this includes the driver's memory. The run reuses buffers that the kernels keep after the probe.
         """
         later = self.resident + LATER
         return max(later, self.settled) if self.backend == "cuda" else later
 
 
 def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np.ndarray, " iterations"]:
-    """Guess how many Gaussians every iteration renders.
+    """Estimate the number of Gaussians at every iteration.
 
-    adc adds the same number at each densification, see `GROWTH`; mcmc multiplies; a cap binds both.
+    adc adds the same number at each densification (see `GROWTH`), mcmc grows by a factor; a cap limits both.
 
     Args:
         config: The run.
-        points: Start points.
-        pixels: Of a view.
+        points: Number of start points.
+        pixels: Pixels of a view.
     """
     cap = config.max_gaussians or sys.maxsize
     counts = np.full(config.iterations, min(points, cap), dtype=np.int64)
@@ -190,7 +191,7 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
 
 
 def wanted_gaussians(config: TrainConfig, points: int, pixels: float) -> int:
-    """Guess how many Gaussians the images ask for in the time there is: the growth of adc, without a cap.
+    """Estimate how many Gaussians the images need within the given iterations: the growth of adc without a cap.
 
     Arguments as for `expected_counts`.
     """
@@ -204,13 +205,13 @@ def _added(points: int, pixels: float) -> int:
 
 @dataclass(frozen=True)
 class Footprint:
-    """How memory follows from the choices that a run leaves open.
+    """Memory as a function of the number of Gaussians and the memory for photos.
 
     Args:
-        facts: The capture, at the size it is trained at.
-        process: Bytes without scene and photos.
-        pairs: Pairs of Gaussian and tile of the start, in a view.
-        sh_degree: Of the Gaussians.
+        facts: The capture at training size.
+        process: Bytes of the process without scene and photos.
+        pairs: Pairs of Gaussian and tile in one view of the start scene.
+        sh_degree: SH degree of the Gaussians.
     """
 
     facts: Facts
@@ -224,11 +225,11 @@ class Footprint:
         return COPIES * 4 * floats + PER_GAUSSIAN
 
     def parts(self, gaussians: int, image_memory: int) -> dict[str, int]:
-        """Return what lies in memory at the peak, bytes.
+        """Return the peak memory by part, bytes.
 
         Args:
-            gaussians: The most there will be.
-            image_memory: Bytes of photos to keep.
+            gaussians: Largest number of Gaussians.
+            image_memory: Bytes of photos kept in memory.
         """
         facts = self.facts
         kept = min(facts.photo_bytes, image_memory)
@@ -240,21 +241,21 @@ class Footprint:
             "Gaussians": gaussians * self._per_gaussian + pairs * PER_PAIR,
             "images": int(PER_PIXEL * facts.largest + read_again) + facts.test * PICTURE_BYTES,
         }
-        # All photos are read before there is a Gaussian: several at once, at their full size.
+        # Photos are first read before any Gaussian exists, several at once and at full size.
         reading = int(facts.workers * DECODING * facts.full)
         found["images"] = max(found["images"], reading - found["Gaussians"])
         return found
 
     def peak(self, gaussians: int, image_memory: int) -> int:
-        """Return the bytes at the peak; arguments as for `parts`."""
+        """Return the peak memory in bytes; arguments as for `parts`."""
         return sum(self.parts(gaussians, image_memory).values())
 
     def most_gaussians(self, limit: int, image_memory: int) -> int:
-        """Return how many Gaussians a limit in bytes leaves room for; below zero where there is none for any."""
+        """Return how many Gaussians fit into a limit in bytes; negative if not even an empty scene fits."""
         if self.peak(0, image_memory) > limit:
             return -1
-        # Where reading sets the peak, Gaussians take the room that it leaves; no more fit than all of the limit holds.
-        low, high = 0, limit // self._per_gaussian + 1  # of which the first fits and the second does not
+        # While reading determines the peak, Gaussians are free; the limit itself gives an upper bound for the search.
+        low, high = 0, limit // self._per_gaussian + 1  # low fits, high does not
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if self.peak(middle, image_memory) <= limit else (low, middle)

@@ -1,4 +1,4 @@
-"""Limits of time: a number of seconds, and the clock that counts them."""
+"""Time limits: a number of seconds, and the clock that counts them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ Clock = Callable[[], float]
 
 
 def stopwatch(elapsed: float = 0.0) -> Clock:
-    """Return a clock that runs from now on.
+    """Return a clock that starts now.
 
     Args:
-        elapsed: Seconds that it shows now, for work that began earlier.
+        elapsed: Its initial reading in seconds, for work that began earlier.
     """
     began = time.perf_counter() - elapsed
     return lambda: time.perf_counter() - began
@@ -22,11 +22,11 @@ def stopwatch(elapsed: float = 0.0) -> Clock:
 
 @dataclass(frozen=True)
 class Deadline:
-    """A limit of time.
+    """A time limit.
 
     Args:
-        seconds: How long the work may take, from the moment at which the clock showed 0.
-        clock: The seconds since the work began; by default they are counted from here on.
+        seconds: The limit, counted from the clock's zero.
+        clock: Returns the seconds since the work began; by default it starts now.
     """
 
     seconds: float
@@ -39,5 +39,5 @@ class Deadline:
 
     @property
     def left(self) -> float:
-        """Seconds until the limit; below zero once it has passed."""
+        """Seconds until the limit; negative once it has passed."""
         return self.seconds - self.clock()

@@ -1,4 +1,4 @@
-"""What a training will take on this machine: time and memory, and how sure that is."""
+"""Forecast the time and memory of a training on this machine, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from gsplat_edu.text import short_number, spelled_seconds
 from gsplat_edu.train.config import TrainConfig
 
 SAVING = 4e8
-"""Bytes per second at which checkpoints are written."""
+"""Write speed of checkpoints, bytes per second."""
 
 ENDING = 2.5
-"""Seconds for the scene's file, the report and the last checkpoint's bookkeeping."""
+"""Seconds to write the scene file, the report and the last checkpoint's bookkeeping."""
 
 SURE = 1.6
-"""Factor within which the time of a whole training is known on a quiet machine: how many Gaussians a scene will ask
-for, and how they will lie, is not known before."""
+"""The time of a whole training is known within this factor on a quiet machine: the number of Gaussians that a scene
+needs, and their layout, are unknown beforehand."""
 
 SURE_OF_MEMORY = 1.25
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a run is expected to take.
+    """Expected time and memory of a run.
 
     Args:
-        iterations: Its length.
-        backend: What renders.
-        gaussians: At its start and at its end.
-        steps: Seconds of its first and of its last iteration.
-        seconds: By part: "reading", "training", "judging" on the way, "saving", "ending".
-        memory: Bytes at the peak by part: "program", "photos", "Gaussians", "images".
-        factor: The time may be longer or shorter by it.
+        iterations: Number of iterations.
+        backend: The rendering backend.
+        gaussians: Numbers of Gaussians at the start and at the end.
+        steps: Seconds of the first and of the last iteration.
+        seconds: Seconds by part: "reading", "training", "judging" (intermediate evaluations), "saving", "ending".
+        memory: Peak bytes by part: "program", "photos", "Gaussians", "images".
+        factor: Uncertainty of the time, as a factor.
     """
 
     iterations: int
@@ -50,16 +50,16 @@ class Forecast:
 
     @property
     def total(self) -> float:
-        """Seconds from the first photo to the report."""
+        """Seconds from reading the first photo to writing the report."""
         return sum(self.seconds.values())
 
     @property
     def peak(self) -> int:
-        """Bytes at the peak."""
+        """Peak memory in bytes."""
         return sum(self.memory.values())
 
     def lines(self) -> list[str]:
-        """Say it: time, memory, and how sure that is."""
+        """Return the forecast as lines of text: time, memory and their uncertainty."""
         parts = ", ".join(f"{name} {spelled_seconds(s)}" for name, s in self.seconds.items() if s >= 0.5)
         first, last = (short_number(1e3 * s, 3) for s in self.steps)
         grown = " to ".join(f"{count:,}" for count in dict.fromkeys(self.gaussians))
@@ -69,13 +69,13 @@ class Forecast:
             + (f" ({parts})" if parts else ""),
             f"an iteration: {first} ms at first, {last} ms at the end; {grown} Gaussians",
             f"memory: up to {spelled_bytes(self.peak)} ({held})",
-            f"how sure: time within a factor of {self.factor:.1f}, memory of {SURE_OF_MEMORY}; measured just now, "
-            "while other programs took what they took",
+            f"accuracy: time within a factor of {self.factor:.1f}, memory within {SURE_OF_MEMORY}; measured just now, "
+            "with whatever else is running",
         ]
 
 
 def spelled_bytes(size: float) -> str:
-    """Write a size: 1.25 GiB, 204 MiB."""
+    """Format a size: 1.25 GiB, 204 MiB."""
     return f"{size / 2**30:.3g} GiB" if size >= 2**30 else f"{size / 2**20:.0f} MiB"
 
 
@@ -87,14 +87,14 @@ def predict(
     eval_every: int = RunOptions.eval_every,
     save_every: int = RunOptions.save_every,
 ) -> Forecast:
-    """Reckon what a run takes.
+    """Compute the forecast of a run from measurements.
 
     Args:
-        facts: The capture, at the size it is trained at.
-        measured: The machine.
+        facts: The capture at training size.
+        measured: Measurements of this machine.
         config: The run.
-        image_memory: Bytes of photos kept in memory; the others are read again, on one core of those that render.
-        eval_every: Iterations between judgements; 0 for none.
+        image_memory: Bytes of photos kept in memory; the others are read again, on one of the rendering cores.
+        eval_every: Iterations between evaluations; 0 for none.
         save_every: Iterations between checkpoints; 0 for none.
     """
     counts = expected_counts(config, facts.points, facts.pixels)
@@ -124,22 +124,22 @@ def predict(
 
 
 def ending_seconds(facts: Facts, score: float, picture: float) -> float:
-    """Reckon what comes after training: every view is scored, test views are drawn, the report is written.
+    """Estimate the time after training, seconds: score every view, draw the test views, write the report.
 
     Args:
         facts: The capture.
-        score: Seconds to score a view, for each of its pixels.
-        picture: Seconds to write a test view's pictures, for each of its pixels.
+        score: Seconds per pixel to score a view.
+        picture: Seconds per pixel to write a test view's pictures.
     """
     return ENDING + ((facts.train + facts.test) * score + facts.test * picture) * facts.pixels
 
 
 def saving_seconds(gaussians: float, sh_degree: int) -> float:
-    """Reckon what a checkpoint takes: parameters and two moments of each.
+    """Estimate the time of a checkpoint, seconds: parameters and two moments of each.
 
     Args:
-        gaussians: How many there are.
-        sh_degree: Theirs.
+        gaussians: Number of Gaussians.
+        sh_degree: Their SH degree.
     """
     return gaussians * 12 * (11 + 3 * (sh_degree + 1) ** 2) / SAVING
 
@@ -158,9 +158,9 @@ def forecast(
     Args:
         dataset: The capture.
         config: The run.
-        measured: What `probe` found; it is asked now where None.
+        measured: Measurements of `probe`; None to measure now.
         backend: The rendering backend, by its own name.
-        eval_every: Iterations between judgements; 0 for none.
+        eval_every: Iterations between evaluations; 0 for none.
         save_every: Iterations between checkpoints; 0 for none.
 
     Raises:

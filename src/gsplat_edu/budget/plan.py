@@ -1,8 +1,8 @@
-"""Settings that keep a training within a limit of memory or time, chosen before it starts.
+"""Choose settings that keep a training within a memory or time limit, before it starts.
 
-What the user gave stays; the rest follows from the forecast: size of the photos, how many of them are kept, the most
-Gaussians, and the iterations. The chosen numbers are printed, and stand in config.json: given as options they train the
-same bits again, though another plan may come out differently, since it looks at a clock.
+Options given by the user stay; the others follow from the forecast: the size of the photos, how many of them stay in
+memory, the maximum number of Gaussians, and the iterations. The chosen values are printed and stored in config.json.
+Given as options, they reproduce the training bit for bit. A new plan may choose other values, since it measures time.
 """
 
 from __future__ import annotations
@@ -23,46 +23,46 @@ from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
 
 PLANNED = ("iterations", *MILESTONES, "max_gaussians", "resolution", "image_memory")
-"""Settings that a plan may choose; `given` lists those of them that the user did."""
+"""Settings that a plan may choose; `given` lists those that the user set."""
 
 FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
-"""What photos may be made smaller by."""
+"""Factors by which photos may be downscaled."""
 
 SMALLEST_SIDE = 64
-"""px: no photo is made smaller than this."""
+"""Photos are not downscaled below this side, px."""
 
 START_PAIRS = 16
-"""Pairs of Gaussian and tile for each Gaussian of a start, before they are counted: more than most have."""
+"""Assumed pairs of Gaussian and tile per start Gaussian before they are counted: more than most scenes have."""
 
 LEAST_GAUSSIANS = 1_000
 
 DENSITY = 0.05
-"""Gaussians per pixel below which smaller photos are the better use of memory; snowmiku97 ends with 0.2."""
+"""Downscale the photos if memory allows fewer Gaussians per pixel than this; snowmiku97 ends with 0.2."""
 
 MEMORY_SHARE = 0.95
-"""Of a limit of memory that is planned with."""
+"""Fraction of the memory limit that a plan uses."""
 
 LEAST_ITERATIONS = 50
 
 WORTHWHILE_ITERATIONS = 1_500
-"""Photos are made smaller until this many fit into a limit of time, down to `WORTHWHILE_PIXELS`."""
+"""Photos are downscaled, at most to `WORTHWHILE_PIXELS`, until this many iterations fit into the time limit."""
 
 WORTHWHILE_PIXELS = 100_000
 
 TIME_SHARE = 0.9
-"""Of a limit of time that the schedule is planned for; what is left over is trained at the schedule's end."""
+"""Fraction of the time limit for which the schedule is planned; the rest extends the end of the schedule."""
 
 GUARD = 1.5
-"""adc: the cap over the number of Gaussians expected, so that a scene that asks for more does not eat the time."""
+"""adc: the cap as a multiple of the expected number of Gaussians, so that a scene that grows more keeps the time."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a run may take.
+    """Limits of a run.
 
     Args:
-        memory: Bytes at its peak, as the system counts the process; None for any.
-        time: From the start of the command to its end; None for any.
+        memory: Peak resident memory of the process, bytes; None for no limit.
+        time: Time from the start of the command to its end; None for no limit.
     """
 
     memory: int | None = None
@@ -70,11 +70,11 @@ class Limits:
 
     @property
     def seconds(self) -> float | None:
-        """The limit of time, from the start of the command to its end; None for any."""
+        """The time limit in seconds, from the start of the command to its end; None for no limit."""
         return None if self.time is None else self.time.seconds
 
     def __str__(self) -> str:
-        """Return the options that say so."""
+        """Return the limits as command-line options."""
         memory = [] if self.memory is None else [f"--max-memory {spelled_bytes(self.memory)}"]
         seconds = [] if self.seconds is None else [f"--time-limit {spelled_seconds(self.seconds)}"]
         return " and ".join(memory + seconds)
@@ -82,13 +82,13 @@ class Limits:
 
 @dataclass(frozen=True)
 class Plan:
-    """What was chosen.
+    """The chosen settings.
 
     Args:
-        options: The run with the chosen numbers.
-        by_time: Whether the iterations were chosen; `gsplat_edu.budget.pace.Pace` then uses up what time is left.
-        forecast: What it is expected to take; None where nothing had to be chosen.
-        sentences: What the user wants to know of it.
+        options: The run with the chosen values.
+        by_time: Whether the iterations were chosen; `gsplat_edu.budget.pace.Pace` then uses up the remaining time.
+        forecast: Expected time and memory; None if nothing had to be chosen.
+        sentences: Explanation for the user.
     """
 
     options: RunOptions
@@ -119,15 +119,15 @@ class Plan:
 
 @dataclass(frozen=True)
 class Request:
-    """What a plan is made from.
+    """Input of a plan.
 
     Args:
         options: The run as it would be without limits.
         limits: The limits.
         given: Names of `PLANNED` that the user gave.
         rescale: Whether milestones that are not given stretch with the iterations.
-        facts: The capture at the size that the user gave, or of its files.
-        factors: What its photos may be made smaller by, rising.
+        facts: The capture at the size given by the user, or at the size of its files.
+        factors: Allowed downscaling factors, ascending.
     """
 
     options: RunOptions
@@ -139,16 +139,16 @@ class Request:
 
     @property
     def by_time(self) -> bool:
-        """Whether the iterations are to be chosen."""
+        """Whether the plan chooses the iterations."""
         return self.limits.seconds is not None and "iterations" not in self.given
 
     def config(self, iterations: int, factor: float, cap: int | None) -> TrainConfig:
-        """Return the recipe of that many iterations, with a cap no higher than the time is planned for.
+        """Return the recipe for a number of iterations, with a cap that fits the memory and the planned time.
 
         Args:
-            iterations: The length.
-            factor: What photos are made smaller by.
-            cap: The most Gaussians that memory has room for; None for any.
+            iterations: Number of iterations.
+            factor: Downscaling factor of the photos.
+            cap: Number of Gaussians that fit into memory; None for no limit.
         """
         config = self.options.config
         if "iterations" not in self.given:
@@ -166,7 +166,7 @@ class Request:
 
 @dataclass(frozen=True)
 class _Choice:
-    """What memory leaves room for."""
+    """Settings that fit into memory."""
 
     factor: float
     image_memory: int
@@ -174,10 +174,10 @@ class _Choice:
 
 
 def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, rescale: bool = True) -> Plan:
-    """Choose what the user did not give so that the limits hold. It takes a few seconds, for a probe.
+    """Choose the settings that the user did not give so that the limits hold. The probe takes a few seconds.
 
-    Nothing is chosen where there is no limit of memory, and either none of time or the iterations are given: then
-    the training is cut short at the limit. A run that is resumed goes on with the numbers of its config.json.
+    Nothing is chosen if there is no memory limit and either no time limit or a given number of iterations; a training
+    with a time limit is then cut short at the limit. A resumed run keeps the values of its config.json.
 
     Args:
         options: The run as it would be without limits.
@@ -186,17 +186,18 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
         rescale: Whether milestones that are not given stretch with the iterations.
 
     Raises:
-        ArgumentError: the least settings are beyond a limit; says what would do. Or the backend is the dense one.
+        ArgumentError: even the smallest settings exceed a limit (the message names a sufficient one), or the backend is
+            the dense one.
         DatasetError: the capture cannot be read.
         CheckpointError: the config.json of a run to resume is damaged.
     """
     if options.resume and options.folder.exists():
-        said = f"{limits}: a resumed run keeps the numbers of its config.json; memory is not planned again"
+        said = f"{limits}: a resumed run keeps the values of its config.json; memory is not planned again"
         return Plan(taken_up(options, given), sentences=(said,) if limits.memory is not None else ())
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
         return Plan(options)
     if options.backend == "torch":
-        raise ArgumentError(f"{limits}: cannot be planned for --backend torch; take cpu or cuda")
+        raise ArgumentError(f"{limits}: cannot be planned for --backend torch; choose cpu or cuda")
     settings = options.data_settings
     chosen = {"resolution": settings.resolution, "max_gaussians": options.config.max_gaussians}
     fixed = frozenset(given) | {name for name, value in chosen.items() if value is not None}
@@ -222,21 +223,21 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
 
 
 def choose(request: Request, measured: Measurements, spent: float) -> Plan:
-    """Choose by arithmetic.
+    """Compute a plan from measurements.
 
     Args:
-        request: What the user wants.
-        measured: What this machine needs, measured with photos as large as the first of the factors makes them.
+        request: Input of the plan.
+        measured: Measurements of this machine, taken with photos downscaled by the first factor.
         spent: Seconds since the command began.
 
     Raises:
-        ArgumentError: the least settings are beyond a limit; says what would do.
+        ArgumentError: even the smallest settings exceed a limit; the message names a sufficient one.
     """
     length, factors = request.options.config.iterations, request.factors
     process, pairs = measured.process, measured.pairs
     choice = _within_memory(request, process, pairs, length, factors)
     if request.by_time:
-        # Twice: fewer iterations ask for fewer Gaussians, and leave room for more photos.
+        # Twice, because fewer iterations need fewer Gaussians, which leaves room for more photos.
         for _ in range(2):
             length, factor = _within_time(request, measured, choice, spent)
             factors = tuple(f for f in request.factors if f >= factor)
@@ -261,7 +262,7 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
 def _within_memory(
     request: Request, process: int, pairs: int, iterations: int, factors: tuple[float, ...]
 ) -> _Choice:
-    """Choose size and number of the photos, and a cap: the largest photos for which enough Gaussians have room."""
+    """Choose the largest photos that leave room for enough Gaussians, how many photos to keep, and the cap."""
     settings, limit = request.options.data_settings, request.limits.memory
     if limit is None:
         return _Choice(factors[0], settings.image_memory, None)
@@ -294,21 +295,21 @@ def _within_memory(
 
 
 def _photos_kept(footprint: Footprint, aim: int, enough: int, wanted: int) -> int:
-    """Choose how many bytes of photos are kept: all if they fit, else half of what Gaussians could have, or more."""
+    """Choose how many bytes of photos to keep: all if they fit, otherwise half of the free memory or more."""
     photos = footprint.facts.photo_bytes
     if footprint.peak(wanted, photos) <= aim:
         return photos
     half, spare = (aim - footprint.peak(0, 0)) // 2, aim - footprint.peak(wanted, 0)
     room = aim - footprint.peak(enough, 0)
     part = max(min(photos, max(half, spare), room), 0) // 2**20 * 2**20
-    # Photos that are read again are decoded at the size of their files, which may take more than keeping all of them.
+    # Photos that are read again are decoded at full size, which may take more memory than keeping all of them.
     return photos if footprint.most_gaussians(aim, photos) >= footprint.most_gaussians(aim, part) else part
 
 
 def _within_time(
     request: Request, measured: Measurements, choice: _Choice, spent: float
 ) -> tuple[int, float]:
-    """Choose iterations, and smaller photos where few would fit."""
+    """Choose the number of iterations, and smaller photos if too few iterations fit."""
     limit = request.limits.seconds or 0.0
     found, least = 0, math.inf
 
@@ -329,7 +330,7 @@ def _within_time(
             break
     if found < LEAST_ITERATIONS:
         raise ArgumentError(
-            f"--time-limit {spelled_seconds(limit)}: is too short: starting, reading and judging leave no time to "
+            f"--time-limit {spelled_seconds(limit)}: is too short: startup, reading and evaluation leave no time to "
             f"train; give at least {spelled_seconds(5 * math.ceil(least / 5))}"
         )
     return _rounded(found), choice.factor
@@ -345,7 +346,7 @@ def _resolution(request: Request, factor: float) -> float | None:
 
 
 def _rounded(count: int) -> int:
-    """Round down to two digits, or three where they begin with a 1: numbers that can be read and typed."""
+    """Round down to two digits, or to three if the first is 1, so that numbers are easy to read and type."""
     digits = 3 if str(count).startswith("1") else 2
     step = int(10 ** max(len(str(count)) - digits, 0))
     return count // step * step
@@ -354,7 +355,7 @@ def _rounded(count: int) -> int:
 def _sentences(request: Request, plan: Plan, at_cap: int) -> tuple[str, ...]:
     found, cap = plan.forecast, plan.max_gaussians
     chosen = flags(plan.options, request.given, photos=request.limits.memory is not None)
-    sentences = [f"{request.limits}: chosen {chosen or 'nothing, all was given'}"]
+    sentences = [f"{request.limits}: chosen {chosen or 'nothing, because every option was given'}"]
     if found is not None:
         sentences += [f"forecast: {line}" for line in found.lines()]
         if cap is not None and cap > found.gaussians[1]:
@@ -363,12 +364,12 @@ def _sentences(request: Request, plan: Plan, at_cap: int) -> tuple[str, ...]:
 
 
 def flags(options: RunOptions, given: Collection[str] = (), *, photos: bool = False) -> str:
-    """Write numbers that a plan chose as options of the command line: they train the same again.
+    """Return the values that a plan chose as command-line options that reproduce the training.
 
     Args:
         options: The run.
-        given: Names that the user gave anyway.
-        photos: Name the memory for photos too, which no result depends on.
+        given: Names of options that the user gave, which are left out.
+        photos: Include the memory for photos, which does not affect the result.
     """
     config, settings = options.config, options.data_settings
     words = []
@@ -391,10 +392,10 @@ def flags(options: RunOptions, given: Collection[str] = (), *, photos: bool = Fa
 
 
 def taken_up(options: RunOptions, given: Collection[str]) -> RunOptions:
-    """Return the options of a run to resume, with the numbers of its config.json where the user gave none.
+    """Return the options of a run to resume; config.json supplies the planned values that the user did not give.
 
     Args:
-        options: As the command line has them.
+        options: Options from the command line.
         given: Names of `PLANNED` that the user gave.
 
     Raises:

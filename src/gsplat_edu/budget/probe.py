@@ -1,4 +1,4 @@
-"""A few seconds of training, measured and thrown away: what this machine needs for a step, at this moment."""
+"""Measure this machine's current speed by training for a few seconds; the result is discarded."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ Bytes = UInt8[np.ndarray, "H W 3"]
 
 PROBE_STEPS = 9
 PROBE_SECONDS = 1.5
-"""A probe ends after this many steps, or after this long, but not before its third step; the first is not counted."""
+"""A probe ends after this many steps or seconds, but not before its third step; the first is not counted."""
 
 SMALL = 32
-"""px: views whose sides would be smaller than this are not halved for a trial."""
+"""Views are halved for a trial only if their sides stay at least this long, px."""
 
 SPREAD = 1.2
-"""Factor on the pairs of the views of a probe: another view may have more. In fox they are 11 % apart."""
+"""Factor on the measured pairs, since other views may have more. In fox, views differ by 11 %."""
 
 GROWN = (125_000, 250_000)
-"""Gaussians that the probe grows the start to, at most: by several doublings, and by the first."""
+"""The probe grows the start scene to at most this many Gaussians: with several doublings, and with one."""
 
 ASSUMED = 400 * 2**20
-"""Bytes of a process that has loaded torch, on systems that cannot be asked."""
+"""Assumed bytes of a process that has loaded torch, if the system does not report them."""
 
 
 def resident_bytes() -> int:
-    """Return the memory this process holds now; where the system does not tell, the most it has held, or a guess."""
+    """Return the memory this process holds now, in bytes; if unknown, its peak so far, or else `ASSUMED`."""
     try:
         for line in Path("/proc/self/status").read_text("ascii", errors="replace").splitlines():
             if line.startswith("VmRSS:"):
@@ -73,29 +73,29 @@ def resident_bytes() -> int:
 
 
 def give_back() -> None:
-    """Hand freed memory back to the system, where the C library can: it keeps what it may need again."""
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library than GNU's
+    """Return freed memory to the system if the C library supports it; by default it keeps memory for reuse."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # not the GNU C library
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measurements:
-    """Train for a few seconds and throw the result away: at the start, with more Gaussians, and on small views.
+    """Train for a few seconds and discard the result: with the start scene, with more Gaussians, and on small views.
 
-    More Gaussians are the start's, split until there are about as many as the run will have (or enough to see what one
-    costs), more opaque, as trained ones are. A start that is large itself is compared with half of it. Times are this
-    moment's: no two probes are alike.
+    The larger scene is the start scene, split until it has about as many Gaussians as the run will have (or enough to
+    measure the cost of one), with the higher opacity of trained Gaussians. A start scene that is already large is
+    compared with half of it. Times depend on the current load and differ between probes.
 
     Args:
         dataset: The capture; a few of its photos are read.
-        config: The run; its cap is kept.
-        backend: The rendering backend, by its own name.
+        config: The run; its cap is respected.
+        backend: Name of the rendering backend.
 
     Raises:
-        ArgumentError: the backend is the dense one, which takes minutes for an iteration of a capture.
+        ArgumentError: the backend is the dense one, which takes minutes per iteration of a capture.
         DatasetError: a photo cannot be read.
     """
     if backend == "torch":
-        raise ArgumentError("backend: torch is too slow to be measured on a capture; take cpu or cuda")
+        raise ArgumentError("backend: torch is too slow to be measured on a capture; choose cpu or cuda")
     resident, views = resident_bytes(), _spread(dataset.train, 4)
     reading, photos = [], []
     for view in views:
@@ -117,7 +117,7 @@ def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measur
     if min(min(view.camera.W, view.camera.H) for view in small) >= SMALL:
         trials.append(trial(start, small))
     score, picture = judging_seconds(grown, photos[:2], config, backend)
-    # of all of the start, and more than the few views had that were looked at
+    # scaled to the whole start scene, with a margin for views that were not measured
     pairs = math.ceil(SPREAD * trials[0].pairs * len(by_points) / len(start))
     del start, by_points, grown, small, photos
     give_back()
@@ -136,7 +136,7 @@ def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measur
 
 @dataclass(frozen=True)
 class _Trial:
-    """A few steps: Gaussians, mean pixels of the views, most pairs of a view, seconds of each step but the first."""
+    """A few steps: Gaussians, mean pixels of the views, most pairs in a view, seconds of each step but the first."""
 
     gaussians: int
     pixels: float
@@ -145,7 +145,7 @@ class _Trial:
 
 
 def _grown(start: Gaussians, wanted: int) -> Gaussians:
-    """Split every Gaussian until there are about as many as wanted; their area in the image stays what it was."""
+    """Split every Gaussian until there are about as many as wanted; their total area in the image is unchanged."""
     generator = torch.Generator().manual_seed(0)
     most = GROWN[1]
     while 2 * len(start) <= min(most, 1.5 * wanted):
@@ -192,14 +192,14 @@ def _until(moments: Sequence[float]) -> Callable[[], bool]:
 
 
 def _halved(view: View) -> View:
-    """Return a view of half the size; which pixels it keeps does not matter here."""
+    """Return a view of half the size; which pixels it keeps is irrelevant here."""
     camera, photo = view.camera, view.read()
     image, alpha, mask = (
         None if plane is None else np.ascontiguousarray(plane[::2, ::2])
         for plane in (photo.image, photo.alpha, photo.mask)
     )
     H, W = -(-camera.H // 2), -(-camera.W // 2)
-    assert image is not None  # a photo has one
+    assert image is not None  # every photo has an image
     small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(W, H))
     return View(small, image, alpha=alpha, mask=mask)
 
@@ -207,16 +207,16 @@ def _halved(view: View) -> View:
 def judging_seconds(
     gaussians: Gaussians, views: Sequence[View], config: TrainConfig, backend: str
 ) -> tuple[float, float]:
-    """Score views as the end of a run does.
+    """Time the scoring of views at the end of a run.
 
     Args:
-        gaussians: The scene; not changed.
+        gaussians: The scene; it is not changed.
         views: Views to score, at least one; the fastest counts.
-        config: How to render.
-        backend: The rendering backend, by its own name.
+        config: Rendering settings.
+        backend: Name of the rendering backend.
 
     Returns:
-        Seconds of scoring a view, and of writing the pictures of a test view, both for each of its pixels.
+        Seconds per pixel to score a view, and to write the pictures of a test view.
     """
     settings = RenderSettings(
         config.background,
@@ -241,7 +241,7 @@ def judging_seconds(
         began = time.perf_counter()
         score_views(placed, [view], renderer, config.background, draw)
         scoring.append((time.perf_counter() - began) / (view.camera.W * view.camera.H))
-    if not drawing:  # masks leave nothing of these views
+    if not drawing:  # masks exclude every pixel of these views
         return min(scoring), 0.0
     return max(min(scoring) - min(drawing), 0.0), min(drawing)
 
