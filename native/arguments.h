@@ -1,4 +1,4 @@
-// What Python hands over, taken by name and checked: a missing, unknown or unsuitable argument is an error that names it.
+// Arguments from Python, taken by name and checked. A missing, unknown or unsuitable argument raises an error that names it.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -15,7 +15,7 @@ namespace gsplat {
 
 namespace nb = nanobind;
 
-constexpr int64_t ANY = -1;  // a size that is not prescribed
+constexpr int64_t ANY = -1;  // a size that may take any value
 constexpr int MOST_AXES = 8;
 
 struct Shape {
@@ -65,8 +65,8 @@ inline std::string spelled(nb::dlpack::dtype type) {
     return (type.code < 7 ? codes[type.code] : "type") + std::to_string(type.bits);
 }
 
-// The C interface of DLPack 1.3, as a type offers it under __dlpack_c_exchange_api__. It fills in a description without
-// making any object, where `Tensor.__dlpack__` takes microseconds; a render has twenty arrays and more.
+// The C interface of DLPack 1.3, which a type offers as __dlpack_c_exchange_api__. It describes a tensor without creating
+// an object; `Tensor.__dlpack__` takes microseconds, and a render has twenty arrays or more.
 struct ExchangeApi {
     uint32_t major, minor;
     void *older;
@@ -75,10 +75,10 @@ struct ExchangeApi {
     void *stream;
 };
 
-// torch's, or null: it is not loaded, or too old to have one. No other type's is used: a description has no room to say
-// that an array is read-only, and torch's never are.
+// torch's interface; null if torch is not loaded or too old. No other type's is used, because a description cannot mark an
+// array as read-only; torch's arrays never are.
 inline const ExchangeApi *torch_api(nb::handle given) {
-    static PyObject *tensor_type = nullptr;  // with the GIL held, as all of this is
+    static PyObject *tensor_type = nullptr;  // guarded by the GIL, like everything here
     static const ExchangeApi *api = nullptr;
     if (!tensor_type) {
         PyObject *torch = PyDict_GetItemString(PyImport_GetModuleDict(), "torch");
@@ -94,10 +94,10 @@ inline const ExchangeApi *torch_api(nb::handle given) {
     return api && PyType_Check(tensor_type) && PyObject_TypeCheck(given.ptr(), (PyTypeObject *)tensor_type) ? api : nullptr;
 }
 
-// An array whose owner stays alive as long as this does. Empty where Python gave None.
+// An array that keeps its owner alive. Empty if Python passed None.
 struct Array {
     nb::object owner;
-    nb::ndarray<nb::ro> held;  // where it came by another way than torch's
+    nb::ndarray<nb::ro> held;  // if it did not come through torch's interface
     void *data = nullptr;
     Shape shape;
     nb::dlpack::dtype dtype{};
@@ -156,7 +156,7 @@ class Arguments {
         return value;
     }
 
-    // `count` numbers; infinite ones too, NaN never.
+    // `count` numbers; infinity is allowed, NaN is not.
     void numbers(const char *name, double *out, size_t count) {
         const nb::object sequence = nb::steal(PySequence_Fast(take(name).ptr(), ""));
         PyErr_Clear();
@@ -168,21 +168,21 @@ class Arguments {
         }
     }
 
-    // A C-contiguous, aligned array in this machine's memory, of one of `kinds` and of a shape.
+    // A C-contiguous, aligned array in this machine's memory, of one of `kinds` and the given shape.
     Array array(const char *name, std::initializer_list<Kind> kinds, const Shape &shape, bool written = false) {
         return read(name, take(name), kinds, &shape, written);
     }
 
-    // The same, or None.
+    // The same; None is allowed.
     Array array_or_none(const char *name, Kind kind, const Shape &shape, bool written = false) {
         nb::handle given = take(name);
         return given.is_none() ? Array{} : read(name, given, {kind}, &shape, written);
     }
 
-    // The same, of any shape.
+    // The same, with any shape.
     Array array_of_any_shape(const char *name, Kind kind, bool written) { return read(name, take(name), {kind}, nullptr, written); }
 
-    // Refuses what nobody took.
+    // Refuses arguments that were not taken.
     void finish() const {
         if (given_.size() == count_) return;
         for (auto [key, value] : given_) {
@@ -210,7 +210,7 @@ class Arguments {
         Array found = described(given, written);
         bool fits = found && found.here && found.contiguous && (!wanted || wanted->allows(found.shape));
         fits = fits && std::any_of(kinds.begin(), kinds.end(), [&](Kind kind) { return found.is(kind); });
-        if (fits && found.shape.size()) {  // what is empty may be nowhere
+        if (fits && found.shape.size()) {  // an empty array may have no address
             const auto address = reinterpret_cast<uintptr_t>(found.data);
             fits = address && address % (found.dtype.bits / 8) == 0;
         }

@@ -1,7 +1,7 @@
 // The module gsplat_edu._native. Only this file and arguments.h know Python.
 //
-// Every call takes its arguments by name, and arrays as arrays: dtype, shape, layout, alignment and device of each are
-// checked here, before a kernel sees its address. Kernels check nothing.
+// Every call takes its arguments by name. The dtype, shape, layout, alignment and device of every array are checked here,
+// before a kernel gets its address. Kernels check nothing.
 #include "arguments.h"
 
 #include <nanobind/stl/array.h>
@@ -53,7 +53,7 @@ Settings settings_of(Arguments a) {
     return set;
 }
 
-// Arrays with an entry per Gaussian: raw parameters, or covariances, colours and opacities.
+// Arrays with one entry per Gaussian: raw parameters, or covariances, colours and opacities.
 struct PerGaussian {
     Array means, quats, log_scales, sh0, sh_rest, logit_opacities, cov3ds, colors, opacities;
     bool direct = false;
@@ -115,7 +115,7 @@ struct GradientArrays : PerGaussian {
     }
 };
 
-// What a frame draws, or the loss's gradients of it; what is None is not wanted, or zero.
+// The images that a frame draws, or the loss's gradients of them. None means not wanted, or zero.
 struct ImageArrays {
     Array image, transmittance, depth;
 
@@ -129,7 +129,7 @@ struct ImageArrays {
     }
 };
 
-// Which scene and images a frame was made of, so that those of its other calls can be compared with them.
+// The scene and image sizes of a frame, against which the arguments of its later calls are checked.
 template <class T>
 struct BoundFrame {
     int64_t n, rest;
@@ -251,7 +251,7 @@ void adam(nb::args positional, nb::kwargs given) {
              [&](int64_t task, int) { kernels<T>().adam(args, task * GRAIN, std::min(size, (task + 1) * GRAIN)); });
 }
 
-// -> (mean |x - y|, mean SSIM); the gradient is written.
+// Returns (mean |x - y|, mean SSIM) and writes the gradient.
 template <class T>
 std::array<double, 2> loss_of(nb::args positional, nb::kwargs given) {
     Arguments a("loss", positional, given);
@@ -277,7 +277,7 @@ std::array<double, 2> loss_of(nb::args positional, nb::kwargs given) {
     return means;
 }
 
-// Vector FMAs per second of one thread: the unit that benchmarks count cost in.
+// Vector FMAs per second of one thread: the unit of cost in the benchmarks.
 double fma_rate() {
     nb::gil_scoped_release release;
     float sink = 0;
@@ -294,7 +294,7 @@ std::vector<std::string> isas() {
     return {names, names + count};
 }
 
-// A Python function, kept as long as the process: native frames may outlive the interpreter's modules.
+// A Python function, kept for the life of the process: native frames may outlive the interpreter's modules.
 PyObject *free_memory_function = nullptr;
 
 int64_t free_memory() {
@@ -304,7 +304,7 @@ int64_t free_memory() {
     const int64_t bytes = found && found != Py_None ? int64_t(PyLong_AsLongLong(found)) : -1;
     Py_XDECREF(found);
     if (!PyErr_Occurred()) return bytes;
-    // Out of memory, or the interpreter is ending: not knowing is no reason to end a training. An interrupt is.
+    // Out of memory, or the interpreter is shutting down: training continues without the answer. An interrupt ends it.
     if (!PyErr_ExceptionMatches(PyExc_MemoryError) && !PyErr_ExceptionMatches(PyExc_ImportError)) throw nb::python_error();
     PyErr_Clear();
     return -1;
@@ -313,7 +313,7 @@ int64_t free_memory() {
 }  // namespace
 
 NB_MODULE(_native, m) {
-    nb::set_leak_warnings(false);  // what Python still holds when it ends is freed with the process
+    nb::set_leak_warnings(false);  // objects that Python still holds at exit are freed with the process
     choose_isa(std::getenv("GSPLAT_EDU_ISA"));
     bind_struct<Camera>(m, "Camera", &camera_of);
     bind_struct<Settings>(m, "Settings", &settings_of);

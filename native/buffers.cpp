@@ -43,15 +43,15 @@ struct Spare {
     size_t capacity;
 };
 
-// Spares live as long as the process: frames may still be freed while it ends.
-// A forked child gets a new mutex: the thread that held it may not exist there.
+// Spare blocks live as long as the process, since frames may be freed during exit.
+// A forked child gets a new mutex: the thread that held the old one may not exist there.
 std::mutex *spares_lock = new std::mutex;
 [[maybe_unused]] const int registered = pthread_atfork(nullptr, nullptr, [] { spares_lock = new std::mutex; });
 
 std::vector<Spare> &spares() {
     static auto *list = [] {
         auto *made = new std::vector<Spare>;
-        made->reserve(MAX_SPARES + 2);  // a destructor adds to it and must not throw
+        made->reserve(MAX_SPARES + 2);  // a destructor appends to it and must not throw
         return made;
     }();
     return *list;
@@ -62,7 +62,7 @@ std::vector<Spare> &spares() {
 void ask_before_large_blocks(FreeMemory function) { free_memory = function; }
 
 #ifdef GSPLAT_SANITIZE
-// Exact sizes and real frees, so that the sanitizer sees every overrun; filled with what no kernel may rely on.
+// Exact sizes and real frees, so that the sanitizer sees every overrun; filled with garbage that no kernel may rely on.
 Buffer::~Buffer() { std::free(data_); }
 
 void *Buffer::reserve(size_t bytes) {
@@ -98,7 +98,7 @@ void *Buffer::reserve(size_t bytes) {
         spares().erase(best);
         return data_;
     }
-    // Nothing fits: grow the largest spare that is too small instead of keeping both.
+    // No spare fits: grow the largest one instead of keeping both.
     auto grow = spares().end();
     for (auto it = spares().begin(); it != spares().end(); ++it)
         if (it->capacity < bytes && (grow == spares().end() || it->capacity > grow->capacity)) grow = it;
@@ -106,7 +106,7 @@ void *Buffer::reserve(size_t bytes) {
         std::free(grow->data);
         spares().erase(grow);
     }
-    lock.unlock();  // asking may wait for Python, which may wait for this lock
+    lock.unlock();  // the query may wait for Python, which may wait for this lock
     const size_t rounded = (bytes + bytes / 4 + 4095) / 4096 * 4096;
     check_room(rounded);
     data_ = std::aligned_alloc(4096, rounded);

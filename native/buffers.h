@@ -1,4 +1,4 @@
-// Memory of frames, which outlives them.
+// Memory of frames, reused after they are gone.
 #pragma once
 
 #include <cstddef>
@@ -6,21 +6,20 @@
 
 namespace gsplat {
 
-// What is asked before a large block is allocated: the bytes that are free, negative where nobody knows. It may throw.
-// None at first.
+// Called before a large block is allocated: returns the free bytes, negative if unknown. It may throw. Initially none.
 using FreeMemory = int64_t (*)();
 void ask_before_large_blocks(FreeMemory free_memory);
 
-// Memory that is kept when its owner goes and handed to the next one that asks, so that frames of changing size do
-// not grow the process.
+// Memory that is kept when its owner is destroyed and given to the next one, so that frames of changing size do not grow
+// the process.
 class Buffer {
   public:
     Buffer() = default;
     ~Buffer();
     Buffer(const Buffer &) = delete;
     Buffer &operator=(const Buffer &) = delete;
-    // At least `bytes`; what was in it is lost. Throws std::bad_alloc, for a large block also where the system would
-    // grant memory that it does not have.
+    // At least `bytes`; previous contents are lost. Throws std::bad_alloc, for a large block also if the system would
+    // overcommit.
     void *reserve(size_t bytes);
     template <class T>
     T *as() const {

@@ -1,8 +1,8 @@
-// composite: one tile's splats, near to far, into its pixels.
+// composite: blend one tile's splats into its pixels, near to far.
 //
 //     p = log2_o - s² - t²;   alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 //
-// The tile ends before the first splat that finds every pixel below 1e-4.
+// A tile stops once the transmittance of every pixel is below 1e-4.
 #include "isa.h"
 #include "tile.h"
 
@@ -15,7 +15,7 @@ struct TileState {
     alignas(64) T red[TILE][TILE], green[TILE][TILE], blue[TILE][TILE], depth[TILE][TILE];
 };
 
-// Draws one splat; returns whether a pixel of the rows it touched still lets light through.
+// Draws one splat; returns whether any pixel in the rows it touched still has a transmittance of T_STOP or more.
 template <class T, bool DEPTH>
 GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileState<T> &tile) {
     using V = typename Vector<T>::V;

@@ -1,12 +1,12 @@
-// composite_backward: the gradient of compositing, near to far again, without dividing T back out.
+// composite_backward: the gradient of compositing, again near to far, so that T is not recovered by division.
 //
 // With g = dL/dimage, t = dL/dT_final and R = g . image + t T_final at the end, for each splat near to far:
 //
 //     cg = g . c;   w = T alpha;   R -= w cg;   dL/dalpha = T cg - R / (1 - alpha);   T -= w
 //     h = alpha dL/dalpha, 0 where alpha was clamped
 //
-// Every pair writes its sums over the tile's pixels, w g and the moments of h about the splat's reference point, to a slot
-// of its own.
+// Every pair writes its sums over the tile's pixels, w g and the moments of h about the splat's reference point, to its own
+// slot.
 #include "isa.h"
 #include "tile.h"
 
@@ -19,7 +19,7 @@ struct TileGradient {
     alignas(64) T red[TILE][TILE], green[TILE][TILE], blue[TILE][TILE], depth[TILE][TILE];
 };
 
-// One splat: its sums over the tile into `slot`.
+// Writes one splat's sums over the tile to `slot`.
 template <class T, bool WITH_DEPTH>
 GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileGradient<T> &tile, T *slot) {
     using V = typename Vector<T>::V;
@@ -32,7 +32,7 @@ GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, 
         const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
         const V across = splat(s.s0) + splat(s.sx) * dx;
         V wr = V{}, wg = V{}, wb = V{};
-        V sum0 = V{}, sum1 = V{}, sum2 = V{};  // h, h dy, h dy²; the factors dx are put in once per splat
+        V sum0 = V{}, sum1 = V{}, sum2 = V{};  // h, h dy, h dy²; multiplied by dx once per splat
         V dy = splat(T(first + box.y0) - s.y);
         for (int row = first; row <= last; ++row, dy += splat(T(1))) {
             const V q = across + splat(terms.shift[row]), p = splat(terms.base[row]) - q * q;
@@ -64,7 +64,7 @@ GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, 
     slot[HYY] = sum(hyy), slot[DEPTH] = WITH_DEPTH ? sum(wz) : T(0);
 }
 
-// Loads what the pixels of a tile need; returns through `background` the sum of g T_final.
+// Loads the inputs of a tile's pixels; returns the sum of g T_final through `background`.
 template <class T, bool WITH_DEPTH>
 GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBox &box, TileGradient<T> &tile, T *background) {
     const CompositeArgs<T> &forward = args.forward;

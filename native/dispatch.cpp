@@ -1,4 +1,4 @@
-// Which instruction set runs: the best this machine has, or the one GSPLAT_EDU_ISA names.
+// Selects the instruction set: the best one of this machine, or the one named by GSPLAT_EDU_ISA.
 #include <cstdlib>
 #include <cstring>
 #include <stdexcept>

@@ -13,7 +13,7 @@
 namespace gsplat {
 namespace {
 
-// Adds the time until it goes to a figure.
+// Adds its lifetime to a total.
 class Timer {
   public:
     explicit Timer(double &seconds) : seconds_(seconds) {}
@@ -61,8 +61,8 @@ void Frame<T>::sort() {
     sort_by_depth(splats(), visible(), visible_count_, sorted);
 }
 
-// Counts pairs per chunk and tile, lays the lists out, and writes them: every list comes out in depth order, and
-// the same for any number of chunks.
+// Counts pairs per chunk and tile, lays out the lists, and writes them. Every list is in depth order and is the same for any
+// number of chunks.
 template <class T>
 void Frame<T>::intersect() {
     Timer timer(seconds_[2]);

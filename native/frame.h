@@ -1,4 +1,4 @@
-// One rendered view: its buffers, from projection to gradients. Kernels do the work; this decides the order.
+// One rendered view: its buffers and the order of its stages, from projection to gradients. Kernels do the work.
 #pragma once
 
 #include <array>
@@ -23,7 +23,7 @@ class Frame {
   public:
     Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, int threads);
     void composite(const Outputs<T> &out);
-    // The scene and the outputs are given again: between the passes they may have moved.
+    // The scene and the outputs are passed again: they may have moved between the passes.
     void backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background);
 
     int64_t num_visible() const { return visible_count_; }

@@ -8,7 +8,7 @@
 namespace gsplat {
 namespace GSPLAT_ISA {
 
-// Of libm, by type.
+// libm functions by type.
 GSPLAT_INLINE float exp_(float x) { return expf(x); }
 GSPLAT_INLINE double exp_(double x) { return exp(x); }
 GSPLAT_INLINE float log_(float x) { return logf(x); }
@@ -26,14 +26,14 @@ GSPLAT_INLINE bool finite(T x) {
     return x - x == T(0);
 }
 
-// Finite, and no larger than any photo could ask for.
+// Finite, and at most COLOR_LIMIT, which no photo needs.
 template <class T>
 GSPLAT_INLINE bool is_color(const T *c) {
     const T limit = T(COLOR_LIMIT);
     return c[0] <= limit && c[1] <= limit && c[2] <= limit && c[0] >= -limit && c[1] >= -limit && c[2] >= -limit;
 }
 
-// px: how far rounding may move a rim that is found from numbers whose sizes add up to `size`.
+// Bound on the rounding error of a rim, px, if it is computed from numbers whose magnitudes add up to `size`.
 template <class T>
 GSPLAT_INLINE T rim_slack(T size) {
     return T(RIM_SLACK) + T(sizeof(T) == sizeof(float) ? 0x1p-21 : 0x1p-50) * size;
@@ -51,7 +51,7 @@ GSPLAT_INLINE void cross3(const double *a, const double *b, double *out) {
     out[0] = a[1] * b[2] - a[2] * b[1], out[1] = a[2] * b[0] - a[0] * b[2], out[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// R(q) of a unit quaternion (w, x, y, z), row by row.
+// R(q) of a unit quaternion (w, x, y, z), row-major.
 template <class T>
 GSPLAT_INLINE void rotation(const T *q, T *R) {
     const T w = q[0], x = q[1], y = q[2], z = q[3];
@@ -70,7 +70,7 @@ GSPLAT_INLINE void rotation_backward(const T *q, const T *G, T *dq) {
     dq[3] = 2 * (x * (G[2] + G[6]) + y * (G[5] + G[7]) + w * (G[3] - G[1]) - 2 * z * (G[0] + G[4]));
 }
 
-// The real harmonics up to `degree` in direction (x, y, z): b has (degree + 1)² entries.
+// The real spherical harmonics up to `degree` in direction (x, y, z): b has (degree + 1)² entries.
 template <class T>
 GSPLAT_INLINE void harmonics(int degree, T x, T y, T z, T *b) {
     b[0] = T(C0);
@@ -108,29 +108,29 @@ GSPLAT_INLINE void harmonics_backward(int degree, T x, T y, T z, const T *g, T *
     d[2] += b * x * y * g[10] + 8 * c * y * z * g[11] + 3 * e * (2 * zz - xx - yy) * g[12] + 8 * c * x * z * g[13] + f * (xx - yy) * g[14];
 }
 
-// The shape of one Gaussian on its way to the screen, with what the backward pass needs again. In double, whatever the
-// scene's type: a camera far from the origin, a long lens and thin ellipses lose digits here that float does not have to
-// spare, and it is done once per Gaussian (docs/PRECISION.md).
+// Intermediate values of one Gaussian's projection, kept for the backward pass. Always in double: distant cameras, long
+// lenses and thin ellipses lose digits here that float cannot spare, and the cost is once per Gaussian
+// (docs/PRECISION.md).
 struct Projected {
     double offset[3], p[3];                   // mean - eye in world axes; mean in camera axes
-    double iz, ratio[2];                      // 1/z; x/z and y/z, clamped, as the Jacobian takes them
-    bool clamped[2];                          // whether they were
+    double iz, ratio[2];                      // 1/z; x/z and y/z, clamped for the Jacobian
+    bool clamped[2];                          // whether each was clamped
     double t0[3], t1[3];                      // rows of J W
-    double q[4], inverse_q_norm, R[9], s[3];  // unit quaternion, 1 / its length before, rotation, scales
+    double q[4], inverse_q_norm, R[9], s[3];  // unit quaternion, 1 / its original length, rotation, scales
     double r0[3], r1[3], n[3];                // rows of J W M, M = R S, and their cross product
-    double a0, b0, c0, det0;                  // covariance on the screen before the dilation
-    double a, b, c, det, inverse_det;         // and after
-    double opacity, compensation;             // opacity without the compensation of antialiasing, and that factor
+    double a0, b0, c0, det0;                  // screen covariance before the dilation
+    double a, b, c, det, inverse_det;         // and after it
+    double opacity, compensation;             // opacity before antialiasing's compensation, and that factor
 };
 
-// Its colour.
+// Intermediate values of its colour.
 template <class T>
 struct Shade {
     T dir[3], distance;          // viewing direction
-    T basis[16], color[3];       // harmonics, colour before the floor at 0
+    T basis[16], color[3];       // harmonics; colour before the floor at 0
 };
 
-// The unit quaternion and 1 / |q|. False for one of zero length.
+// The unit quaternion and 1 / |q|. False if q has zero length.
 template <class T>
 GSPLAT_INLINE bool unit_quaternion(const T *q, Projected &g) {
     double scale = 1, norm = 0;
@@ -148,7 +148,7 @@ GSPLAT_INLINE bool unit_quaternion(const T *q, Projected &g) {
     return true;
 }
 
-// Sigma2d = (J W M)(J W M)' + 0.3 I, and opacity. False where nothing can be drawn: behind, faint or not finite.
+// Sigma2d = (J W M)(J W M)' + 0.3 I, and opacity. False if the Gaussian is behind the camera, too faint or not finite.
 template <class T>
 GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const Settings &set, int64_t i, Projected &g) {
     for (int k = 0; k < 3; ++k) g.offset[k] = double(scene.means[3 * i + k]) - cam.eye[k];
@@ -172,7 +172,7 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
             g.r1[k] = (g.t1[0] * g.R[k] + g.t1[1] * g.R[3 + k] + g.t1[2] * g.R[6 + k]) * g.s[k];
         }
         g.a0 = dot3(g.r0, g.r0), g.b0 = dot3(g.r0, g.r1), g.c0 = dot3(g.r1, g.r1);
-        // |n|² = a0 c0 - b0² without the cancellation; nor is n taken from r0 and r1, which are as good as parallel for a needle.
+        // |n|² = a0 c0 - b0² without cancellation. n is not computed from r0 and r1, which are almost parallel for a needle.
         double flat[3];
         cross3(g.t0, g.t1, flat);
         for (int k = 0; k < 3; ++k)
@@ -194,12 +194,12 @@ GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const
     g.a = g.a0 + d, g.b = g.b0, g.c = g.c0 + d;
     g.det = g.det0 + d * (g.a0 + g.c0) + d * d, g.inverse_det = 1 / g.det;
     g.compensation = set.antialiased ? sqrt_(vmax(g.det0, DET_FLOOR) * g.inverse_det) : 1.0;
-    // The mean in the scene's type, which its gradients are in; z squared, so that depths can still be weighted and added.
+    // The mean must be finite in the scene's type, the type of its gradients; so must z², so that weighted depths can be added.
     return finite(T(g.p[0] + g.p[1] + z * z)) && g.a + g.c <= SPLAT_LIMIT * SPLAT_LIMIT && finite(g.det) && g.det > 0 &&
            g.opacity * g.compensation >= ALPHA_MIN;
 }
 
-// The mean on the screen, u = fx x/z + cx and v, and the point of the image nearest to it, as a splat holds that.
+// The mean on the screen, u = fx x/z + cx and v, and the nearest point of the image, in the splat's type.
 template <class T>
 struct Position {
     double u, v;
@@ -214,7 +214,7 @@ GSPLAT_INLINE Position<T> position(const Projected &g, const Camera &cam) {
     return at;
 }
 
-// colour = sum_i b_i sh_i + 0.5, before the floor. False where it is not finite.
+// colour = sum_i b_i sh_i + 0.5, before the floor. False if it is not finite.
 template <class T>
 GSPLAT_INLINE bool project_color(const Scene<T> &scene, const Settings &set, int64_t i, const Projected &g, Shade<T> &shade) {
     if (!scene.quats) {

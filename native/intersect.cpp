@@ -1,7 +1,7 @@
-// intersect: which tiles an ellipse alpha >= 1/255 meets, exactly, and the tile lists in depth order.
+// intersect: find exactly the tiles that an ellipse alpha >= 1/255 meets, and write the tile lists in depth order.
 //
-// The ellipse is (sx dx + sy dy)² + (ty dy)² <= L. Its x interval over a band of rows is found where the band meets it:
-// at the rightmost point of the ellipse if that lies in the band, else at the end of the band that is nearest to it.
+// The ellipse is (sx dx + sy dy)² + (ty dy)² <= L. Its x interval over a band of rows ends at the rightmost (leftmost) point of
+// the ellipse if that lies in the band, otherwise at the edge of the band nearest to that point.
 #include "gaussian_math.h"
 #include "isa.h"
 
@@ -10,7 +10,7 @@ namespace GSPLAT_ISA {
 
 constexpr int64_t AHEAD = 16;  // Gaussians whose records are fetched before they are needed
 
-// An ellipse as the search for tiles wants it.
+// An ellipse in the form that the tile search needs.
 template <class T>
 struct Ellipse {
     T u, v, ex, ey;

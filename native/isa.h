@@ -1,4 +1,4 @@
-// The kernels of one instruction set, as declared for its table.
+// Declarations of one instruction set's kernels, for its table.
 #pragma once
 
 #include "kernels.h"

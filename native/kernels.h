@@ -1,7 +1,7 @@
-// What the kernels take and give: raw pointers and sizes, the same for every instruction set.
+// Inputs and outputs of the kernels: raw pointers and sizes, the same for every instruction set.
 //
-// A kernel works on a range of its items and writes only what belongs to them, so any number of threads may run
-// any ranges in any order and the result is the same to the bit.
+// A kernel processes a range of items and writes only their outputs, so any number of threads may run any ranges in any
+// order and the result is the same to the bit.
 #pragma once
 
 #include <stdint.h>
@@ -19,7 +19,7 @@ struct Camera {
     int32_t H, W;
 };
 
-// Choices of one render.
+// Settings of one render.
 struct Settings {
     double z_near;
     double background[3];
@@ -27,7 +27,7 @@ struct Settings {
     int32_t antialiased;
 };
 
-// N Gaussians. Either raw parameters (quats is not null) or covariances, colours and opacities.
+// N Gaussians: raw parameters if quats is not null, otherwise covariances, colours and opacities.
 template <class T>
 struct Scene {
     int64_t n;
@@ -38,7 +38,7 @@ struct Scene {
     const T *cov3ds, *colors, *opacities;              // N 3 3, N 3, N
 };
 
-// Gradients of the same; every entry of a range is written, zeros included.
+// Gradients of the scene; every entry of a range is written, including zeros.
 template <class T>
 struct SceneGrads {
     T *means, *quats, *log_scales, *sh0, *sh_rest, *logit_opacities, *cov3ds, *colors, *opacities;
@@ -47,9 +47,9 @@ struct SceneGrads {
 
 // One visible Gaussian on the screen, in base 2: alpha = 2^(log2_o - s² - t²), s = s0 + sx dx + sy dy, t = t0 + ty dy.
 //
-// Two squares cannot cancel, which the terms of a polynomial in dx and dy do wherever an ellipse is longer than it is wide.
-// (dx, dy) is the pixel less (x, y), the point of the image nearest to the mean: a mean far outside takes no digits either.
-// No factor is above sqrt(log2(e) / 2 / 0.3) = 1.55 per px. In float, 64 bytes: a line of cache.
+// Two squares cannot cancel; the terms of a polynomial in dx and dy do if an ellipse is longer than it is wide.
+// (dx, dy) is the pixel minus (x, y), the point of the image nearest to the mean, so a mean far outside costs no digits.
+// No factor exceeds sqrt(log2(e) / 2 / 0.3) = 1.55 per px. In float a splat has 64 bytes: one cache line.
 template <class T>
 struct Splat {
     T u, v;                                            // mean, px
@@ -62,7 +62,7 @@ struct Splat {
     T extent[2];                                       // half width and height of alpha >= 1/255, px
 };
 
-// One Gaussian in one tile: which, and where its partial gradients go.
+// One Gaussian in one tile: its index, and the slot of its partial gradients.
 struct Pair {
     uint32_t gaussian;
     uint32_t slot;
@@ -82,7 +82,7 @@ struct ProjectArgs {
     Camera camera;
     Settings settings;
     Splat<T> *splats;                                  // N, filled where visible
-    uint32_t *visible;                                 // ids, compact within each block
+    uint32_t *visible;                                 // ids, contiguous within each block
     uint32_t *block_visible;                           // count per block of BLOCK Gaussians
 };
 
@@ -92,7 +92,7 @@ struct IntersectArgs {
     const uint32_t *sorted;                            // ids, near to far
     Grid grid;
     Camera camera;
-    uint32_t *pairs_of;                                // N, tiles that each Gaussian touches
+    uint32_t *pairs_of;                                // N, number of tiles that each Gaussian touches
     const uint32_t *slot_begin;                        // N, first slot of each Gaussian
     Pair *pairs;
 };
@@ -134,26 +134,26 @@ struct AdamArgs {
     double rate, beta1, beta2, eps, correction1, correction2;
 };
 
-constexpr int SSIM_HALF = 5;                           // taps on either side of the middle one
-constexpr int64_t SSIM_BAND = 64;                      // image rows a thread takes at a time
-constexpr int64_t SSIM_STRIP = 192;                    // and numbers of each row; multiples of every vector's width,
-constexpr int64_t SSIM_MAP = 224;                      // as is this: a strip and a window's half on either side
+constexpr int SSIM_HALF = 5;                           // taps on each side of the central one
+constexpr int64_t SSIM_BAND = 64;                      // image rows per task
+constexpr int64_t SSIM_STRIP = 192;                    // and numbers of each row; multiples of every vector width,
+constexpr int64_t SSIM_MAP = 224;                      // like this: a strip plus half a window on each side
 
 template <class T>
 struct LossArgs {
     const T *image, *target;                           // H W 3
-    const uint8_t *target_bytes;                       // H W 3, used instead of target where not null
+    const uint8_t *target_bytes;                       // H W 3, used instead of target if not null
     int32_t H, W;
     double ssim_weight;
     T *grad;                                           // H W 3
     double *sums;                                      // bands x 2: sums of |x - y| and of SSIM
 
     int64_t bands() const { return (H + SSIM_BAND - 1) / SSIM_BAND; }
-    // Numbers of scratch that a thread needs.
+    // Number of scratch values that a thread needs.
     static constexpr int64_t SCRATCH = 4 * (SSIM_BAND + 4 * SSIM_HALF) * SSIM_MAP + 3 * (SSIM_BAND + 2 * SSIM_HALF) * SSIM_STRIP;
 };
 
-constexpr int64_t BLOCK = 256;                         // Gaussians a thread takes at a time
+constexpr int64_t BLOCK = 256;                         // Gaussians per task
 
 // The kernels of one instruction set and scalar type.
 template <class T>

@@ -1,4 +1,4 @@
-// project: Gaussians to ellipses on the screen, one block of Gaussians at a time.
+// project: project Gaussians to ellipses on the screen, one block at a time.
 //
 //     Sigma2d = J W Sigma W' J' + 0.3 I,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
 //

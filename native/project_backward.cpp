@@ -1,4 +1,4 @@
-// project_backward: adds up each Gaussian's slots in fixed order and goes on to its raw parameters.
+// project_backward: sum each Gaussian's slots in a fixed order and propagate the gradient to its raw parameters.
 //
 //     moments of h -> J W M -> (J W, quaternion, log scale) -> mean;   colour -> (coefficients, direction -> mean)
 #include "gaussian_math.h"
@@ -7,15 +7,15 @@
 namespace gsplat {
 namespace GSPLAT_ISA {
 
-// Sigma2d^-1 = L' L, y = L d of a pixel d px from the mean: y0 = sx dx + sy dy, y1 = ty dy. And the moments of h in y, which
-// are of order 1 where those in d are as large as the ellipse and cancel.
+// Sigma2d^-1 = L' L, y = L d of a pixel d px from the mean: y0 = sx dx + sy dy, y1 = ty dy. The moments of h are taken
+// in y, where they are of order 1; in d they grow with the ellipse and cancel.
 struct Whitened {
     double sx, sy, ty;
     double m0, m1;         // sum h y0, sum h y1
-    double m00, m01, m11;  // sum h y0², sum h y0 y1, sum h y1²; less sum h on the diagonal with antialiasing
+    double m00, m01, m11;  // sum h y0², sum h y0 y1, sum h y1²; minus sum h on the diagonal with antialiasing
 };
 
-// From the moments of h about the splat's reference point.
+// Computed from the moments of h about the splat's reference point.
 template <class T>
 GSPLAT_INLINE Whitened whiten(const Camera &cam, const Settings &set, const Projected &g, const double *slot) {
     Whitened w;
@@ -28,11 +28,12 @@ GSPLAT_INLINE Whitened whiten(const Camera &cam, const Settings &set, const Proj
     w.m00 = s * (s * slot[H] + 2 * along) + w.sx * (w.sx * slot[HXX] + 2 * w.sy * slot[HXY]) + w.sy * w.sy * slot[HYY];
     w.m01 = s * (t * slot[H] + down) + t * along + w.ty * (w.sx * slot[HXY] + w.sy * slot[HYY]);
     w.m11 = t * (t * slot[H] + 2 * down) + w.ty * w.ty * slot[HYY];
-    if (set.antialiased) w.m00 -= slot[H], w.m11 -= slot[H];  // the opacity's factor has det^(-1/2) in it
+    if (set.antialiased) w.m00 -= slot[H], w.m11 -= slot[H];  // the opacity's factor contains det^(-1/2)
     return w;
 }
 
-// From the gradients d of J W (two rows t, `total` the sum of d . t) and of the image position to the mean in camera axes.
+// Propagates gradients d of J W (two rows t; `total` is the sum of d . t) and of the image position to the mean in camera
+// axes.
 GSPLAT_INLINE void mean_gradient(const Projected &g, const Camera &cam, const double *d0, const double *d1, double total, const double *uv,
                                  double *dp) {
     const double iz = g.iz, x = g.p[0] * iz, y = g.p[1] * iz;  // x/z, y/z
@@ -47,7 +48,7 @@ GSPLAT_INLINE void mean_gradient(const Projected &g, const Camera &cam, const do
     dp[2] = -x * fx * uv[0] - y * fy * uv[1] - iz * total + iz * (fx * x * w0 + fy * y * w1);
 }
 
-// From the colour to the coefficients, and through the viewing direction to the mean (world axes, added).
+// Propagates the colour gradient to the coefficients, and through the viewing direction to the mean (world axes, added).
 template <class T>
 GSPLAT_INLINE void color_gradient(const ProjectBackwardArgs<T> &args, int64_t i, const Shade<T> &shade, const T *slot, double *dmean) {
     const Scene<T> &scene = args.scene;
@@ -71,14 +72,14 @@ GSPLAT_INLINE void color_gradient(const ProjectBackwardArgs<T> &args, int64_t i,
     for (int k = 0; k < 3; ++k) dmean[k] += double((dd[k] - along * shade.dir[k]) / shade.distance);
 }
 
-// From the moments to M = R S and J W, for raw parameters; returns d0 . t0 + d1 . t1. With r = (J W) M (two rows), w = L r and
+// Propagates the moments to M = R S and J W, for raw parameters; returns d0 . t0 + d1 . t1. With r = (J W) M (two rows), w = L r and
 // N the matrix of moments: dL/dSigma2d = L' N L / 2, dL/dr = L' N w; w is of order 1, however long the ellipse.
 template <class T>
 GSPLAT_INLINE double raw_gradient(const ProjectBackwardArgs<T> &args, int64_t i, const Projected &g, const Whitened &m, double h,
                                   double *d0, double *d1) {
     double across0[3], across1[3], dR[9], dr0[3], dr1[3], total = 0;
     cross3(g.r1, g.n, across0), cross3(g.n, g.r0, across1);  // c0 r0 - b0 r1 and a0 r1 - b0 r0
-    // With antialiasing, det0^(1/2) in the opacity's factor: dL/dr = sum h Sigma^-1 r, Sigma before the dilation.
+    // With antialiasing the opacity's factor contains det0^(1/2): dL/dr = sum h Sigma^-1 r, Sigma before the dilation.
     const double lit = args.settings.antialiased && g.det0 > DET_FLOOR ? h / g.det0 : 0;
     for (int k = 0; k < 3; ++k) {
         // sx r0 + sy r1 = sx (r0 - b/c r1)
@@ -104,11 +105,11 @@ GSPLAT_INLINE double raw_gradient(const ProjectBackwardArgs<T> &args, int64_t i,
     return total;
 }
 
-// The same for covariances given as they are: a = t0' S t0, b = t0' S t1, c = t1' S t1.
+// The same for covariances given directly: a = t0' S t0, b = t0' S t1, c = t1' S t1.
 template <class T>
 GSPLAT_INLINE double direct_gradient(const ProjectBackwardArgs<T> &args, int64_t i, const Projected &g, const Whitened &m, double h,
                                      double *d0, double *d1) {
-    // Gradient of a, of b (once for both places) and of c: L' N L / 2.
+    // Gradients of a, b (once for both entries) and c: L' N L / 2.
     double a = m.sx * m.sx * m.m00 / 2, b = m.sx * (m.sy * m.m00 + m.ty * m.m01);
     double c = (m.sy * (m.sy * m.m00 + 2 * m.ty * m.m01) + m.ty * m.ty * m.m11) / 2;
     if (args.settings.antialiased && g.det0 > DET_FLOOR) a += h / 2 * g.c0 / g.det0, b -= h * g.b0 / g.det0, c += h / 2 * g.a0 / g.det0;
@@ -133,7 +134,7 @@ GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
         memset(grads.quats + 4 * i, 0, 4 * sizeof(T));
         memset(grads.log_scales + 3 * i, 0, 3 * sizeof(T));
         memset(grads.sh0 + 3 * i, 0, 3 * sizeof(T));
-        if (args.scene.rest)  // else there is no array, and memset takes no null
+        if (args.scene.rest)  // otherwise there is no array, and memset must not get null
             memset(grads.sh_rest + 3 * int64_t(args.scene.rest) * i, 0, 3 * size_t(args.scene.rest) * sizeof(T));
         grads.logit_opacities[i] = 0;
     } else {

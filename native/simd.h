@@ -1,8 +1,8 @@
 // SIMD through the vector extensions of GCC and Clang: one source, any width.
 //
-// This file is compiled once per instruction set, each time inside a namespace of its own (GSPLAT_ISA), and uses
-// nothing of the standard library but C functions: an inline function shared between two instruction sets would be
-// linked once, perhaps in the version that the machine cannot run.
+// This file is compiled once per instruction set, each time in its own namespace (GSPLAT_ISA). It uses only C functions of
+// the standard library: an inline function shared between two instruction sets would be linked once, perhaps in a version
+// that the machine cannot run.
 #pragma once
 
 #include <math.h>
@@ -133,7 +133,7 @@ GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
     const VF magic = splat(12582912.0f), bottom = splat(least), top = splat(most);
     const auto keep = p >= bottom;
     p = p < top ? p : top;
-    p = p > bottom ? p : bottom;  // a smaller one would shift out of the exponent
+    p = p > bottom ? p : bottom;  // a smaller value would overflow the exponent bits
     const VF n = (p + magic) - magic;
     const VF f = p - n;
 #endif
@@ -156,7 +156,7 @@ GSPLAT_INLINE VD exp2_between(VD p, double least, double most) {
     return p;
 }
 
-// x, 0 where key is not below the limit.
+// x where key is below the limit, otherwise 0.
 GSPLAT_INLINE VF where_below(VF key, float limit, VF x) {
 #if GSPLAT_VECTOR_BYTES == 64
     return (VF)_mm512_maskz_mov_ps(_mm512_cmp_ps_mask((__m512)key, _mm512_set1_ps(limit), _CMP_LT_OQ), (__m512)x);
@@ -167,7 +167,7 @@ GSPLAT_INLINE VF where_below(VF key, float limit, VF x) {
 
 GSPLAT_INLINE VD where_below(VD key, double limit, VD x) { return key < splat(limit) ? x : VD{}; }
 
-// 1 / x. AVX-512 has an estimate of 14 bits, which one step of Newton's takes to 2^-27; it is a third of a division.
+// 1 / x. AVX-512 has an estimate of 14 bits; one Newton step refines it to 2^-27 at a third of the cost of a division.
 GSPLAT_INLINE VF reciprocal(VF x) {
 #if GSPLAT_VECTOR_BYTES == 64
     const VF y = (VF)_mm512_rcp14_ps((__m512)x);
@@ -179,8 +179,8 @@ GSPLAT_INLINE VF reciprocal(VF x) {
 
 GSPLAT_INLINE VD reciprocal(VD x) { return splat(1.0) / x; }
 
-// The sums over the lanes of eight vectors, to out[0..7]: pairs of vectors are folded into one, three times, which
-// leaves every sum in two halves of the register.
+// Writes the lane sums of eight vectors to out[0..7]: three rounds fold pairs of vectors into one, which leaves every sum
+// split over the two halves of the register.
 GSPLAT_INLINE void sum8(const VF *v, float *out) {
 #if GSPLAT_VECTOR_BYTES == 64
     VF a[4], b[2];

@@ -9,7 +9,7 @@
 
 namespace gsplat {
 
-// A stable radix sort by the bits of the depths: positive floats are ordered as their bits are.
+// A stable radix sort by the bits of the depths: positive floats have the same order as their bits.
 template <class T>
 void sort_by_depth(const Splat<T> *splats, const uint32_t *ids, int64_t visible, uint32_t *sorted) {
     using Key = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
@@ -29,7 +29,7 @@ void sort_by_depth(const Splat<T> *splats, const uint32_t *ids, int64_t visible,
     for (int shift = 0; shift < int(8 * sizeof(Key)); shift += DIGIT) {
         std::vector<uint32_t> next(BINS + 1);
         for (size_t k = 0; k < count; ++k) ++next[((from[k].key >> shift) & (BINS - 1)) + 1];
-        if (count && next[((from[0].key >> shift) & (BINS - 1)) + 1] == count) continue;  // all alike
+        if (count && next[((from[0].key >> shift) & (BINS - 1)) + 1] == count) continue;  // all keys share this digit
         for (int bin = 0; bin < BINS; ++bin) next[bin + 1] += next[bin];
         for (size_t k = 0; k < count; ++k) to[next[(from[k].key >> shift) & (BINS - 1)]++] = from[k];
         std::swap(from, to);

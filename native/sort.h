@@ -5,7 +5,7 @@
 
 namespace gsplat {
 
-// Writes `count` ids to `sorted` by the depths of their splats, which are positive; ids of one depth keep their order.
+// Writes `count` ids to `sorted`, ordered by the positive depths of their splats; ids of equal depth keep their order.
 template <class T>
 void sort_by_depth(const Splat<T> *splats, const uint32_t *ids, int64_t count, uint32_t *sorted);
 

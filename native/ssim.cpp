@@ -7,8 +7,8 @@
 //     dS/dv = -S / B2,  dS/dc = 2 A1 / (B1 B2),  dS/dmx = 2 my A2 / (B1 B2) - 2 mx S / B1 - 2 mx dS/dv - my dS/dc
 //     dsum(S)/dx = G dS/dmx + 2 x G dS/dv + y G dS/dc
 //
-// Channels are interleaved, so a tap to the right is three numbers further on. A band goes through in strips, with as much
-// around a strip as its windows reach twice (for S, and for the gradient), so that nothing but images goes to memory.
+// Channels are interleaved, so the next tap to the right is three numbers away. A band is processed in strips, each with a
+// margin of two window halves (for S and for the gradient), so that only images are read from and written to memory.
 #include "gaussian_math.h"
 #include "isa.h"
 
@@ -16,7 +16,7 @@ namespace gsplat {
 namespace GSPLAT_ISA {
 
 constexpr int HALF = SSIM_HALF, CHANNELS = 3, MARGIN = HALF * CHANNELS;
-constexpr int64_t STRIP = SSIM_STRIP, MAP = SSIM_MAP;            // numbers of a row: of the strip, and where S is needed
+constexpr int64_t STRIP = SSIM_STRIP, MAP = SSIM_MAP;            // numbers per row: of the strip, and of its map of S
 constexpr int64_t MAP_ROWS = SSIM_BAND + 2 * HALF, IN_ROWS = SSIM_BAND + 4 * HALF;
 constexpr int64_t IN_PLANE = IN_ROWS * MAP, OUT_PLANE = MAP_ROWS * STRIP;
 
@@ -26,7 +26,7 @@ struct Strip {
     bool has_row(int64_t row) const { return row >= 0 && row < height; }
 };
 
-// Part of an image row, from 2 MARGIN to the left of the strip on; zero outside the image.
+// Part of an image row, starting 2 MARGIN left of the strip; zero outside the image.
 template <class T>
 struct Segment {
     alignas(64) T numbers[MAP + 2 * MARGIN];
@@ -50,7 +50,7 @@ GSPLAT_INLINE void cut_target(const LossArgs<T> &args, int64_t row, const Strip 
         cut(args.target + row * s.width, T(1), s, out);
 }
 
-// G along y: `in` points to the middle row, rows are `stride` numbers apart.
+// G along y: `in` points to the central row; rows are `stride` numbers apart.
 template <class V, class T>
 GSPLAT_INLINE V blur_y(const T *in, int64_t stride) {
     V sum = splat(T(SSIM_TAP[0])) * load<V>(in);

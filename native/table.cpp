@@ -13,8 +13,8 @@ static constexpr Kernels<T> kernels() {
     return {project<T>, count<T>, scatter<T>, composite<T>, composite_backward<T>, project_backward<T>, adam<T>, loss<T>};
 }
 
-// Twelve independent chains of vector FMAs, enough to hide their latency and few enough for sixteen registers: the
-// machine's own unit of cost. (An array of chains would be kept in memory.)
+// Twelve independent chains of vector FMAs, enough to hide their latency and few enough for sixteen registers: a
+// unit of cost for this machine. (An array of chains would be kept in memory.)
 static int fma_benchmark(int64_t rounds, float *sink) {
     const VF m = splat(0.999f), t = splat(1e-3f);
     VF a = t, b = a + t, c = b + t, d = c + t, e = d + t, f = e + t, g = f + t, h = g + t, i = h + t, j = i + t, k = j + t, l = k + t;

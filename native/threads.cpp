@@ -13,8 +13,8 @@
 namespace gsplat {
 namespace {
 
-// Work is announced by a new round number. Workers spin for it a little while, because the next stage of a frame
-// comes within microseconds, and then sleep. The pool lives as long as the process; tasks do not throw.
+// A new round number announces work. Workers spin briefly, because the next stage of a frame follows within microseconds,
+// and then sleep. The pool lives as long as the process; tasks do not throw.
 class Pool {
   public:
     void run(int threads, int64_t count, const Task &task) {
@@ -30,7 +30,7 @@ class Pool {
         }
         wake_.notify_all();
         drain(0);
-        {  // whoever has not come by now is not waited for: its core may be busy with something else
+        {  // do not wait for workers that have not joined: their cores may be busy
             std::lock_guard<std::mutex> lock(mutex_);
             open_ = false;
         }
@@ -70,7 +70,7 @@ class Pool {
     bool open_ = false;
 };
 
-// Held while a round runs. A forked child gets a new one: the thread that held it may not exist there.
+// Held while a round runs. A forked child gets a new mutex: the thread that held the old one may not exist there.
 std::mutex *pool_mutex = new std::mutex;
 [[maybe_unused]] const int registered = pthread_atfork(nullptr, nullptr, [] { pool_mutex = new std::mutex; });
 
@@ -84,7 +84,7 @@ void parallel(int threads, int64_t count, const Task &task) {
     static Pool *pool = nullptr;
     static pid_t owner = 0;
     std::lock_guard<std::mutex> lock(*pool_mutex);
-    if (owner != getpid()) {  // a forked child has none of its parent's threads
+    if (owner != getpid()) {  // a forked child does not have its parent's threads
         pool = new Pool;
         owner = getpid();
     }

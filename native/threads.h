@@ -1,4 +1,4 @@
-// A pool of threads that runs numbered tasks. Which thread runs which task is open; kernels do not care.
+// A thread pool that runs numbered tasks. The assignment of tasks to threads is unspecified.
 #pragma once
 
 #include <cstdint>
@@ -6,8 +6,8 @@
 
 namespace gsplat {
 
-// Runs task(0, worker) .. task(count - 1, worker) on up to `threads` threads, the caller among them, and waits for all.
-// Tasks do not throw. `worker` is below `threads`, and no two tasks run at once on the same one.
+// Runs task(0, worker) .. task(count - 1, worker) on up to `threads` threads, including the caller, and waits for all.
+// Tasks do not throw. `worker` is below `threads`, and no two tasks run on the same worker at once.
 using Task = std::function<void(int64_t, int)>;
 void parallel(int threads, int64_t count, const Task &task);
 

@@ -1,4 +1,4 @@
-// What compositing a tile and going back through it share.
+// Code shared by the forward and backward pass of a tile.
 #pragma once
 
 #include "gaussian_math.h"
@@ -18,7 +18,7 @@ GSPLAT_INLINE TileBox tile_box(const Grid &grid, const gsplat::Camera &cam, int3
     return box;
 }
 
-// What a splat's exponent takes from each row of a tile: p = base - (shift + s0 + sx dx)².
+// The per-row part of a splat's exponent: p = base - (shift + s0 + sx dx)².
 template <class T>
 struct RowTerms {
     alignas(64) T base[TILE], shift[TILE];
@@ -32,14 +32,14 @@ GSPLAT_INLINE void row_terms(const Splat<T> &s, const TileBox &box, RowTerms<T> 
     }
 }
 
-// The rows of a tile that each of its next few splats can touch; first > last where it touches none.
+// The rows of a tile that each of the next splats can touch; first > last if it touches none.
 constexpr uint32_t BATCH = 16;
 
 struct Rows {
     int32_t first[BATCH], last[BATCH];
 };
 
-// Asks for the records of the batch after the one that begins at `pairs`; a record may lie across two lines of cache.
+// Prefetches the records of the batch after the one that begins at `pairs`; a record may span two cache lines.
 template <class T>
 GSPLAT_INLINE void fetch_next(const Splat<T> *splats, const Pair *pairs, uint32_t left) {
     for (uint32_t i = BATCH; i < 2 * BATCH && i < left; ++i) {
@@ -49,9 +49,9 @@ GSPLAT_INLINE void fetch_next(const Splat<T> *splats, const Pair *pairs, uint32_
     }
 }
 
-// Over the tile's columns [low, high] (relative to the mean) the ellipse reaches from its highest to its lowest point, or
-// to where the band ends nearest to that point. At width dx it spans dy = tangent dx +- half sqrt(1 - (dx / ex)²).
-// Plain loops over BATCH lanes, which the compiler turns into vectors.
+// Over the tile's columns [low, high] (relative to the mean) the ellipse spans from its highest to its lowest point; if one
+// lies outside the columns, the nearest column counts. At width dx it spans dy = tangent dx +- half sqrt(1 - (dx / ex)²).
+// Plain loops over BATCH lanes, which the compiler vectorises.
 template <class T>
 GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, Rows &rows) {
     T u[BATCH], v[BATCH], sx[BATCH], sy[BATCH], ty[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
