@@ -1,4 +1,4 @@
-"""The capture that a benchmark measures: one that is named, the project's own, or one made on the spot."""
+"""Choose the capture for a benchmark: the given one, the project's own, or a procedural one."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ def capture(named: Path | None, smoke: bool) -> Iterator[Path]:
     """Yield the folder of a capture.
 
     Args:
-        named: What the user named; where None it is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data.
-        smoke: Make a tiny one instead.
+        named: Path given by the user; None for snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data.
+        smoke: Make a tiny procedural capture instead of the default.
 
     Raises:
-        SystemExit: what was named is not there.
+        SystemExit: the given path does not exist.
     """
     if named is not None and not named.exists():
-        raise SystemExit(f"{named}: is not there; name another capture")
+        raise SystemExit(f"{named}: does not exist; give another capture")
     default = Path(os.environ.get("GSPLAT_EDU_DATA", "../shared/data")) / NAME
     if named is not None or (default.exists() and not smoke):
         yield named or default
         return
-    # Late: it takes memory, and limits.py measures that of its children.
+    # Imported late: these take memory, which limits.py would count as its children's.
     from gsplat_edu.data.procedural import procedural_capture
     from gsplat_edu.data.writers import write_colmap
 

@@ -2,9 +2,9 @@
 
     python benchmarks/dense.py [--smoke] [--out FILE.json]
 
-Renders and differentiates a cloud of the course's size (1,600 splats, 128 px, float32) with several chunks,
-in turn, and prints the median time of each and its ratio to the chapter's chunk of 512 within the same round.
-The ratios are what to compare: machines drift, rounds do not.
+Renders and differentiates a cloud of the course's size (1,600 splats, 128 px, float32) with several chunk sizes
+in turn. Prints the median time of each and its ratio to the chapter's chunk of 512 within the same round. Compare
+the ratios: the machine's speed drifts between runs, but little within a round.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def seconds(gaussians: Gaussians, camera: Camera, chunk: int) -> tuple[float, fl
 
 
 def measure(count: int, size: int, num_rounds: int) -> list[dict[str, float]]:
-    """Time every chunk in every round; the first round warms up and is not counted."""
+    """Time every chunk size in every round; the first round is a warm-up and is not counted."""
     camera = sphere_cameras(size)[8]
     gaussians = random_ball(count, torch.Generator().manual_seed(0)).trainable()
     rounds = [{chunk: seconds(gaussians, camera, chunk) for chunk in CHUNKS} for _ in range(num_rounds + 1)][
@@ -53,8 +53,8 @@ def measure(count: int, size: int, num_rounds: int) -> list[dict[str, float]]:
 
 
 def main() -> None:
-    """Measure, print the table, write the JSON."""
-    arguments = hardware.parser("Dense torch renderer: time against chunk size.").parse_args()
+    """Measure, print the table and write the JSON."""
+    arguments = hardware.parser("Dense torch renderer: time by chunk size.").parse_args()
     count, size, num_rounds = (20, 8, 1) if arguments.smoke else (NUM_GAUSSIANS, SIZE, ROUNDS)
     rows = measure(count, size, num_rounds)
     hardware.report({"rows": rows}, arguments.out)

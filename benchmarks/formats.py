@@ -1,11 +1,11 @@
-"""How long does a scene take to write and to read in each format, how large is it, and does it show the same?
+"""How long does each format take to write and read a scene, how large is the file, and how accurate is it?
 
     python benchmarks/formats.py [SCENE|RUN] [--count N] [--formats .ply .spz ...] [--smoke]
         [--out FILE.json]
 
-Without a scene, N random Gaussians of SH degree 3 (default: a million) are written and read, and nothing is rendered:
-random numbers compress as no scene does. Of a scene, PSNR is that of `gsplat-edu convert --verify`. Each time is the
-best of three in one process, with the file in the operating system's cache.
+Without a scene, N random Gaussians of SH degree 3 (default: a million) are written and read but not rendered; their
+file sizes differ from those of real scenes. For a scene, PSNR is that of `gsplat-edu convert --verify`. Each time is
+the best of three in one process, with the file in the operating system's cache.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ROUNDS = 3
 
 
 def random_source(count: int) -> Source:
-    """Make Gaussians of the sizes and opacities of scenes."""
+    """Make Gaussians with the sizes and opacities typical of scenes."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -50,7 +50,7 @@ def random_source(count: int) -> Source:
 
 
 def best(call: Callable[[], object], rounds: int) -> float:
-    """Return the least of some times, s."""
+    """Return the shortest time of several rounds, s."""
     times = []
     for _ in range(rounds):
         began = time.perf_counter()
@@ -60,7 +60,7 @@ def best(call: Callable[[], object], rounds: int) -> float:
 
 
 def measure(source: Source, suffix: str, folder: Path, compare: bool, rounds: int) -> dict[str, Any]:
-    """Write, read, weigh and compare one format."""
+    """Measure one format: writing, reading, file size and, with `compare`, PSNR."""
     path = folder / f"scene{suffix}"
     row: dict[str, Any] = {"format": suffix}
     row["write_s"] = best(lambda: export.write(path, source), rounds)
@@ -74,18 +74,16 @@ def measure(source: Source, suffix: str, folder: Path, compare: bool, rounds: in
 
 def main() -> int:
     """Read the command line and measure."""
-    parser = hardware.parser("Every scene format: time, size, and what it shows.")
+    parser = hardware.parser("Every scene format: time, size and accuracy.")
     parser.add_argument("scene", nargs="?", type=Path, help="scene or run (default: random Gaussians)")
     parser.add_argument(
         "--count", type=int, default=1_000_000, help="random Gaussians (default: %(default)s)"
     )
     suffixes = [*(found.suffix for found in FORMATS), export.PAGE]
     parser.add_argument(
-        "--formats", nargs="+", default=suffixes, metavar="SUFFIX", help="which (default: all)"
+        "--formats", nargs="+", default=suffixes, metavar="SUFFIX", help="formats to measure (default: all)"
     )
-    parser.add_argument(
-        "--rounds", type=int, default=ROUNDS, help="times each is done (default: %(default)s)"
-    )
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help="repetitions (default: %(default)s)")
     options = parser.parse_args()
     if options.smoke:
         options.count, options.rounds = min(options.count, 300), 1

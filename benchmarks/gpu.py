@@ -1,12 +1,12 @@
-"""What does a training iteration cost on a GPU, stage by stage, and how near is it to the machine's limits?
+"""What does a training iteration cost on a GPU, stage by stage, and how close is it to the hardware's limits?
 
     python benchmarks/gpu.py [--smoke] [--out FILE.json]
 
 Random scenes of 0.1, 1 and 3 million Gaussians at 1297x840 and 1920x1080: render, 0.8 L1 + 0.2 (1 - SSIM), backward,
-Adam. Milliseconds per stage are the kernels' own, from torch's profiler, over 20 iterations; how often the host waits
-is counted too. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. Then the
-gradients' error and the time with each precision of matrix products, against the native kernels in float64; and, where
-gsplat can be imported, the same scene through it: times, and the agreement of images and gradients. Needs a GPU;
+Adam. Milliseconds per stage are kernel times from torch's profiler over 20 iterations; host synchronisations are
+counted too. Ceilings (copying 1 GiB, a float32 matrix product) are measured in the same run. The benchmark then
+measures the time and the gradient error, relative to the native kernels in float64, for each precision of matrix
+products. If gsplat can be imported, it renders the same scene and compares times, images and gradients. Needs a GPU;
 without one it says so and exits with 2.
 """
 
@@ -32,7 +32,7 @@ from gsplat_edu.train.schedule import gaussian_groups
 
 
 class Scale(NamedTuple):
-    """How much is measured."""
+    """Sizes of the measurements."""
 
     counts: tuple[int, ...]  # Gaussians
     sizes: tuple[tuple[int, int], ...]  # px
@@ -40,13 +40,13 @@ class Scale(NamedTuple):
     copied: int  # floats
     product: int  # rows and columns of the matrices
     few: int  # Gaussians whose gradients are compared with float64
-    many: int  # Gaussians that are timed by precision, and beside gsplat
+    many: int  # Gaussians for the timings by precision and against gsplat
 
 
 FULL = Scale((100_000, 1_000_000, 3_000_000), ((1297, 840), (1920, 1080)), 20, 2**28, 8192, 50_000, 1_000_000)
 SMOKE = Scale((500,), ((64, 48),), 2, 2**16, 64, 200, 500)
 FLOATS = 59
-"""Numbers of one Gaussian of SH degree 3."""
+"""Floats per Gaussian of SH degree 3."""
 
 SETTINGS = RenderSettings(depth=False, jacobian_limit=1.3)
 STAGES = {
@@ -65,7 +65,7 @@ STAGES = {
     "gradient_down": "loss",
     "adam": "Adam",
 }
-"""Parts of kernels' names, and the stage they belong to; the first that fits."""
+"""Stage by substring of the kernel's name; the first match wins."""
 
 
 def scene(count: int, device: str, dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -87,12 +87,12 @@ def scene(count: int, device: str, dtype: torch.dtype = torch.float32) -> Gaussi
 
 
 def camera(width: int, height: int) -> Camera:
-    """Look at the box."""
+    """Return a camera that looks at the box."""
     return Camera.looking_at((0, 0, -3.0), (0, 0, 0), 0.9 * width, 0.9 * width, height, width)
 
 
 def milliseconds(work: Callable[[], object], rounds: int) -> float:
-    """Time work on the GPU, after three rounds of warming up."""
+    """Return milliseconds per round of work on the GPU, after three warm-up rounds."""
     for _ in range(3):
         work()
     torch.cuda.synchronize()
@@ -104,14 +104,14 @@ def milliseconds(work: Callable[[], object], rounds: int) -> float:
 
 
 def iteration(gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer: Adam) -> None:
-    """Take one step of training."""
+    """Run one training step."""
     output = render(gaussians, cam, settings=SETTINGS, backend="cuda")
     photo_loss(output.image, photo).backward()
     optimizer.step(gaussians.tensors())
 
 
 def stages(count: int, width: int, height: int, rounds: int) -> dict[str, float]:
-    """Return milliseconds per iteration, in all and by stage, waits per iteration and the peak of memory."""
+    """Return milliseconds per iteration (total and by stage), synchronisations per iteration and peak memory."""
     gaussians, cam = scene(count, "cuda"), camera(width, height)
     photo = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, device="cuda")
     config = TrainConfig()
@@ -123,9 +123,7 @@ def stages(count: int, width: int, height: int, rounds: int) -> dict[str, float]
         for _ in range(rounds):
             iteration(gaussians, cam, photo, optimizer)
         torch.cuda.synchronize()
-    for (
-        event
-    ) in profile.key_averages():  # operators carry the time of their kernels too: kernels alone are counted
+    for event in profile.key_averages():  # count kernels only; operators repeat the time of their kernels
         spent = event.self_device_time_total if event.device_type == torch.autograd.DeviceType.CUDA else 0.0
         if spent:
             stage = next((s for part, s in STAGES.items() if part in event.key), "torch around them")
@@ -144,10 +142,10 @@ def stages(count: int, width: int, height: int, rounds: int) -> dict[str, float]
 
 
 def achieved(found: dict[str, float], count: int, pairs: int) -> dict[str, float]:
-    """Return bandwidths and FLOP rates of stages, to be held against the ceilings.
+    """Return bandwidths and FLOP rates of stages, for comparison with the ceilings.
 
-    Bytes are those that have to move: Adam reads four numbers and writes three per parameter. Operations are counted in
-    the kernels' text: about 25 per pixel and pair forward, 45 backward, an exponential as one.
+    Bytes are the minimum traffic: Adam reads four numbers and writes three per parameter. Operations are counted in the
+    kernels' source: about 25 per pixel and pair forward, 45 backward, an exponential as one.
     """
     pixels = 256 * pairs
     return {
@@ -159,7 +157,7 @@ def achieved(found: dict[str, float], count: int, pairs: int) -> dict[str, float
 
 
 def ceilings(scale: Scale) -> dict[str, float]:
-    """Measure what the machine can do: copying, and float32 products."""
+    """Measure the hardware's limits: copy bandwidth and float32 matrix products."""
     block = torch.empty(scale.copied, device="cuda")
     square = torch.randn(scale.product, scale.product, device="cuda")
     torch.backends.cuda.matmul.allow_tf32 = False
@@ -169,7 +167,7 @@ def ceilings(scale: Scale) -> dict[str, float]:
 
 
 def precisions(scale: Scale) -> dict[str, dict[str, float]]:
-    """Return the largest gradient error relative to the largest gradient, and the time, by precision."""
+    """Return, by precision, the time and the largest gradient error relative to the largest gradient."""
     from gsplat_edu.render.triton import rasterize
 
     cam = camera(640, 420)
@@ -192,7 +190,7 @@ def precisions(scale: Scale) -> dict[str, dict[str, float]]:
 
 
 def beside_gsplat(scale: Scale) -> dict[str, float] | None:
-    """Render a million Gaussians with gsplat and with us; None where it is not installed."""
+    """Render a million Gaussians with gsplat and with our renderer; None if gsplat is not installed."""
     try:
         from gsplat import rasterization
     except ImportError:
@@ -201,7 +199,7 @@ def beside_gsplat(scale: Scale) -> dict[str, float] | None:
     view = torch.eye(4, device="cuda")
     view[:3, :3] = torch.tensor(cam.R)
     view[:3, 3] = torch.tensor(-cam.R @ cam.eye)
-    # It evaluates pixels at half-integers, we at integers.
+    # gsplat evaluates pixels at half-integers, our renderer at integers.
     K = torch.tensor([[cam.fx, 0, cam.cx + 0.5], [0, cam.fy, cam.cy + 0.5], [0, 0, 1.0]], device="cuda")
 
     def theirs() -> torch.Tensor:
@@ -234,7 +232,7 @@ def beside_gsplat(scale: Scale) -> dict[str, float] | None:
 
 
 def main() -> int:
-    """Measure, print the tables, write the JSON."""
+    """Measure, print the tables and write the JSON."""
     arguments = hardware.parser("A training iteration on a GPU, stage by stage.").parse_args()
     if not torch.cuda.is_available():
         print("gpu.py: torch sees no GPU; benchmarks/train_step.py measures the CPU", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What a figure was measured on, and how it is kept."""
+"""Describe the machine of a measurement and store the result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsplat_edu import _native
 
 
 def describe() -> dict[str, str | int]:
-    """Name the machine and the versions that decide a figure."""
+    """Return the machine and the versions that affect a measurement."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line for line in lines if "model name" in line]
@@ -31,24 +31,24 @@ def describe() -> dict[str, str | int]:
 
 
 def parser(description: str) -> argparse.ArgumentParser:
-    """Make a benchmark's command line."""
+    """Return the argument parser of a benchmark."""
     made = argparse.ArgumentParser(description=description)
     add_options(made)
     return made
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add what every benchmark takes."""
+    """Add the options common to all benchmarks."""
     parser.add_argument("--out", type=Path, help="JSON file to write")
     parser.add_argument(
         "--smoke",
         action="store_true",
-        help="run everything once at a tiny size, to see that it runs; the figures mean nothing",
+        help="run everything once at a tiny size as a test; the figures are meaningless",
     )
 
 
 def report(result: dict[str, Any], out: Path | None) -> None:
-    """Print the machine and write everything to a file where one is named."""
+    """Print the machine; write everything to `out` if it is given."""
     result = {"hardware": describe(), **result}
     print(", ".join(f"{key}: {value}" for key, value in result["hardware"].items()))
     if out:

@@ -3,10 +3,10 @@
     python benchmarks/limits.py [CAPTURE] [--memory SIZE ...] [--time TIME ...] [--smoke] [--out FILE.json]
 
 Runs `gsplat-edu train CAPTURE` (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else a procedural
-capture) in a process of its own, once for each limit (default: 1GiB, 2GiB, 2m, 4m), and measures it from outside: its
-peak RSS by wait4, its wall time, the forecast it printed. Runs with a limit of memory get options that split every
-Gaussian as often as possible, so that they reach the cap that was chosen and use the memory. Linux, where ru_maxrss is
-in KiB.
+capture) in its own process, once for each limit (default: 1GiB, 2GiB, 2m, 4m), and measures it from outside: its
+peak RSS by wait4, its wall time, and the forecast it printed. Runs with a memory limit get options that split every
+Gaussian as often as possible, so that they reach the chosen cap and use the memory. Needs Linux, where ru_maxrss is in
+KiB.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ FILLING = (
     "--iterations 300 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20 --densify-stop 250"
 )
 FILLING += " --reset-every 0 --grad-threshold 2e-6 --eval-every 200 --save-every 100"
-"""Options that grow a scene to its cap in a few hundred iterations. What comes out is of no use otherwise."""
+"""Options that grow a scene to its cap in a few hundred iterations. The scene itself is useless."""
 
 UNITS = {"h": 3600.0, "min": 60.0, "s": 1.0}
 SIZES = {"MiB": 2.0**20, "GiB": 2.0**30}
 
 
 def train(folder: Path, limit: list[str]) -> dict[str, Any]:
-    """Train under one limit; return what was measured from outside and what was forecast."""
+    """Train under one limit; return the measurements and the forecast."""
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
         words = [sys.executable, "-c", COMMAND, "train", str(folder), "--out", str(out), *limit]
         with (Path(scratch) / "said.txt").open("w+") as said:
-            # A child counts what its parent held when it was started; this process holds little.
+            # A child's peak includes its parent's memory at the start, so this process keeps its own small.
             actions = [(os.POSIX_SPAWN_DUP2, said.fileno(), descriptor) for descriptor in (1, 2)]
             began = time.perf_counter()
             child = os.posix_spawn(words[0], words, os.environ, file_actions=actions)
@@ -51,7 +51,7 @@ def train(folder: Path, limit: list[str]) -> dict[str, Any]:
             text = said.read()
         code = os.waitstatus_to_exitcode(status)
         if code:
-            raise SystemExit(f"limits.py: the training ended with {code}: {text.strip()[-500:]}")
+            raise SystemExit(f"limits.py: the training failed with exit code {code}: {text.strip()[-500:]}")
         metrics = json.loads((out / "metrics.json").read_text())
         config = json.loads((out / "config.json").read_text())
     return {
@@ -70,7 +70,7 @@ def train(folder: Path, limit: list[str]) -> dict[str, Any]:
 
 
 def forecast(text: str) -> dict[str, float | None]:
-    """Read the forecast out of what the command printed: seconds, and bytes with all Gaussians that are allowed."""
+    """Parse the printed forecast: seconds, and bytes with the maximum number of Gaussians."""
     duration = re.search(r"forecast: time: about ((?:\d+ (?:h|min|s) ?)+)", text)
     sizes = re.findall(r"up to ([\d.e+]+) (MiB|GiB)", text)
     seconds = None
@@ -80,7 +80,7 @@ def forecast(text: str) -> dict[str, float | None]:
 
 
 def line(found: dict[str, Any]) -> str:
-    """Write a run as a row."""
+    """Return a run as one row of the table."""
     expected, gib = found["forecast"], 2.0**30
     return (
         f"{found['limit']:20} {found['seconds']:7.1f} s (forecast {expected['seconds'] or 0:.0f})  "
@@ -92,11 +92,11 @@ def line(found: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Train under every limit, print the rows, write the JSON."""
-    made = argparse.ArgumentParser(description="Limits of memory and time, from outside.")
+    """Train under every limit, print the rows and write the JSON."""
+    made = argparse.ArgumentParser(description="Check memory and time limits from outside the process.")
     made.add_argument("capture", nargs="?", type=Path)
-    made.add_argument("--memory", nargs="*", metavar="SIZE", help="limits of memory (default: 1GiB 2GiB)")
-    made.add_argument("--time", nargs="*", metavar="TIME", help="limits of time (default: 2m 4m)")
+    made.add_argument("--memory", nargs="*", metavar="SIZE", help="memory limits (default: 1GiB 2GiB)")
+    made.add_argument("--time", nargs="*", metavar="TIME", help="time limits (default: 2m 4m)")
     made.add_argument("--out", type=Path, help="JSON file to write")
     made.add_argument("--smoke", action="store_true", help="one tiny training per kind of limit")
     arguments = made.parse_args()
@@ -115,7 +115,7 @@ def main() -> None:
             rows.append(train(folder, limit) | {"load": [before, os.getloadavg()[0]]})
             load = rows[-1]["load"]
             print(line(rows[-1]) + f", load {load[0]:.1f} to {load[1]:.1f}", flush=True)
-    import hardware  # it imports torch, which the children would be charged for
+    import hardware  # imports torch, whose memory would be counted as the children's
 
     hardware.report({"capture": folder.name, "runs": rows}, arguments.out)
 

@@ -1,12 +1,12 @@
-"""Does the memory of a training stay where it is, iteration after iteration?
+"""Does the memory of a training stay constant over its iterations?
 
     python benchmarks/memory.py [--smoke] [--size PX] [--photos N] [--iterations N] [--keep FOLDER] [--out FILE.json]
                                 [-- options of gsplat-edu train]
 
-Makes a capture in Blender's layout: RGBA photos of a patterned ball. Runs `gsplat-edu train` on it in a process of its
-own, with few Gaussians so that images are what takes memory, and reads the resident set size (RSS) of that process
-from outside while the log grows; the peak is what wait4 reports. Prints a table of iterations and RSS. The default is
-5,000 iterations of 100 photos of 800 x 800 on white. Linux, which has /proc.
+Makes a capture in Blender's layout: RGBA photos of a patterned ball. Runs `gsplat-edu train` on it in its own process,
+with few Gaussians so that images dominate the memory. Reads the resident set size (RSS) of that process from outside
+while the log grows; wait4 reports the peak. Prints a table of iterations and RSS. The default is 5,000 iterations with
+100 photos of 800 x 800 on white. Needs Linux, for /proc.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ import numpy as np
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
 OPTIONS = "--white-background --max-gaussians 2000 --no-rescale --eval-every 0"
-"""Of the training, where none are given."""
+"""Default options of the training."""
 
 TEST_PHOTOS = 4
 
 INTERVAL = 0.1
-"""Seconds between two readings."""
+"""Seconds between readings."""
 
 ROWS = 12
-"""Of the printed table."""
+"""Rows of the printed table."""
 
 MIB = 2.0**20
 
@@ -46,7 +46,7 @@ def make_capture(folder: Path, size: int, count: int) -> None:
     Args:
         folder: The capture, in Blender's layout.
         size: Height and width of the photos, px.
-        count: Photos to train on.
+        count: Number of training photos.
     """
     from gsplat_edu.camera import Camera, look_at
     from gsplat_edu.data.writers import write_blender
@@ -66,7 +66,7 @@ def make_capture(folder: Path, size: int, count: int) -> None:
 
 
 def _photograph(camera: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401
-    """Cast a ray per pixel at a ball of radius 1 around the origin."""
+    """Render a ball of radius 1 around the origin by ray casting; return RGB and alpha."""
     u, v = np.meshgrid(np.arange(camera.W) - camera.cx, np.arange(camera.H) - camera.cy)
     rays = np.stack([u / camera.fx, v / camera.fy, np.ones_like(u)], axis=-1) @ camera.R
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -80,11 +80,11 @@ def _photograph(camera: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401
 
 
 def watch(capture: Path, run: Path, words: list[str]) -> dict[str, Any]:
-    """Train in a process of its own; return its curve [iteration, RSS in bytes], peak, seconds and exit code.
+    """Train in a separate process; return its curve [iteration, RSS in bytes], peak, seconds, exit code and output.
 
     Args:
-        capture: What to train on.
-        run: The run's folder; what the command prints is written beside it.
+        capture: The capture to train on.
+        run: The run's folder; the command's output is written beside it.
         words: Options of the training.
     """
     command = [sys.executable, "-c", COMMAND, "train", str(capture), "--out", str(run), *words]
@@ -111,7 +111,7 @@ def watch(capture: Path, run: Path, words: list[str]) -> dict[str, Any]:
 
 
 def _resident(process: int) -> int:
-    """Return the RSS of a process in bytes; 0 once it has ended."""
+    """Return the RSS of a process in bytes; 0 after it has ended."""
     try:
         fields = Path(f"/proc/{process}/statm").read_text().split()
     except (FileNotFoundError, ProcessLookupError):
@@ -120,7 +120,7 @@ def _resident(process: int) -> int:
 
 
 def _last_iteration(log: Path) -> int:
-    """Return the iteration of the log's last whole line; 0 before there is one."""
+    """Return the iteration of the log's last complete line; 0 if there is none."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - 1000))
@@ -131,7 +131,7 @@ def _last_iteration(log: Path) -> int:
 
 
 def table(curve: list[list[int]]) -> list[list[int]]:
-    """Pick rows at even distances in iterations, the first and the last included."""
+    """Pick rows evenly spaced in iterations, including the first and the last."""
     if not curve:
         return []
     wanted = np.linspace(curve[0][0], curve[-1][0], ROWS)
@@ -140,19 +140,17 @@ def table(curve: list[list[int]]) -> list[list[int]]:
 
 
 def main() -> None:
-    """Make the capture, train, print the table, write the JSON."""
-    made = argparse.ArgumentParser(description="The memory of a training, iteration by iteration.")
-    made.add_argument(
-        "--smoke", action="store_true", help="a tiny capture and a few iterations: does it run at all?"
-    )
+    """Make the capture, train, print the table and write the JSON."""
+    made = argparse.ArgumentParser(description="Memory of a training by iteration.")
+    made.add_argument("--smoke", action="store_true", help="a tiny capture and a few iterations, as a test")
     made.add_argument("--size", type=int, default=800, help="height and width of the photos, px")
-    made.add_argument("--photos", type=int, default=100, help="photos to train on")
+    made.add_argument("--photos", type=int, default=100, help="number of training photos")
     made.add_argument("--iterations", type=int, default=5_000)
-    made.add_argument(
-        "--keep", type=Path, help="folder for capture and run (default: one that is thrown away)"
-    )
+    made.add_argument("--keep", type=Path, help="folder for capture and run (default: a temporary one)")
     made.add_argument("--out", type=Path, help="JSON file to write")
-    made.add_argument("options", nargs="*", help=f"of gsplat-edu train, after -- (default: {OPTIONS})")
+    made.add_argument(
+        "options", nargs="*", help=f"options of gsplat-edu train, after -- (default: {OPTIONS})"
+    )
     given = made.parse_args()
     if given.smoke:
         given.size, given.photos, given.iterations = 48, 4, 60
@@ -162,14 +160,14 @@ def main() -> None:
         capture, run = folder / "capture", folder / "run"
         if (
             not capture.exists()
-        ):  # elsewhere: a child is charged with what its parent held when it was started
+        ):  # made in another process: a child's peak includes its parent's memory at the start
             maker = multiprocessing.get_context("spawn").Process(
                 target=make_capture, args=(capture, given.size, given.photos)
             )
             maker.start()
             maker.join()
             if maker.exitcode:
-                raise SystemExit(f"memory.py: the capture could not be made: exit code {maker.exitcode}")
+                raise SystemExit(f"memory.py: making the capture failed with exit code {maker.exitcode}")
         found = watch(capture, run, ["--iterations", str(given.iterations), *options])
     print("iteration  RSS MiB")
     for iteration, resident in table(found["curve"]):
@@ -177,9 +175,9 @@ def main() -> None:
     print(f"peak {found['peak_rss'] / MIB:.1f} MiB, {found['seconds']:.1f} s")
     if found["code"]:
         raise SystemExit(
-            f"memory.py: the training ended with {found['code']}: {found['said'].strip()[-500:]}"
+            f"memory.py: the training failed with exit code {found['code']}: {found['said'].strip()[-500:]}"
         )
-    import hardware  # it imports torch, which the child would be charged with as well
+    import hardware  # imports torch, whose memory would be counted as the child's
 
     parts = ("curve", "peak_rss", "seconds")
     hardware.report(

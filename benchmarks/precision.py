@@ -2,10 +2,10 @@
 
     python benchmarks/precision.py [--scenes 2000] [--seed 24] [--smoke] [--out FILE.json]
 
-Each scene is drawn at random over many decades: focal length, distance, place in the world, scales along the axes,
-distance of the means from the image. The native kernels render it in float32 and in float64 from the same float32
-parameters. Every scene whose images differ by more than rounding is searched for a discontinuity that a rounding can
-step over; the table counts scenes by what was found. docs/PRECISION.md explains the classes and the bound.
+Each scene is random over many decades of focal length, distance, position in the world, scales, and distance of the
+means from the image. The native kernels render it in float32 and in float64 from the same float32 parameters. If the
+images differ by more than rounding, the benchmark looks for a discontinuity that a rounding error can cross; the table
+counts scenes by the cause found. docs/PRECISION.md explains the classes and the bound.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ EPS = 2.0**-24
 """Relative error of one float32 rounding."""
 
 STEEPEST = np.sqrt(np.log2(np.e) / 2 / DILATION)
-"""Largest factor of dx and dy in the exponent's squares, per px: no ellipse is thinner than the dilation makes it."""
+"""Largest factor of dx and dy in the exponent's squares, per px: the dilation limits how thin an ellipse is."""
 
 
 def extreme_scene(seed: int, index: int) -> tuple[Camera, Gaussians]:
-    """Draw one scene: up to 40 Gaussians of float32 parameters, and a camera of up to 48 x 48 px."""
+    """Make one random scene: up to 40 Gaussians with float32 parameters, and a camera of up to 48 x 48 px."""
     rng = np.random.default_rng([seed, index])
     n, (W, H) = int(rng.integers(1, 41)), (int(size) for size in rng.integers(8, 49, 2))
     focal, distance = W * 10.0 ** rng.uniform(-1, 3), 10.0 ** rng.uniform(-2, 4)
@@ -55,7 +55,7 @@ def extreme_scene(seed: int, index: int) -> tuple[Camera, Gaussians]:
 
 
 def needle(size: int) -> tuple[Camera, Gaussians]:
-    """Make one Gaussian: standard deviation 1000 px along the diagonal, none across, its mean outside."""
+    """Make one Gaussian with a standard deviation of 1000 px along the diagonal, none across, and its mean outside."""
     camera = Camera(np.eye(3), (0, 0, 0), 1000.0, 1000.0, size / 2, size / 2, size, size)
     place = (-100 - size / 2) / 1000.0
     arrays = {
@@ -78,23 +78,21 @@ def _direction(rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Layers:
-    """What is drawn of a scene in float64, near to far: computed here in NumPy, not by the kernels."""
+    """The composited layers of a scene in float64, near to far, computed in NumPy independently of the kernels."""
 
-    order: np.ndarray  # M, which Gaussian
+    order: np.ndarray  # M, index of the Gaussian
     depths: np.ndarray  # M
     alphas: np.ndarray  # M H W, before the floor and the clamp
     colors: np.ndarray  # M 3
-    noise: (
-        np.ndarray
-    )  # M, an estimate of how far float64 may be off in the exponent where covariances are multiplied out
+    noise: np.ndarray  # M, estimated float64 error of the exponent if covariances are multiplied out
 
     def drawn(self) -> np.ndarray:
-        """Return alpha as it is composited, (M, H, W)."""
+        """Return the alpha used for compositing, (M, H, W)."""
         return np.where(self.alphas < ALPHA_MIN, 0.0, np.minimum(self.alphas, ALPHA_MAX))
 
 
 def layers(camera: Camera, gaussians: Gaussians) -> Layers:
-    """Project and evaluate every Gaussian at every pixel, from the factors of its covariance."""
+    """Project and evaluate every Gaussian at every pixel, using the factors of its covariance."""
     arrays = {name: tensor.double().numpy() for name, tensor in gaussians.tensors().items()}
     seen = camera.world_to_cam(arrays["means"])
     order = np.flatnonzero(seen[:, 2] > Z_NEAR)
@@ -118,7 +116,7 @@ def layers(camera: Camera, gaussians: Gaussians) -> Layers:
     toward = arrays["means"][order] - camera.eye
     sh = np.concatenate([arrays["sh0"], arrays["sh_rest"]], axis=1)[order]
     colors = eval_sh(1, sh, toward / np.linalg.norm(toward, axis=1, keepdims=True))
-    # The relative error of a multiplied-out inverse is its condition number times eps, of terms as large as these.
+    # The relative error of a multiplied-out inverse is its condition number times eps, for terms of this size.
     terms = (shape[2] * dx**2 + shape[0] * dy**2).max(axis=(1, 2)) / det
     noise = 64 * np.finfo(np.float64).eps * (a + c) ** 2 / det * (11 + terms)
     return Layers(order, z, opacities[:, None, None] * np.exp(power), colors, noise)
@@ -127,9 +125,9 @@ def layers(camera: Camera, gaussians: Gaussians) -> Layers:
 def relative_bound(camera: Camera) -> float:
     """Bound the relative error of an alpha in float32.
 
-    alpha = 2^(log2 o - s² - t²), |s| and |t| at most sqrt(8) where alpha >= 1/255. s is a sum of three terms of at most
-    STEEPEST times the image's diagonal D, each rounded with its factors four times: |ds| <= 12 EPS STEEPEST D, and the
-    exponent's error is 2 sqrt(8) (|ds| + |dt|). Polynomial, opacity and the last rounding add 16 EPS.
+    alpha = 2^(log2 o - s² - t²), with |s| and |t| at most sqrt(8) if alpha >= 1/255. s is a sum of three terms of at
+    most STEEPEST times the image's diagonal D, each rounded with its factors four times: |ds| <= 12 EPS STEEPEST D, and
+    the exponent's error is 2 sqrt(8) (|ds| + |dt|). Polynomial, opacity and the last rounding add 16 EPS.
     """
     diagonal = float(np.hypot(camera.W, camera.H))
     return float(np.log(2) * 2 * np.sqrt(8) * 2 * 12 * EPS * STEEPEST * diagonal + 16 * EPS)
@@ -137,16 +135,16 @@ def relative_bound(camera: Camera) -> float:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found of one scene's float32 image."""
+    """Error of one scene's float32 image and its causes."""
 
     error: float  # largest difference from float64, any pixel and channel
-    bound: float  # what rounding may do
-    causes: tuple[str, ...]  # discontinuities that a rounding can step over, whether or not one was
-    allowed: float  # bound with those
+    bound: float  # largest error that rounding explains
+    causes: tuple[str, ...]  # discontinuities that a rounding error can cross, whether or not it did
+    allowed: float  # bound including these
 
 
 def judge(camera: Camera, gaussians: Gaussians) -> Verdict:
-    """Compare float32 with float64 and look for ties."""
+    """Compare float32 with float64 and find ties."""
     with torch.no_grad():
         single, double = (
             render(
@@ -159,8 +157,8 @@ def judge(camera: Camera, gaussians: Gaussians) -> Verdict:
     bright = float(max(1.0, np.abs(drawn.colors).max(initial=0.0)))
     relative = relative_bound(camera)
     alphas = drawn.drawn()
-    # An alpha's error moves the image by that times the difference of its colour from what lies behind, T before it;
-    # the weights T alpha of a pixel add up to 1 at most. Sums round once per layer.
+    # An error in alpha changes the image by that error, times T, times the colour difference to the layers behind. The
+    # weights T alpha of a pixel add up to at most 1. Sums round once per layer.
     bound = 2 * bright * (relative + (len(alphas) + 16) * EPS)
     floor_ties = (np.abs(drawn.alphas / ALPHA_MIN - 1) < relative).sum(axis=0).max(initial=0)
     causes, allowed = [], bound
@@ -170,7 +168,7 @@ def judge(camera: Camera, gaussians: Gaussians) -> Verdict:
     if _stop_is_tied(alphas, relative * (len(alphas) + 1)):
         causes.append("tile at the stop 1e-4")
         allowed += 2 * bright * T_STOP
-    # The float32 depth is float64's, rounded: neighbours tie where the rounded ones do.
+    # The float32 depth is the rounded float64 depth, so neighbours tie if their rounded depths do.
     near = np.diff(drawn.depths.astype(np.float32)) <= 0
     if np.any(near & (np.diff(drawn.depths) > 0)):
         causes.append("equal depths in float32")
@@ -179,17 +177,17 @@ def judge(camera: Camera, gaussians: Gaussians) -> Verdict:
 
 
 def _stop_is_tied(alphas: np.ndarray, relative: float) -> bool:
-    """Say whether a tile's largest transmittance comes within `relative` of where it stops."""
+    """Return whether a tile's largest transmittance comes within `relative` of the stop."""
     T = np.cumprod(1 - alphas, axis=0)
     padded = np.pad(T, ((0, 0), (0, -T.shape[1] % TILE), (0, -T.shape[2] % TILE)))
     count, H, W = padded.shape
     tiles = padded.reshape(count, H // TILE, TILE, W // TILE, TILE).max(axis=(2, 4))
-    # 1 - alpha at the clamp is 0.01: its relative error is a hundred times that of alpha.
+    # At the clamp, 1 - alpha is 0.01, so its relative error is a hundred times that of alpha.
     return bool((np.abs(tiles / T_STOP - 1) < 100 * relative).any())
 
 
 def is_stopped(camera: Camera, gaussians: Gaussians) -> bool:
-    """Say whether a tile ends before its last layer, behind which the dense renderer goes on."""
+    """Return whether a tile stops before its last layer; the dense renderer does not stop there."""
     T = np.prod(1 - layers(camera, gaussians).drawn(), axis=0)
     padded = np.pad(T, ((0, -T.shape[0] % TILE), (0, -T.shape[1] % TILE)))
     tiles = padded.reshape(padded.shape[0] // TILE, TILE, padded.shape[1] // TILE, TILE).max(axis=(1, 3))
@@ -197,7 +195,7 @@ def is_stopped(camera: Camera, gaussians: Gaussians) -> bool:
 
 
 def oracle_error(camera: Camera, gaussians: Gaussians) -> tuple[float, float] | str:
-    """Return by how much float64 kernels and the NumPy oracle differ, and a bound; or why the oracle refuses."""
+    """Return the difference of the float64 kernels from the NumPy oracle and a bound, or why the oracle refuses."""
     arrays = {name: tensor.double().numpy() for name, tensor in gaussians.tensors().items()}
     covs = build_cov3d_batch(np.exp(arrays["log_scales"]), quat_to_R_batch(arrays["quats"]))
     toward = arrays["means"] - camera.eye
@@ -220,7 +218,7 @@ def oracle_error(camera: Camera, gaussians: Gaussians) -> tuple[float, float] | 
 
 
 def gradient_error(camera: Camera, gaussians: Gaussians) -> tuple[float, str]:
-    """Return the largest relative difference of float64 gradients, kernels against autograd, and whose it is."""
+    """Return the largest relative difference of float64 gradients, kernels vs. autograd, and its parameter."""
     found = []
     for backend in ("cpu", "torch"):
         moved = gaussians.map(torch.Tensor.double).trainable()
@@ -237,7 +235,7 @@ def gradient_error(camera: Camera, gaussians: Gaussians) -> tuple[float, str]:
 
 
 def images_table(seed: int, count: int) -> list[Verdict]:
-    """Print how many scenes are in each class; return what was found of each."""
+    """Print how many scenes are in each class; return every verdict."""
     verdicts = [judge(*extreme_scene(seed, k)) for k in range(count)]
     print(f"float32 against float64, {count} scenes (seed {seed})")
     limits = (1e-5, 1e-4, 1e-3, 0.02)
@@ -256,7 +254,7 @@ def images_table(seed: int, count: int) -> list[Verdict]:
 
 
 def oracle_table(seed: int, count: int) -> dict[str, int]:
-    """Print how the float64 kernels agree with the NumPy oracle; return how many scenes do in which way."""
+    """Print how the float64 kernels agree with the NumPy oracle; return the number of scenes by class."""
     classes: Counter[str] = Counter()
     for k in range(count):
         result = oracle_error(*extreme_scene(seed, k))

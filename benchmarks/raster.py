@@ -4,8 +4,8 @@
 
 200,000 and 500,000 round Gaussians of 2 px at 1024 x 1024, float32, every instruction set of the machine, one and
 two threads. Times are medians of 7 rounds. A pair is one Gaussian in one 16 x 16 tile that its ellipse alpha >=
-1/255 meets. The unit beside the nanoseconds is one vector FMA of the native width, measured in the same run on one
-thread: machines drift, and that drifts with them.
+1/255 meets. Costs are also given in vector FMAs of the native width, measured in the same run on one thread, since
+their speed drifts with the machine's.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def round_gaussians(count: int, size: int) -> dict[str, torch.Tensor]:
 
 
 class Room(NamedTuple):
-    """Where results go, made once: the system's handing out of pages is not the raster's cost."""
+    """Output buffers, allocated once, so that page allocation by the system is not timed."""
 
     images: _native.Images
     incoming: _native.Images
@@ -49,7 +49,7 @@ class Room(NamedTuple):
 
 
 def room(parameters: dict[str, torch.Tensor], size: int) -> Room:
-    """Make room for the results of a scene."""
+    """Allocate the output buffers for a scene."""
     gradient = torch.randn(size, size, 3, generator=torch.Generator().manual_seed(0))
     out = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
     norms = torch.zeros(len(parameters["means"]))
@@ -64,7 +64,7 @@ def room(parameters: dict[str, torch.Tensor], size: int) -> Room:
 def frame_seconds(
     parameters: dict[str, torch.Tensor], to: Room, size: int, threads: int
 ) -> tuple[tuple[float, ...], int]:
-    """Render once and go back once; return the seconds of each stage and the number of pairs."""
+    """Run one forward and one backward pass; return the seconds of each stage and the number of pairs."""
     scene = _native.Scene(**parameters)
     unlimited = (-math.inf, math.inf)
     frame = _native.FrameF32(
@@ -90,7 +90,7 @@ def frame_seconds(
 
 
 def measure(count: int, isa: str, threads: int, size: int, num_rounds: int) -> dict[str, float | str]:
-    """Measure one line of the table."""
+    """Measure one row of the table."""
     _native.choose_isa(isa)
     parameters = round_gaussians(count, size)
     to = room(parameters, size)
@@ -114,7 +114,7 @@ def measure(count: int, isa: str, threads: int, size: int, num_rounds: int) -> d
 
 
 def main() -> None:
-    """Measure, print the table, write the JSON."""
+    """Measure, print the table and write the JSON."""
     arguments = hardware.parser("Raster: cost of a pair, per instruction set.").parse_args()
     before = _native.isa()
     size, num_rounds, few, many = (64, 1, 200, 500) if arguments.smoke else (SIZE, ROUNDS, 200_000, 500_000)

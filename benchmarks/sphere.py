@@ -1,10 +1,10 @@
-"""How long does an iteration of the course's training take, on the kernels and on the dense renderer?
+"""How long does an iteration of the course's training take with the kernels and with the dense renderer?
 
     python benchmarks/sphere.py [--smoke] [--out FILE.json]
 
-The chapter's run ends at 1,600 Gaussians at 128 px. From there, the number of Gaussians fixed, both backends take
-turns: the dense renderer with the chapter's chunk of 512 splats and with the 16 it trains with, the kernels in
-between. Then the kernels train all 800 iterations.
+The chapter's run ends with 1,600 Gaussians at 128 px. From that scene, with a fixed number of Gaussians, the benchmark
+times the kernels and the dense renderer in turn, the latter with the chapter's chunk of 512 splats and with the 16 used
+for training. The kernels also train all 800 iterations.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NATIVE = functools.partial(render, backend="cpu")
 
 
 def dense(gaussians: Gaussians, camera: Camera, *, settings: RenderSettings, chunk: int) -> RenderOutput:
-    """Render on the dense backend, so many splats at a time."""
+    """Render on the dense backend, `chunk` splats at a time."""
     settings = dataclasses.replace(settings, dense_chunk=chunk)
     return render(gaussians, camera, settings=settings, backend="torch")
 
@@ -43,7 +43,7 @@ DENSE = {chunk: functools.partial(dense, chunk=chunk) for chunk in (512, 16)}
 
 
 def whole_run(size: int, iterations: int) -> tuple[Gaussians, float]:
-    """Train as the chapter does; return the scene and the milliseconds per iteration."""
+    """Train as in the chapter; return the scene and the milliseconds per iteration."""
     capture, config = sphere_capture_once(size), course_config(iterations)
     generator = torch.Generator().manual_seed(9)
     start = random_ball(400, generator)
@@ -54,7 +54,7 @@ def whole_run(size: int, iterations: int) -> tuple[Gaussians, float]:
 
 
 def iteration_ms(scene: Gaussians, renderer: object, size: int, iterations: int) -> float:
-    """Time iterations of a fixed number of Gaussians."""
+    """Return milliseconds per iteration with a fixed number of Gaussians."""
     capture = sphere_capture_once(size)
     config = course_config(iterations=iterations)
     trainer = Trainer(scene, capture.train, config, render=renderer, extent=EXTENT)
@@ -63,12 +63,12 @@ def iteration_ms(scene: Gaussians, renderer: object, size: int, iterations: int)
 
 @functools.cache
 def sphere_capture_once(size: int) -> SphereCapture:
-    """Take the photos once."""
+    """Return the sphere capture, rendered once per size."""
     return sphere_capture(size)
 
 
 def stages(scene: Gaussians, size: int, rounds: int) -> dict[str, float]:
-    """Split an iteration of the kernels into its stages, in milliseconds."""
+    """Return milliseconds of each stage of an iteration with the kernels."""
     view = sphere_capture_once(size).train[0]
     target, leaves = torch.tensor(view.image), scene.trainable()
     names = ("project", "sort", "intersect", "composite", "composite_backward", "project_backward")
@@ -91,7 +91,7 @@ def stages(scene: Gaussians, size: int, rounds: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print the table, write the JSON."""
+    """Measure, print the table and write the JSON."""
     arguments = hardware.parser("The course's training: kernels against the dense renderer.").parse_args()
     size, iterations, few, rounds_of_stages, turns = (
         (16, 5, 1, 2, 1) if arguments.smoke else (128, 800, 200, 200, 3)

@@ -1,11 +1,10 @@
-"""What does a whole training of a capture come to, and where does its time go as the scene grows?
+"""What does a whole training of a capture cost, and how is its time spent as the scene grows?
 
     python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--smoke] [--out FILE.json] [options of train]
 
 Trains as `gsplat-edu train CAPTURE --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data,
-or else a procedural capture), and takes an iteration apart at the start, after 1,000 and 3,000 iterations and at the
-end: medians over 20 views. The wall time is that of the training with its checkpoints and evaluations, without these
-measurements.
+or else a procedural capture). Times the stages of an iteration at the start, after 1,000 and 3,000 iterations, and at
+the end: medians over 20 views. The wall time includes checkpoints and evaluations but not these measurements.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ ROWS = (*STAGES, "loss", "Adam", "rest", "iteration", "pairs")
 
 
 def train(options: argparse.Namespace, out: Path | None) -> None:
-    """Train, measure at the moments, print and write what came out."""
+    """Train, measure at `MOMENTS`, then print and write the results."""
     run = CaptureRun(command.options_from(options), print)
     table: dict[int, dict[str, float]] = {}
 
@@ -65,9 +64,11 @@ def main() -> int:
     """Read the command line and train."""
     outer = argparse.ArgumentParser(add_help=False)
     hardware.add_options(outer)
-    outer.add_argument("--run", type=Path, help="folder of the run (default: one that is thrown away)")
+    outer.add_argument("--run", type=Path, help="folder of the run (default: a temporary one)")
     mine, theirs = outer.parse_known_args()
-    parser = OneLineParser(prog="train_capture.py", description="A whole training of a capture, taken apart.")
+    parser = OneLineParser(
+        prog="train_capture.py", description="A whole training of a capture, timed by stage."
+    )
     command.add_arguments(parser)
     named = None if not theirs or theirs[0].startswith("-") else Path(theirs.pop(0))
     iterations = "10" if mine.smoke else "7000"

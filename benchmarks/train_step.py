@@ -2,10 +2,9 @@
 
     python benchmarks/train_step.py [CAPTURE] [--smoke] [--out FILE.json]
 
-CAPTURE is anything that `gsplat-edu train` takes (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data,
-or else a procedural capture).
-Gaussians start at its points, as the recipe has them. One iteration: render at full size, 0.8 L1 + 0.2 (1 - SSIM)
-against the uint8 photo, backward, Adam. Medians over 20 views.
+CAPTURE is anything that `gsplat-edu train` accepts (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else
+a procedural capture). Gaussians start at its points, as in the recipe. One iteration: render at full size, 0.8 L1
++ 0.2 (1 - SSIM) against the uint8 photo, backward, Adam. Medians over 20 views.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ WARM_UP = 3
 
 
 def measure(scene: Gaussians, views: Sequence[View], rounds: int = 20) -> dict[str, float]:
-    """Take an iteration at some of the views; return the median milliseconds of every stage, and the pairs.
+    """Time iterations at some of the views; return the median milliseconds of every stage, and the pairs.
 
     The scene is not changed.
     """
@@ -74,7 +73,7 @@ def measure(scene: Gaussians, views: Sequence[View], rounds: int = 20) -> dict[s
 
 
 def main() -> None:
-    """Measure, print the table, write the JSON."""
+    """Measure, print the table and write the JSON."""
     made = hardware.parser("A training iteration of a capture, stage by stage.")
     made.add_argument("capture", nargs="?", type=Path)
     arguments = made.parse_args()

@@ -1,8 +1,8 @@
-"""Write docs/CLI.md, the reference of the command line, from the parsers and the Makefile.
+"""Write docs/CLI.md, the command-line reference, from the parsers and the Makefile.
 
     python tools/build_cli_reference.py
 
-`tests/repo/test_cli_reference.py` fails while the file differs from what this writes.
+`tests/repo/test_cli_reference.py` fails if the file differs from this script's output.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _section(title: str, parser: argparse.ArgumentParser) -> str:
 
 
 def _invocation(action: argparse.Action) -> str:
-    """Spell an option with its values, as --help does."""
+    """Return an option with its values, as in --help."""
     if not action.option_strings:
         return _cell(f"{action.metavar} ..." if action.nargs == "+" else str(action.metavar))
     names = ", ".join(action.option_strings)
@@ -110,7 +110,7 @@ def _meaning(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
 
 
 def _cell(text: str) -> str:
-    """Escape what ends a cell of a table."""
+    """Escape characters that would end a table cell."""
     return " ".join(text.split()).replace("|", "\\|")
 
 

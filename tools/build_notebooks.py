@@ -1,10 +1,10 @@
 """Execute the chapters: notebooks/source/NN_name.py (jupytext percent) -> notebooks/NN_name.ipynb.
 
-    python tools/build_notebooks.py                      every chapter, on the full budget
-    python tools/build_notebooks.py 09 --out DIR         those whose names start so, into another folder
+    python tools/build_notebooks.py                      every chapter, with the full budget
+    python tools/build_notebooks.py 09 --out DIR         chapters whose names start with 09, into another folder
 
-GSPLAT_EDU_BUDGET=reduced in the environment trains for less. A cell that raises, or a figure without titles and labels
-(tools/chapter_figures.py), stops the build with exit code 1, and the notebook that stood there stays.
+GSPLAT_EDU_BUDGET=reduced in the environment shortens the trainings. A cell that raises, or a figure without titles and
+labels (tools/chapter_figures.py), stops the build with exit code 1 and leaves the existing notebook unchanged.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ROOT / "notebooks" / "source"
 TOOLS = str(ROOT / "tools")
 STRICT_FIGURES = f"import sys; sys.path.append({TOOLS!r}); import chapter_figures; chapter_figures.install()"
-"""What the kernel executes before the first cell."""
+"""Code that the kernel executes before the first cell."""
 
 CELL_TIMEOUT = 3600  # seconds; the full training of chapter 09 takes minutes on two cores
 
 
 def build(source: Path, out: Path) -> None:
-    """Execute one chapter and write it, whole or not at all.
+    """Execute one chapter and write it atomically.
 
     Args:
         source: The chapter, jupytext percent.
@@ -40,15 +40,15 @@ def build(source: Path, out: Path) -> None:
     """
     notebook = jupytext.read(source)
     for number, cell in enumerate(notebook.cells):
-        cell["id"] = f"cell-{number:02d}"  # drawn at random otherwise
-        cell["metadata"] = {}  # a tag could excuse a cell that raises
+        cell["id"] = f"cell-{number:02d}"  # random by default
+        cell["metadata"] = {}  # a tag could allow a cell to raise
     notebook.metadata = {"kernelspec": notebook.metadata["kernelspec"], "language_info": {"name": "python"}}
     NotebookClient(
         notebook,
         timeout=CELL_TIMEOUT,
         record_timing=False,
         extra_arguments=[
-            "--IPKernelApp.log_level=40",  # errors; it warns of its own local port otherwise
+            "--IPKernelApp.log_level=40",  # errors only; otherwise it warns about its own local port
             f"--IPKernelApp.exec_lines={STRICT_FIGURES}",
         ],
         resources={"metadata": {"path": str(ROOT)}},
@@ -60,7 +60,7 @@ def build(source: Path, out: Path) -> None:
 
 
 def main() -> int:
-    """Build the chapters asked for."""
+    """Build the requested chapters."""
     parser = argparse.ArgumentParser(description="Execute the chapters into notebooks.")
     parser.add_argument("names", nargs="*", help="beginnings of chapter names, for example 09 (default: all)")
     parser.add_argument("--out", type=Path, default=ROOT / "notebooks", help="folder (default: notebooks)")

@@ -2,7 +2,7 @@
 
     python tools/build_recipe_table.py
 
-`tests/repo/test_recipe_document.py` fails while the table differs from what this writes.
+`tests/repo/test_recipe_document.py` fails if the table differs from this script's output.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ HEAD = "| setting | default | meaning | source |\n|---|---|---|---|\n"
 
 
 def table() -> str:
-    """Return the table: a row for each setting, those that are scaled with the run marked by a star."""
+    """Return the table: one row per setting; a star marks settings that scale with the run."""
     return HEAD + "".join(_row(setting) for setting in SETTINGS)
 
 

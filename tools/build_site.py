@@ -2,9 +2,9 @@
 
     python tools/build_site.py [--out out/site]
 
-Pages are gathered in the layout of the repository, so that their relative links stay valid; a link to a module leads to
-its page of the reference. A warning from the generator stops the build with exit code 1. Notebooks are shown as built,
-with their set-up cells folded.
+Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
+reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
+set-up cells folded.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ BUILD_ON = {
 
 PICTURES = ("docs/images/sphere.png", "docs/images/capture.jpg")
 TILES = ("notebooks/11_tiles.ipynb", 0)
-"""Figure of a chapter that the landing page shows: the notebook, and which of its figures."""
+"""The chapter figure on the landing page: the notebook and the figure's index."""
 
 PUBLIC = {
     "Course (NumPy, from `gsplat_edu`)": "gsplat_edu",
@@ -85,13 +85,13 @@ PUBLIC = {
         "gsplat_edu.io.ply.save_ply",
     ),
 }
-"""The public API: the names of a module's `__all__`, or names by their full path."""
+"""The public API: the names of a module's `__all__`, or full paths of names."""
 
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 
 
 def modules() -> list[str]:
-    """Name every module of the package, packages before what is in them."""
+    """List every module of the package, packages before their contents."""
     names = []
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
@@ -100,7 +100,7 @@ def modules() -> list[str]:
 
 
 def relinked(text: str, page: Path, stage: Path) -> str:
-    """Point a page's links to modules at the reference, and bring along other files that it links.
+    """Point a page's links to modules at the reference, and copy the other files that it links to.
 
     Args:
         text: Markdown.
@@ -114,7 +114,7 @@ def relinked(text: str, page: Path, stage: Path) -> str:
             return match[0]
         target = (ROOT / page.parent / link).resolve()
         if not target.exists() or not target.is_relative_to(ROOT):
-            raise SystemExit(f"build_site.py: {page}: {link} leads nowhere")
+            raise SystemExit(f"build_site.py: {page}: {link} is a dead link")
         up = "../" * (len(page.parts) - 1)
         if target.is_relative_to(PACKAGE) and target.suffix == ".py":
             name = ".".join(target.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(
@@ -131,10 +131,10 @@ def relinked(text: str, page: Path, stage: Path) -> str:
 
 
 def gather(stage: Path) -> None:
-    """Lay out all pages in a folder.
+    """Write all pages to a folder.
 
     Args:
-        stage: The folder, empty.
+        stage: An empty folder.
     """
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
     documents = [Path(name) for name in (*USE, *BUILD_ON) if not name.endswith("/index.md")]
@@ -161,7 +161,7 @@ def gather(stage: Path) -> None:
 
 
 def fold_set_up(notebook: dict[str, Any]) -> None:
-    """Fold the code of cells that begin with imports; what they print or draw stays visible.
+    """Fold the code of cells that begin with imports; their output stays visible.
 
     Args:
         notebook: The notebook; its cells are changed.
@@ -172,7 +172,7 @@ def fold_set_up(notebook: dict[str, Any]) -> None:
 
 
 def _figure(page: str, number: int) -> bytes:
-    """Return a figure of an executed notebook, a PNG."""
+    """Return a figure of an executed notebook as PNG."""
     notebook = json.loads((ROOT / page).read_text(encoding="utf-8"))
     outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
     figures = [output["data"]["image/png"] for output in outputs if "image/png" in output.get("data", {})]
@@ -180,7 +180,7 @@ def _figure(page: str, number: int) -> bytes:
 
 
 def _reference(name: str) -> str:
-    """Write the page of a module; that of a package lists its modules."""
+    """Return the page of a module; the page of a package also lists its modules."""
     # The package's own names are indexed where they are defined.
     again = "   :no-index:\n" if "." not in name else ""
     page = f"# {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}```\n"
@@ -189,7 +189,7 @@ def _reference(name: str) -> str:
 
 
 def _public_api() -> str:
-    """Write the first page of the reference: the public API by topic, then every package."""
+    """Return the first page of the reference: the public API by topic, then every package."""
     parts = ["# Reference\n\nThe public API first; the pages of all packages and modules follow.\n"]
     for topic, listed in PUBLIC.items():
         names = _names(listed) if isinstance(listed, str) else listed
@@ -204,7 +204,7 @@ def _public_api() -> str:
 
 
 def _names(module: str) -> list[str]:
-    """Name the functions and classes of a module's `__all__`."""
+    """List the functions and classes of a module's `__all__`."""
     everything = [f"{module}.{name}" for name in importlib.import_module(module).__all__]
     return [name for name in everything if callable(_found(name))]
 
@@ -215,7 +215,7 @@ def _found(name: str) -> object:
 
 
 def _row(name: str) -> str:
-    """Link a name to its definition, and summarise it by the first line of its docstring."""
+    """Return a table row that links a name to its definition and quotes the first line of its docstring."""
     thing: Any = _found(name)
     if not (isinstance(thing, type) or inspect.isfunction(thing)):  # a type alias: its module documents it
         return (
@@ -238,7 +238,7 @@ def _toctree(options: str, pages: Iterable[str]) -> str:
 
 
 def _contents(chapters: list[Path]) -> str:
-    """Write the sidebar: the three ways in."""
+    """Return the sidebar with its sections: learn, use, build on."""
     sections = {
         "Learn": [str(page.with_suffix("")) for page in chapters],
         "Use": [f"{title} <{name.removesuffix('.md')}>" for name, title in USE.items()],
@@ -255,12 +255,12 @@ def _write(path: Path, text: str) -> None:
 
 
 def main() -> int:
-    """Build the site; return 1 where the generator warned."""
+    """Build the site; return 1 if the generator warned."""
     parser = argparse.ArgumentParser(description="Build the site of chapters, documents and reference.")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "site", help="folder (default: out/site)")
     out = parser.parse_args().out.resolve()
     if out.exists() and not (out / "objects.inv").is_file() and not (out.is_dir() and not any(out.iterdir())):
-        print(f"build_site.py: --out: {out} is there and is no site; choose another folder", file=sys.stderr)
+        print(f"build_site.py: --out: {out} exists and is not a site; choose another folder", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory() as scratch:
         stage, made = Path(scratch) / "source", Path(scratch) / "site"
@@ -279,7 +279,9 @@ def main() -> int:
         ]
         done = subprocess.run([*command, str(stage), str(made)], check=False)
         if done.returncode:
-            print("build_site.py: the lines above say what is wrong; nothing was written", file=sys.stderr)
+            print(
+                "build_site.py: the site was not written; the lines above name the problems", file=sys.stderr
+            )
             return 1
         if out.exists():
             shutil.rmtree(out)

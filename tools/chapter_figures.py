@@ -1,7 +1,7 @@
-"""What a figure of a chapter has to carry before it may be shown: titles, and names on its axes.
+"""Check that every figure of a chapter has titles and axis labels.
 
-`tools/build_notebooks.py` installs it in the kernel that executes a chapter: a figure that lacks something
-stops the build at its cell.
+`tools/build_notebooks.py` installs the check in the kernel that executes a chapter. An incomplete figure stops the
+build at its cell.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from matplotlib.figure import Figure
 
 
 class FigureError(ValueError):
-    """A figure that a reader could not read."""
+    """A figure without titles or labels."""
 
 
 def faults(figure: Figure) -> list[str]:
-    """Say what a figure lacks.
+    """List what a figure lacks.
 
-    Every axes has a title. An axis whose numbers can be seen has a label; a colour bar has one too.
+    Every axes needs a title. Every axis with visible numbers needs a label, and so does a colour bar.
 
     Args:
-        figure: The figure, finished.
+        figure: The finished figure.
 
     Returns:
-        One sentence for each fault; empty for a figure that may be shown.
+        One sentence per fault; empty if the figure is complete.
     """
     if not figure.axes:
         return ["the figure has no axes"]
-    figure.canvas.draw()  # ticks are placed when they are drawn
+    figure.canvas.draw()  # drawing places the ticks
     return [fault for number, axes in enumerate(figure.axes) for fault in _faults_of(number, axes)]
 
 
 def _faults_of(number: int, axes: Axes) -> list[str]:
-    # A twin has the title of the axes that it lies on; a colour bar needs none.
+    # Twin axes share the title of the axes below them; a colour bar needs none.
     same = [other for other in axes.figure.axes if other.bbox.bounds == axes.bbox.bounds]
     titles = [other.get_title(loc=place).strip() for other in same for place in ("left", "center", "right")]  # type: ignore[arg-type]
     title = next((text for text in titles if text), "")
@@ -54,7 +54,7 @@ def _faults_of(number: int, axes: Axes) -> list[str]:
 
 
 def _numbered(axis: Axis) -> bool:
-    """Say whether an axis shows numbers; inner axes of a shared grid do not."""
+    """Return whether an axis shows numbers; inner axes of a shared grid do not."""
     return axis.get_visible() and any(
         label.get_visible() and label.get_text() for label in axis.get_ticklabels()
     )

@@ -2,9 +2,9 @@
 
     python tools/check_objects.py BUILD_FOLDER
 
-A function that the compiler emits as a weak symbol in several object files is kept once by the linker, perhaps in
-the version for a machine newer than the one it runs on. So every weak symbol of a kernel's object file has to
-live in that instruction set's own namespace. Exits with 1, and a line for each, where one does not.
+If the compiler emits a function as a weak symbol in several object files, the linker keeps only one copy, perhaps the
+one for a newer machine than the current one. So every weak symbol of a kernel's object file must be in that instruction
+set's own namespace. Prints one line for each that is not, and exits with 1.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def shared(build: Path) -> list[str]:
     """List the weak symbols of kernel object files that are outside their own namespace."""
     objects = sorted(build.glob("**/kernels_*.dir/**/*.o"))
     if not objects:
-        return [f"{build}: holds no kernel object files; name the folder that cmake built in"]
+        return [f"{build}: contains no kernel object files; give the cmake build folder"]
     found = []
     for path in objects:
         listing = subprocess.run(["nm", "-C", str(path)], capture_output=True, text=True, check=True).stdout

@@ -1,8 +1,8 @@
-"""Write native/constants.h from src/gsplat_edu/constants.py, so that each constant stands in one place.
+"""Write native/constants.h from src/gsplat_edu/constants.py, so that each constant is defined once.
 
     python tools/generate_constants.py
 
-A test compares the file with what this writes.
+A test compares the file with this script's output.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NAMES = (
     "SSIM_C2",
 )
 SSIM_TAPS = 6
-"""The middle tap of SSIM's window and the five on one side of it."""
+"""Taps of one half of SSIM's window: the central one and five on one side."""
 
 
 def header() -> str:

@@ -1,8 +1,8 @@
-"""Check the limits that keep the house small: lines a file, lines a function, parameters a function.
+"""Check the size limits of the code: lines per file, lines per function, parameters per function.
 
     python tools/house_limits.py [FOLDER ...]
 
-Prints one line per breach and exits with 1 where there is one. An exception needs a reason in EXCEPTIONS.
+Prints one line per violation and exits with 1 if there is any. An exception needs a reason in EXCEPTIONS.
 Parameters of Triton kernels are not counted.
 """
 
@@ -25,15 +25,15 @@ EXCEPTIONS = {
         "the chapter's seven parameters stay as they are; extent, stop and jacobian_limit make it the kernels' oracle"
     ),
 }
-"""Functions that may have more parameters, and why."""
+"""Functions that may have more parameters, with the reason."""
 
 
 def breaches(path: Path, name: str) -> Iterator[str]:
-    """Yield a line for everything in one file that is over a limit.
+    """Yield one line for each violation in a file.
 
     Args:
         path: The file.
-        name: What to call it, relative to the root.
+        name: Its path relative to the root.
     """
     text = path.read_text(encoding="utf-8")
     lines = text.count("\n")
@@ -53,7 +53,7 @@ def breaches(path: Path, name: str) -> Iterator[str]:
 
 
 def _is_kernel(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
-    """Say whether Triton compiles a function: such a one takes pointers, which nothing bundles."""
+    """Return whether Triton compiles a function; such kernels take pointers, which cannot be bundled."""
     return any(ast.unparse(decorator) == "triton.jit" for decorator in node.decorator_list)
 
 
@@ -63,7 +63,7 @@ def _parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 def main(folders: list[str]) -> int:
-    """Check every file below the folders; print what is over a limit."""
+    """Check every file below the folders and print the violations."""
     root = Path(__file__).resolve().parent.parent
     files = [f for folder in folders for f in sorted((root / folder).rglob("*")) if f.suffix in SUFFIXES]
     found = [line for file in files for line in breaches(file, file.relative_to(root).as_posix())]
