@@ -38,7 +38,7 @@ SAME_PLACE = 1e-9
 """The same limit relative to the largest coordinate, if the subject's depth is unknown: rounding error."""
 
 AWAY = math.radians(45.0)
-"""A camera faces away if its axis is at least this far from the point or direction that the others look at: more than
+"""A camera faces away if its axis is turned at least this far from the point or direction that the others look at: more than
 half of any usual field of view."""
 
 AWAY_FACTOR = 2.5
@@ -167,7 +167,9 @@ def check_parallax(survey: Survey) -> list[Finding]:
     what = (
         "all cameras are at one place"
         if same
-        else (f"all cameras are within {short_number(100 * geometry.spread, 2)} % of the subject's distance")
+        else (
+            f"the cameras' positions differ by only {short_number(100 * geometry.spread, 2)} % of the subject's distance"
+        )
     )
     advice = "walk while you take the photos: photos from one spot contain no depth, so no scene can be reconstructed"
     return [Finding("no parallax", Severity.FATAL, what, advice)]
