@@ -38,8 +38,8 @@ SAME_PLACE = 1e-9
 """The same limit relative to the largest coordinate, if the subject's depth is unknown: rounding error."""
 
 AWAY = math.radians(45.0)
-"""A camera faces away if its axis is turned at least this far from the point or direction that the others look at: more than
-half of any usual field of view."""
+"""A camera faces away if its axis points at least this far from the point or direction that the others look at: more
+than half of any usual field of view."""
 
 AWAY_FACTOR = 2.5
 """The angle must also exceed this multiple of the cameras' 75th percentile, since close-ups of details face aside."""
@@ -168,7 +168,7 @@ def check_parallax(survey: Survey) -> list[Finding]:
         "all cameras are at one place"
         if same
         else (
-            f"the cameras' positions differ by only {short_number(100 * geometry.spread, 2)} % of the subject's distance"
+            f"the cameras' positions differ by {short_number(100 * geometry.spread, 2)} % of the subject's distance"
         )
     )
     advice = "walk while you take the photos: photos from one spot contain no depth, so no scene can be reconstructed"
