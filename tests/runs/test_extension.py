@@ -242,7 +242,7 @@ def test_scenes_of_other_degrees_origins_and_broken_splats(capture, finished, tm
     )
     trainer = run.trainer
     assert len(trainer.gaussians) == len(near) - 2 and "2 of" in say.text and "left out" in say.text
-    assert "up to degree 1 are stored; the others start at zero" in say.text
+    assert "contains harmonics up to degree 1; the others start at zero" in say.text
     assert trainer.gaussians.sh_rest.shape[1] == 8
     kept = [i for i in range(len(near)) if i not in (3, 5)]
     # float32 near 2e5 keeps 2**-7 of a coordinate, half of that lost in writing
