@@ -103,7 +103,7 @@ def test_what_cannot_be_decoded_is_named_with_its_reason(tmp_path):
     assert [(f.name, f.copy) for f in found] == [("good.png", "000001.jpg")]
     assert unreadable[:2] == [
         "empty.jpg (not a JPEG, PNG, WebP, TIFF, BMP or PPM image)",
-        "phone.HEIC (HEIC is not decoded here: export it as JPEG)",
+        "phone.HEIC (HEIC is not supported: export it as JPEG)",
     ]
     assert unreadable[2].startswith("torn.png") and len(unreadable) == 3
     assert all("\n" not in reason for reason in unreadable)
