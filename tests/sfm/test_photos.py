@@ -50,7 +50,7 @@ def test_photos_lie_in_one_folder(tmp_path):
     photo(tmp_path / "session" / "atlas" / "texture.png")
     assert photo_files(tmp_path, (tmp_path / "out").resolve()) == wanted, "one picture alone is no capture"
     others = [photo(tmp_path / "day 2" / name) for name in ("a.jpg", "b.jpg", "c.jpg")]
-    said = r"lie in 2 folders: day 2 \(3\), session/jpeg \(2\); name one of them"
+    said = r"its photos are in 2 folders: day 2 \(3\), session/jpeg \(2\); give one of them"
     with pytest.raises(DatasetError, match=said):
         photo_files(tmp_path, (tmp_path / "out").resolve())
     assert photo_files(tmp_path / "day 2") == others
