@@ -32,13 +32,13 @@ from gsplat_edu.views import Photo
 LOG_EVERY = 50
 
 PHOTO = Path(mpl.get_data_path()) / "sample_data" / "grace_hopper.jpg"
-"""Grace Hopper, US Navy portrait, in the public domain; matplotlib brings it along."""
+"""Portrait of Grace Hopper by the US Navy, in the public domain; matplotlib includes it."""
 
 LARGEST = {"--splats": 100_000, "--iters": 1_000_000, "--size": 4096, "--seed": 2**63 - 1}
-"""Beyond the first three a fit would take weeks."""
+"""Upper bounds of the options. Beyond the first three, a fit would take weeks."""
 
 SHOWN = 512
-"""px: small pictures are written enlarged, each pixel a square, to come near this."""
+"""Small pictures are enlarged by a whole factor to a longer side of about this, px."""
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -49,14 +49,14 @@ class Fit2DOptions:
 
     Args:
         image: The picture's file.
-        splats: N.
-        iters: Steps.
-        size: Longer side of the picture that is fitted, px.
-        seed: Seed of the start.
-        out: Target and fit side by side, a .png; the curves go beside it.
+        splats: Number of splats.
+        iters: Number of steps.
+        size: Longer side to which the picture is downscaled, px.
+        seed: Seed of the initial splats.
+        out: A .png for target and fit side by side; the curves are written beside it.
 
     Raises:
-        ArgumentError: an option is out of range, or `out` is no place for a .png; the message names the flag.
+        ArgumentError: an option is out of range, or `out` is unusable; the message names the flag.
     """
 
     image: Path
@@ -71,7 +71,7 @@ class Fit2DOptions:
         for flag, largest in LARGEST.items():
             whole_number(flag, getattr(self, flag[2:]), 0 if flag == "--seed" else 1, largest)
         if not self.image.is_file():
-            reason = "is a folder" if self.image.is_dir() else "is not there"
+            reason = "is a folder" if self.image.is_dir() else "does not exist"
             raise ArgumentError(f"--image: {self.image} {reason}; give an image file")
         if self.out.suffix.lower() != ".png":
             raise ArgumentError(f"--out: {str(self.out)!r} must end in .png; the curves are named after it")
@@ -86,10 +86,10 @@ class Fit2DOptions:
 
 
 def read_target(options: Fit2DOptions) -> np.ndarray:
-    """Read the picture, over black where it is transparent, at the size to fit.
+    """Read the picture, composited over black and downscaled.
 
     Raises:
-        DatasetError: the file is no image.
+        ArgumentError: the file is not an image.
     """
     try:
         pixels, alpha = decode(options.image)
@@ -101,7 +101,7 @@ def read_target(options: Fit2DOptions) -> np.ndarray:
 
 
 def log(step: Step2D) -> None:
-    """Print a line now and then."""
+    """Print a line every 50 iterations."""
     if step.iteration % LOG_EVERY == 0:
         print(f"iter {step.iteration:4d}  MSE {step.loss:.6f}  PSNR {step.psnr:.2f} dB", flush=True)
 
@@ -113,7 +113,7 @@ def curves_figure_2d(fit: Fit2D) -> Figure:
     loss_axes.semilogy(fit.losses)
     loss_axes.set(title="loss", xlabel="iteration", ylabel="mean squared error")
     psnr_axes.plot(fit.psnrs)
-    psnr_axes.set(title="the same, as it is quoted", xlabel="iteration", ylabel="PSNR, dB")
+    psnr_axes.set(title="the same error as PSNR", xlabel="iteration", ylabel="PSNR, dB")
     for axes in (loss_axes, psnr_axes):
         axes.grid(alpha=0.3)
     return figure
@@ -177,7 +177,7 @@ def main(given: list[str] | None = None) -> int:
     """Read the command line and fit.
 
     Args:
-        given: The arguments; those of the process where None.
+        given: The arguments; those of the process if None.
     """
     options = vars(build_parser().parse_args(given))
     debug = options.pop("debug")

@@ -21,7 +21,7 @@ LOG_EVERY = 100
 
 
 def log(trainer: Trainer, event: StepEvent | DensifyEvent) -> None:
-    """Print the chapter's lines."""
+    """Print the log lines of the chapter."""
     if isinstance(event, DensifyEvent):
         print(
             f"  densify: +{event.num_cloned} cloned, +{event.num_split_children} split children, "
@@ -33,7 +33,7 @@ def log(trainer: Trainer, event: StepEvent | DensifyEvent) -> None:
 
 
 def train(arguments: argparse.Namespace) -> None:
-    """Run the training the arguments ask for."""
+    """Run the training with these arguments."""
     options, notice = options_from(arguments)
     if notice:
         print(notice, flush=True)

@@ -104,7 +104,7 @@ def test_scenes_are_joined_on_request(convert, plain, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["gone.ply", "out.ply"], "gone.ply: is not there"),
+        (["gone.ply", "out.ply"], "gone.ply: does not exist"),
         (["IN", "out.obj"], "known are .compressed.ply, .ply, .splat, .spz, .sog, .glb, .html"),
         (["IN", "."], "unknown scene format"),
         (["IN", "IN/out.ply"], "is a file; give a folder"),

@@ -215,7 +215,7 @@ def test_a_dataset_that_moved_is_named(doctor, run, capture, tmp_path):
     moved.scene(5).parent.mkdir(parents=True)
     moved.scene(5).write_bytes(run.scene(30).read_bytes())
     code, said = doctor(moved.path)
-    assert code == 2 and "/gone: the run's dataset is no longer there" in said
+    assert code == 2 and "/gone: the run's dataset no longer exists" in said
     assert doctor(moved.path, "--dataset", capture[0])[0] == 0
 
 

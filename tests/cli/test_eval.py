@@ -78,7 +78,7 @@ def test_a_dataset_that_moved_is_named(made, cli, capsys, tmp_path):
     error = capsys.readouterr().err
     assert (
         error.count("\n") == 1
-        and "/gone: the run's dataset is no longer there" in error
+        and "/gone: the run's dataset no longer exists" in error
         and "--dataset" in error
     )
     assert cli(["eval", str(moved.path), "--dataset", str(capture), "--backend", "torch"]) == 0
@@ -118,7 +118,9 @@ def test_another_dataset_is_scored_apart_or_not_at_all(run, other, cli, capsys, 
     capsys.readouterr()
     assert cli(["eval", str(run.path), "--dataset", str(other)]) == 2
     error = capsys.readouterr().err
-    assert "is not the capture of" in error and "other cameras: view_00" in error and "--out FOLDER" in error
+    assert (
+        "is not the capture of" in error and "different cameras: view_00" in error and "--out FOLDER" in error
+    )
     assert error.count("\n") == 1 and contents(run.path) == before
     words = ["eval", str(run.path), "--dataset", str(other), "--out", str(tmp_path / "apart")]
     (tmp_path / "apart").mkdir()

@@ -64,7 +64,7 @@ def test_a_run_says_how_far_it_got(info, tmp_path):
         {"version": "9.9", "train": {"iterations": 7000}, "backend": "cpu", "data": {"path": "x"}}
     )
     said = info(folder.path)
-    assert "not started of 7,000" in said and "holds no scene" in said and "not evaluated yet" in said
+    assert "not started of 7,000" in said and "contains no scene" in said and "not evaluated yet" in said
 
     folder.log_file.write_text(json.dumps({"iteration": 6999}) + "\n")
     folder.write_metrics({"test": {"psnr": 23.456, "ssim": 0.8, "num_images": 3}, "seconds": 61.0})

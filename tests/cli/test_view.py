@@ -160,13 +160,13 @@ def test_a_person_at_a_screen_has_the_browser_opened(made, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["nowhere"], "nowhere: is not there; give a scene file or the folder of a run"),
-        (["empty"], "empty: is no run (it has no config.json)"),
+        (["nowhere"], "nowhere: does not exist; give a scene file or the folder of a run"),
+        (["empty"], "empty: is not a run (it has no config.json)"),
         (["notes.txt"], "notes.txt: unknown scene format"),
         (["cut.ply"], "cut.ply: "),
         (["desk.html"], "desk.html: is already a page; open it in a browser: file://"),
-        (["gone.html"], "gone.html: is not there"),
-        (["unfinished"], "unfinished: holds no scene"),
+        (["gone.html"], "gone.html: does not exist"),
+        (["unfinished"], "unfinished: contains no scene"),
         (["nowhere", "--port", "70000"], "--port: is 70000"),
         (["nowhere", "--port", "many"], "argument --port: 'many' is not a whole number"),
         (["nowhere", "--host", "no such host"], "--host: 'no such host' is not an address"),

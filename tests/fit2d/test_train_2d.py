@@ -107,7 +107,7 @@ def test_transparent_and_gray_pictures_are_fitted(main, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["--image", "nowhere.jpg"], "--image: nowhere.jpg is not there; give an image file"),
+        (["--image", "nowhere.jpg"], "--image: nowhere.jpg does not exist; give an image file"),
         (["--image", "."], "--image: . is a folder; give an image file"),
         (["--image", "text.png"], "--image: text.png: cannot be decoded"),
         (["--image", "short.png"], "--image: short.png: cannot be decoded"),

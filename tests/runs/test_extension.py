@@ -1,4 +1,4 @@
-"""Longer than it was begun, from another scene, from photos that changed: what a run makes of it."""
+"""Runs that are extended, start from another scene, or resume with photos that have changed."""
 
 import dataclasses
 import json
@@ -128,7 +128,7 @@ def test_a_run_is_complete_once_it_is_constructed(capture, tmp_path):
     assert (held.trainer.iteration, held.seconds, len(held.dataset.train)) == (0, 0.0, VIEWS - 1)
     assert held.save().name == "iteration_0.safetensors"
     assert held.train(lambda: held.trainer.iteration >= 2, [lambda trainer, event: heard.append(event)])
-    with pytest.raises(CheckpointError, match="holds a run already"):
+    with pytest.raises(CheckpointError, match="already holds a run"):
         CaptureRun(chosen)
     resumed = CaptureRun(dataclasses.replace(chosen, resume=True))
     assert resumed.trainer.iteration == 2 == len([event for event in heard if isinstance(event, StepEvent)])
@@ -153,7 +153,7 @@ def test_an_unfinished_run_is_extended_and_no_run_is_shortened(capture, whole, t
     first.train(lambda: trainer.iteration >= 7)
     assert train(capture, out, "--iterations", "19", "--resume") == 2
     error = capsys.readouterr().err
-    assert "begun with iterations = 20, not 19: a run can be extended, not shortened" in error
+    assert "started with iterations = 20, not 19: a run can be extended, not shortened" in error
     assert error.count("\n") == 1
     assert train(capture, out, "--iterations", "30", "--resume") == 0
     assert ply(out, 30) == ply(whole, 30)
@@ -203,13 +203,13 @@ def test_a_run_from_a_scene_is_resumed_with_it_or_without_its_name(capture, fini
     other = tmp_path / "other"
     assert train(capture, other, "--iterations", "8", "--resume", "--from", str(scene)) == 2
     error = capsys.readouterr().err
-    assert "was begun from another scene" in error and error.count("\n") == 1
+    assert "was not started from" in error and error.count("\n") == 1
     scene.unlink()
     assert train(capture, other, "--resume") == 0, "the checkpoint holds all that the scene gave"
     assert ply(other, 8) == ply(out, 8)
     capsys.readouterr()
     assert train(capture, finished, "--iterations", "20", "--resume", "--from", str(out)) == 2
-    assert "was begun from points" in capsys.readouterr().err
+    assert "was started from points" in capsys.readouterr().err
 
 
 def test_scenes_of_other_degrees_origins_and_broken_splats(capture, finished, tmp_path, capsys):
@@ -242,7 +242,7 @@ def test_scenes_of_other_degrees_origins_and_broken_splats(capture, finished, tm
     )
     trainer = run.trainer
     assert len(trainer.gaussians) == len(near) - 2 and "2 of" in say.text and "left out" in say.text
-    assert "up to degree 1 are stored; the others start at zero" in say.text
+    assert "contains harmonics up to degree 1; the others start at zero" in say.text
     assert trainer.gaussians.sh_rest.shape[1] == 8
     kept = [i for i in range(len(near)) if i not in (3, 5)]
     # float32 near 2e5 keeps 2**-7 of a coordinate, half of that lost in writing
@@ -320,7 +320,7 @@ def test_a_photo_that_changed_before_a_resume_is_named(capture, tmp_path, capsys
     capsys.readouterr()
     assert train(moved, out, "--iterations", "4", "--resume") == 2
     error = capsys.readouterr().err
-    assert "other photos: 1 of 6 have changed since the run began, first view_003.png" in error
+    assert "different photos: 1 of 6 changed since the run started, first view_003.png" in error
     assert error.count("\n") == 1
     photo.write_bytes(before)
     assert train(moved, out, "--iterations", "4", "--resume") == 0
@@ -338,7 +338,7 @@ def test_an_older_run_resumes_by_the_older_check(capture, whole, tmp_path, capsy
     moved = copied(capture, tmp_path)
     changed(moved / "images" / "view_001.png")  # the first view of training
     assert train(moved, out, "--resume") == 2
-    assert "other photos or start points" in capsys.readouterr().err
+    assert "different photos or start points" in capsys.readouterr().err
     assert train(capture, out, "--resume") == 0
 
 

@@ -56,16 +56,16 @@ def test_json_is_strict(folder):
             folder.write_metrics({"psnr": bad})
     assert folder.metrics.read_bytes() == before
     folder.metrics.write_text('{"psnr": NaN}')
-    with pytest.raises(CheckpointError, match=r"metrics\.json: is not JSON \(NaN is no JSON\)"):
+    with pytest.raises(CheckpointError, match=r"metrics\.json: is not JSON \(NaN is not valid JSON\)"):
         folder.read_metrics()
 
 
 def test_what_is_missing_or_damaged_is_named(folder):
-    with pytest.raises(CheckpointError, match=r"run: is no run: it has no config\.json; give the folder"):
+    with pytest.raises(CheckpointError, match=r"run: is not a run: it has no config\.json; give the folder"):
         folder.read_config()
-    with pytest.raises(CheckpointError, match="run: holds no scene"):
+    with pytest.raises(CheckpointError, match="run: contains no scene"):
         folder.latest_scene()
-    with pytest.raises(CheckpointError, match=r"cameras\.json: is not there"):
+    with pytest.raises(CheckpointError, match=r"cameras\.json: does not exist"):
         folder.read_cameras()
     folder.write_config({})
     for text, says in (("[1]", "is not a JSON object"), ("{", "is not JSON"), ("", "is not JSON")):
@@ -178,8 +178,8 @@ def test_render_settings_come_from_the_config():
 @pytest.mark.parametrize(
     ("section", "says"),
     [
-        ({"glow": 1, "fog": 2}, "render: fog, glow: not known to this version"),
-        ([], "render: is no object"),
+        ({"glow": 1, "fog": 2}, "render: unknown settings fog, glow; use the version"),
+        ([], "render: is not an object"),
         ({"sh_degree": 9}, "render: sh_degree: is 9"),
         ({"background": "white"}, "render: background: cannot be read"),
     ],

@@ -98,7 +98,7 @@ def test_the_message_names_the_field(run):
     before = folder.metrics.read_bytes()
     folder.metrics.write_text('{"test": {"psnr": "high"}}')
     with pytest.raises(
-        CheckpointError, match=r"metrics\.json: test\.psnr is high, but has to be a number; mend or remove"
+        CheckpointError, match=r"metrics\.json: test\.psnr is high, but has to be a number; fix or remove"
     ):
         folder.read_metrics()
     folder.metrics.write_text('{"iterations": ' + 100_000 * "[" + "}")

@@ -58,12 +58,12 @@ def test_probes_are_spread_over_the_cameras_and_small(tmp_path):
 
 
 def test_what_is_no_scene_is_one_line(tmp_path):
-    with pytest.raises(ArgumentError, match="is not there; give a scene file"):
+    with pytest.raises(ArgumentError, match="does not exist; give a scene file"):
         open_source(tmp_path / "gone.ply")
-    with pytest.raises(ArgumentError, match="is no run"):
+    with pytest.raises(ArgumentError, match="is not a run"):
         open_source(tmp_path)
     RunFolder(tmp_path / "run").write_config({})
-    with pytest.raises(CheckpointError, match="holds no scene"):
+    with pytest.raises(CheckpointError, match="contains no scene"):
         open_source(tmp_path / "run")
 
 

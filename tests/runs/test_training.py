@@ -240,7 +240,7 @@ def test_another_capture_is_refused(capture, finished, tmp_path, capsys):
     captures = {
         "has 15": (views[:15], points, colors),
         "view_003.png differs": ([*views[:3], with_another_lens(views[3]), *views[4:]], points, colors),
-        "other photos": (darker, points, colors),
+        "different photos": (darker, points, colors),
         "start points": (views, points + 0.01, colors),
     }
     out = tmp_path / "run"
@@ -261,7 +261,7 @@ def test_checkpoints_without_their_config_are_not_taken_up(capture, tmp_path, ca
     assert train(capture, out, *SHORT, "--time-limit", "0.001s") == 0
     (out / "config.json").unlink()
     assert train(capture, out, *SHORT, "--seed", "5") == 2
-    assert "config.json is gone" in capsys.readouterr().err
+    assert "checkpoints of a run but no config.json" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -327,7 +327,7 @@ def test_a_finished_run_has_nothing_to_do(capture, finished, capsys):
 
 def test_a_run_is_not_overwritten(capture, finished, capsys):
     assert train(capture, finished, *SHORT) == 2
-    assert "holds a run already; add --resume" in capsys.readouterr().err
+    assert "already holds a run; add --resume" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -346,7 +346,9 @@ def test_another_schedule_is_refused(capture, finished, capsys, change, named):
 
 def test_resume_without_a_run_starts_over_and_says_so(capture, tmp_path, capsys):
     assert train(capture, tmp_path / "new", *SHORT, "--resume") == 0
-    assert "holds no run to resume; starting at the beginning" in capsys.readouterr().out.replace("\n", " ")
+    assert "contains no run to resume; starting from the beginning" in capsys.readouterr().out.replace(
+        "\n", " "
+    )
 
 
 def test_resume_without_a_checkpoint_starts_over_and_says_so(capture, finished, tmp_path, capsys):
@@ -355,7 +357,7 @@ def test_resume_without_a_checkpoint_starts_over_and_says_so(capture, finished, 
     for name in ("config.json", "cameras.json", "log.jsonl"):
         (out / name).write_bytes((finished / name).read_bytes())
     assert train(capture, out, *SHORT, "--resume") == 0
-    assert "holds no checkpoint; starting at the beginning" in capsys.readouterr().out.replace("\n", " ")
+    assert "contains no checkpoint; starting from the beginning" in capsys.readouterr().out.replace("\n", " ")
     assert ply(out, 40) == ply(finished, 40)
 
 

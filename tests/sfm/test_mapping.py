@@ -218,5 +218,5 @@ def test_two_ways_that_agree_about_most_photos_are_the_last(mapped):
 
 def test_without_poses_the_reason_is_named(mapped):
     best, _, _ = mapped(0, 0, 0)
-    assert "10 of 10 photos match one another, but no poses follow" in str(best)
+    assert "10 of 10 photos match one another, but their matches yield no poses" in str(best)
     assert "too little in common" not in str(best)

@@ -53,9 +53,9 @@ def test_a_mask_that_two_photos_could_mean_is_neithers(tmp_path):
 def test_a_mask_of_another_size_is_refused(tmp_path):
     photo = image(tmp_path / "a.png")
     mask = image(tmp_path / "masks" / "a.png", np.zeros((15, 20), np.uint8))
-    with pytest.raises(DatasetError, match=r"the mask is 20x15 but its photo 40x30; make them one size"):
+    with pytest.raises(DatasetError, match=r"the mask is 20x15 but its photo 40x30; make them the same size"):
         upright_masks({photo: mask}, {photo: (40, 30, 0)})
-    with pytest.raises(DatasetError, match=r"but its photo 40x30 \(30x40 upright\); make them one size"):
+    with pytest.raises(DatasetError, match=r"but its photo 40x30 \(30x40 upright\); make them the same size"):
         upright_masks({photo: mask}, {photo: (40, 30, 1)})
     with pytest.raises(DatasetError, match=r"masks.a\.png: the mask is 20x15"):
         copy_photos([photo], tmp_path, tmp_path / "copies", 1600)
@@ -153,8 +153,10 @@ def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
     said = []
     reconstruct(SfmOptions(source, out), said.append)
     notes = "\n".join(said)
-    assert "; 0 say their focal length; 4 of them have a mask" in notes
-    assert notes.count(f"{tmp_path / 'masks'}: not used, none of its images is named like a photo") == 1
+    assert "; 0 with a focal length in EXIF; 4 of them have a mask" in notes
+    assert (
+        notes.count(f"{tmp_path / 'masks'}: not used, because none of its images is named like a photo") == 1
+    )
     with closing(sqlite3.connect(out / "sfm" / "database.db")) as reader:
         *rows, last = reader.execute("SELECT rows, cols, data FROM keypoints ORDER BY image_id").fetchall()
     assert len(rows) == 7

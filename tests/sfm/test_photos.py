@@ -50,7 +50,7 @@ def test_photos_lie_in_one_folder(tmp_path):
     photo(tmp_path / "session" / "atlas" / "texture.png")
     assert photo_files(tmp_path, (tmp_path / "out").resolve()) == wanted, "one picture alone is no capture"
     others = [photo(tmp_path / "day 2" / name) for name in ("a.jpg", "b.jpg", "c.jpg")]
-    said = r"lie in 2 folders: day 2 \(3\), session/jpeg \(2\); name one of them"
+    said = r"its photos are in 2 folders: day 2 \(3\), session/jpeg \(2\); give one of them"
     with pytest.raises(DatasetError, match=said):
         photo_files(tmp_path, (tmp_path / "out").resolve())
     assert photo_files(tmp_path / "day 2") == others
@@ -103,7 +103,7 @@ def test_what_cannot_be_decoded_is_named_with_its_reason(tmp_path):
     assert [(f.name, f.copy) for f in found] == [("good.png", "000001.jpg")]
     assert unreadable[:2] == [
         "empty.jpg (not a JPEG, PNG, WebP, TIFF, BMP or PPM image)",
-        "phone.HEIC (HEIC is not decoded here: export it as JPEG)",
+        "phone.HEIC (HEIC is not supported: export it as JPEG)",
     ]
     assert unreadable[2].startswith("torn.png") and len(unreadable) == 3
     assert all("\n" not in reason for reason in unreadable)

@@ -94,7 +94,7 @@ def test_stages_are_told_with_real_counts(done):
     pairs = 14 * 13 // 2
     assert last == {stage: (pairs, pairs) if stage == "matches" else (14, 14) for stage in stages}
     assert [sentence.split(":")[0] for sentence in done.said] == list(STAGES)
-    assert "14 by one camera" in done.said[0], "held upright or not, the sensor is the same"
+    assert "14 from one camera" in done.said[0], "held upright or not, the sensor is the same"
     assert "14 of 14 photos have a pose (incremental mapper, SIMPLE_RADIAL)" in done.said[3], (
         "few photos fix a simple lens only"
     )
@@ -180,7 +180,7 @@ def test_a_part_in_the_way_is_refused_and_untouched(tmp_path):
         (work / "result" / part).mkdir(parents=True)
     (out / "masks").mkdir()
     (out / "masks" / "mine.png").write_text("mine")
-    with pytest.raises(ArgumentError, match="masks is in the way and not of this command; move it away"):
+    with pytest.raises(ArgumentError, match="masks was not written by this command; move it away"):
         publish(work, out)
     assert (out / "masks" / "mine.png").is_file() and not (out / "images").exists()
     (out / "masks").rename(out / "kept")
@@ -323,7 +323,7 @@ def test_two_cameras_with_their_focal_lengths_in_exif(tmp_path):
         Image.fromarray(photograph_box(camera)).save(folder / name, quality=95, exif=exif)
     said = []
     reconstruct(SfmOptions(folder, tmp_path / "out"), said.append)
-    assert "12 by 2 kinds of camera or zoom; 12 say their focal length" in said[0]
+    assert "12 from 2 kinds of camera or zoom; 12 with a focal length in EXIF" in said[0]
     found = cameras_of(tmp_path / "out")
     assert set(found) == set(truth)
     check(found, truth)

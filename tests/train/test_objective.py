@@ -223,7 +223,7 @@ def test_a_checkpoint_with_another_view_model_is_refused(capture, tmp_path):
 
     with_gains = trainer(capture, CONFIG, StepParts(view_model=Gains(4)))
     path = save_checkpoint(tmp_path, with_gains, 0.0)
-    with pytest.raises(CheckpointError, match="view_model: 'gains' is not known"):
+    with pytest.raises(CheckpointError, match="view_model: 'gains' is unknown"):
         load_checkpoint(path, trainer(capture, CONFIG))
     with pytest.raises(CheckpointError, match=r"view_model\.gains: is .*\(4,\), but has to be .*\(3,\)"):
         load_checkpoint(path, trainer(capture, CONFIG, StepParts(view_model=Gains(3))))

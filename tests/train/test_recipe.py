@@ -215,5 +215,5 @@ def test_odd_clouds():
     assert len(one) == 1 and torch.isfinite(one.log_scales).all()
     same = from_points(np.ones((5, 3)), np.ones((5, 3)), TrainConfig())
     assert torch.isfinite(same.log_scales).all(), "coinciding points have a floor"
-    with pytest.raises(ArgumentError, match="^points: are none"):
+    with pytest.raises(ArgumentError, match="^points: is empty"):
         from_points(np.zeros((0, 3)), np.zeros((0, 3)), TrainConfig())

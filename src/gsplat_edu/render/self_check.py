@@ -1,8 +1,8 @@
-"""The backend cuda against an exact one, on a small scene, before it is trusted with a large one.
+"""Check the backend cuda on a small scene before its first use.
 
-A GPU, its driver and the compiler of the day may differ from everything the kernels were tested on. So the first use
-on a device renders one scene of 64 Gaussians and differentiates it, and compares both with float64 on the CPU. A pass
-is remembered in the user's cache folder, under the device's name and the versions of everything that takes part.
+A GPU, its driver and the installed compiler may differ from everything the kernels were tested on. The first use on a
+device therefore renders and differentiates a scene of 64 Gaussians, and compares both with float64 on the CPU. A
+passed check is stored in the user's cache folder, under the device's name and the versions of all components.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 
 IMAGE_BOUND = 1.1 * ALPHA_MIN
-"""Largest error of a pixel, relative to the brightest or 1. Where float32 rounds an alpha to the other side of 1/255,
-that Gaussian is missing from a pixel or added to it: at most 1/255 of its colour; a tenth more for all other rounding.
-tests/gpu has the same bound."""
+"""Largest error of a pixel, relative to the brightest or 1. If float32 rounds an alpha across 1/255, a pixel loses or
+gains that Gaussian: at most 1/255 of its colour. Another tenth covers all other rounding. tests/gpu uses the same
+bound."""
 
 MEAN_BOUND = 1e-5
-"""Mean error of all pixels. Rounding alone gives about 1e-7; the few pixels that miss a Gaussian are not enough of them
-to matter, and a wrong formula moves most pixels."""
+"""Largest mean error of all pixels. Rounding alone gives about 1e-7, and too few pixels lose a Gaussian to matter; a
+wrong formula changes most pixels."""
 
 GRADIENT_BOUND = 3e-4
-"""Largest error of a gradient, relative to the largest entry of its tensor: that of tests/gpu and tests/native."""
+"""Largest error of a gradient, relative to the largest entry of its tensor, as in tests/gpu and tests/native."""
 
 SETTINGS = RenderSettings(background=(0.2, 0.5, 0.9), jacobian_limit=1.3)
 
 
 def cuda_failure(device: torch.device | None = None) -> str | None:
-    """Say what is wrong with the kernels of the backend cuda on a device; None where they are right.
+    """Describe what is wrong with the kernels of the backend cuda on a device; None if they pass.
 
-    The answer holds for the process, a pass for as long as device, driver and versions stay the same.
+    The result is cached for the process; a pass is stored until device, driver or versions change.
 
     Args:
-        device: A CUDA device, the current one where None or without an index; or the CPU, under Triton's interpreter.
+        device: A CUDA device, the current one if None or without an index; or the CPU, under Triton's interpreter.
     """
     try:
         if device is None or (device.type == "cuda" and device.index is None):
             device = torch.device("cuda", torch.cuda.current_device())
         return _failure(device)
-    except Exception as error:  # whatever a compiler or a driver comes up with: the CPU renders instead
+    except Exception as error:  # compilers and drivers raise anything; the CPU renders instead
         first = str(error).strip().splitlines()
         return f"they do not run ({type(error).__name__}: {first[0] if first else 'no message'})"
 
@@ -71,13 +71,13 @@ def _failure(device: torch.device) -> str | None:
 
 
 def difference(device: torch.device) -> str | None:
-    """Render and differentiate the scene on a device, and compare with float64 on the CPU.
+    """Render and differentiate the scene on a device, and compare the results with float64 on the CPU.
 
     Args:
         device: As for `cuda_failure`.
 
     Returns:
-        What differs by more than its bound, and by how much; None where nothing does.
+        The first result that exceeds its bound, and its error; None if none does.
     """
     from gsplat_edu.render.triton.rasterize import render_triton
 
@@ -98,16 +98,16 @@ def difference(device: torch.device) -> str | None:
 
 
 CHECK_CAMERA = Camera(np.eye(3), (0.0, 0.0, -3.0), fx=44.0, fy=47.0, cx=23.1, cy=18.4, H=37, W=46)
-"""No multiple of a tile; the principal point is off the middle."""
+"""The image size is not a multiple of the tile size, and the principal point is off-centre."""
 
 
 def check_scene(dtype: torch.dtype) -> Gaussians:
-    """Make 64 Gaussians around the origin with harmonics of degree 3 whose depths all differ.
+    """Make 64 Gaussians around the origin, with harmonics of degree 3 and distinct depths.
 
-    Neither the near plane nor the tiles' stop comes into play: both would let rounding decide what is drawn.
+    The scene triggers neither the near plane nor early termination: with these, rounding would decide what is drawn.
 
     Args:
-        dtype: Of the tensors; the numbers are those of float32.
+        dtype: Type of the tensors; the values are those of float32.
     """
     n = 64
     generator = torch.Generator().manual_seed(0)
@@ -140,7 +140,7 @@ def _exact(gaussians: Gaussians, background: Tensor) -> RenderOutput:
 def _differentiated(
     gaussians: Gaussians, render: Callable[[Gaussians, Tensor], RenderOutput]
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the image, and the gradients of a loss that weighs every pixel of all three images at random."""
+    """Return the image, and the gradients of a loss with random weights for every pixel of all three images."""
     gaussians = gaussians.trainable()
     background = torch.tensor(SETTINGS.background).to(gaussians.means).requires_grad_()
     with torch.enable_grad():
@@ -158,7 +158,7 @@ def _differentiated(
 
 
 def _identity(device: torch.device) -> str:
-    """Name everything that a pass depends on: the device, its driver, the compiler, torch, and our kernels' source."""
+    """Identify everything that a pass depends on: device, driver, compiler, torch, and the source of our kernels."""
     if device.type == "cuda":
         name, capability = torch.cuda.get_device_name(device), torch.cuda.get_device_capability(device)
         on = f"{name}, {capability}, CUDA {torch.version.cuda}, driver {_driver()}"
@@ -171,7 +171,7 @@ def _identity(device: torch.device) -> str:
 
 
 def _driver() -> str:
-    """Return the NVIDIA driver's version as the kernel module gives it; "unknown" where it gives none."""
+    """Return the NVIDIA driver's version from its kernel module; "unknown" if it gives none."""
     try:
         return Path("/sys/module/nvidia/version").read_text().strip()
     except OSError:
@@ -179,7 +179,7 @@ def _driver() -> str:
 
 
 def _memory() -> Path:
-    """Return the file that passes are remembered in."""
+    """Return the file that stores passed checks."""
     folder = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(folder) / "gsplat_edu" / "cuda_passed.json"
 

@@ -1,1 +1,1 @@
-"""Runs: a folder per training, what is in it, and how it is judged."""
+"""Runs: the folder of a training, its files, and its evaluation."""

@@ -1,4 +1,4 @@
-"""Judging a run: scores, pictures and the report, written into its folder."""
+"""Evaluate a run: write scores, pictures and the report into its folder."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from gsplat_edu.views import View
 Image = UInt8[np.ndarray, "H W 3"]
 
 EVALUATED = "evaluated"
-"""Key of a metrics.json that belongs to no run's folder: which run was scored, on which dataset."""
+"""Key of a metrics.json written outside the run's folder: which run was scored, and on which dataset."""
 
 Progress = Callable[[str, ImageScore], None]
-"""Is told of every scored view: its split and its score."""
+"""Called with the split and the score of every scored view."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What a scene is judged by.
+    """The views that a scene is scored on.
 
     Args:
-        test: Views that were held out.
-        train: Views it was trained on; none to leave them out.
-        background: (3,) what renders have behind them, and photos that are not opaque are put over.
-        notes: Sentences a reader of the report should know.
+        test: Held-out views.
+        train: Training views; empty to skip them.
+        background: (3,) colour behind the renders and behind photos that are not opaque.
+        notes: Sentences to print in the report.
     """
 
     test: Sequence[View]
@@ -46,12 +46,12 @@ class Judged:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What the judgement is.
+    """The result of an evaluation.
 
     Args:
-        test: Scores of the views that were held out.
-        train: Scores of the views of training.
-        metrics: What metrics.json holds.
+        test: Scores of the held-out views.
+        train: Scores of the training views.
+        metrics: Contents of metrics.json.
     """
 
     test: list[ImageScore]
@@ -70,16 +70,16 @@ def evaluate_run(
 ) -> Evaluation:
     """Score a scene and write metrics.json, renders/test/NAME.png (render | photo) and report.html.
 
-    Keys of an older metrics.json that are not scored here stay.
+    Other keys of an existing metrics.json are kept.
 
     Args:
         folder: The run's folder; its config and log go into the report.
         judged: The views.
         gaussians: The scene, in the frame of the views' cameras.
         render: Renders Gaussians from a camera, over the background of `judged`.
-        facts: Single numbers for metrics.json: "iterations", "seconds".
-        progress: Is told of every scored view.
-        into: Where files are written; the run's folder, whose other metrics stay, if None.
+        facts: Further numbers for metrics.json: "iterations", "seconds".
+        progress: Called for every scored view.
+        into: Folder to write to; the run's own folder if None, and its other metrics are then kept.
 
     Returns:
         The scores and the metrics.
@@ -114,12 +114,12 @@ def evaluate_run(
         Report(title, metrics, log, config, scores=test, pictures=gallery.pictures, notes=judged.notes),
     )
     gallery.remove_others(before)
-    into.write_metrics(metrics)  # last: it says that the run has been judged
+    into.write_metrics(metrics)  # last: its presence marks the run as evaluated
     return Evaluation(test, train, metrics)
 
 
 class _Gallery:
-    """Writes each test view beside its photo, and keeps a small picture of it for the report."""
+    """Writes each test view beside its photo, and keeps a thumbnail for the report."""
 
     def __init__(self, folder: RunFolder, views: Sequence[View], progress: Progress | None) -> None:
         names = image_file_names([view.name for view in views])
@@ -131,7 +131,7 @@ class _Gallery:
         self.pictures: list[Picture] = []
 
     def remove_others(self, metrics: dict[str, Any]) -> None:
-        """Remove renders of an earlier evaluation, by its metrics, that are of none of these views."""
+        """Remove renders that the metrics of an earlier evaluation list and that show none of these views."""
         scores = metrics.get("test_views", [])
         known = (
             [score.get("name") for score in scores if isinstance(score, dict)]

@@ -1,4 +1,4 @@
-"""What the fields of a run's files may hold. The files are edited by hand and come from elsewhere."""
+"""Types of the fields in a run's files. They are checked because users edit these files and exchange them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from gsplat_edu.errors import CheckpointError
 
 LARGEST_WHOLE = 2**63
-"""Whole numbers have to be smaller than this in absolute value."""
+"""Integers must be smaller than this in absolute value."""
 
 Check = Callable[[object], bool]
 
@@ -46,7 +46,7 @@ KINDS: Mapping[Check, str] = {
     _numbers: "an object of numbers",
     _place: "three numbers",
 }
-"""What messages call the values that each check accepts."""
+"""How messages describe the values that each check accepts."""
 
 CONFIG: Mapping[str, Check] = {
     "version": _text,
@@ -84,15 +84,15 @@ METRICS: Mapping[str, Check] = {
 
 
 def checked(contents: dict[str, Any], fields: Mapping[str, Check], where: str) -> dict[str, Any]:
-    """Return a file's contents once the fields that this program reads have the types that it writes.
+    """Check the types of the fields that this program reads, and return the contents.
 
     Args:
         contents: The file's object.
-        fields: `CONFIG`, `LOG` or `METRICS`; a dot leads into a section. Fields may be missing or null.
-        where: The file, and the line where it has lines.
+        fields: `CONFIG`, `LOG` or `METRICS`; a dot separates a section from its field. Fields may be missing or null.
+        where: The file, with the line number for log.jsonl.
 
     Raises:
-        CheckpointError: a field has another type; the message names it.
+        CheckpointError: a field has the wrong type; the message names it.
     """
     for name, check in fields.items():
         section, _, field = name.rpartition(".")
@@ -101,6 +101,6 @@ def checked(contents: dict[str, Any], fields: Mapping[str, Check], where: str) -
         if value is not None and not check(value):
             said = str(value)[:40] if not isinstance(value, int) or _whole(value) else "a huge number"
             raise CheckpointError(
-                f"{where}: {name} is {said}, but has to be {KINDS[check]}; mend or remove the file"
+                f"{where}: {name} is {said}, but has to be {KINDS[check]}; fix or remove the file"
             )
     return contents

@@ -1,19 +1,19 @@
-"""The folder of a run: which file lies where, and what is in it.
+"""The folder of a run and its files.
 
-    config.json                                   everything that decides the run
-    log.jsonl                                     one JSON object a line, each with `iteration`
-    metrics.json                                  the judgement: {"test": {...}, "train": {...}, "num_gaussians": ...}
-    cameras.json                                  the cameras, as Inria's viewers read them
+    config.json                                   all settings of the run
+    log.jsonl                                     one JSON object per line, each with `iteration`
+    metrics.json                                  the scores: {"test": {...}, "train": {...}, "num_gaussians": ...}
+    cameras.json                                  the cameras, in the format of Inria's viewers
     point_cloud/iteration_N/point_cloud.ply       the scene after N iterations
-    photos.json                                   size and digest of every photo's file when the run began
-    checkpoints/                                  what a run is continued from
+    photos.json                                   size and digest of every photo's file when the run started
+    checkpoints/                                  states to resume from
     renders/                                      pictures
     report.html                                   the run on one page
-    .lock                                         the process that is writing here (`gsplat_edu.locks`); one that was
-                                                  killed leaves the file behind, which then locks nothing
+    .lock                                         names the process that writes here (`gsplat_edu.locks`); the file of
+                                                  a killed process remains, but locks nothing
 
-Scenes and cameras.json stand in the capture's own frame: training may have moved the origin, and config.json's
-`origin` says where to.
+Scenes and cameras.json are in the capture's own frame. Training may subtract an origin from the coordinates;
+config.json stores it as `origin`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 @dataclasses.dataclass(frozen=True)
 class RunFolder:
-    """A run's folder; it need not be there yet.
+    """A run's folder; it need not exist yet.
 
     Args:
         path: The folder.
@@ -52,22 +52,22 @@ class RunFolder:
 
     @property
     def config(self) -> Path:
-        """What decides the run."""
+        """All settings of the run."""
         return self.path / "config.json"
 
     @property
     def log_file(self) -> Path:
-        """One JSON object a line."""
+        """One JSON object per line."""
         return self.path / "log.jsonl"
 
     @property
     def metrics(self) -> Path:
-        """The judgement."""
+        """The scores."""
         return self.path / "metrics.json"
 
     @property
     def cameras(self) -> Path:
-        """The cameras of training and test."""
+        """The training and test cameras."""
         return self.path / "cameras.json"
 
     @property
@@ -82,7 +82,7 @@ class RunFolder:
 
     @property
     def checkpoints(self) -> Path:
-        """Folder of what a run is continued from."""
+        """Folder of the states to resume from."""
         return self.path / "checkpoints"
 
     @property
@@ -91,36 +91,36 @@ class RunFolder:
         return self.path / "report.html"
 
     def scene(self, iteration: int) -> Path:
-        """Return where the scene after so many iterations lies."""
+        """Return the path of the scene after this many iterations."""
         return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
     def exists(self) -> bool:
-        """Say whether a run has begun here: it has written its config.json."""
+        """Return whether a run has started here: config.json exists."""
         return self.config.is_file()
 
     def read_config(self) -> dict[str, Any]:
-        """Read what decides the run.
+        """Read the settings of the run.
 
         Raises:
-            CheckpointError: there is no run here, or the file is damaged.
+            CheckpointError: the folder contains no run, or the file is damaged.
         """
         if not self.exists():
             raise CheckpointError(
-                f"{self.path}: is no run: it has no config.json; give the folder of a training"
+                f"{self.path}: is not a run: it has no config.json; give the folder of a run"
             )
         return checked(_read_object(self.config), CONFIG, str(self.config))
 
     def write_config(self, config: dict[str, Any]) -> None:
-        """Write what decides the run.
+        """Write the settings of the run.
 
         Raises:
-            ArgumentError: something in it has no JSON, NaN for example.
-            OSError: the file cannot be written. What stood there before is untouched.
+            ArgumentError: a value cannot be represented in JSON, for example NaN.
+            OSError: the file cannot be written. An existing file is unchanged.
         """
         write_json(self.config, config)
 
     def read_metrics(self) -> dict[str, Any]:
-        """Read the judgement; empty where the run has not been judged.
+        """Read the scores; empty if the run has not been evaluated.
 
         Raises:
             CheckpointError: the file is damaged.
@@ -130,11 +130,11 @@ class RunFolder:
         return checked(_read_object(self.metrics), METRICS, str(self.metrics))
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
-        """Write the judgement; errors as for `write_config`."""
+        """Write the scores; errors as for `write_config`."""
         write_json(self.metrics, metrics)
 
     def read_photos(self) -> dict[str, Any] | None:
-        """Read what was known of the photos when the run began; None if it was begun by a version that kept nothing.
+        """Read the photos' digests at the start of the run; None if an older version started it without photos.json.
 
         Raises:
             CheckpointError: the file is damaged.
@@ -142,16 +142,16 @@ class RunFolder:
         return _read_object(self.photos) if self.photos.is_file() else None
 
     def write_photos(self, photos: dict[str, Any]) -> None:
-        """Write what is known of the photos; errors as for `write_config`."""
+        """Write the photos' digests; errors as for `write_config`."""
         write_json(self.photos, photos)
 
     def log(self) -> list[dict[str, Any]]:
-        """Read the log: the objects of its lines; none where there is no log.
+        """Read the objects of the log's lines; empty if there is no log.
 
-        A last line that does not end was being written when the run was stopped, and is left out.
+        A last line without a newline was cut off when the run was stopped, and is skipped.
 
         Raises:
-            CheckpointError: another line is no JSON object; the message names it.
+            CheckpointError: another line is not a JSON object; the message names it.
         """
         if not self.log_file.is_file():
             return []
@@ -163,10 +163,10 @@ class RunFolder:
         ]
 
     def latest_scene(self) -> tuple[Path, int]:
-        """Return the scene of the most iterations, and how many those are.
+        """Return the scene with the most iterations, and their number.
 
         Raises:
-            CheckpointError: there is none.
+            CheckpointError: the folder contains no scene.
         """
         found = {}
         for path in self.path.glob("point_cloud/iteration_*/point_cloud.ply"):
@@ -175,8 +175,8 @@ class RunFolder:
                 found[int(digits)] = path
         if not found:
             raise CheckpointError(
-                f"{self.path}: holds no scene (point_cloud/iteration_N/point_cloud.ply); let the training go on"
-                " until it writes one"
+                f"{self.path}: contains no scene (point_cloud/iteration_N/point_cloud.ply) yet; continue the"
+                " training until it writes one"
             )
         latest = max(found)
         return found[latest], latest
@@ -184,16 +184,16 @@ class RunFolder:
     def write_cameras(
         self, train_views: Sequence[View], test_views: Sequence[View], origin: ArrayLike = ORIGIN
     ) -> None:
-        """Write the cameras as Inria's viewers read them, with our principal points and the split.
+        """Write the cameras in the format of Inria's viewers, with the principal points and the split added.
 
         Args:
-            train_views: Views of training.
-            test_views: Views that were held out.
-            origin: (3,) added to the cameras' centres: where their zero lies in the capture's own frame.
+            train_views: Training views.
+            test_views: Held-out views.
+            origin: (3,) added to the camera centres: position of their zero in the capture's own frame.
 
         Raises:
             ShapeError: the origin is not of shape (3,).
-            OSError: the file cannot be written. What stood there before is untouched.
+            OSError: the file cannot be written. An existing file is unchanged.
         """
         shift = float64_array("origin", origin, (3,))
         views = [(view, "train") for view in train_views] + [(view, "test") for view in test_views]
@@ -204,20 +204,20 @@ class RunFolder:
     def read_cameras(self, origin: ArrayLike = ORIGIN) -> list[tuple[str, str, Camera]]:
         """Read the cameras: name, split ("train" or "test") and camera of each.
 
-        A file by Inria's code, without principal points and split, has them in the image's middle, and all are of
-        training. What `write_cameras` wrote comes back to the bit where the origin is zero.
+        Files by Inria's code have no principal points and no split: principal points default to the image centre, and
+        all views to training. With a zero origin, cameras are read back bit for bit as `write_cameras` wrote them.
 
         Args:
-            origin: (3,) subtracted from the cameras' centres; what `write_cameras` was given.
+            origin: (3,) subtracted from the camera centres; the origin that `write_cameras` was called with.
 
         Raises:
             ShapeError: the origin is not of shape (3,).
-            CheckpointError: the file is not there, or damaged; the message names the entry.
+            CheckpointError: the file does not exist or is damaged; the message names the entry.
         """
         shift = float64_array("origin", origin, (3,))
         if not self.cameras.is_file():
             raise CheckpointError(
-                f"{self.cameras}: is not there; name a dataset's folder with --dataset PATH"
+                f"{self.cameras}: does not exist; give a dataset's folder with --dataset PATH"
             )
         entries = _read_json(self.cameras)
         if not isinstance(entries, list):
@@ -226,17 +226,17 @@ class RunFolder:
 
 
 def render_settings(config: dict[str, Any]) -> RenderSettings:
-    """Build the render settings of a run from the section "render" of its config; defaults for what it leaves out.
+    """Build the render settings of a run from the section "render" of its config; missing keys get their defaults.
 
     Raises:
-        CheckpointError: the section holds what this version does not know, or a value is out of its range.
+        CheckpointError: this version does not know a key of the section, or a value is out of range.
     """
     section = config.get("render", {})
     known = {field.name for field in dataclasses.fields(RenderSettings)}
     if not isinstance(section, dict) or (unknown := sorted(set(section) - known)):
-        what = f"{', '.join(unknown)}: not known" if isinstance(section, dict) else "is no object"
+        what = f"unknown settings {', '.join(unknown)}" if isinstance(section, dict) else "is not an object"
         raise CheckpointError(
-            f"config.json: render: {what} to this version of gsplat_edu; use the run's version"
+            f"config.json: render: {what}; use the version of gsplat_edu that started the run"
         )
     values: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in section.items()
@@ -244,29 +244,30 @@ def render_settings(config: dict[str, Any]) -> RenderSettings:
     try:
         return RenderSettings(**values)
     except (ArgumentError, TypeError) as error:
-        raise CheckpointError(f"config.json: render: {error}; mend the file") from None
+        raise CheckpointError(f"config.json: render: {error}; fix the file") from None
 
 
 def image_file_names(names: Sequence[str], suffix: str = ".png") -> list[str]:
-    """Turn the names of images into different file names of one folder.
+    """Turn image names into distinct file names for one folder.
 
-    Whatever is not a letter, digit, ".", "_" or "-" becomes "_", folders included; an image's own suffix goes.
+    Every character other than letters, digits, ".", "_" and "-" becomes "_", including path separators. The image's
+    own suffix is removed.
 
     Args:
-        names: What the capture calls the images, "left/0001.jpg" for example.
-        suffix: Of the file names.
+        names: Image names in the capture, for example "left/0001.jpg".
+        suffix: Suffix of the file names.
 
     Returns:
-        A file name per image: "left_0001.png".
+        One file name per image: "left_0001.png".
     """
     result: list[str] = []
     taken: set[str] = set()
-    copies: dict[str, int] = {}  # a thousand images of one name are not counted up from 2 each
+    copies: dict[str, int] = {}  # the next number to try, so that equal names do not count up from 2 each
     for index, name in enumerate(names):
         base = re.sub(r"\.[A-Za-z]{3,4}$", "", name)
         stem = re.sub(r"[^\w.-]", "_", base).lstrip(".")[:200] or f"view_{index:04d}"
         chosen, copy = stem, copies.get(stem.lower(), 2)
-        while chosen.lower() in taken:  # file systems that know no case
+        while chosen.lower() in taken:  # some file systems ignore case
             chosen, copy = f"{stem}_{copy}", copy + 1
         taken.add(chosen.lower())
         copies[stem.lower()] = copy
@@ -278,8 +279,8 @@ def write_json(path: Path, value: object) -> None:
     """Write strict JSON: no NaN, no infinity.
 
     Raises:
-        ArgumentError: the value has no such JSON; the message says why.
-        OSError: the file cannot be written. What stood there before is untouched.
+        ArgumentError: the value cannot be represented; the message says why.
+        OSError: the file cannot be written. An existing file is unchanged.
     """
     try:
         text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=True)
@@ -290,7 +291,7 @@ def write_json(path: Path, value: object) -> None:
 
 
 def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON")
+    raise ValueError(f"{name} is not valid JSON")
 
 
 def _parse(text: str, where: str) -> Any:  # noqa: ANN401
@@ -298,13 +299,13 @@ def _parse(text: str, where: str) -> Any:  # noqa: ANN401
         return parse_json(text, _refuse_constant)
     except ValueError as error:
         reason = str(error)[:80]
-        raise CheckpointError(f"{where}: is not JSON ({reason}); mend or remove it") from None
+        raise CheckpointError(f"{where}: is not JSON ({reason}); fix or remove it") from None
 
 
 def _parse_object(text: str, where: str) -> dict[str, Any]:
     value = _parse(text, where)
     if not isinstance(value, dict):
-        raise CheckpointError(f"{where}: is not a JSON object; mend or remove it")
+        raise CheckpointError(f"{where}: is not a JSON object; fix or remove it")
     return value
 
 

@@ -16,37 +16,37 @@ from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
 
 SAME = ("train", "render", "data")
-"""What of config.json a resumed run has to share with the one it goes on from."""
+"""Sections of config.json that must be equal in a resumed run."""
 
 MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("iterations",)}
-"""What may differ all the same: files may have been moved, if their contents are equal, and a run may be extended."""
+"""Keys of these sections that may differ: files with the same contents may have moved, and a run may be extended."""
 
 MOVED = 1e-9
-"""Tolerance of camera coordinates, relative and absolute: subtracting an origin and adding it again rounds."""
+"""Tolerance of camera coordinates, relative and absolute: subtracting an origin and adding it back rounds."""
 
 
 def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
-    """Compare the options that a run was begun with and those it is resumed with.
+    """Compare the options of a resumed run with those it was started with.
 
     Raises:
-        CheckpointError: they differ, or config.json is damaged; names the option.
+        CheckpointError: an option differs, or config.json is damaged; the message names the option.
     """
     old = folder.read_config()
     length, wanted = (_section(folder, config, "train").get("iterations") for config in (old, new))
     if not isinstance(length, int) or not isinstance(wanted, int):
-        raise CheckpointError(f"{folder.config}: train: iterations: is no whole number; mend the file")
+        raise CheckpointError(f"{folder.config}: train: iterations: is not a whole number; fix the file")
     if wanted < length:
         raise CheckpointError(
-            f"--resume: {folder.path} was begun with iterations = {length}, not {wanted}: a run can be extended,"
-            " not shortened; give as many or more, or end it earlier with --time-limit"
+            f"--resume: {folder.path} was started with iterations = {length}, not {wanted}: a run can be extended,"
+            " not shortened; give at least as many, or stop it earlier with --time-limit"
         )
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))
         for key in sorted({*before, *now} - set(MAY_DIFFER.get(section, ()))):
             a, b = (_plain(values.get(key)) for values in (before, now))
             if a != b:
-                begun = f"--resume: {folder.path} was begun with {key} = {a}, not {b}"
-                raise CheckpointError(f"{begun}; give the same options, or another --out")
+                begun = f"--resume: {folder.path} was started with {key} = {a}, not {b}"
+                raise CheckpointError(f"{begun}; give the same options or another --out")
 
 
 def fingerprint(dataset: Dataset) -> str:
@@ -59,9 +59,9 @@ def fingerprint(dataset: Dataset) -> str:
 
 
 def photo_digests(dataset: Dataset) -> dict[str, Any]:
-    """Return what photos.json holds: by view, size and digest of the photo's file, and of its mask's.
+    """Return the contents of photos.json: by view, size and digest of the photo's file and of its mask's.
 
-    Files that were not read yet are hashed, several at a time.
+    Files that have not been read yet are hashed in parallel.
     """
     used = {view.name for view in (*dataset.train, *dataset.test)}
     files = [(name, source) for name, source in dataset.files if name in used]
@@ -78,10 +78,10 @@ def photo_digests(dataset: Dataset) -> dict[str, Any]:
 
 
 def capture_difference(folder: RunFolder, dataset: Dataset) -> str | None:
-    """Say how a capture differs from the one that a run was begun with; None if nothing does.
+    """Describe how a capture differs from the one a run was started with; None if it does not.
 
-    Compared are the views, their splits and cameras, and the files of the photos. A capture that was moved or copied
-    is the same: places and times do not count. Runs of older versions keep less, and then less is compared.
+    The comparison covers the views, their splits and cameras, and the photos' files. Paths and file times do not
+    matter, so a moved or copied capture is the same. Runs of older versions store less, so less is compared.
 
     Raises:
         CheckpointError: a file of the run is damaged.
@@ -89,40 +89,40 @@ def capture_difference(folder: RunFolder, dataset: Dataset) -> str | None:
     here = [(view, "train") for view in dataset.train] + [(view, "test") for view in dataset.test]
     known = folder.read_cameras(dataset.origin) if folder.cameras.is_file() else None
     if known is not None and len(known) != len(here):
-        return f"the run was begun with {len(known)} views, this capture has {len(here)}"
+        return f"the run was started with {len(known)} views, but this capture has {len(here)}"
     for (name, split, camera), (view, part) in zip(known or (), here, strict=known is not None):
         if (name, split) != (view.name, part) or not _alike(camera, view.camera):
-            return f"other cameras: {view.name} differs"
+            return f"different cameras: {view.name} differs"
     then = folder.read_photos()
     if then is not None:
         now = photo_digests(dataset)
         if changed := [name for name in now if then.get(name) != now[name]]:
-            return f"other photos: {len(changed)} of {len(now)} have changed since the run began, first {changed[0]}"
+            return f"different photos: {len(changed)} of {len(now)} changed since the run started, first {changed[0]}"
     elif _comparable(config := folder.read_config()) and config.get("fingerprint") != fingerprint(dataset):
-        return "other photos or start points"
+        return "different photos or start points"
     return None
 
 
 def check_capture(folder: RunFolder, dataset: Dataset) -> None:
-    """Compare the capture with the one a run was begun on: views, splits, cameras, photos and start points.
+    """Compare the capture with the one a run was started on: views, splits, cameras, photos and start points.
 
     Raises:
-        CheckpointError: they differ; names the first view that does. Or a file of the run is damaged.
+        CheckpointError: they differ, and the message names the first such view; or a file of the run is damaged.
     """
     if not folder.cameras.is_file():
-        folder.read_cameras()  # says what is missing
+        folder.read_cameras()  # raises an error that names the missing file
     found = capture_difference(folder, dataset)
     if found is None and folder.read_config().get("fingerprint") != fingerprint(dataset):
-        found = "other start points" if folder.photos.is_file() else "other photos or start points"
+        found = "different start points" if folder.photos.is_file() else "different photos or start points"
     if found is not None:
         raise CheckpointError(
-            f"--resume: {folder.path} was begun with another capture: {found}; "
-            "resume with the capture it was begun with, or name another --out"
+            f"--resume: {folder.path} was started with another capture: {found}; "
+            "resume with the original capture, or give another --out"
         )
 
 
 def _comparable(config: dict[str, Any]) -> bool:
-    """Say whether the fingerprint is of the capture alone: it covers the start points, which may be given apart."""
+    """Return whether the fingerprint covers only the capture; start points from a separate file are part of it."""
     data = config.get("data")
     return "fingerprint" in config and isinstance(data, dict) and data.get("points") is None
 
@@ -135,7 +135,9 @@ def _alike(a: Camera, b: Camera) -> bool:
 def _section(folder: RunFolder, config: dict[str, Any], name: str) -> dict[str, Any]:
     value = config.get(name, {})
     if not isinstance(value, dict):
-        raise CheckpointError(f"{folder.config}: {name}: is no object; mend the file or name another --out")
+        raise CheckpointError(
+            f"{folder.config}: {name}: is not an object; fix the file or give another --out"
+        )
     return value
 
 

@@ -1,4 +1,4 @@
-"""The log of a run: log.jsonl, one JSON object a line, each with the number of steps taken as `iteration`."""
+"""The log of a run: log.jsonl, one JSON object per line, each with the number of steps taken as `iteration`."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.train.events import Event, StepEvent
 
 STEPS_PER_LINE = 10
-"""Steps that a line sums up: loss and time are means over them."""
+"""Steps per line; loss and time are means over them."""
 
 
 class LogWriter:
-    """Writes what the trainer reports.
+    """Writes the trainer's events to the log.
 
     Args:
-        path: The file; lines are added to what it holds.
+        path: The file; lines are appended.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,10 +32,10 @@ class LogWriter:
         self._last = 0.0
 
     def record(self, event: Event, seconds: float) -> None:
-        """Write a change of the Gaussians as it comes, and steps ten at a time.
+        """Write a change of the Gaussians at once, and one line for every ten steps.
 
         Args:
-            event: What happened.
+            event: The event.
             seconds: Wall time of the training so far.
         """
         iteration = event.iteration + 1
@@ -47,7 +47,7 @@ class LogWriter:
         if iteration % STEPS_PER_LINE == 0:
             count, names = len(self._steps), list(event.terms)
             values = [[step.loss_tensor, *(step.terms[name] for name in names)] for step in self._steps]
-            # one wait for a GPU in ten steps
+            # one GPU synchronisation per ten steps
             rows = torch.stack([torch.stack(row) for row in values]).tolist()
             loss, *terms = (sum(column) / count for column in zip(*rows, strict=True))
             line = {
@@ -62,7 +62,7 @@ class LogWriter:
             self._steps, self._last = [], seconds
 
     def write(self, line: dict[str, Any]) -> None:
-        """Add a line; it is on its way to the disk when this returns."""
+        """Append a line and flush it to the operating system."""
         if self._file is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("a", encoding="utf-8")
@@ -71,11 +71,11 @@ class LogWriter:
             self._file.flush()
 
     def cut(self, iteration: int, seconds: float = 0.0) -> None:
-        """Drop the lines of steps beyond a checkpoint, which will be taken again.
+        """Drop the lines of steps after a checkpoint; those steps will be repeated.
 
         Args:
             iteration: Steps taken at the checkpoint.
-            seconds: Wall time of the training up to there.
+            seconds: Wall time of the training up to the checkpoint.
         """
         self.close()
         self._steps, self._last = [], seconds
@@ -87,19 +87,19 @@ class LogWriter:
                 if line.endswith("\n") and parse_json(line)["iteration"] <= iteration:
                     kept.append(line)
             except (ValueError, KeyError, TypeError):
-                continue  # torn by a kill
+                continue  # incomplete: the process was killed
         with written_aside(self.path) as aside:
             aside.write_text("".join(kept), encoding="utf-8")
 
     def close(self) -> None:
-        """Close the file; the next line opens it again."""
+        """Close the file; the next line reopens it."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
 
 def _finite(value: Any) -> Any:  # noqa: ANN401
-    """Return what JSON can say: null for NaN and infinities, in objects too."""
+    """Replace NaN and infinities by null, recursively: JSON cannot represent them."""
     if isinstance(value, dict):
         return {key: _finite(entry) for key, entry in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value

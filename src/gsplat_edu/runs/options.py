@@ -1,4 +1,4 @@
-"""What a run of training is asked to do. It imports nothing heavy: the command line checks its options first."""
+"""Options of a training run. The module imports nothing slow, so that the command line can check its options first."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from gsplat_edu.validation import whole_number
 
 @dataclass(frozen=True)
 class RunOptions:
-    """One run of training.
+    """Options of one training run.
 
     Args:
         data: The capture.
         out: The run's folder.
         config: The recipe.
         data_settings: How the capture is read.
-        points: A PLY to start from; the capture's own points where None.
-        scene: A trained scene to start from in place of points: a scene file, or the folder of a run.
-        backend: Rendering backend, by its own name.
-        eval_every: Iterations between judgements by the test views; 0 judges at the end only.
-        save_every: Iterations between checkpoints; 0 writes one at the end only, or when the run is stopped.
-        time_limit: Seconds of training after which the run ends; None for none.
+        points: A PLY to start from; the capture's own points if None.
+        scene: A trained scene to start from instead of points: a scene file or the folder of a run.
+        backend: Name of the rendering backend.
+        eval_every: Iterations between evaluations on the test views; 0 evaluates only at the end.
+        save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
+        time_limit: Seconds of training after which the run ends; None for no limit.
         resume: Continue from the last checkpoint of the folder.
 
     Raises:
@@ -63,7 +63,7 @@ class RunOptions:
 
     @property
     def render_settings(self) -> RenderSettings:
-        """How the scene is rendered once it is trained."""
+        """Settings to render the trained scene with."""
         config = self.config
         return RenderSettings(
             background=config.background,
@@ -75,7 +75,7 @@ class RunOptions:
 
     @property
     def renderer(self) -> Callable[..., Any]:
-        """Renders the scene with these settings; takes Gaussians and a camera."""
+        """A function of Gaussians and a camera that renders with these settings."""
         from gsplat_edu.render.api import render  # it imports torch
 
         return functools.partial(render, settings=self.render_settings, backend=self.backend)

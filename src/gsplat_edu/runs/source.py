@@ -1,4 +1,4 @@
-"""A scene to show or to convert: a file or a run, with the cameras and the settings that belong to it."""
+"""A scene to show or convert, from a file or a run, with its cameras and render settings."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.validation import ArrayLike, float64_array
 
 FARTHEST_ORIGIN = 1e30
-"""World units: what is subtracted from float32 means stays in their range."""
+"""World units: the largest origin, so that float32 means stay finite after the subtraction."""
 
 SCENE_LEVELS = 3
-"""Folders between a run and its scenes: RUN/point_cloud/iteration_N/point_cloud.ply."""
+"""Path levels from a scene up to its run: RUN/point_cloud/iteration_N/point_cloud.ply."""
 
 CAPTURE_JACOBIAN_LIMIT = 1.3
-"""How scenes that come without settings are rendered: captures are trained so, here and by Kerbl et al.'s code."""
+"""Jacobian limit for scenes without settings. Captures are trained with it, here and in Kerbl et al.'s code."""
 
 NamedCamera = tuple[str, Camera]
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A scene and what belongs to it.
+    """A scene with its cameras and settings.
 
     Args:
         path: The scene's file.
         scene: The scene.
-        cameras: Name and camera of each view of its capture, in the same frame, in the order of their names, which
-            is the capture's; none where they are not known.
-        settings: How it is to be rendered.
-        origin: What was subtracted from the coordinates of the file and its cameras: that of the run, where its
+        cameras: Name and camera of each view of its capture, in the scene's frame and sorted by name, as in the
+            capture; empty if unknown.
+        settings: Settings to render it with.
+        origin: Origin subtracted from the coordinates of the file and the cameras: that of the run, non-zero if its
             capture lies far from zero.
-        held_out: Names of the views that were not trained on.
+        held_out: Names of the views that were not used for training.
     """
 
     path: Path
@@ -54,14 +54,14 @@ class Source:
     held_out: frozenset[str] = frozenset()
 
     def probes(self, most: int, longest: int) -> list[NamedCamera]:
-        """Choose cameras to look at the scene from: its own, evenly over the list, or an orbit.
+        """Choose cameras to render the scene from: its own, spread evenly over the list, or an orbit if it has none.
 
         Args:
-            most: Number of cameras at most.
-            longest: Longer side of their images at most, px; that of an orbit's.
+            most: Largest number of cameras.
+            longest: Upper bound of the longer side of their images, px; an orbit's images have this side.
 
         Raises:
-            ArgumentError: there are no cameras, and no Gaussians that an orbit could look at.
+            ArgumentError: there are neither cameras nor Gaussians to orbit.
         """
         if not self.cameras:
             orbit = orbit_of_scene(self.scene.gaussians, most, longest)
@@ -72,16 +72,16 @@ class Source:
 
 
 def open_source(path: str | Path) -> Source:
-    """Read a scene of any readable format, or a run's latest one.
+    """Read a scene of any supported format, or the latest scene of a run.
 
-    A scene in a run's folder gets the run's cameras and settings. Others have no cameras, and are rendered as the
-    file says, or as captures are.
+    A scene in a run's folder gets the run's cameras and settings. Other scenes have no cameras and get the settings
+    of their file, or else the usual ones of captures.
 
     Args:
-        path: Scene file, folder of a SOG, or folder of a run.
+        path: Scene file, SOG folder, or folder of a run.
 
     Raises:
-        ArgumentError: there is nothing that could be a scene.
+        ArgumentError: the path names neither a scene nor a run.
         SceneFormatError: the scene is damaged.
         CheckpointError: the run is damaged, or has no scene yet.
         OSError: a file cannot be read.
@@ -91,11 +91,11 @@ def open_source(path: str | Path) -> Source:
         folder = RunFolder(path)
         if not folder.exists():
             raise ArgumentError(
-                f"{path}: is no run (it has no config.json); give a scene file or the folder of a run"
+                f"{path}: is not a run (it has no config.json); give a scene file or the folder of a run"
             )
         return _of_run(folder, folder.latest_scene()[0])
     if not path.exists():
-        raise ArgumentError(f"{path}: is not there; give a scene file or the folder of a run")
+        raise ArgumentError(f"{path}: does not exist; give a scene file or the folder of a run")
     if (run := run_of(path)) is not None:
         return _of_run(run, path)
     scene = read_scene(path)
@@ -103,7 +103,7 @@ def open_source(path: str | Path) -> Source:
 
 
 def run_of(path: Path) -> RunFolder | None:
-    """Return the run that a scene file was written by; None if it lies in no run's folder."""
+    """Return the run that a scene file belongs to; None if it is not in a run's folder."""
     above = path.absolute().parents
     if path.name != "point_cloud.ply" or len(above) < SCENE_LEVELS or above[1].name != "point_cloud":
         return None
@@ -112,7 +112,7 @@ def run_of(path: Path) -> RunFolder | None:
 
 
 def file_settings(scene: Scene) -> RenderSettings:
-    """Return how a scene is rendered that came as a file: as the file says, and as captures are."""
+    """Return the settings to render a scene file with: antialiasing from the file, the rest as for captures."""
     return RenderSettings(
         antialiased=bool(scene.antialiased), jacobian_limit=CAPTURE_JACOBIAN_LIMIT, depth=False
     )
@@ -132,7 +132,7 @@ def _of_run(folder: RunFolder, path: Path) -> Source:
     settings = replace(render_settings(config), depth=False)
     x, y, z = float64_array("config.json: origin", config.get("origin") or ORIGIN, (3,)).tolist()
     if max(abs(x), abs(y), abs(z)) > FARTHEST_ORIGIN:
-        raise CheckpointError(f"{folder.config}: origin: is beyond {FARTHEST_ORIGIN:g}; mend the file")
+        raise CheckpointError(f"{folder.config}: origin: is beyond {FARTHEST_ORIGIN:g}; fix the file")
     gaussians = load_ply(path, (x, y, z))
     cameras: tuple[NamedCamera, ...] = ()
     held_out: frozenset[str] = frozenset()
@@ -145,6 +145,6 @@ def _of_run(folder: RunFolder, path: Path) -> Source:
 
 
 def scene_up(cameras: Sequence[Camera]) -> tuple[float, float, float]:
-    """Return what is up for the cameras of a capture; the world's up, (0, -1, 0), where there are none."""
+    """Return the up direction of a capture's cameras; the world's, (0, -1, 0), if there are no cameras."""
     x, y, z = common_up(cameras) if cameras else WORLD_UP
     return float(x), float(y), float(z)

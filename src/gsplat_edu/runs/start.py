@@ -1,4 +1,4 @@
-"""A trained scene as the start of another training."""
+"""Start a training from a trained scene."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from gsplat_edu.validation import ArrayLike
 
 
 def scene_file(path: Path) -> Path:
-    """Return the scene file that a path names: a file as it is, the latest scene of a run.
+    """Return the scene file for a path: the file itself, or the latest scene of a run.
 
     Raises:
-        ArgumentError: there is nothing that could be a scene.
+        ArgumentError: the path names neither a scene nor a run.
         CheckpointError: the run is damaged, or has no scene yet.
     """
     if not path.exists():
-        raise ArgumentError(f"--from: {path} is not there; give a scene file or the folder of a run")
+        raise ArgumentError(f"--from: {path} does not exist; give a scene file or the folder of a run")
     if not path.is_dir() or (path / SOG_META).is_file():
         file = path / SOG_META if path.is_dir() else path
         format_of(file)
@@ -41,22 +41,22 @@ def scene_start(path: Path, config: TrainConfig, origin: ArrayLike) -> tuple[Gau
     """Read a scene to start training from.
 
     Args:
-        path: Scene file of any readable format, in the capture's own coordinates; or the folder of a run.
-        config: SH degree and cap of the run that starts.
-        origin: (3,) what is subtracted from the capture's coordinates for training.
+        path: Scene file of any supported format, in the capture's own coordinates, or the folder of a run.
+        config: SH degree and cap of the new run.
+        origin: (3,) subtracted from the capture's coordinates for training.
 
     Returns:
-        Gaussians of the run's SH degree, float32, relative to the origin; and sentences that say what was done.
+        Gaussians of the run's SH degree, float32, relative to the origin; and sentences that report the changes.
 
     Raises:
-        ArgumentError: there is no scene, or it has no Gaussians that can be used, or more than the cap.
+        ArgumentError: there is no scene, or it has no usable Gaussians, or more than the cap.
         SceneFormatError: the file is damaged.
         CheckpointError: the run is damaged, or has no scene yet.
         OSError: the file cannot be read.
     """
     file = scene_file(path)
-    # A PLY is read with its broken Gaussians, which are left out below. The PLYs of older runs do not say whether they
-    # are antialiased; config.json does.
+    # A PLY is read with its non-finite Gaussians, which `from_gaussians` drops. PLYs of older runs do not store
+    # whether they are antialiased; config.json does.
     scene = ply.read(file, finite=False) if format_of(file).suffix == ".ply" else read_scene(file)
     run = run_of(file)
     antialiased = scene.antialiased if run is None else render_settings(run.read_config()).antialiased
@@ -70,8 +70,8 @@ def scene_start(path: Path, config: TrainConfig, origin: ArrayLike) -> tuple[Gau
         was, now = ("with", "without") if antialiased else ("without", "with")
         advice = "leave out --antialiased" if config.antialiased else "add --antialiased"
         notes.append(
-            f"{file}: was trained {was} antialiasing, this run trains {now}: small splats change their brightness;"
-            f" {advice} to keep it"
+            f"{file}: was trained {was} antialiasing, but this run trains {now}: the brightness of small splats"
+            f" changes; {advice} to keep it"
         )
     return start, [f"{file}: {len(start)} Gaussians to start from", *notes]
 

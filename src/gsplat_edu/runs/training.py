@@ -1,6 +1,6 @@
-"""A capture becomes a scene, in a run folder that can be taken up again wherever it was left.
+"""Train a scene from a capture, in a run folder from which training can be resumed.
 
-The trainer knows neither files nor datasets; this module gives it both, and writes what comes out.
+The trainer knows neither files nor datasets; this module provides both and writes the results.
 
 Chapter: 13_photos_to_scene.
 """
@@ -43,7 +43,7 @@ from gsplat_edu.train.trainer import Callback, Trainer
 
 
 def document(options: RunOptions) -> dict[str, Any]:
-    """Return what config.json holds of a run's options."""
+    """Return the part of config.json that a run's options determine."""
     data = dataclasses.asdict(options.data_settings)
     return {
         "version": version("gsplat-edu"),
@@ -61,16 +61,16 @@ def document(options: RunOptions) -> dict[str, Any]:
 
 
 Export = Callable[[Source], list[dict[str, Any]]]
-"""Writes a scene elsewhere too, and says what it wrote: "path", "psnr" and more of each file."""
+"""Writes a scene in further formats and returns a record of each file: "path", "psnr" and more."""
 
 
 def _checked_folder(options: RunOptions) -> RunOptions:
-    """Check the folder against what is asked for; return the options with the scene that a resumed run began with."""
+    """Check the folder against the options; return them with the start scene of a resumed run filled in."""
     folder = options.folder
     if folder.exists():
         if not options.resume:
             raise CheckpointError(
-                f"--out: {folder.path} holds a run already; add --resume to continue it, or name another folder"
+                f"--out: {folder.path} already holds a run; add --resume to continue it, or give another folder"
             )
         options = _with_scene(options)
         check_options(folder, document(options))
@@ -78,19 +78,19 @@ def _checked_folder(options: RunOptions) -> RunOptions:
     check_folder("--out", folder.path)
     if list_checkpoints(folder.checkpoints):
         raise CheckpointError(
-            f"--out: {folder.path} holds checkpoints of a run whose config.json is gone; name another folder"
+            f"--out: {folder.path} contains checkpoints of a run but no config.json; give another folder"
         )
     return options
 
 
 def _with_scene(options: RunOptions) -> RunOptions:
-    """Refuse to resume a run from points with a scene; without --from, the scene of its config.json is used."""
+    """Refuse --from for a run started from points; without --from, use the scene named in config.json."""
     data = options.folder.read_config().get("data")
     stored = data.get("scene") if isinstance(data, dict) else None
     if stored is None and options.scene is not None:
         raise CheckpointError(
-            f"--resume: {options.folder.path} was begun from points, not --from {options.scene};"
-            " leave that out, or name another --out"
+            f"--resume: {options.folder.path} was started from points, not --from {options.scene};"
+            " leave --from out, or give another --out"
         )
     if stored is not None and options.scene is None and not list_checkpoints(options.folder.checkpoints):
         return dataclasses.replace(options, scene=Path(str(stored)))
@@ -98,43 +98,43 @@ def _with_scene(options: RunOptions) -> RunOptions:
 
 
 def is_finished(options: RunOptions) -> bool:
-    """Say whether the folder holds this run with all of its iterations, and its evaluation: nothing is left to do.
+    """Return whether the folder contains this run, trained to the end and evaluated.
 
     Raises:
-        CheckpointError: the folder holds a run that is not to be resumed, or another one.
+        CheckpointError: the folder contains a different run, or one that the options do not resume.
         OSError: the folder cannot be written to.
     """
     folder = _checked_folder(options).folder
     done = folder.read_metrics().get("iterations", 0) if folder.exists() else 0
     if not isinstance(done, int):
-        raise CheckpointError(f"{folder.metrics}: iterations: is no number; mend or remove the file")
+        raise CheckpointError(f"{folder.metrics}: iterations: is not a number; fix or remove the file")
     return done >= options.config.iterations
 
 
 class CaptureRun:
-    """A run of training on a capture, ready to train: its photos are read, and the last checkpoint is loaded.
+    """A training run on a capture, ready to train: its photos are read, and the last checkpoint is loaded.
 
-    It is complete once it is constructed, so any program can hold it: `train` takes the iterations that are left,
-    `finish` writes the scene and evaluates it. `is_finished` says beforehand whether anything is left to do. The
+    The object is complete once constructed, so any program can use it: `train` runs the remaining iterations, and
+    `finish` writes the scene and evaluates it. `is_finished` tells beforehand whether anything remains to do. The
     folder is not locked; see `gsplat_edu.locks.locked`.
 
     Args:
-        options: The run.
-        say: Receives, in sentences, what the user wants to know.
-        progress: Receives how many photos of how many have been read.
+        options: Options of the run.
+        say: Receives sentences for the user.
+        progress: Receives the number of photos read and their total.
 
     Raises:
-        CheckpointError: the folder holds a run that is not to be resumed, or another one.
+        CheckpointError: the folder contains a different run, or one that the options do not resume.
         DatasetError: the capture cannot be read.
-        ArgumentError: options do not fit together.
+        ArgumentError: options contradict each other.
         OSError: the folder cannot be written to.
 
     Attributes:
-        options: The run, with the scene it began with where it is resumed.
+        options: Options of the run; a resumed run has its start scene filled in.
         folder: Its folder.
         dataset: The capture.
         trainer: The training.
-        seconds: Wall time of the training up to the last time `train` ended.
+        seconds: Wall time of the training up to the last return of `train`.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class CaptureRun:
         self.options, self.folder, self._say = _checked_folder(options), options.folder, say
         self._say_what_is_resumed()
         self.seconds = 0.0
-        self._began: float | None = None  # while it trains: the moment that its seconds count from
+        self._began: float | None = None  # during training: when the count of seconds started
         self.dataset = load_dataset(options.data, options.data_settings, points=options.points)
         for note in self.dataset.notes:
             say(note)
@@ -161,14 +161,14 @@ class CaptureRun:
         folder, options = self.folder, self.options
         if not folder.exists():
             if options.resume:
-                self._say(f"{folder.path}: holds no run to resume; starting at the beginning")
+                self._say(f"{folder.path}: contains no run to resume; starting from the beginning")
         elif (before := folder.read_config().get("backend")) != options.backend:
             self._say(
-                f"{folder.path}: was begun on the backend {before}; {options.backend} rounds differently"
+                f"{folder.path}: was started on the backend {before}; {options.backend} rounds differently"
             )
 
     def _begin(self) -> Gaussians:
-        """Make the Gaussians to start from; write what decides the run, or compare it with what was written."""
+        """Make the start Gaussians; write the run's settings, or compare them with the stored ones."""
         options, dataset, folder = self.options, self.dataset, self.folder
         gaussians, digest = self._start_cloud()
         if folder.exists():
@@ -176,10 +176,10 @@ class CaptureRun:
             check_capture(folder, dataset)
             if digest is not None and folder.read_config().get("start") != digest:
                 raise CheckpointError(
-                    f"--resume: {folder.path} was begun from another scene than {options.scene} is now;"
-                    " resume with that one, or name another --out"
+                    f"--resume: {folder.path} was not started from {options.scene} as it is now;"
+                    " resume with the original scene, or give another --out"
                 )
-        else:  # config.json comes last: it says that the run has begun
+        else:  # config.json comes last: its presence means that the run has started
             folder.write_cameras(dataset.train, dataset.test, dataset.origin)
             folder.write_photos(photo_digests(dataset))
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
@@ -201,7 +201,7 @@ class CaptureRun:
         )
 
     def _start_cloud(self) -> tuple[Gaussians, str | None]:
-        """Make the Gaussians that training starts from, and a digest of them if they come from a scene."""
+        """Make the start Gaussians, and their digest if they come from a scene."""
         options, dataset = self.options, self.dataset
         if options.scene is not None:
             gaussians, notes = scene_start(options.scene, options.config, dataset.origin)
@@ -211,12 +211,12 @@ class CaptureRun:
         gaussians = from_points(dataset.points, dataset.colors, options.config)
         if len(gaussians) < len(dataset.points) and not self.folder.exists():
             self._say(
-                f"the capture has {len(dataset.points)} points to start from; {len(gaussians)} are used, the cap"
+                f"the capture has {len(dataset.points)} start points; {len(gaussians)} of them are used (the cap)"
             )
         return gaussians, None
 
     def _extend(self) -> None:
-        """Write to config.json that the run is longer than it was, before the first of the new iterations."""
+        """Record in config.json that the run was extended, before the first additional iteration."""
         stored, wanted = self.folder.read_config(), self.options.config.iterations
         before = stored["train"].get("iterations")
         if before == wanted:
@@ -227,7 +227,7 @@ class CaptureRun:
         past = history if isinstance(history, list) else []
         self.folder.write_config(stored | {"train": train, "history": [*past, entry]})
         self._say(
-            f"{self.folder.path}: extended from {before} to {wanted} iterations; milestones and rates stay as they were"
+            f"{self.folder.path}: extended from {before} to {wanted} iterations; milestones and rates are unchanged"
         )
 
     def _take_up(self) -> None:
@@ -237,18 +237,18 @@ class CaptureRun:
             self.seconds = read_seconds(checkpoints[-1])
             self._say(f"resuming after {self.trainer.iteration} iterations")
         elif self.options.resume and self.folder.log_file.exists():
-            self._say(f"{self.folder.path}: holds no checkpoint; starting at the beginning")
+            self._say(f"{self.folder.path}: contains no checkpoint; starting from the beginning")
         self._log.cut(self.trainer.iteration, self.seconds)
 
     def train(self, stop: Callable[[], bool] = lambda: False, callbacks: Sequence[Callback] = ()) -> bool:
-        """Take the iterations that are left, and save where they ended.
+        """Run the remaining iterations, then save a checkpoint.
 
         Args:
-            stop: Asked after every iteration; the run is saved and can be resumed when it says so.
+            stop: Called after every iteration; if it returns true, the run is saved and can be resumed.
             callbacks: Receive every step and every change, after the log.
 
         Returns:
-            Whether `stop` ended it.
+            Whether `stop` ended the training.
         """
         limit, asked, whole = self.options.time_limit, False, self.trainer.iteration
         self._began = time.perf_counter() - self.seconds
@@ -266,7 +266,7 @@ class CaptureRun:
                 self.trainer.run(ends, callbacks)
         except DatasetError as error:
             if whole != self.trainer.iteration:
-                raise  # in the middle of an iteration: the last checkpoint is the state to resume from
+                raise  # in the middle of an iteration: resume from the last checkpoint
             self.save()
             raise DatasetError(
                 f"{error}; saved after {whole} iterations, --resume continues from there"
@@ -280,14 +280,14 @@ class CaptureRun:
     def _judge_and_save_where_due(self, stop: Callable[[], bool]) -> None:
         done, options = self.trainer.iteration, self.options
         if done == options.config.iterations:
-            return  # both are done at the end
+            return  # the end of the run evaluates and saves anyway
         if options.eval_every and done % options.eval_every == 0 and self.dataset.test:
             self._judge(stop)
         if options.save_every and done % options.save_every == 0:
             self.save()
 
     def _judge(self, stop: Callable[[], bool]) -> None:
-        """Score the test views as the scene stands; say and log what came out, unless it is to stop meanwhile."""
+        """Score the current scene on the test views; report and log the means. `stop` aborts it."""
         options, done, scores = self.options, self.trainer.iteration, []
         for view in self.dataset.test:
             if stop():
@@ -305,16 +305,16 @@ class CaptureRun:
         return save_checkpoint(self.folder.checkpoints, self.trainer, self._elapsed())
 
     def finish(self, progress: Progress | None = None, export: Export | None = None) -> Evaluation:
-        """Write the scene, in other formats too where `export` is there, and judge it by test and training views.
+        """Write the scene, in other formats too if `export` is given, and score it on the test and training views.
 
         Args:
-            progress: Told of every view that was scored.
-            export: Given the written scene; what it returns goes into metrics.json and the report, as "exports".
+            progress: Called for every scored view.
+            export: Called with the written scene; metrics.json and the report get its result as "exports".
         """
         trainer, dataset = self.trainer, self.dataset
         gaussians = trainer.gaussians.map(lambda tensor: tensor[trainer.gaussians.finite_rows()])
         if lost := len(trainer.gaussians) - len(gaussians):
-            self._say(f"{lost} Gaussians are NaN or infinite, and are left out of the scene")
+            self._say(f"{lost} Gaussians are NaN or infinite and are left out of the scene")
         path = self.folder.scene(trainer.iteration)
         save_ply(path, gaussians, dataset.origin, self.options.render_settings.antialiased)
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
@@ -331,7 +331,7 @@ class CaptureRun:
 
     @contextmanager
     def clock_stopped(self) -> Iterator[None]:
-        """Leave what the block does out of the run's seconds: a measurement, or a person looking at it."""
+        """Exclude the block from the run's seconds, for example a measurement or a live view."""
         before = time.perf_counter()
         yield
         if self._began is not None:

@@ -1,4 +1,4 @@
-"""From matches to poses: one way after the other, until most photos have one."""
+"""From matches to poses: make attempts until most photos have a pose."""
 
 from __future__ import annotations
 
@@ -15,42 +15,43 @@ from gsplat_edu.sfm.colmap import COLMAP_SEED, call
 from gsplat_edu.sfm.source import FEWEST
 
 ENOUGH = 0.8
-"""Stop once this share of the photos that are connected by matches has a pose that counts."""
+"""Stop once this fraction of the connected photos has a pose that counts."""
 
 MANY_PHOTOS = 400
-"""Photos beyond which the global mapper comes first: the incremental one's time grows with their square."""
+"""Number of photos above which the global mapper is tried first: the time of the incremental one grows with the square
+of their number."""
 
 ENOUGH_FOR_FREE = 20
-"""Photos per camera from which placing them with a freer lens is tried: fewer are not divided into halves that judge a
+"""Photos per camera from which a freer lens is tried during mapping. Fewer are too few for the cross-validation of the
 lens (`gsplat_edu.sfm.engine.lenses.WITNESSES`)."""
 
 MAIN = 0.5
-"""Share of the photos that have one size from which the others follow their lens (`gsplat_edu.sfm.engine.kin`)."""
+"""If at least this fraction of the photos has one size, the others follow their lens (`gsplat_edu.sfm.engine.kin`)."""
 
 OWN = 10
-"""Photos of one size from which they have a camera of their own, as in `gsplat_edu.sfm.engine.kin`."""
+"""Number of photos of one size from which they get their own camera, as in `gsplat_edu.sfm.engine.kin`."""
 
 SAME = 0.5
-"""Share of the connected photos from which two ways that agree are believed."""
+"""Two attempts that agree are accepted if they place more than this fraction of the connected photos."""
 
 NEARLY = 0.97
-"""Models whose worth is at least this share of the best one's are compared by their points as well."""
+"""Models whose score is at least this fraction of the best one's are also compared by their points."""
 
 PER_PHOTO = 6 / 8
-"""Worth of a photo with a camera of its own: its points have to fix eight numbers, the pose, a focal length and a
-coefficient of distortion, instead of six."""
+"""Weight of a photo with its own camera: its points determine eight numbers (the pose, a focal length and a distortion
+coefficient) instead of six."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One way of mapping.
+    """The settings of one attempt at mapping.
 
     Args:
         mapper: "incremental" (Schönberger and Frahm 2016) or "global" (Pan et al. 2024, GLOMAP).
         model: COLMAP's camera model.
-        free: Photos are placed with a freer lens; it is then dropped, and held-out photos judge what is refined.
-        per_photo: Every photo has a camera of its own.
-        loose: Lower thresholds.
+        free: Map with a freer lens, then drop it; held-out photos decide what is refined.
+        per_photo: Give every photo its own camera.
+        loose: Use lower thresholds.
     """
 
     mapper: str
@@ -60,7 +61,7 @@ class Attempt:
     loose: bool = False
 
     def __str__(self) -> str:
-        """Say what it does."""
+        """Describe the attempt."""
         words = [f"{self.mapper} mapper"] + [self.model] * (self.model != "auto")
         words += ["a freer lens at first"] * self.free
         words += ["a camera per photo"] * self.per_photo + ["lower thresholds"] * self.loose
@@ -68,14 +69,14 @@ class Attempt:
 
 
 def attempts(mapper: str, model: str, photos: int, cameras: int, one_lens: bool) -> list[Attempt]:
-    """List the ways in the order in which they are tried.
+    """List the attempts in the order in which they are made.
 
     Args:
-        mapper: What the user asked for, or "auto".
-        model: What the user asked for, or "auto".
-        photos: How many there are.
-        cameras: How many cameras they are mapped with.
-        one_lens: They are known to be of one camera, as the frames of a video are.
+        mapper: The mapper chosen by the user, or "auto".
+        model: The camera model chosen by the user, or "auto".
+        photos: Number of photos.
+        cameras: Number of cameras they are mapped with.
+        one_lens: Whether one camera took them all, as for the frames of a video.
     """
     order = ["incremental", "global"] if photos <= MANY_PHOTOS else ["global", "incremental"]
     order = order if mapper == "auto" else [mapper]
@@ -90,18 +91,18 @@ def attempts(mapper: str, model: str, photos: int, cameras: int, one_lens: bool)
 
 
 def shared_cameras(groups: Sequence[Mapping[str, Any]]) -> dict[int, int]:
-    """Find cameras of several sizes that are mapped as one: photos scaled, each to another size.
+    """Find cameras of different sizes that are mapped as one, for photos that were scaled to various sizes.
 
-    A camera of one or two photos fixes its focal length badly, and if most photos are of such cameras, there is no main
-    one to compare with. Photos of the same kind, by EXIF, and of the same aspect then share a camera. Photos of one
-    camera that were cropped, each to another aspect, still have one each.
+    One or two photos determine a focal length poorly, and if most cameras have so few, there is no main camera to
+    compare with. Photos of the same kind (by EXIF) and the same aspect ratio then share a camera. Photos of one camera
+    that were cropped to different aspect ratios still get one camera each.
 
     Args:
-        groups: Of photos that share a size: "names", "width" and "height", px, and their "kind" by EXIF.
+        groups: Groups of photos of one size: "names", "width" and "height", px, and their "kind" by EXIF.
 
     Returns:
-        The number of the camera that replaces another one, from 1 in the order of the groups. Empty where most photos
-        are of one size.
+        For each replaced camera, the number of its replacement; numbers count from 1 in the order of the groups. Empty
+        if most photos have one size.
     """
     total = sum(len(group["names"]) for group in groups)
     if max((len(group["names"]) for group in groups), default=0) >= MAIN * total:
@@ -120,7 +121,7 @@ def shared_cameras(groups: Sequence[Mapping[str, Any]]) -> dict[int, int]:
 
 
 def _scaled(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Say whether photos may be of one camera, scaled: each side is off by half a pixel of rounding at most."""
+    """Return whether photos may be scaled versions from one camera, up to rounding by half a pixel per side."""
     W, H, w, h = one["width"], one["height"], other["width"], other["height"]
     return bool(one["kind"] == other["kind"] and abs(W * h - H * w) <= 0.5 * (W + H + w + h))
 
@@ -135,25 +136,25 @@ def map_photos(
     say: Callable[[str], None],
     progress: Callable[[str, int, int], None],
 ) -> dict[str, Any]:
-    """Try ways until one gives most of the photos a pose that counts; keep the best model.
+    """Make attempts until one gives most of the photos a pose that counts; keep the best model.
 
     Args:
-        folder: Holds database.db and photos/; models/ is made anew.
-        ways: In this order.
-        shared: Cameras that are replaced by a camera of the same aspect, by their numbers.
-        total: How many photos there are.
-        connected: How many of them hang together by matches.
-        threads: For COLMAP.
-        say: Told what each way gave, if it was not enough.
-        progress: Told how many photos have a pose.
+        folder: Folder with database.db and photos/; models/ is recreated.
+        ways: The attempts, in order.
+        shared: For each replaced camera, the number of its replacement.
+        total: Number of photos.
+        connected: Number of photos connected by matches.
+        threads: Number of threads for COLMAP.
+        say: Receives the result of each attempt that was not enough.
+        progress: Called with the number of photos that have a pose.
 
     Returns:
-        The model: its "folder" below `folder`, the "names" of the photos whose pose counts, "doubtful", those with a
-        pose that does not, "unclear", those of them whose focal length is why, "points", "error" in px, and the "way"
-        that gave it; the rest is as the job "mapping" returns it.
+        The model: its "folder" below `folder`; the "names" of the photos whose pose counts; "doubtful", the photos
+        whose pose does not; "unclear", those of them with an ambiguous focal length; "points"; "error" in px; the
+        "way" that made it; and the other entries of the job "mapping".
 
     Raises:
-        DatasetError: no way gives enough photos a pose to be a model, or the last one failed and none gave any.
+        DatasetError: no attempt places enough photos for a model, or the last one failed and none placed any.
     """
     models = folder / "models"
     shutil.rmtree(models, ignore_errors=True)
@@ -188,9 +189,9 @@ def map_photos(
 
 
 def _agreed(found: Sequence[dict[str, Any]], connected: int) -> bool:
-    """Say whether two ways gave the same photos a pose that counts, most of the connected ones.
+    """Return whether two attempts gave a pose that counts to the same photos, most of the connected ones.
 
-    The others then share too little with them, and no further way is tried.
+    The other photos then overlap too little with these, and no further attempt is made.
     """
     sets = [set(model["names"]) for model in found if len(model["names"]) > SAME * connected]
     return any(len(one & other) >= NEARLY * len(one | other) for one, other in combinations(sets, 2))
@@ -199,13 +200,13 @@ def _agreed(found: Sequence[dict[str, Any]], connected: int) -> bool:
 def best_model(models: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Choose a model.
 
-    The worth of a model is the number of photos whose pose counts, times the share of all their matches that agree with
-    their poses, times `PER_PHOTO` if every photo has a camera of its own. Of models of nearly equal worth, those with
-    the most points that three photos see are taken, and of these the one with the smallest reprojection error; one with
-    a camera per photo last.
+    The score of a model is the number of photos whose pose counts, times the fraction of all their matches that agree
+    with their poses, times `PER_PHOTO` if every photo has its own camera. Among models with nearly equal scores, keep
+    those with the most points seen by three photos; among these, take the one with the smallest reprojection error.
+    Models with one camera per photo come last.
 
     Args:
-        models: At least one, as the job "mapping" returns them, and whether they have a camera "per_photo".
+        models: At least one result of the job "mapping", with a flag "per_photo".
     """
     worth = [
         len(model["names"]) * model["agreement"] * (PER_PHOTO if model["per_photo"] else 1.0)
@@ -220,11 +221,11 @@ def best_model(models: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _without_poses(total: int, connected: int) -> str:
-    """Say why there is no model."""
+    """Return a message that explains why there is no model."""
     if connected < FEWEST:
         return no_overlap(f"of {total} photos, no {FEWEST} match one another")
     return (
-        f"{connected} of {total} photos match one another, but no poses follow from their matches; photos from one "
+        f"{connected} of {total} photos match one another, but their matches yield no poses; photos from one "
         "spot show no depth: walk around the subject in small steps, and photograph something that is not flat"
     )
 
@@ -237,7 +238,7 @@ def _mapped(
     threads: int,
     progress: Callable[[int], None],
 ) -> list[dict[str, Any]]:
-    """Map in one way, and return the models."""
+    """Make one attempt, and return its models."""
     found = call(
         "mapping",
         folder / "log.txt",
@@ -254,15 +255,15 @@ def _mapped(
 
 
 def no_overlap(what: str) -> str:
-    """Say what is wrong, and how to photograph."""
+    """Return a message about the missing overlap, with advice on how to photograph."""
     return (
         f"{what}: the photos show too little in common; walk around the subject in small steps, each photo showing two "
-        "thirds of the one before, sharp and in even light (plain walls, glass and mirrors give nothing to hold on to)"
+        "thirds of the previous one, sharp and in even light (plain walls, glass and mirrors have no features to match)"
     )
 
 
 def _usable(out: Path, model: dict[str, Any]) -> dict[str, Any]:
-    """Leave out photos whose lens came out so odd that they cannot be undistorted."""
+    """Leave out photos whose estimated lens is too implausible to undistort them."""
     folder, good = out / model["folder"], dict[int, bool]()
     for number, lens in read_cameras(folder / "cameras.bin").items():
         try:

@@ -1,4 +1,4 @@
-"""Masks beside photos: where they lie, and the copies that COLMAP reads."""
+"""Masks of photos: find them, and write the copies that COLMAP reads."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 
 MASK_ENDING = ".mask.png"
-"""What names of masks end in that lie beside their photos, in any case."""
+"""Ending of masks stored beside their photos; case does not matter."""
 
 OPAQUE = 128
-"""Alpha from which a pixel counts when features are looked for."""
+"""Smallest alpha at which a pixel is used for features."""
 
 
 def find_masks(files: Sequence[Path]) -> dict[Path, Path]:
     """Find the masks of photos in one folder: zero where a pixel does not count.
 
-    A mask of NAME.jpg is NAME.jpg.mask.png or NAME.mask.png beside it, or NAME.jpg.png or NAME.png in a folder masks/
-    inside the photos' folder or next to it. A mask that several photos could mean, which differ only in their endings,
-    is no one's.
+    The mask of NAME.jpg is NAME.jpg.mask.png or NAME.mask.png beside it, or NAME.jpg.png or NAME.png in a folder masks/
+    inside the photos' folder or next to it. A mask is ignored if it fits several photos that differ only in their
+    endings.
 
     Args:
         files: The photos.
 
     Returns:
-        The masks by the photos that have one.
+        The masks, by photo; photos without a mask are missing.
     """
     stems = [path.stem for path in files]
     found = {}
@@ -46,11 +46,11 @@ def find_masks(files: Sequence[Path]) -> dict[Path, Path]:
 
 
 def unused_folders(files: Sequence[Path], masks: Mapping[Path, Path]) -> list[Path]:
-    """List the folders masks/ inside the photos' folder and next to it that hold images, none of them a photo's mask.
+    """List the folders masks/ inside and next to the photos' folder that contain images but no photo's mask.
 
     Args:
         files: The photos.
-        masks: As `find_masks` returns them.
+        masks: The result of `find_masks`.
     """
     used = {mask.parent for mask in masks.values()}
     folders = {folder for path in files[:1] for folder in _folders(path)}
@@ -62,18 +62,18 @@ def unused_folders(files: Sequence[Path], masks: Mapping[Path, Path]) -> list[Pa
 
 
 def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, int, int]]) -> set[Path]:
-    """Find the photos whose masks are upright, not as the photo's pixels are stored; check the sizes of all.
+    """Find the photos whose masks are upright rather than oriented like the stored pixels; check all sizes.
 
-    Sizes tell, unless the photo is square or upside down. Then the other masks decide; if they do not tell either, the
-    mask is taken as stored, which is COLMAP's convention.
+    The size of a mask reveals its orientation unless the photo is square or upside down. Such masks are oriented like
+    the other masks. If those are ambiguous too, they are read as stored, which is COLMAP's convention.
 
     Args:
-        masks: As `find_masks` returns them.
-        shapes: Width, height and quarter turns clockwise to upright of the photos; photos that are not in it are passed
-            over.
+        masks: The result of `find_masks`.
+        shapes: Width, height and quarter turns clockwise to upright of the photos; photos without an entry are
+            skipped.
 
     Raises:
-        DatasetError: a mask is neither as large as its photo nor as its photo upright, or is no image.
+        DatasetError: the size of a mask fits neither its photo nor its upright photo, or the mask is not an image.
     """
     stored, upright, either = set[Path](), set[Path](), set[Path]()
     for photo, mask in masks.items():
@@ -84,8 +84,8 @@ def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, i
         if size not in ((W, H), turned):
             also = f" ({H}x{W} upright)" if turns % 2 else ""
             raise DatasetError(
-                f"{mask}: the mask is {size[0]}x{size[1]} but its photo {W}x{H}{also}; make them one size, or move the "
-                "mask away"
+                f"{mask}: the mask is {size[0]}x{size[1]} but its photo {W}x{H}{also}; make them the same size, or "
+                "move the mask away"
             )
         if turns:
             kind = either if turned == (W, H) else stored if size == (W, H) else upright
@@ -94,7 +94,7 @@ def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, i
 
 
 def counting(mask: Path | None, alpha: UInt8[np.ndarray, "H W"] | None) -> Bool[np.ndarray, "H W"] | None:
-    """Return where features are looked for: where a pixel counts and is not transparent; None for everywhere.
+    """Return the pixels used for features: those that count and are not transparent; None for all pixels.
 
     Args:
         mask: The mask's file.
@@ -110,10 +110,10 @@ def counting(mask: Path | None, alpha: UInt8[np.ndarray, "H W"] | None) -> Bool[
 
 
 def turn_mask(mask: Path, turns: int, target: Path) -> None:
-    """Write a mask that is upright as its photo's pixels are stored.
+    """Turn an upright mask to the orientation of its photo's stored pixels, and write it.
 
     Args:
-        mask: The file.
+        mask: The mask's file.
         turns: Quarter turns clockwise that bring the photo upright.
         target: The file to write.
 
@@ -128,7 +128,7 @@ def write_mask(counts: Bool[np.ndarray, "H W"], target: Path, size: tuple[int, i
     """Write a mask.
 
     Args:
-        counts: Where features are looked for.
+        counts: True for the pixels used for features.
         target: The file.
         size: Its width and height, px.
     """
@@ -144,6 +144,6 @@ def _places(photo: Path, names: Sequence[str]) -> Iterator[Path]:
 
 
 def _folders(photo: Path) -> list[Path]:
-    """List where masks of photos lie, besides the photos' own folder: inside it, and next to it."""
+    """List the mask folders of a photo: masks/ inside the photo's folder and next to it."""
     beside = [photo.parent.with_name("masks")] if photo.parent.name not in ("", "masks") else []
     return [photo.parent / "masks", *beside]

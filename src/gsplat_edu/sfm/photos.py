@@ -1,4 +1,4 @@
-"""Which files are photos, what their EXIF says, and the working copies that features are found in."""
+"""Find photos, read their EXIF, and write the working copies for feature extraction."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from gsplat_edu.sfm.masks import MASK_ENDING, counting, find_masks, turn_mask, u
 from gsplat_edu.views import Photo
 
 PASSED_OVER = frozenset(("masks", *PHOTO_FOLDERS[1:]))
-"""Folders beside photos whose images are no photos, or the same ones smaller."""
+"""Folders that are skipped: their images are masks or smaller copies of the photos."""
 
 PEEK = 65536
-"""Bytes at a file's beginning and at its end that tell it from others."""
+"""Bytes at the start and end of a file that go into its fingerprint."""
 
 FULL_FRAME = math.hypot(36.0, 24.0)
-"""Diagonal of the film that equivalent focal lengths refer to, mm (CIPA DCG-001)."""
+"""Film diagonal that 35 mm equivalent focal lengths refer to, mm (CIPA DCG-001)."""
 
 TURNS = {3: 2, 6: 1, 8: 3}
-"""Quarter turns clockwise that bring a photo upright, by EXIF's orientation. The mirrored ones are no camera's."""
+"""Quarter turns clockwise that bring a photo upright, by EXIF orientation. Cameras do not write the mirrored ones."""
 
 COPY_QUALITY = 97
 """JPEG quality of the working copies."""
 
 GRAY = (0.5, 0.5, 0.5)
-"""What is put behind transparent photos before features are looked for."""
+"""Background of transparent photos in the working copies."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ class PhotoFacts:
     """A photo, without its pixels.
 
     Args:
-        name: Its path below the source, with slashes.
-        copy: Name of its working copy.
+        name: Path below the source, with slashes.
+        copy: Name of the working copy.
         W: Width as stored, px.
         H: Height as stored, px.
-        turns: Quarter turns clockwise that bring it upright.
-        focal: Focal length by EXIF, px; None where it does not say.
-        camera: Equal for photos that one camera took with one lens and zoom.
-        place: Latitude and longitude in degrees and height in m by EXIF; None where it does not say.
-        mask: File of its mask, turned as the photo is stored; empty where it has none.
+        turns: Quarter turns clockwise that bring the photo upright.
+        focal: Focal length from EXIF, px; None if unknown.
+        camera: A key that is equal for photos taken by one camera with one lens and zoom.
+        place: Latitude and longitude in degrees and height in m from EXIF; None if unknown.
+        mask: File of the mask, oriented like the stored photo; empty if there is none.
     """
 
     name: str
@@ -79,21 +79,21 @@ class PhotoFacts:
 
 
 def photo_files(source: Path, besides: Path | None = None) -> list[Path]:
-    """List the photos of one folder, by what is in the files.
+    """List the photos of one folder, recognised by their contents.
 
-    It is the folder that was named where that holds at least two photos, else images/ in it, else the only folder below
-    it that holds some. Hidden files and folders are passed over, and so are masks, smaller copies of the photos, and
-    captures and runs that were made here.
+    The folder is `source` if it contains at least two photos, else images/ in it, else the only folder below it with
+    photos. Hidden files and folders, masks, smaller copies of the photos, and captures and runs of this program are
+    skipped.
 
     Args:
         source: The folder.
-        besides: A folder that is passed over, resolved.
+        besides: A folder to skip, resolved.
 
     Returns:
-        Sorted by path. A file that is named like a photo is among them even if it is none.
+        The photos, sorted by path. Files with a photo's ending are included even if they are not photos.
 
     Raises:
-        DatasetError: several folders hold photos, and none of them is named images.
+        DatasetError: several folders contain photos, and none of them is named images.
     """
     here = _photos_in(source)
     if len(here) > 1:
@@ -118,13 +118,13 @@ def _only(source: Path, folders: dict[Path, list[Path]]) -> list[Path]:
     shown = [f"{folder.relative_to(source).as_posix()} ({len(found)})" for folder, found in folders.items()]
     more = f" and {len(shown) - 3} more" if len(shown) > 3 else ""
     raise DatasetError(
-        f"{source}: its photos lie in {len(shown)} folders: {', '.join(shown[:3])}{more}; name one of them, or put the "
+        f"{source}: its photos are in {len(shown)} folders: {', '.join(shown[:3])}{more}; give one of them, or put the "
         "photos of one place into one folder"
     )
 
 
 def _folders_below(source: Path, besides: Path | None) -> Iterator[Path]:
-    """Yield the folders below one, sorted, but for those that hold no photos of their own."""
+    """Yield the folders below a folder, sorted, without those to skip."""
     for place, folders, _ in os.walk(source):
         here = Path(place)
         folders[:] = [
@@ -137,34 +137,34 @@ def _folders_below(source: Path, besides: Path | None) -> Iterator[Path]:
 
 
 def _photos_in(folder: Path) -> list[Path]:
-    """List the photos in a folder, not those below it; a folder that cannot be read has none."""
+    """List the photos directly in a folder; empty if it cannot be read."""
     try:
         paths = sorted(folder.iterdir())
     except OSError:
         return []
     visible = [path for path in paths if path.name[0] != "." and not path.name.lower().endswith(MASK_ENDING)]
-    return [path for path in visible if is_file(path) and is_photo(path)]  # no pipe, no link to nowhere
+    return [path for path in visible if is_file(path) and is_photo(path)]  # no pipes, no broken links
 
 
 def is_run(folder: Path) -> bool:
-    """Say whether a folder is that of a run."""
+    """Return whether a folder is that of a run."""
     return all(is_file(folder / name) for name in ("config.json", "cameras.json"))
 
 
 def _made_here(folder: Path) -> bool:
-    """Say whether a folder is a capture that structure from motion wrote, or a run."""
+    """Return whether a folder is a capture written by structure from motion, or a run."""
     return is_file(folder / "sfm" / "stages.json") or is_run(folder)
 
 
 def is_photo(path: Path) -> bool:
-    """Say whether a file is named like a photo, or is one."""
+    """Return whether a file has a photo's ending or a photo's contents."""
     if path.suffix.lower() in (*PHOTO_ENDINGS, ".heif"):
         return True
     return is_image(path)
 
 
 def fingerprint(files: Sequence[Path], source: Path) -> str:
-    """Return a digest of files: their names below the source, their sizes, and how they begin and end.
+    """Return a digest of files: their names below the source, their sizes, and their first and last bytes.
 
     Raises:
         DatasetError: a file cannot be read.
@@ -191,25 +191,25 @@ def copy_photos(
     longest: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[list[PhotoFacts], list[str]]:
-    """Write a working copy of every photo that can be decoded. Copies that are there already are kept.
+    """Write a working copy of every photo that can be decoded. Existing copies are kept.
 
-    Copies have names without spaces, which COLMAP's lists of pairs need, and are RGB in 8 bits: pycolmap reads fewer
-    kinds of files than Pillow. A photo with a mask or with transparent parts gets a mask beside them, masks/COPY.png; a
-    mask that is upright where the photo is stored turned is written again, turned back, to masks/stored/COPY.png.
+    Copies have names without spaces, as COLMAP's pair lists require, and are 8-bit RGB, because pycolmap reads fewer
+    formats than Pillow. A photo with a mask or transparent parts gets a mask masks/COPY.png in the neighbouring folder.
+    If the mask is upright and the stored photo is not, a mask turned like the photo goes to masks/stored/COPY.png.
 
     Args:
         files: The photos.
-        source: What their names are relative to.
-        folder: Where the copies go.
+        source: Folder that their names are relative to.
+        folder: Folder for the copies.
         longest: Longest side of a copy, px; smaller photos keep their size.
-        progress: Told how many photos of how many are done, from the calling thread.
+        progress: Called from the calling thread with the number of photos done and the total.
 
     Returns:
-        facts: Of the photos that can be decoded, in the order of the files.
-        unreadable: Of the others: name and reason.
+        facts: The photos that can be decoded, in the order of the files.
+        unreadable: Name and reason for each of the others.
 
     Raises:
-        DatasetError: a mask is neither as large as its photo nor as its photo upright.
+        DatasetError: the size of a mask fits neither its photo nor its upright photo.
     """
     folder.mkdir(parents=True, exist_ok=True)
     headers, upright, unreadable = _headers(files, source, folder)
@@ -229,9 +229,8 @@ def copy_photos(
     finally:
         pool.shutdown(cancel_futures=True)
     masked = mask_folder(folder)
-    for photo in (
-        facts if masked.is_dir() else ()
-    ):  # COLMAP passes over photos without a mask where others have one
+    # If any photo has a mask, COLMAP skips the photos without one.
+    for photo in facts if masked.is_dir() else ():
         if not (target := masked / f"{photo.copy}.png").is_file():
             write_mask(np.ones((1, 1), np.bool_), target, photo.copy_size(longest))
     return facts, unreadable
@@ -243,10 +242,10 @@ def _headers(
     """Read the headers of photos.
 
     Returns:
-        The facts of each file that is a photo, the masks that are upright, and names and reasons of the other files.
+        The facts of each photo, the upright masks, and name and reason for each file that is not a photo.
 
     Raises:
-        DatasetError: a mask is neither as large as its photo nor as its photo upright.
+        DatasetError: the size of a mask fits neither its photo nor its upright photo.
     """
     found, unreadable, masks = list[tuple[Path, PhotoFacts]](), list[str](), find_masks(files)
     for number, path in enumerate(files):
@@ -267,20 +266,18 @@ def _facts(path: Path, name: str, copy: str) -> PhotoFacts:
     """Read a header.
 
     Raises:
-        ValueError: the file is no photo; the message says why.
+        ValueError: the file is not a photo; the message says why.
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # of sizes and of odd EXIF, neither of which is the user's to mend
+            warnings.simplefilter("ignore")  # about sizes and invalid EXIF, which the user cannot fix
             with opened_image(path) as file:
                 (W, H), exif = file.size, file.getexif()
                 details = exif.get_ifd(ExifTags.IFD.Exif)
                 place = _place(exif.get_ifd(ExifTags.IFD.GPSInfo))
     except UNDECODABLE as error:
         if path.suffix.lower() in (".heic", ".heif"):
-            raise ValueError("HEIC is not decoded here: export it as JPEG") from None
+            raise ValueError("HEIC is not supported: export it as JPEG") from None
         reason = f"not a {SPELLED} image" if "cannot identify" in str(error) else str(error).split("\n")[0]
         raise ValueError(reason) from None
     focal = _focal(details, W, H)
@@ -293,7 +290,7 @@ def _facts(path: Path, name: str, copy: str) -> PhotoFacts:
 
 
 def _number(value: object) -> float:
-    """Turn what EXIF holds, perhaps 0/0, into a number; NaN where it is none."""
+    """Convert an EXIF value, perhaps 0/0, to a number; NaN if that is impossible."""
     try:
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):
@@ -301,9 +298,9 @@ def _number(value: object) -> float:
 
 
 def _focal(details: dict[int, object], W: int, H: int) -> float | None:
-    """Work out the focal length in px: by the equivalent one, f / 43.27 mm = f_px / diagonal, or by the sensor's pitch.
+    """Compute the focal length in px from the 35 mm equivalent, f / 43.27 mm = f_px / diagonal, or the sensor's pitch.
 
-    A focal length outside 0.3 to 20 times the longer side is not believed.
+    Reject a focal length outside 0.3 to 20 times the longer side.
     """
     equivalent = _number(details.get(ExifTags.Base.FocalLengthIn35mmFilm))
     focal = equivalent / FULL_FRAME * math.hypot(W, H)
@@ -336,7 +333,7 @@ def _place(gps: dict[int, object]) -> tuple[float, float, float] | None:
 
 
 def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, upright: Path | None) -> None:
-    """Write the working copy, and its mask before it, unless it is there; an upright mask is turned back first.
+    """Write the mask and then the working copy, unless the copy exists; an upright mask is turned first.
 
     Raises:
         DatasetError: the photo or its mask cannot be decoded.
@@ -362,10 +359,10 @@ def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, upright: Pa
 
 
 def mask_folder(folder: Path) -> Path:
-    """Return where the masks of working copies lie, given where these do."""
+    """Return the folder of the working copies' masks, given the folder of the copies."""
     return folder.with_name("masks")
 
 
 def stored_mask(folder: Path, copy: str) -> Path:
-    """Return where the mask of a photo is written that was upright, given where the working copies lie."""
+    """Return the file for an upright mask turned like its stored photo, given the folder of the working copies."""
     return mask_folder(folder) / "stored" / f"{copy}.png"

@@ -1,4 +1,4 @@
-"""Photos or a video become a capture, stage by stage; an interrupted run resumes after the last finished one.
+"""Turn photos or a video into a capture in stages; an interrupted run resumes after the last completed stage.
 
 Chapter: 13_photos_to_scene.
 """
@@ -35,29 +35,29 @@ from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
 
 EXHAUSTIVE = 150
-"""Photos up to which every pair is matched: 11,175 pairs, ten minutes on two cores."""
+"""Largest number of photos for which every pair is matched: 11,175 pairs, ten minutes on two cores."""
 
 OVERLAP = {"video": 10, "photos": 4}
-"""Photos that follow one another are matched with so many that follow; photos are mostly taken in a row, too."""
+"""Each photo is matched with this many that follow it; photos, too, are usually taken in sequence."""
 
 ALIKE = {"video": 5, "photos": 25}
-"""Each photo is matched with so many that look alike: in a video, those that close a loop."""
+"""Each photo is matched with this many of similar appearance; in a video, these close loops."""
 
 CLOSE_BY = 15
-"""Each photo whose EXIF says where it was taken is matched with so many that were taken close by."""
+"""Each photo is matched with this many taken nearby, if EXIF gives the positions of all photos."""
 
 INLIERS = 15
-"""Matches of one geometry from which two photos hang together: COLMAP's own bound."""
+"""Smallest number of matches with one geometry that connects two photos: COLMAP's own bound."""
 
 
 FEATURES, MAPPING = 2, 4
-"""Numbers of the methods, part of the stages' options: results that an earlier method left in a work folder are found
-anew. Before 2, photos kept more features than `max_features`, and every pose counted; before 3,
-photos of every size had a focal length of their own; before 4, also where every photo has a size of its own."""
+"""Versions of the methods. They are part of the stages' options, so results of an earlier version in a work folder are
+recomputed. Before 2, photos kept more features than `max_features`, and every pose counted. Before 3, photos of each
+size had their own focal length; before 4, this still held if every photo had its own size."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
-"""Told which stage, how much of it is done, and of how much."""
+"""Called with the stage, the amount done, and the total."""
 
 
 def reconstruct(
@@ -65,23 +65,24 @@ def reconstruct(
     say: Say = lambda sentence: None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Path:
-    """Find poses for photos, and write a capture in COLMAP's layout: undistorted photos and a model of pinholes.
+    """Find the poses of photos, and write a capture in COLMAP's layout: undistorted photos and a model of pinholes.
 
-    Features, matches and the order of all random draws are the same in every run. The mappers add up in an order that
-    depends on their threads: poses agree between runs to far below a pixel, not to the bit; with one thread they do.
+    Features, matches and the order of all random draws are the same in every run. The mappers' order of summation
+    depends on their threads, so poses of different runs agree to far below a pixel but not to the bit. With one thread
+    they agree to the bit.
 
     Args:
-        options: What is asked for.
-        say: Told, in sentences, what the user wants to know.
-        progress: Told how far a stage has come. What it raises ends the run, which then can be taken up again.
+        options: The options.
+        say: Receives sentences for the user.
+        progress: Called with the progress of each stage. An exception from it ends the run, which can be resumed.
 
     Returns:
         The capture's folder, `options.out`.
 
     Raises:
-        ArgumentError: pycolmap is not installed, or the folder of the result cannot be used.
-        DatasetError: there are no photos, or they show too little in common. Folders that were made for the work are
-            removed where no stage was finished.
+        ArgumentError: pycolmap is not installed, or the output folder cannot be used.
+        DatasetError: there are no photos, or they overlap too little. If no stage was completed, the folders created
+            for the run are removed.
         OSError: a file cannot be written.
     """
     require_colmap()
@@ -101,7 +102,7 @@ def reconstruct(
 
 
 class _Run:
-    """The stages of one run, each with what its outcome depends on."""
+    """The stages of one run, each with the options that determine its result."""
 
     def __init__(self, options: SfmOptions, say: Say, progress: Progress) -> None:
         self.options, self._say, self._progress = options, say, progress
@@ -109,13 +110,13 @@ class _Run:
         self.folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.folder)
         if parts := published(self.folder):
-            note_published(self.folder, parts)  # before a stage is forgotten that tells of it
+            note_published(self.folder, parts)  # before the stage that records them is discarded
         self.stages = Stages(self.folder / "stages.json", say)
         self.video = is_video(options.source)
         self.threads = options.threads or -1
 
     def run(self, files: list[Path]) -> Path:
-        """Go through the stages."""
+        """Run the stages."""
         options, source = self.options, self.options.source
         if self.video:
             wanted = {"video": fingerprint([source], source.parent), "frames": options.frames}
@@ -157,14 +158,14 @@ class _Run:
         rubbish: Sequence[Path],
         tidy: Callable[[], None] = lambda: None,
     ) -> dict[str, Any]:
-        """Do a stage, unless it is done.
+        """Run a stage unless it is complete.
 
         Args:
             name: The stage.
-            wanted: What its outcome depends on.
-            work: Does it, and returns what it found out; "summary" is for the user.
-            rubbish: What is removed before it begins anew.
-            tidy: Done then, too.
+            wanted: The options that determine its result.
+            work: Runs the stage and returns its facts; "summary" is for the user.
+            rubbish: Paths removed before the stage starts over.
+            tidy: Further cleaning at that point.
         """
         facts = self.stages.finished(name, wanted)
         if facts is not None:
@@ -188,13 +189,11 @@ class _Run:
         written = write_frames(source, chosen, folder, self._progress)
         if len(written) < 3:
             raise DatasetError(
-                f"{source}: the camera moves too little ({len(written)} frames differ from the one before); walk "
-                "around the subject while filming"
+                f"{source}: the camera moves too little (only {len(written)} frames differ from the previous one); "
+                "walk around the subject while filming"
             )
         same = (
-            f", {len(chosen) - len(written)} that show the same left out"
-            if len(written) < len(chosen)
-            else ""
+            f", {len(chosen) - len(written)} near-duplicates left out" if len(written) < len(chosen) else ""
         )
         return {"summary": f"{len(written)} of {source.name}{same}"}
 
@@ -214,17 +213,17 @@ class _Run:
         lenses = len({photo.camera for photo in photos})
         known = sum(photo.focal is not None for photo in photos)
         kinds = "one camera" if lenses == 1 else f"{lenses} kinds of camera or zoom"
-        summary = f"{len(photos)} by {kinds}; {known} say their focal length"
+        summary = f"{len(photos)} from {kinds}; {known} with a focal length in EXIF"
         if masked := sum(bool(photo.mask) for photo in photos):
             summary += "; all have a mask" if masked == len(photos) else f"; {masked} of them have a mask"
         self._note_masks(files, photos)
         return {"summary": summary, "photos": [asdict(photo) for photo in photos], "unreadable": unreadable}
 
     def _note_masks(self, files: Sequence[Path], photos: Sequence[PhotoFacts]) -> None:
-        """Say which masks are not used, and which might be upright although they are not taken to be."""
+        """Report the masks that are not used, and those whose orientation is ambiguous."""
         for folder in unused_folders(files, find_masks(files)):
             self._say(
-                f"{folder}: not used, none of its images is named like a photo (PHOTO.png or PHOTO.jpg.png)"
+                f"{folder}: not used, because none of its images is named like a photo (PHOTO.png or PHOTO.jpg.png)"
             )
         stored = stored_mask(self.folder / "photos", "").parent
         unknown = [
@@ -235,7 +234,7 @@ class _Run:
         ]
         if unknown:
             self._say(
-                f"masks taken to be stored like their photos, not upright (sizes do not tell): {listed(unknown)}"
+                f"masks assumed to be stored like their photos, not upright (their sizes fit both): {listed(unknown)}"
             )
 
     def _features(self) -> dict[str, Any]:
@@ -253,7 +252,7 @@ class _Run:
         found = {name: min(count, most) for name, count in found.items()}
         names = [photo.name for photo in self.photos if not found.get(photo.copy)]
         if names:
-            self._say(f"without features, blank or out of focus: {listed(names)}")
+            self._say(f"no features found, because blank or out of focus: {listed(names)}")
         return {"summary": f"{sum(found.values()):,} in {total - len(names)} photos"}
 
     def _match(self) -> dict[str, Any]:
@@ -265,7 +264,7 @@ class _Run:
         verified = self._match_pairs(chosen)
         part = pairs.largest_part(count, verified)
         if len(part) < count and self.options.matcher == "auto" and kind == "nearest":
-            # What follows and looks alike was not enough: look farther.
+            # Neighbours in the sequence and similar photos did not connect all photos: try more pairs.
             chosen |= pairs.all_pairs(count) if count <= EXHAUSTIVE else self._pairs(kind, 3)
             verified = self._match_pairs(chosen)
             part = pairs.largest_part(count, verified)
@@ -273,11 +272,11 @@ class _Run:
             raise DatasetError(no_overlap(f"{self.options.source}: of {len(chosen):,} pairs, none match"))
         summary = f"{len(verified):,} of {len(chosen):,} pairs match"
         if len(part) < count:
-            summary += f"; {len(part)} of {count} photos hang together"
+            summary += f"; {len(part)} of {count} photos are connected"
         return {"summary": summary, "connected": len(part)}
 
     def _forget_matches(self) -> None:
-        """Matches of pairs that were chosen in another way would stay, and be mapped."""
+        """Delete the matches, because those of pairs chosen by another matcher would be mapped too."""
         forget_matches(self.folder / "database.db")
 
     def _pairs(self, kind: str, farther: int) -> set[pairs.Pair]:
@@ -298,7 +297,7 @@ class _Run:
         return chosen
 
     def _match_pairs(self, chosen: set[pairs.Pair]) -> list[pairs.Pair]:
-        """Match pairs, those that are not matched yet, and return those of all that hang together."""
+        """Match the pairs that are not matched yet; return all pairs that are connected."""
         names = [photo.copy for photo in self.photos]
         listed = self.folder / "pairs.txt"
         listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in sorted(chosen)), encoding="utf-8")
@@ -335,12 +334,13 @@ class _Run:
             self._say(f"left out, no pose was found: {listed(facts['left_out'])}")
         if facts["unclear"]:
             self._say(
-                "left out, of another size than the main camera's photos, and no single focal length explains them: "
+                "left out, because their size differs from the main camera's and no single focal length explains them: "
                 f"{listed(facts['unclear'])}; use photos as the camera wrote them, neither cropped nor scaled"
             )
         if facts["doubtful"]:
             self._say(
-                f"left out, too little in common with the others to trust the pose: {listed(facts['doubtful'])}"
+                "left out, because they overlap too little with the others to trust the pose: "
+                f"{listed(facts['doubtful'])}"
             )
         figures = f"{facts['points']:,} points, mean reprojection error {facts['error']:.2f} px"
         return facts | {"summary": f"{len(self.model['names'])} photos undistorted, {figures}"}
@@ -359,7 +359,7 @@ class _Run:
 
 
 def _groups(photos: Sequence[PhotoFacts], longest: int) -> list[dict[str, Any]]:
-    """Put photos of one camera together, with the focal length that EXIF gives at the size of the working copies."""
+    """Group photos by camera, with the focal length from EXIF at the size of the working copies."""
     groups: dict[str, dict[str, Any]] = {}
     for photo in photos:
         if photo.camera not in groups:

@@ -1,4 +1,4 @@
-"""From a model of the working copies to a capture: undistorted photos, upright, and a model that goes with them."""
+"""Turn a model of the working copies into a capture: upright, undistorted photos and a matching model."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ QUALITY = 95
 """JPEG quality of undistorted photos."""
 
 JPEGS = (".jpg", ".jpeg")
-"""Endings of photos that were compressed with losses before; the others are written as PNG."""
+"""Endings of photos written as JPEG, because they were lossy before; the others are written as PNG."""
 
 PARTS = ("images", "masks", "sparse")
-"""What a capture consists of. The model comes last: it says that the capture is there."""
+"""Parts of a capture. The model comes last: its presence means that the capture is complete."""
 
 PUBLISHED = "published.json"
-"""File in the work folder that names the parts which runs put into the capture."""
+"""File in the work folder that names the parts of the capture written by this program."""
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""What a quarter turn clockwise of the image does to camera coordinates: right becomes down."""
+"""Effect of a clockwise quarter turn of the image on camera coordinates: right becomes down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +49,10 @@ class Undistorted:
     """A photo of the capture.
 
     Args:
-        photo: What it was.
+        photo: The original photo.
         name: Its name in images/.
-        lens: The lens that took it, at the size of the file.
-        pinhole: The camera of the undistorted, upright photo; no pose matters.
+        lens: Its lens, at the size of the file.
+        pinhole: Intrinsics of the undistorted, upright photo.
     """
 
     photo: PhotoFacts
@@ -61,7 +61,7 @@ class Undistorted:
     pinhole: Intrinsics
 
     def entry(self) -> dict[str, Any]:
-        """Return what `gsplat_edu.sfm.engine.jobs.finish` wants to know."""
+        """Return the photo's entry for `gsplat_edu.sfm.engine.jobs.finish`."""
         p = self.pinhole  # formats put the first pixel's centre at (0.5, 0.5)
         sizes = {"name": self.name, "W": p.W, "H": p.H, "turns": self.photo.turns}
         return sizes | {"fx": p.fx, "fy": p.fy, "cx": p.cx + 0.5, "cy": p.cy + 0.5}
@@ -74,21 +74,22 @@ def build_capture(
     folder: Path,
     progress: Callable[[str, int, int], None],
 ) -> dict[str, Any]:
-    """Write images/, masks/ where a photo has one, and sparse/0 into folder/result.
+    """Write images/, masks/ (if a photo has a mask) and sparse/0 into folder/result.
 
     Args:
-        model: As `gsplat_edu.sfm.mapping.map_photos` returns it.
-        photos: All of them.
-        source: Where they are.
-        folder: Work folder; result/ in it is made anew.
-        progress: Told how many photos are undistorted.
+        model: The result of `gsplat_edu.sfm.mapping.map_photos`.
+        photos: All photos.
+        source: Their folder.
+        folder: Work folder; result/ in it is recreated.
+        progress: Called with the number of undistorted photos.
 
     Returns:
-        "points", "error" in px of the undistorted photos, "left_out", the names of photos without a pose, "unclear",
-        those of another size whose focal length is unclear, and "doubtful", the others whose pose did not count.
+        "points", their number; "error" in px of the undistorted photos; "left_out", the names of photos without a pose;
+        "unclear", those of another size whose focal length is ambiguous; and "doubtful", the others whose pose did not
+        count.
 
     Raises:
-        DatasetError: a photo cannot be decoded any more, or COLMAP failed.
+        DatasetError: a photo can no longer be decoded, or COLMAP failed.
     """
     result = folder / "result"
     shutil.rmtree(result, ignore_errors=True)
@@ -106,7 +107,7 @@ def build_capture(
         cameras.append(Camera.posed(turn @ R, -R.T @ pose.shift, pinhole))
     cloud = read_points(found)
     if cloud is None:
-        raise DatasetError(f"{found}: holds no points; the photos show too little in common")
+        raise DatasetError(f"{found}: contains no points; the photos show too little in common")
     _write_photos(entries, source, result, progress)
     move = upright(cameras, cloud.points)
     facts = call(
@@ -129,13 +130,13 @@ def build_capture(
 
 
 def published(folder: Path) -> tuple[str, ...]:
-    """Return which parts of the capture earlier runs put there; the others are the user's.
+    """Return the parts of the capture that earlier runs wrote; the others belong to the user.
 
     Args:
         folder: Work folder.
 
     Raises:
-        DatasetError: the file that says so is damaged.
+        DatasetError: the file that lists them is damaged.
     """
     path = folder / PUBLISHED
     if not path.is_file():
@@ -144,11 +145,11 @@ def published(folder: Path) -> tuple[str, ...]:
         named = parse_json(read_text(path))["parts"]
         return tuple(part for part in PARTS if part in named)
     except (ValueError, KeyError, TypeError):
-        raise DatasetError(f"{path}: is damaged; name another folder, or remove the capture") from None
+        raise DatasetError(f"{path}: is damaged; give another folder, or remove the capture") from None
 
 
 def _published_before(stages: Path) -> tuple[str, ...]:
-    """Return the parts of captures that were finished before there was a file that names them."""
+    """Return the parts of captures that a version without published.json finished."""
     try:
         finished = parse_json(read_text(stages))["stages"]["capture"]["facts"] is not None
     except (OSError, ValueError, KeyError, TypeError):
@@ -157,21 +158,21 @@ def _published_before(stages: Path) -> tuple[str, ...]:
 
 
 def publish(folder: Path, out: Path) -> None:
-    """Put what `build_capture` wrote where the user wants it; what an earlier run put there goes, nothing else.
+    """Move the result of `build_capture` into the capture, replacing only parts written by an earlier run.
 
     Args:
         folder: Work folder.
         out: The capture.
 
     Raises:
-        ArgumentError: a part is in the way that no run put there.
+        ArgumentError: a part exists that no run wrote.
     """
     new = [part for part in PARTS if (folder / "result" / part).exists()]
     ours = published(folder)
     for part in new:
         if part not in ours and (out / part).exists():
             raise ArgumentError(
-                f"OUT: {out / part} is in the way and not of this command; move it away, and the same command goes on"
+                f"OUT: {out / part} was not written by this command; move it away and run the same command to resume"
             )
     note_published(folder, {*ours, *new})
     old = folder / "old"
@@ -188,7 +189,7 @@ def publish(folder: Path, out: Path) -> None:
 
 
 def note_published(folder: Path, parts: Iterable[str]) -> None:
-    """Note which parts of the capture runs put there.
+    """Record which parts of the capture were written by this program.
 
     Args:
         folder: Work folder.
@@ -199,23 +200,22 @@ def note_published(folder: Path, parts: Iterable[str]) -> None:
 
 
 def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
-    """Name the undistorted photos as the photos are named, each differently, and as the files they are.
+    """Give the undistorted photos distinct names after the photos, with the endings of their formats.
 
     Args:
         photos: The photos.
 
     Returns:
-        Paths below images/: JPEGs keep their names, others end in .png. What COLMAP's files cannot hold becomes "_".
+        Paths below images/: JPEGs keep their names, others end in .png. Characters that COLMAP's files cannot store
+        become "_".
     """
     paths = [PurePosixPath(re.sub("[\\\\\x00-\x1f\ud800-\udfff]", "_", photo.name)) for photo in photos]
     names = list[str]()
-    taken = {
-        str(folder).lower() for path in paths for folder in path.parents
-    }  # no file is named like a folder
+    taken = {str(folder).lower() for path in paths for folder in path.parents}  # folders' names are taken too
     for path in paths:
         base, ending = path.with_suffix(""), path.suffix if path.suffix.lower() in JPEGS else ".png"
         name, number = f"{base}{ending}", 2
-        while name.lower() in taken:  # file systems that know no case
+        while name.lower() in taken:  # some file systems ignore case
             name, number = f"{base}_{number}{ending}", number + 1
         taken.add(name.lower())
         names.append(name)
@@ -225,7 +225,7 @@ def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
 def _write_photos(
     entries: Sequence[Undistorted], source: Path, result: Path, progress: Callable[[str, int, int], None]
 ) -> None:
-    """Undistort and turn photos, several at a time."""
+    """Undistort and turn photos in parallel."""
     largest = max(entry.lens.W * entry.lens.H for entry in entries)
     pool = ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, AT_ONCE // largest)))
     futures = [pool.submit(_write_photo, entry, source, result) for entry in entries]

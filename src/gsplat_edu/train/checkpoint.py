@@ -1,7 +1,7 @@
-"""A run on disk, so that it can go on as if nothing had happened.
+"""Checkpoints, from which a run resumes with identical results.
 
-One safetensors file holds everything: tensors as tensors, and what is not a tensor as JSON in the header. So a
-checkpoint is whole or not there.
+One safetensors file holds everything: tensors as tensors, all other values as JSON in the header. A checkpoint is
+therefore either complete or absent.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from gsplat_edu.headroom import shortage
 from gsplat_edu.train.trainer import Trainer
 
 KEPT = 2
-"""Checkpoints that stay when a new one has been written."""
+"""Number of checkpoints to keep, including the newest."""
 
 FORMAT = "1"
 """Version of the file's contents."""
 
 LONGEST = 1 << 24
-"""Characters of the JSON in the header: the order of views takes nine of them for each photo."""
+"""Largest number of characters of JSON in the header: the view order takes nine for each photo."""
 
 MOST_SECONDS = 1e9
-"""s: thirty years of training."""
+"""Largest plausible training time, s: thirty years."""
 
 _NAME = re.compile(r"iteration_(\d+)\.safetensors")
 
@@ -41,7 +41,7 @@ def save_checkpoint(folder: Path, trainer: Trainer, seconds: float) -> Path:
     """Write the trainer's state as folder/iteration_N.safetensors, and remove all but the last two.
 
     Args:
-        folder: Where checkpoints go; made where it is missing.
+        folder: Folder of the checkpoints; created if missing.
         trainer: The run.
         seconds: Wall time of the training so far.
 
@@ -49,7 +49,7 @@ def save_checkpoint(folder: Path, trainer: Trainer, seconds: float) -> Path:
         The file.
 
     Raises:
-        CheckpointError: it cannot be written. Those written before are untouched.
+        CheckpointError: the file cannot be written. Earlier checkpoints are unchanged.
     """
     tensors, numbers = trainer.state()
     path = folder / f"iteration_{trainer.iteration}.safetensors"
@@ -84,10 +84,10 @@ def read_seconds(path: Path) -> float:
 
 
 def load_checkpoint(path: Path, trainer: Trainer) -> None:
-    """Bring a trainer that was made with the same arguments to where the checkpoint was written.
+    """Restore the state of a checkpoint in a trainer made with the same arguments.
 
     Raises:
-        CheckpointError: the file is damaged, or of another run. The trainer is as it was.
+        CheckpointError: the file is damaged or belongs to another run. The trainer is unchanged.
     """
     with _opened(path) as file:
         metadata = file.metadata()
@@ -97,12 +97,12 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a checkpoint; errors that the block raises about its contents name the file."""
+    """Open a checkpoint; errors about its contents raised in the block name the file."""
     try:
         with safe_open(path, framework="pt") as file:
             if (file.metadata() or {}).get("format") != FORMAT:
                 raise CheckpointError(
-                    f"{path}: is no checkpoint of this version of gsplat_edu; start the run again"
+                    f"{path}: is not a checkpoint of this version of gsplat_edu; start the run again"
                 )
             yield file
     except OSError as error:
@@ -115,13 +115,13 @@ def _tensors(file: Any) -> dict[str, Tensor]:  # noqa: ANN401
     found = {}
     for name in file.keys():  # noqa: SIM118
         try:
-            # A copy: what safetensors returns is the file itself, mapped into memory.
+            # Copy, because safetensors returns memory mapped from the file.
             found[name] = file.get_tensor(name).clone()
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             if shortage(error) is not None:
-                raise  # memory ran out: the file is as good as it was
-            # Kinds of tensors that safetensors knows and torch does not, numbers that straddle their places.
-            raise ArgumentError(f"{name[:60]!r}: is no tensor: {str(error)[:200]}") from None
+                raise  # out of memory; the file is intact
+            # dtypes that safetensors supports but torch does not, or misaligned data
+            raise ArgumentError(f"{name[:60]!r}: is not a tensor: {str(error)[:200]}") from None
     return found
 
 
@@ -148,5 +148,5 @@ def _seconds(metadata: dict[str, str]) -> float:
 
 def _damaged(path: Path, reason: str) -> CheckpointError:
     others = [other.name for other in list_checkpoints(path.parent) if other != path]
-    advice = f"delete it to go on from {others[-1]}" if others else "delete it to start over"
+    advice = f"delete it to resume from {others[-1]}" if others else "delete it to start over"
     return CheckpointError(f"{path}: is damaged ({' '.join(reason.split())}); {advice}")

@@ -1,10 +1,10 @@
-"""Every number of a training, named, with its meaning and its source.
+"""The settings of a training, each with its meaning and source.
 
-The defaults are the recipe of Kerbl et al. 2023 ("2023" below) as its code runs it, and of Kheradmand et al. 2024
-for the strategy mcmc. Iterations count from 0: what happens "at iteration i" happens with or after step i + 1.
+The defaults are those of Kerbl et al. 2023's code ("2023" below), and of Kheradmand et al. 2024 for the strategy mcmc.
+Iterations count from 0: "at iteration i" means with or after step i + 1.
 
-`TrainConfig` holds what every run has, `AdcConfig` and `McmcConfig` what belongs to one strategy. Options of the
-command line, config.json and docs/RECIPE.md name all of them in one flat list, `SETTINGS`, made from fields' metadata.
+`TrainConfig` holds the settings common to all runs; `AdcConfig` and `McmcConfig` hold those of one strategy. Options,
+config.json and docs/RECIPE.md use one flat list of them, `SETTINGS`, made from the metadata of the fields.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
 
 RECIPE_ITERATIONS = 30_000
-"""Length of the run that the recipe's milestones are made for."""
+"""Length of the run for which the recipe's milestones are defined."""
 
 SHORT_RUN = 3_000
-"""Runs shorter than this do not reset opacities: there would be no time to recover."""
+"""Runs shorter than this do not reset opacities: there is no time to recover."""
 
 STRATEGIES = ("adc", "mcmc", "none")
 OVER_CAP = ("strongest", "cut")
 VIEW_ORDERS = ("shuffled", "random")
 
 FROM_SCENE = {"means_rate": 1.6e-5, "sh_every": 0}
-"""Defaults of a run that starts from a trained scene. Its Gaussians are about where they belong, so the means' rate
-starts at the geometric mean of the recipe's first and last; its harmonics are trained, so all of them are in use."""
+"""Defaults of a run that starts from a trained scene. Its Gaussians are nearly in place, so the means' rate starts at
+the geometric mean of the recipe's initial and final rates. Its harmonics are trained, so all of them are in use."""
 
 Check = Callable[[str, Any], object]
-"""Raises `ArgumentError`, which names the setting, if a value is out of its range."""
+"""Raises an `ArgumentError` that names the setting if a value is out of range."""
 
 Class = TypeVar("Class", bound=type)
 
 
 def _number(default: Any, check: Check, help: str, source: str = "", *, milestone: bool = False) -> Any:  # noqa: A002, ANN401
-    """Declare a setting: default, range, meaning, source, and whether `recipe` scales it with the run."""
+    """Declare a setting: default, range, meaning, source, and whether `recipe` scales it with the run's length."""
     metadata = {"check": check, "help": help, "source": source, "milestone": milestone}
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -82,11 +82,11 @@ def _one_of(names: tuple[str, ...]) -> Check:
 
 
 def _flag(name: str, value: object) -> None:
-    """Take true and false."""
+    """Accept any value: the option is a flag."""
 
 
 def _documented(kind: Class) -> Class:
-    """Add the settings' meanings to a class's docstring, as its arguments."""
+    """Add the help texts of the settings to a class's docstring, as its arguments."""
     lines = [f"    {field.name}: {field.metadata['help']}" for field in fields(kind) if field.metadata]
     kind.__doc__ = "\n".join([f"{(kind.__doc__ or '').rstrip()}", "", "Args:", *lines, ""])
     return kind
@@ -187,8 +187,8 @@ class McmcConfig:
 class TrainConfig:
     """One training run; see `recipe` for runs of other lengths than 30,000 iterations.
 
-    `adc` and `mcmc` hold the settings of the two strategies; only those of `strategy` are used. A value outside its
-    range raises `ArgumentError`, which names it.
+    `adc` and `mcmc` hold the settings of the two strategies; only those of `strategy` are used. A value out of range
+    raises an `ArgumentError` that names it.
     """
 
     iterations: int = _number(
@@ -307,10 +307,10 @@ class TrainConfig:
         }
 
     def changed(self, **changes: Any) -> TrainConfig:  # noqa: ANN401
-        """Return a copy with other values of settings, given by their flat names.
+        """Return a copy with some settings changed, given by their flat names.
 
         Raises:
-            ArgumentError: a value is outside its range, or there is no such setting.
+            ArgumentError: a value is out of range, or a setting is unknown.
         """
         parts: dict[str | None, dict[str, Any]] = {None: {}, "adc": {}, "mcmc": {}}
         by_name = {setting.name: setting for setting in SETTINGS}
@@ -326,14 +326,14 @@ class TrainConfig:
 
     @property
     def start(self) -> tuple[float, float]:
-        """Opacity and scale factor of the start cloud, by strategy."""
+        """Opacity and scale factor of the initial Gaussians for the strategy."""
         if self.strategy == "mcmc":
             return self.mcmc.start_opacity, self.mcmc.start_scale
         return self.start_opacity, self.start_scale
 
     @property
     def learning_rates(self) -> dict[str, float]:
-        """Adam's rate of every raw parameter by name; that of the means before the extent and its schedule."""
+        """Adam's rate of every raw parameter by name; for the means, the initial rate without the extent."""
         return {
             "means": self.means_rate,
             "quats": self.quats_rate,
@@ -346,15 +346,15 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Setting:
-    """A number of the recipe, as options, config.json and docs/RECIPE.md know it.
+    """A setting, as used by the command line, config.json and docs/RECIPE.md.
 
     Args:
-        name: Flat name: the field's own, with "mcmc_" in front of those of `McmcConfig`.
+        name: Flat name: the field's name, with the prefix "mcmc_" for `McmcConfig`.
         field: The field's name in its class.
-        strategy: The strategy whose settings hold it, and which alone uses it; None for `TrainConfig` itself.
-        default: Its default, that of 30,000 iterations.
-        help: What it means.
-        source: Where the default comes from; "" for ours.
+        strategy: The only strategy that uses it; None for the settings of `TrainConfig` itself.
+        default: Its default for 30,000 iterations.
+        help: Its meaning.
+        source: Source of the default; "" if it is ours.
         milestone: Whether `recipe` scales it with the length of the run.
         check: Raises if a value is out of range.
     """
@@ -370,7 +370,7 @@ class Setting:
 
     @property
     def meaning(self) -> str:
-        """What it means, as help and tables say it: in lower case, behind the strategy it belongs to."""
+        """The help text for --help and tables: it starts in lower case, after the strategy that uses the setting."""
         only = f"{self.strategy}: " if self.strategy else ""
         return f"{only}{self.help[0].lower()}{self.help[1:].rstrip('.')}"
 
@@ -388,7 +388,7 @@ SETTINGS: tuple[Setting, ...] = (
     *_settings(AdcConfig, "adc"),
     *_settings(McmcConfig, "mcmc", "mcmc_"),
 )
-"""Every number of the recipe."""
+"""All settings of a training."""
 
 ONLY_FOR = {
     strategy: tuple(setting.name for setting in SETTINGS if setting.strategy == strategy)
@@ -397,22 +397,22 @@ ONLY_FOR = {
 """Settings that only one strategy uses."""
 
 MILESTONES = tuple(setting.name for setting in SETTINGS if setting.milestone)
-"""Settings that `recipe` scales with the run; the interval of densification is not among them."""
+"""Settings that `recipe` scales with the length of the run; the densification interval is not one of them."""
 
 
 def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **changes: Any) -> TrainConfig:  # noqa: ANN401
     """Make the configuration of a run of any length.
 
-    Milestones keep their place relative to the length of the run: with 7,000 iterations densification ends at
-    3,500 instead of 15,000. Runs under 3,000 iterations do not reset opacities.
+    Milestones scale with the length of the run: with 7,000 iterations densification ends at 3,500 instead of 15,000.
+    Runs under 3,000 iterations do not reset opacities.
 
     Args:
         iterations: Number of steps.
-        rescale: Scale the milestones; False keeps the plain numbers of 30,000 iterations.
-        changes: Settings by their flat names, which are set as they are.
+        rescale: Scale the milestones; False keeps the values for 30,000 iterations.
+        changes: Settings by their flat names; they are not scaled.
 
     Raises:
-        ArgumentError: a value is outside its range, or there is no such setting.
+        ArgumentError: a value is out of range, or a setting is unknown.
     """
     whole_number("iterations", iterations, 1)
     scaled: dict[str, Any] = {}

@@ -1,30 +1,29 @@
-"""The course's training of the sphere: its numbers, and every way in which it differs from the paper.
+"""The course's training of the sphere: its settings, and every difference from the paper.
 
-The paper is Kerbl et al. 2023. The sphere is learned in 800 iterations where the paper takes 30,000, on
-images of 128 px where the paper's have a thousand and more; most of what follows comes from that. Each
-item names what is done here and, in brackets, what the paper or its code does.
+The paper is Kerbl et al. 2023. The sphere trains for 800 iterations on images of 128 px; the paper trains for
+30,000 on images of a thousand pixels and more. Most differences follow from that. Each item states what this
+training does and, in brackets, what the paper or its code does.
 
 1.  The means' learning rate is 1e-3 throughout. (1.6e-4 times the scene's extent, falling a
-    hundredfold.) The cloud has a long way to go and few steps to go it in.
+    hundredfold.) The Gaussians have to move far in few steps.
 2.  The loss is L1. (0.8 L1 + 0.2 (1 - SSIM).)
-3.  Colour is spherical harmonics of degree 0, as the sphere looks alike from everywhere. (Degree 3, one
-    more every 1,000 iterations.)
+3.  Colour is spherical harmonics of degree 0, as the sphere looks the same from every direction. (Degree 3,
+    reached by one degree every 1,000 iterations.)
 4.  Opacity is never reset. (Every 3,000 iterations, which this run does not reach.)
 5.  Nothing is pruned for its size, neither in the image nor in the world. (Both.)
-6.  There is a cap on the number of Gaussians: survivors come first, then clones, then split children,
-    and what is over the cap is cut from the end; a parent whose children are cut is gone all the same.
-    (No cap.)
-7.  Densification runs every 100 iterations from 100 to before 600. (Every 100 from 500 to 15,000.)
+6.  The number of Gaussians is capped: survivors come first, then clones, then split children, and those over
+    the cap are dropped from the end; the parent of dropped children is removed too. (No cap.)
+7.  Densification runs every 100 iterations, first at 100 and last before 600. (Every 100 from 500 to 15,000.)
 8.  The scene's extent is the radius of the camera orbit. (1.1 times the largest distance of a camera
     from the cameras' centre.)
-9.  Views are drawn with replacement. (Each view once before any comes again.)
+9.  Views are drawn with replacement. (Each view once before any is repeated.)
 10. Adam's eps is 1e-8. (1e-15.)
-11. The start is a random cloud in the unit ball, all of one size (`gsplat_edu.train.initialize`). (The
-    points of structure-from-motion, sized by the distance to their neighbours.)
-12. Gradients are averaged over the renders in which a Gaussian is in front of the camera, on the dense
-    backend. (In which it also reaches the image.)
-13. Means nearer than 0.05 are culled (0.2), and the Jacobian of the projection is not clamped at the
-    edge of the field of view (at 1.3 times it).
+11. The start is a random cloud in the unit ball, with Gaussians of one size (`gsplat_edu.train.initialize`).
+    (The points of structure from motion, sized by the distance to their neighbours.)
+12. On the dense backend, gradients are averaged over the renders in which a Gaussian is in front of the
+    camera. (Over those in which it also touches the image.)
+13. Means nearer than 0.05 are culled (0.2), and the Jacobian of the projection is not clamped (at 1.3 times
+    the half field of view).
 14. Images have one size throughout. (The first iterations run at a lower resolution.)
 """
 

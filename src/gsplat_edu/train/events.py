@@ -1,4 +1,4 @@
-"""What the trainer reports while it runs. Whoever listens (a log, a bar, a plot) is given the trainer too."""
+"""Events that the trainer reports to its callbacks (a log, a progress bar, a plot), along with itself."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class StepEvent:
 
     Args:
         iteration: Counted from 0.
-        loss_tensor: () the objective's term "photo" before the step, where the Gaussians are.
+        loss_tensor: () the objective's term "photo" before the step, on the Gaussians' device.
         num_gaussians: Gaussians that were rendered.
-        terms: () every term of the objective by name, likewise.
+        terms: () every term of the objective before the step, by name, on the same device.
     """
 
     iteration: int
@@ -26,7 +26,7 @@ class StepEvent:
 
     @property
     def loss(self) -> float:
-        """How far the render was from the photo before the step. Reading it waits for a GPU to come to it."""
+        """The loss before the step, as a number. Reading it synchronises with a GPU."""
         return float(self.loss_tensor)
 
 
@@ -37,7 +37,7 @@ class DensifyEvent:
     Args:
         iteration: Counted from 0.
         num_cloned: Gaussians added as clones.
-        num_split_children: Gaussians added as children of splits; their parents are gone.
+        num_split_children: Gaussians added as children of splits; their parents are removed.
         num_pruned: Gaussians removed for their opacity or size.
         num_gaussians: Gaussians afterwards.
     """
@@ -55,7 +55,7 @@ class ResetEvent:
 
     Args:
         iteration: Counted from 0.
-        opacity: What they were lowered to where they were above it.
+        opacity: The upper bound applied.
     """
 
     iteration: int
@@ -64,11 +64,11 @@ class ResetEvent:
 
 @dataclass(frozen=True)
 class RelocateEvent:
-    """MCMC moved dead Gaussians to living ones and added others, after the step of the same iteration.
+    """MCMC moved dead Gaussians onto living ones and added others, after the step of the same iteration.
 
     Args:
         iteration: Counted from 0.
-        num_relocated: Gaussians too faint to be seen that were moved.
+        num_relocated: Dead Gaussians that were moved.
         num_added: Gaussians added.
         num_gaussians: Gaussians afterwards.
     """

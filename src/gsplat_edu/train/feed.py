@@ -1,4 +1,4 @@
-"""Which view comes next, and what its render is compared with: read ahead, put over the background, kept on a GPU."""
+"""Draw the next view and prepare its target: read ahead, composited over the background, and cached on a GPU."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_w
 from gsplat_edu.views import Photo, View
 
 DEVICE_SHARE = 0.25
-"""Fraction of the GPU memory that is free when training starts which photos may take. Gaussians take the rest."""
+"""Fraction of the GPU memory free at the start of training that photos may use. The rest is for the Gaussians."""
 
 CPU = torch.device("cpu")
 
@@ -26,12 +26,12 @@ Color = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """A view whose turn it is.
+    """The view drawn for a step.
 
     Args:
-        index: Which of the feed's views.
+        index: Index into the feed's views.
         view: The view.
-        photo: Its photo; None if its target is kept on the GPU.
+        photo: Its photo; None if its target is cached on the GPU.
     """
 
     index: int
@@ -41,11 +41,11 @@ class Draw:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What the render of a view is compared with, on the Gaussians' device.
+    """The target of a view's render, on the Gaussians' device.
 
     Args:
-        image: (H, W, 3) the photo, over the background.
-        mask: (H, W) true where a pixel counts; None where all do.
+        image: (H, W, 3) the photo over the background.
+        mask: (H, W) true for pixels that count; None if all do.
     """
 
     image: UInt8[Tensor, "H W 3"] | Float32[Tensor, "H W 3"]
@@ -53,24 +53,24 @@ class Target:
 
     @property
     def nbytes(self) -> int:
-        """Bytes it takes."""
+        """Size in bytes."""
         return sum(tensor.nbytes for tensor in (self.image, self.mask) if tensor is not None)
 
 
 class ViewFeed:
-    """An endless sequence of views and targets, the same for the same seed.
+    """An endless sequence of views and targets, determined by the seed.
 
-    A photo on disk is read while the step before it runs. A photo in memory that is not opaque is put over a fixed
-    background once. A GPU keeps as many targets as it has room for, and their photos are not read again; targets over
+    A photo on disk is read while the previous step runs. A photo in memory that is not opaque is composited over a
+    fixed background only once. A GPU caches as many targets as fit, and their photos are not read again; targets over
     random backgrounds are made for every step.
 
     Args:
-        views: What to draw from, at least one.
-        order: "shuffled": each once before any comes again; "random": with replacement.
+        views: Views to draw from, at least one.
+        order: "shuffled" draws each view once before any is repeated; "random" draws with replacement.
         seed: Seed of the order.
-        background: Behind photos that are not opaque; None: a random colour for every draw.
-        device: Where the Gaussians are.
-        room: Bytes of targets to keep on a GPU; `DEVICE_SHARE` of what is free where None.
+        background: Colour behind photos that are not opaque; None for a random colour per draw.
+        device: Device of the Gaussians.
+        room: Bytes of targets to cache on a GPU; `DEVICE_SHARE` of the free memory if None.
     """
 
     def __init__(
@@ -93,14 +93,14 @@ class ViewFeed:
         self._room = _free_bytes(device) if room is None else room
 
     def next(self) -> Draw:
-        """Draw a view, which stays due if reading its photo fails, and begin to read the photo of the one after it."""
+        """Draw a view, and start reading the photo of the next one. If reading fails, the view remains due."""
         index = self._following()
         ahead, self._ahead = self._ahead, None
         view = self.views[index]
         photo = None
         if view not in self._kept:
             photo = ahead[1].result() if ahead and ahead[0] == index else self._read(view)
-        self._queue.pop(0)  # only now: a photo that could not be read stays due
+        self._queue.pop(0)  # only now, so that a view whose photo could not be read remains due
         following = self._following()
         after = self.views[following]
         if after.on_disk and after not in self._kept:
@@ -108,7 +108,7 @@ class ViewFeed:
         return Draw(index, view, photo)
 
     def _read(self, view: View) -> Photo:
-        """Read a photo and put it over the background if that is known; a photo in memory only once."""
+        """Read a photo and composite it over a fixed background; the result for a photo in memory is cached."""
         photo = self._flat.get(view) or view.read()
         if photo.alpha is None or self._background is None:
             return photo
@@ -118,11 +118,11 @@ class ViewFeed:
         return flat
 
     def target(self, draw: Draw, background: Color) -> Target:
-        """Move what `next` returned to the Gaussians' device; keep it there if it will not change and there is room.
+        """Move the target of a draw to the Gaussians' device; cache it there if it is constant and fits.
 
         Args:
-            draw: The view and its photo.
-            background: Behind the photo where it is not opaque; the feed's own if it has one.
+            draw: The result of `next`.
+            background: Colour behind a photo that is not opaque; the feed's own if it has one.
         """
         view, photo = draw.view, draw.photo
         if photo is None:
@@ -142,14 +142,14 @@ class ViewFeed:
         return self._queue[0]
 
     def state(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps: the draws that are outstanding and the generator, as JSON."""
+        """Return the state for a checkpoint, as JSON: the outstanding draws and the generator."""
         return {"queue": list(self._queue), "generator": self._generator.bit_generator.state}
 
     def check_state(self, state: object) -> None:
-        """Check what `load_state` is going to take.
+        """Check a state before `load_state` uses it.
 
         Raises:
-            ArgumentError: it is not what `state` returns for these views; names the entry.
+            ArgumentError: the state does not fit these views; the message names the entry.
         """
         given = check_entries("feed", state, ("queue", "generator"))
         queue, count = given["queue"], len(self.views)
@@ -158,7 +158,7 @@ class ViewFeed:
         for index in queue:
             check_whole("feed: queue", index, count - 1)
         if len(set(queue)) < len(queue):
-            raise ArgumentError("feed: queue: names a view twice")
+            raise ArgumentError("feed: queue: contains a view twice")
         check_numpy_generator("feed: generator", given["generator"], self._generator)
 
     def load_state(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Where training starts."""
+"""Initial Gaussians and the density strategy of a training."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
 START_SCALE = 0.09
-"""World units: standard deviation of every start Gaussian; a few hundred of them fill the unit ball."""
+"""Standard deviation of every start Gaussian, world units; a few hundred of them fill the unit ball."""
 
 START_LOGIT_OPACITY = -2.2
-"""Opacity 0.0998: light enough for the Gaussians behind to get a gradient."""
+"""Opacity 0.0998: low enough for the Gaussians behind to get a gradient."""
 
 QUAT_JITTER = 0.01
 """Standard deviation of the start quaternions around the identity."""
@@ -30,21 +30,22 @@ SH0_JITTER = 0.2
 """Standard deviation of the start coefficients around 0, which is mid-grey."""
 
 NEIGHBOURS = 3
-"""Start scales come from the distances to this many nearest points. (Kerbl et al. 2023's code)"""
+"""Number of nearest points whose distances determine a start scale. (Kerbl et al. 2023's code)"""
 
 SMALLEST_DISTANCE = 1e-7**0.5
-"""World units: floor under the start scales, for points that coincide. (Kerbl et al. 2023's code)"""
+"""Lower bound of the start scales, world units, for coincident points. (Kerbl et al. 2023's code)"""
 
 
 def from_points(points: ArrayLike, colors: ArrayLike, config: TrainConfig) -> Gaussians:
-    """Put a Gaussian on every point: a ball as wide as the gap to its neighbours, of the point's colour.
+    """Place a Gaussian on every point: a ball as large as the distance to its neighbours, of the point's colour.
 
     scale = factor * sqrt(mean squared distance to the 3 nearest points),  sh0 = (colour - 0.5) / C0
 
     Args:
         points: (N, 3) positions, world units.
         colors: (N, 3) colours, 0 to 1.
-        config: Start opacity, scale factor, SH degree, seed; and the cap: of more points a random part is taken.
+        config: Start opacity, scale factor, SH degree, seed and cap; of more points than the cap, a random subset
+            is used.
 
     Returns:
         Gaussians of the configuration's SH degree, float32; min(N, cap) of them.
@@ -59,7 +60,7 @@ def from_points(points: ArrayLike, colors: ArrayLike, config: TrainConfig) -> Ga
     points = float64_array("points", points, ("N", 3), sizes)
     colors = float64_array("colors", colors, ("N", 3), sizes)
     if not len(points):
-        raise ArgumentError("points: are none; give at least one to start from")
+        raise ArgumentError("points: is empty; give at least one point to start from")
     if config.max_gaussians is not None and len(points) > config.max_gaussians:
         chosen = np.random.default_rng(config.seed).permutation(len(points))[: config.max_gaussians]
         points, colors = points[np.sort(chosen)], colors[np.sort(chosen)]
@@ -82,54 +83,52 @@ def from_points(points: ArrayLike, colors: ArrayLike, config: TrainConfig) -> Ga
 
 
 def from_gaussians(gaussians: Gaussians, config: TrainConfig) -> tuple[Gaussians, list[str]]:
-    """Make trained Gaussians the start of another run.
+    """Start a run from trained Gaussians.
 
-    Those with a NaN or infinite parameter or a zero quaternion are left out, since no gradient repairs them. Harmonics
-    above the run's degree are cut off; missing ones are zero.
+    Gaussians with a NaN or infinite parameter or a zero quaternion are dropped, since no gradient repairs them.
+    Harmonics above the run's degree are dropped; missing ones are zero.
 
     Args:
         gaussians: Raw parameters, relative to the run's origin.
-        config: SH degree, and the cap.
+        config: SH degree and cap.
 
     Returns:
-        Gaussians of the configuration's SH degree, float32; and sentences that say what was changed.
+        Gaussians of the configuration's SH degree, float32; and sentences that describe the changes.
 
     Raises:
-        ArgumentError: none is left, or more than the cap.
+        ArgumentError: no Gaussian remains, or more than the cap.
     """
     whole = gaussians.finite_rows() & (gaussians.quats.abs().amax(dim=1) > 0)
     notes = []
     if broken := len(gaussians) - int(whole.sum()):
         notes.append(
-            f"{broken} of {len(gaussians)} Gaussians are NaN, infinite or without rotation: left out"
+            f"left out {broken} of {len(gaussians)} Gaussians that are NaN, infinite or have a zero quaternion"
         )
     kept = gaussians.map(lambda tensor: tensor.detach()[whole].float().contiguous())
     if not len(kept):
-        raise ArgumentError("holds no Gaussian to start from; give another scene")
+        raise ArgumentError("contains no Gaussian to start from; give another scene")
     if config.max_gaussians is not None and len(kept) > config.max_gaussians:
         raise ArgumentError(
-            f"holds {len(kept)} Gaussians, more than --max-gaussians {config.max_gaussians}; raise that, or thin it out"
-            " with `gsplat-edu convert --min-opacity`"
+            f"contains {len(kept)} Gaussians, more than --max-gaussians {config.max_gaussians}; raise that, or reduce"
+            " the scene with `gsplat-edu convert --min-opacity`"
         )
     wanted, stored = (config.sh_degree + 1) ** 2 - 1, kept.sh_rest.shape[1]
     if stored > wanted:
-        notes.append(
-            f"harmonics up to degree {kept.sh_degree} are stored; those above --sh-degree are cut off"
-        )
+        notes.append(f"contains harmonics up to degree {kept.sh_degree}; those above --sh-degree are dropped")
     elif stored < wanted:
-        notes.append(f"harmonics up to degree {kept.sh_degree} are stored; the others start at zero")
+        notes.append(f"contains harmonics up to degree {kept.sh_degree}; the others start at zero")
     rest = torch.zeros(len(kept), wanted, 3)
     rest[:, : min(stored, wanted)] = kept.sh_rest[:, :wanted]
     return Gaussians(**(kept.tensors() | {"sh_rest": rest})), notes
 
 
 def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> DensityStrategy | None:
-    """Make the density strategy that a configuration names; None for none.
+    """Make the density strategy of a configuration; None for the strategy "none".
 
     Args:
-        config: The configuration; its seed is that of the strategy's draws.
+        config: The configuration; its seed also seeds the strategy.
         extent: Size of the scene, world units.
-        gaussians: What training starts from.
+        gaussians: The start Gaussians.
 
     Raises:
         ArgumentError: the strategy is mcmc and there is no cap.
@@ -143,11 +142,11 @@ def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> D
 def random_ball(count: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Gaussians:
     """Fill the unit ball with near-grey, nearly isotropic, faint Gaussians.
 
-    The draws come in this order: directions, radii, quaternions, sh0.
+    The order of the draws is directions, radii, quaternions, sh0.
 
     Args:
         count: Number of Gaussians.
-        generator: Source of the draws; it is left where the last draw put it.
+        generator: Source of the draws; its state advances.
         dtype: Float type of the parameters.
 
     Returns:

@@ -1,7 +1,7 @@
-"""What a step minimises: a sum of named terms, each a scalar that autograd can differentiate.
+"""The objective of a step: a sum of named terms, each a scalar that autograd can differentiate.
 
-A new term (depth, normals, a regulariser) is a class here and an entry in `make_objective`; the log, the report and the
-checkpoints need no change.
+To add a term (depth, normals, a regulariser), add a class here and an entry in `make_objective`; the log, the report
+and the checkpoints need no change.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import Draw, Target
 
 PHOTO = "photo"
-"""Name of the term that compares image and photo: what logs and progress call the loss."""
+"""Name of the term that compares image and photo; logs and progress call it the loss."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """One view of a step, rendered: what the terms of an objective look at.
+    """The render of one view of a step: the input of an objective's terms.
 
     Args:
-        gaussians: What was rendered, raw parameters.
+        gaussians: The rendered Gaussians, raw parameters.
         draw: The view and its index.
-        output: The render: image, transmittance, depth where the settings ask for it.
-        image: (H, W, 3) the image behind the view model, which is what is compared.
+        output: The render: image, transmittance, and depth if the settings ask for it.
+        image: (H, W, 3) the output of the view model, which is compared with the photo.
         target: The photo over the step's background, and its mask.
         iteration: Counted from 0.
     """
@@ -50,7 +50,7 @@ class Rendered:
 
 @runtime_checkable
 class Term(Protocol):
-    """One summand of an objective. One that looks at `output.depth` has an attribute `needs_depth` that is true."""
+    """One summand of an objective. A term that uses `output.depth` has a true attribute `needs_depth`."""
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return the weighted value, differentiable in what the step learns."""
@@ -61,7 +61,7 @@ class Objective:
     """The sum of named terms.
 
     Args:
-        terms: The terms by name; "photo" among them.
+        terms: The terms by name, including "photo".
 
     Raises:
         ArgumentError: there is no term "photo".
@@ -74,11 +74,11 @@ class Objective:
 
     @property
     def needs_depth(self) -> bool:
-        """Whether a term looks at the render's depth, which is made only then."""
+        """Whether a term uses the depth; only then is it rendered."""
         return any(getattr(term, "needs_depth", False) for term in self.terms.values())
 
     def backward(self, rendered: Rendered) -> dict[str, Float[Tensor, ""]]:
-        """Add the gradients of the sum to those of its leaves, and return the value of every term, detached."""
+        """Add the gradients of the sum to the `grad` of its leaves; return the value of every term, detached."""
         values = {name: term(rendered) for name, term in self.terms.items()}
         total(list(values.values())).backward()  # type: ignore[no-untyped-call]
         return {name: value.detach() for name, value in values.items()}
@@ -93,7 +93,7 @@ def total(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
 
 
 def make_objective(config: TrainConfig) -> Objective:
-    """Make the objective that a configuration names: the photo, and the regularisers of its strategy.
+    """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
     (1 - k) L1 + k (1 - SSIM), and for mcmc + weight_o mean(opacity) + weight_s mean(scale)
 
@@ -108,7 +108,7 @@ def make_objective(config: TrainConfig) -> Objective:
 
 @dataclass(frozen=True)
 class PhotoTerm:
-    """How far the image is from the photo: `gsplat_edu.losses.photo_loss`.
+    """The difference between image and photo: `gsplat_edu.losses.photo_loss`.
 
     Args:
         ssim_weight: k, 0 to 1.
@@ -159,9 +159,9 @@ class MeanScale:
 
 
 class _MeanOpacity(torch.autograd.Function):
-    """Weight mean(sigmoid(l)), with the gradient weight o (1 - o) / N.
+    """Compute weight mean(sigmoid(l)), with the gradient weight o (1 - o) / N.
 
-    Torch rounds a sigmoid by the number of its threads, so one thread computes it.
+    The rounding of torch's sigmoid depends on the number of threads, so one thread computes it.
     """
 
     @staticmethod
@@ -179,7 +179,7 @@ class _MeanOpacity(torch.autograd.Function):
 
 
 class _MeanScale(torch.autograd.Function):
-    """Weight mean(exp(l)), with the gradient weight exp(l) / N; on one thread, as above."""
+    """Compute weight mean(exp(l)), with the gradient weight exp(l) / N; on one thread, as above."""
 
     @staticmethod
     def forward(ctx: Any, log_scales: Tensor, weight: float) -> Tensor:  # noqa: ANN401

@@ -17,19 +17,19 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.train.saved import check_entries, check_not_negative, check_tensor_kind
 
 MOMENTS = ("first", "second")
-"""What Adam keeps for each parameter: decaying means of its gradient and of the gradient's square."""
+"""Adam's state for each parameter: decaying means of its gradient and of the squared gradient."""
 
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """How Adam moves one named tensor.
+    """Adam's settings for one named tensor.
 
     Args:
-        rate: Learning rate, or the schedule that returns it for an iteration counted from 0.
-        eps: Floor under the root of the second moment.
+        rate: Learning rate, or a schedule that returns it for an iteration counted from 0.
+        eps: Added to the root of the second moment.
         betas: Decay of the first and second moment.
-        per_gaussian: Whether the tensor has a row for each Gaussian. The moments of such a group follow density
-            surgery; those of other groups (exposures, poses) do not change with it.
+        per_gaussian: Whether the tensor has a row for each Gaussian. Only the moments of such a group follow density
+            surgery; those of other groups (exposures, poses) are unaffected.
     """
 
     rate: float | Callable[[int], float]
@@ -38,7 +38,7 @@ class ParameterGroup:
     per_gaussian: bool = True
 
     def rate_at(self, iteration: int) -> float:
-        """Return the rate of an iteration."""
+        """Return the rate at an iteration."""
         return self.rate(iteration) if callable(self.rate) else self.rate
 
 
@@ -52,9 +52,9 @@ class Adam:
 
     Args:
         parameters: The tensors by name.
-        groups: How each moves, by the same names; a number stands for a group with that rate. A tensor that no group
-            names does not move.
-        kernel: Moves one tensor; by default the fastest that takes it.
+        groups: Settings by the same names; a number stands for a group with that rate. Tensors without a group do not
+            change.
+        kernel: Updates one tensor; by default the fastest that supports it.
 
     Raises:
         ArgumentError: a group has no parameter.
@@ -76,7 +76,9 @@ class Adam:
         kernel: AdamKernel = adam_step,
     ) -> None:
         if unknown := sorted(set(groups) - set(parameters)):
-            raise ArgumentError(f"groups: {unknown[0]!r} is none of the parameters {', '.join(parameters)}")
+            raise ArgumentError(
+                f"groups: {unknown[0]!r} is not one of the parameters {', '.join(parameters)}"
+            )
         self.groups = {
             name: group if isinstance(group, ParameterGroup) else ParameterGroup(group)
             for name, group in groups.items()
@@ -94,15 +96,15 @@ class Adam:
         )
 
     def schedule(self, iteration: int) -> None:
-        """Set every group's rate to that of an iteration, counted from 0."""
+        """Set every group's rate for an iteration, counted from 0."""
         self.learning_rates = {name: group.rate_at(iteration) for name, group in self.groups.items()}
 
     @torch.no_grad()
     def step(self, parameters: Mapping[str, Tensor]) -> None:
-        """Move every parameter that has a gradient, in place, and drop the gradients.
+        """Update every parameter that has a gradient, in place, and clear the gradients.
 
         Args:
-            parameters: The tensors by name, those of the constructor or what density surgery made of them.
+            parameters: The tensors by name: those given to the constructor, or their replacements by density surgery.
 
         Raises:
             ArgumentError: the moments of a group do not fit its parameter.
@@ -122,14 +124,14 @@ class Adam:
 
     @torch.no_grad()
     def forget(self, name: str) -> None:
-        """Set a group's moments to zero, where its parameter was changed by hand."""
+        """Set a group's moments to zero, after its parameter was changed directly."""
         for moments in (self.first, self.second):
             if name in moments:
                 moments[name].zero_()
 
     @torch.no_grad()
     def forget_rows(self, indices: Int64[Tensor, " S"]) -> None:
-        """Set the moments of some Gaussians to zero, where those were changed by hand."""
+        """Set the moments of some Gaussians to zero, after these were changed directly."""
         for moments in (self.first, self.second):
             for name, moment in moments.items():
                 if self.groups[name].per_gaussian:
@@ -137,11 +139,11 @@ class Adam:
 
     @torch.no_grad()
     def follow(self, survivors: Int64[Tensor, " S"], num_new: int) -> None:
-        """Carry the moments of the groups with a row per Gaussian through a change of the Gaussians.
+        """Apply a change of the Gaussians to the moments of the per-Gaussian groups.
 
         Args:
-            survivors: (S,) indices of the Gaussians that stay, in their new order; they keep their moments.
-            num_new: Gaussians added behind them, which start from zero moments.
+            survivors: (S,) indices of the remaining Gaussians, in their new order; they keep their moments.
+            num_new: Number of Gaussians appended, with zero moments.
         """
         for moments in (self.first, self.second):
             for name, old in moments.items():
@@ -160,10 +162,10 @@ class Adam:
         Args:
             moments: "first" and "second", by group.
             steps: Steps taken.
-            parameters: The tensors that they belong to.
+            parameters: The parameters of the moments.
 
         Raises:
-            ArgumentError: a moment is missing, or differs from its parameter in dtype or shape; nothing has changed.
+            ArgumentError: a moment is missing or differs from its parameter in dtype or shape; nothing has changed.
         """
         for part in MOMENTS:
             given = check_entries(part, moments[part], tuple(self.groups))
@@ -182,9 +184,9 @@ def _check_moments(name: str, parameter: Tensor, moments: tuple[Tensor, Tensor])
     for moment in moments:
         if moment.shape != parameter.shape:
             raise ArgumentError(
-                f"{name}: has shape {tuple(parameter.shape)}, its moments {tuple(moment.shape)}; call follow"
+                f"{name}: has shape {tuple(parameter.shape)}, but its moments {tuple(moment.shape)}; call follow"
             )
         if (moment.dtype, moment.device) != (parameter.dtype, parameter.device):
             raise ArgumentError(
-                f"{name}: is {parameter.dtype} on {parameter.device}, its moments are {moment.dtype} on {moment.device}"
+                f"{name}: is {parameter.dtype} on {parameter.device}, but its moments {moment.dtype} on {moment.device}"
             )

@@ -1,7 +1,7 @@
-"""Checks of what a checkpoint holds, made before any of it is used.
+"""Checks of a checkpoint's contents before any of them is used.
 
-Each raises `ArgumentError`, which names the entry. A checkpoint is a file like any other: it may be damaged, of another
-run, or made to do harm.
+Each check raises an `ArgumentError` that names the entry. A checkpoint may be damaged, belong to another run, or be
+malicious.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from torch import Tensor
 from gsplat_edu.errors import ArgumentError
 
 GENERATOR_LAYOUT = "<QiiQ"
-"""Head of a torch CPU generator's state: seed, numbers left before the next block, whether seeded, next number."""
+"""Start of a torch CPU generator's state: seed, numbers left before the next block, whether seeded, next index."""
 
 GENERATOR_BLOCK = 624
 """Numbers in a block of the Mersenne Twister."""
 
 GENERATOR_FLAGS = 5052
-"""Offset in the state of the last flag, a C++ bool: whether a normal number is kept for later."""
+"""Offset of the state's last flag, a C++ bool: whether a normal number is cached."""
 
 
 def check_entries(name: str, given: object, names: Sequence[str]) -> dict[str, Any]:
-    """Check that something is an object with exactly these entries, and return it."""
+    """Check that a value is an object with exactly these entries, and return it."""
     if not isinstance(given, dict):
         raise ArgumentError(f"{name}: has to be an object, got {type(given).__name__}")
     if missing := sorted(set(names) - set(given)):
         raise ArgumentError(f"{name}: {missing[0]} is missing")
     if unknown := sorted(set(given) - set(names)):
-        raise ArgumentError(f"{name}: {unknown[0][:60]!r} is not known")
+        raise ArgumentError(f"{name}: {unknown[0][:60]!r} is unknown")
     return given
 
 
@@ -52,7 +52,7 @@ def check_not_negative(name: str, given: Tensor) -> None:
 
 
 def check_statistics(tensors: Mapping[str, Tensor], like: Tensor) -> None:
-    """Check sums and maxima per Gaussian: of this tensor's dtype and shape, and none negative."""
+    """Check that per-Gaussian sums and maxima have this tensor's dtype and shape and are not negative."""
     for name, tensor in tensors.items():
         check_tensor_kind(f"density.{name}", tensor, like.dtype, like.shape)
         check_not_negative(f"density.{name}", tensor)
@@ -61,8 +61,8 @@ def check_statistics(tensors: Mapping[str, Tensor], like: Tensor) -> None:
 def check_torch_generator(name: str, state: Tensor, generator: torch.Generator) -> None:
     """Check a state of torch's CPU generator.
 
-    torch checks each number of it, but not that they agree: if a state claims that more numbers are left than there
-    are, torch reads past the end of its own memory.
+    torch checks each number of the state, but not that they are consistent: if a state claims more remaining numbers
+    than there are, torch reads past the end of its buffer.
     """
     check_tensor_kind(name, state, torch.uint8, generator.get_state().shape)
     data = state.contiguous().numpy().tobytes()
@@ -70,11 +70,11 @@ def check_torch_generator(name: str, state: Tensor, generator: torch.Generator) 
     fresh = (left, following) == (1, 0)
     agree = 1 <= left <= GENERATOR_BLOCK and left + following == GENERATOR_BLOCK + 1
     if seeded != 1 or not (fresh or agree) or data[GENERATOR_FLAGS] > 1:
-        raise ArgumentError(f"{name}: is no state of a generator")
+        raise ArgumentError(f"{name}: is not the state of a generator")
 
 
 def check_numpy_generator(name: str, state: object, generator: np.random.Generator) -> None:
-    """Check a state of NumPy's PCG64, which is what `default_rng` makes."""
+    """Check a state of NumPy's PCG64, the generator that `default_rng` creates."""
     kind = generator.bit_generator.state["bit_generator"]
     given = check_entries(name, state, ("bit_generator", "state", "has_uint32", "uinteger"))
     if given["bit_generator"] != kind:
@@ -89,14 +89,14 @@ def check_numpy_generator(name: str, state: object, generator: np.random.Generat
 
 
 def check_whole(name: str, given: object, most: int) -> int:
-    """Check a whole number from 0 to `most`; without printing it, as it may have thousands of digits."""
+    """Check a whole number from 0 to `most`. The message omits it, since it may have thousands of digits."""
     if type(given) is not int or not 0 <= given <= most:
         raise ArgumentError(f"{name}: has to be a whole number from 0 to {most}")
     return given
 
 
 def check_flag(name: str, given: object) -> bool:
-    """Check that something is true or false."""
+    """Check that a value is true or false."""
     if not isinstance(given, bool):
         raise ArgumentError(f"{name}: has to be true or false")
     return given

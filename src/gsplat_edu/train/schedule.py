@@ -1,4 +1,4 @@
-"""What changes over a run: the means' learning rate and the degree of the harmonics."""
+"""Schedules: the means' learning rate and the degree of the harmonics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsplat_edu.train.optimizer import ParameterGroup
 
 
 def gaussian_groups(config: TrainConfig, extent: float) -> dict[str, ParameterGroup]:
-    """Return the parameter groups of the Gaussians: one for each raw parameter, by its name.
+    """Return the parameter groups of the Gaussians: one for each raw parameter, by name.
 
     Args:
         config: Rates, eps and the schedule of the means.
@@ -25,7 +25,7 @@ def means_rate(config: TrainConfig, extent: float, iteration: int) -> float:
     """Return Adam's rate of the means: extent * start * (end / start)^t, log-linear in t from 0 to 1.
 
     Args:
-        config: The rates and where the end is reached.
+        config: The rates, and the iteration that reaches the final one.
         extent: Size of the scene, world units.
         iteration: Counted from 0.
 
@@ -39,7 +39,7 @@ def means_rate(config: TrainConfig, extent: float, iteration: int) -> float:
 
 
 def sh_degree(config: TrainConfig, iteration: int) -> int:
-    """Return the degree of harmonics in use: 0 at first, one more every so many iterations."""
+    """Return the degree of harmonics in use: 0 at first, one more every `sh_every` iterations."""
     if config.sh_every == 0:
         return config.sh_degree
     return min(config.sh_degree, iteration // config.sh_every)

@@ -36,7 +36,7 @@ from gsplat_edu.views import View
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Renders Gaussians from a camera, differentiably. Which backend does it is not the trainer's business."""
+    """Renders Gaussians from a camera, differentiably. The trainer does not depend on the backend."""
 
     def __call__(self, gaussians: Gaussians, camera: Camera, *, settings: RenderSettings) -> RenderOutput:
         """Render; see `gsplat_edu.render.api.render`."""
@@ -44,22 +44,22 @@ class Renderer(Protocol):
 
 
 Callback = Callable[["Trainer", Event], None]
-"""Is told of every step and every change of the Gaussians, with the trainer as it stands after it."""
+"""Called after every step and every change of the Gaussians, with the trainer and the event."""
 
 PARTS = ("gaussians", "view_model", *MOMENTS, "density")
-"""Parts of a checkpoint's tensors: the first word of their names."""
+"""Groups of a checkpoint's tensors: the first word of their names."""
 
 BACKGROUND_STREAM = 1
-"""Second word of the seed of the random backgrounds, so that they do not follow the view order."""
+"""Second word of the random backgrounds' seed, so that they are independent of the view order."""
 
 
 Reduce = Callable[[Mapping[str, Tensor], int], None]
-"""Given all parameters and the number of views: turns the sums over the views, in each `grad`, into what is applied.
-Processes that share a step add up their sums here."""
+"""Called with all parameters and the number of views: turns the sum over the views in each `grad` into the gradient to
+apply. Processes that share a step add up their sums here."""
 
 
 def mean_over_views(parameters: Mapping[str, Tensor], num_views: int) -> None:
-    """Divide every gradient by the number of views; that of one view is left as it is."""
+    """Divide every gradient by the number of views; the gradient of a single view is unchanged."""
     if num_views > 1:
         for parameter in parameters.values():
             if parameter.grad is not None:
@@ -68,13 +68,13 @@ def mean_over_views(parameters: Mapping[str, Tensor], num_views: int) -> None:
 
 @dataclass(frozen=True)
 class StepParts:
-    """The parts of a step that can be replaced.
+    """The replaceable parts of a step.
 
     Args:
-        objective: What is minimised; `make_objective` of the configuration where None.
-        view_model: What lies between a render and its loss.
-        reduce: Runs between the gradients of a step's views and their application.
-        adam: Moves one tensor by Adam's rule; by default the fastest kernel that takes it.
+        objective: The objective to minimise; `make_objective` of the configuration if None.
+        view_model: Maps a render to the image that the loss compares.
+        reduce: Combines the gradients of a step's views before they are applied.
+        adam: Updates one tensor by Adam's rule; by default the fastest kernel that supports it.
     """
 
     objective: Objective | None = None
@@ -85,7 +85,7 @@ class StepParts:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What `Trainer.run` has done.
+    """The record of one call of `Trainer.run`.
 
     Args:
         losses: Loss of every iteration of this call.
@@ -101,8 +101,8 @@ class TrainResult:
 class _Losses:
     """The losses of a run as numbers.
 
-    They are collected where the Gaussians are and read many at a time: reading waits for a GPU, and a tensor kept for
-    every step would pin the heap's pages.
+    They are collected on the Gaussians' device and read in batches: reading synchronises with a GPU, and keeping a
+    tensor for every step would pin heap pages.
     """
 
     ROOM = 1024
@@ -125,28 +125,28 @@ class _Losses:
 
 
 class Trainer:
-    """Moves Gaussians until they look like the views.
+    """Optimises Gaussians until their renders match the views.
 
-    Each step takes the gradients of the objective at the views it draws, reduces them to one, and applies that;
-    then the density strategy may change the Gaussians.
+    Each step computes the gradients of the objective for the views it draws, reduces them, and applies the result.
+    Then the density strategy may change the Gaussians.
 
     Args:
-        gaussians: Where to start; not changed.
-        views: What to learn from, at least one.
+        gaussians: The start Gaussians; not changed.
+        views: Training views, at least one.
         config: Budget, rates, schedule and seed.
         render: The renderer.
         extent: Size of the scene, world units: the means' learning rate is a fraction of it.
         density: The density strategy; None keeps the number of Gaussians.
-        callbacks: Told of every step and every change, in this order.
-        parts: What a step is made of beyond these; the recipe's where None.
+        callbacks: Called after every step and every change, in this order.
+        parts: The other parts of a step; the recipe's if None.
 
     Raises:
         ArgumentError: there are no views, no Gaussians, or more Gaussians than the cap.
 
     Attributes:
-        gaussians: The Gaussians as they stand.
+        gaussians: The current Gaussians.
         iteration: Steps taken so far.
-        last: The last image that was compared, its photo and its mask, for whoever wants to look.
+        last: The last image that was compared, its photo and its mask, for display.
         last_name: The name of their view.
     """
 
@@ -190,11 +190,11 @@ class Trainer:
     def run(
         self, stop: Callable[[], bool] = lambda: False, callbacks: Sequence[Callback] = ()
     ) -> TrainResult:
-        """Take the iterations that are left of the budget.
+        """Run the remaining iterations of the budget.
 
         Args:
-            stop: Asked after every iteration; the run ends when it says so, and can be resumed.
-            callbacks: Receive every event of this call, after those of the constructor.
+            stop: Called after every iteration; if it returns true, the run ends and can be resumed.
+            callbacks: Receive every event of this call, after the callbacks of the constructor.
         """
         receivers = (*self._callbacks, *callbacks)
         losses, counts = _Losses(self.gaussians.means.detach()), []
@@ -224,17 +224,17 @@ class Trainer:
         return StepEvent(iteration, terms[PHOTO], len(self.gaussians), terms)
 
     def _draw(self) -> list[Draw]:
-        """Return the views of the next step: one, as the recipe has it. A batch draws more of them here."""
+        """Return the views of the next step: one, as in the recipe. A batch would draw several here."""
         return [self._feed.next()]
 
     def gradients(self, draws: Sequence[Draw]) -> dict[str, Tensor]:
-        """Add the gradients of the objective at these views to the parameters' `grad`.
+        """Add the gradients of the objective for these views to the parameters' `grad`.
 
         Args:
-            draws: Views of the feed; density control observes each of them.
+            draws: Views from the feed; density control observes each of them.
 
         Returns:
-            () every term of the objective, its mean over the views.
+            () the mean over the views of every term of the objective, by name.
         """
         found = []
         for draw in draws:
@@ -250,7 +250,7 @@ class Trainer:
         return {name: total([values[name] for values in found]) / len(found) for name in found[0]}
 
     def _rendered(self, draw: Draw) -> Rendered:
-        """Render a view with the settings of the iteration, and put the view model behind it."""
+        """Render a view with the settings of the iteration, and apply the view model."""
         config, background = self.config, self.config.background
         if config.random_background:
             background = tuple(self._backgrounds.uniform(size=3).tolist())
@@ -267,13 +267,13 @@ class Trainer:
         return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 
     def apply(self) -> None:
-        """Step down the gradients that the parameters hold, at the rates of the iteration, and drop them."""
+        """Take an optimiser step with the stored gradients at the rates of the iteration, then clear them."""
         self._optimizer.schedule(self.iteration)
         self._optimizer.step(self.parameters())
         self.iteration += 1
 
     def parameters(self) -> dict[str, Tensor]:
-        """Return all that is learned by name: the Gaussians' raw parameters and those of the view model."""
+        """Return all learned tensors by name: the raw parameters of the Gaussians and those of the view model."""
         return self.gaussians.tensors() | self._learned
 
     def _tell(self, event: Event, receivers: Sequence[Callback]) -> None:
@@ -281,7 +281,7 @@ class Trainer:
             callback(self, event)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return all that a run needs to go on later as if nothing had happened: tensors, and what JSON holds."""
+        """Return the state from which a run resumes with identical results: tensors, and values for JSON."""
         moments, steps = self._optimizer.state()
         parts = {"gaussians": self.gaussians.tensors(), "view_model": self._learned, **moments}
         numbers: dict[str, Any] = {
@@ -298,25 +298,25 @@ class Trainer:
         return flat, numbers
 
     def load_state(self, tensors: dict[str, Tensor], numbers: object) -> None:
-        """Resume from what `state` returned, in a trainer made with the same arguments.
+        """Restore what `state` returned, in a trainer made with the same arguments.
 
-        All of it is checked before any of it is used.
+        The whole state is checked before any of it is used.
 
         Raises:
-            ArgumentError: it is not the state of such a trainer; names the entry. The trainer is as it was.
+            ArgumentError: the state does not fit this trainer, which stays unchanged; the message names the entry.
         """
         parts: dict[str, dict[str, Tensor]] = {part: {} for part in PARTS}
         for key, tensor in tensors.items():
             part, _, name = key.partition(".")
             if part not in parts:
-                raise ArgumentError(f"{key[:60]!r}: is not known")
+                raise ArgumentError(f"{key[:60]!r}: is unknown")
             parts[part][name] = tensor
         gaussians = self._checked_gaussians(parts["gaussians"])
         keys = ("iteration", "steps", "feed", "backgrounds", *(["density"] if self.density else []))
         given = check_entries("state", numbers, keys)
         iteration = check_whole("iteration", given["iteration"], self.config.iterations)
         if check_whole("steps", given["steps"], self.config.iterations) != iteration:
-            raise ArgumentError("steps: has to be the iteration")
+            raise ArgumentError("steps: has to equal the iteration")
         self._feed.check_state(given["feed"])
         check_numpy_generator("backgrounds", given["backgrounds"], self._backgrounds)
         learned = check_entries("view_model", parts["view_model"], tuple(self._learned))
@@ -325,7 +325,7 @@ class Trainer:
         parameters = gaussians.tensors() | self._learned
         optimizer = Adam(parameters, self._groups, self._parts.adam)
         optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, parameters)
-        if self.density is not None:  # the last that can fail
+        if self.density is not None:  # the last check that can fail
             if not isinstance(given["density"], dict):
                 raise ArgumentError("density: has to be an object")
             device = gaussians.means.device
@@ -335,7 +335,7 @@ class Trainer:
             }
             self.density.load_state(density, given["density"], gaussians)
         elif parts["density"]:
-            raise ArgumentError("density: is there, but this run has no density control")
+            raise ArgumentError("density: is present, but this run has no density control")
         self.gaussians, self._optimizer, self.iteration = gaussians, optimizer, iteration
         with torch.no_grad():
             for name, parameter in self._learned.items():
@@ -344,7 +344,7 @@ class Trainer:
         self._backgrounds.bit_generator.state = given["backgrounds"]
 
     def _checked_gaussians(self, given: dict[str, Tensor]) -> Gaussians:
-        """Return the stored Gaussians once dtypes and shapes fit those at the start; some may be NaN or infinite."""
+        """Check dtypes and shapes against the start Gaussians, and return the stored ones; NaN and infinity pass."""
         like = self.gaussians.tensors()
         check_entries("gaussians", given, tuple(like))
         count = given["means"].shape[0] if given["means"].ndim else 0
@@ -352,5 +352,7 @@ class Trainer:
             check_tensor_kind(f"gaussians.{name}", given[name], tensor.dtype, (count, *tensor.shape[1:]))
         cap = self.config.max_gaussians
         if not count or (cap is not None and count > cap):
-            raise ArgumentError(f"gaussians: are {count}, but have to be from 1 to {cap or 'any number'}")
+            raise ArgumentError(
+                f"gaussians: there are {count}; their number has to be from 1 to {cap or 'any'}"
+            )
         return Gaussians(**given).to(self.gaussians.means.device).trainable()

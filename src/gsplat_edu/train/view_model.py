@@ -1,7 +1,7 @@
-"""What lies between the rendered image and the loss of one view.
+"""View models, which map the rendered image of a view to the image that its loss compares.
 
-The photos of a capture differ in more than their cameras: exposure, white balance, vignetting. A view model learns such
-a difference for each view, so that the Gaussians need not.
+Exposure, white balance and vignetting differ between the photos of a capture. A view model learns such differences for
+each view, so that the Gaussians need not.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from gsplat_edu.train.optimizer import ParameterGroup
 
 @runtime_checkable
 class ViewModel(Protocol):
-    """Turns the rendered image of a view into the one that is compared with the photo.
+    """Maps the rendered image of a view to the image that is compared with the photo.
 
-    Its state is its parameters: leaves that collect gradients, which the trainer's optimiser moves in place, and which
-    checkpoints keep, with their moments, by name. Names must differ from those of the Gaussians' parameters.
+    Its state consists of its parameters: leaves that collect gradients. The trainer's optimiser updates them in place,
+    and checkpoints store them and their moments by name. Names must differ from those of the Gaussians' parameters.
     """
 
     def parameters(self) -> Mapping[str, Tensor]:
-        """Return what is learned, by name; always the same tensors."""
+        """Return the learned tensors by name; always the same objects."""
         ...
 
     def groups(self) -> Mapping[str, ParameterGroup]:
-        """Return how each parameter moves, by the same names; none has a row for each Gaussian."""
+        """Return the optimiser settings by the same names; none is per Gaussian."""
         ...
 
     def __call__(self, index: int, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
         """Return the image that is compared, differentiable in the render and in the parameters.
 
         Args:
-            index: Which of the trainer's views.
+            index: Index into the trainer's views.
             image: (H, W, 3) the render.
         """
         ...
 
 
 class Identity:
-    """The render itself is compared; nothing is learned."""
+    """Compares the render itself and learns nothing."""
 
     def parameters(self) -> Mapping[str, Tensor]:
         """Return none."""
@@ -53,5 +53,5 @@ class Identity:
         return {}
 
     def __call__(self, index: int, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-        """Return the image."""
+        """Return the image unchanged."""
         return image

@@ -20,7 +20,7 @@ def opened(path: str) -> Iterator[pycolmap.Database]:
 
 
 def add_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
-    """Write a camera, and the rig of the same number that is this camera alone."""
+    """Write a camera, and a rig of the same number that consists of this camera."""
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=camera.camera_id)
     rig.add_ref_sensor(camera.sensor_id)
@@ -28,7 +28,7 @@ def add_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
 
 
 def add_photo(database: pycolmap.Database, name: str, number: int, camera: int) -> None:
-    """Write an image, and the frame of the same number that is this image alone."""
+    """Write an image, and a frame of the same number that consists of this image."""
     image = pycolmap.Image(name=name, camera_id=camera, image_id=number)
     database.write_image(image, use_image_id=True)
     frame = pycolmap.Frame(frame_id=number, rig_id=camera)
@@ -37,19 +37,19 @@ def add_photo(database: pycolmap.Database, name: str, number: int, camera: int) 
 
 
 def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: dict[int, int]) -> str:
-    """Copy a database, without descriptors, and give its photos other cameras.
+    """Copy a database without descriptors, and assign new cameras to its photos.
 
-    Photos that share a camera with larger or smaller ones have their features scaled to that camera's size.
+    If photos of different sizes share a camera, their features are scaled to the camera's size.
 
     Args:
         source: The database.
         target: The copy.
-        model: The cameras' model.
-        per_photo: Whether every photo gets a camera of its own.
-        shared: Cameras that are replaced by a camera of the same aspect, by their numbers.
+        model: The camera model.
+        per_photo: Whether every photo gets its own camera.
+        shared: For each replaced camera, the number of its replacement, which has the same aspect ratio.
 
     Returns:
-        The copy's path.
+        The path of the copy.
     """
     with opened(source) as old, opened(target) as new, pycolmap.DatabaseTransaction(new):
         made = set[int]()
@@ -80,7 +80,7 @@ def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: 
 
 
 def _scale(geometry: pycolmap.TwoViewGeometry, first: np.ndarray, second: np.ndarray) -> None:
-    """Fit a pair's matrices to pixels x' = S x: F' = S2^-T F S1^-1, H' = S2 H S1^-1; E is about rays."""
+    """Convert a pair's matrices to pixels x' = S x: F' = S2^-T F S1^-1, H' = S2 H S1^-1; E does not change."""
     if (first == 1.0).all() and (second == 1.0).all():
         return
     if geometry.F is not None:

@@ -1,4 +1,4 @@
-"""The jobs: features, matches, mapping, and the model that goes into the capture."""
+"""The jobs of the engine: features, matches, mapping, and the final model."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ from .lenses import Kin, refined, simplified
 from .mappers import Options, Tell, all_at_once, incremental, mended, without_doubtful
 
 BLOCK = 64
-"""Pairs that are matched between two writes to the database: what is lost when the program is ended."""
+"""Pairs matched between two writes to the database: the most that is lost if the program is interrupted."""
 
 FOCAL = 0.85
-"""Focal length where EXIF says none, as a share of the longer side. The main cameras of phones have 0.69 to 0.81 (24 to
-28 mm, photos and videos), normal lenses 1.4; COLMAP's own 1.2 lets phones' photos begin with a bad geometry."""
+"""Initial focal length if EXIF gives none, as a fraction of the longer side. The main cameras of phones have 0.69 to
+0.81 (24 to 28 mm, photos and videos), normal lenses 1.4. With COLMAP's 1.2, photos from phones start with a bad
+geometry."""
 
 FIRST_LENS = "SIMPLE_RADIAL"
-"""Lens model that mapping begins with where the user names none; see `lenses`."""
+"""Lens model for mapping if the user gives none; see `lenses`."""
 
 FREE_LENS = "OPENCV"
-"""Lens model that photos are placed with where `FIRST_LENS` places too few, as it does for strong wide angles. The lens
-it finds is then dropped, and held-out photos judge how much of one is refined, as in the other ways."""
+"""Lens model for mapping if `FIRST_LENS` places too few photos, as it does for strong wide angles. Its result is
+then dropped, and held-out photos decide how much of the lens is refined, as in the other attempts."""
 
 
 def features(
@@ -47,28 +48,28 @@ def features(
     threads: int,
     seed: int,
 ) -> dict[str, Any]:
-    """Find SIFT features in photos; those that have theirs in the database already are passed over.
+    """Find SIFT features in photos; photos that already have features in the database are skipped.
 
     Args:
-        tell: Not told: whoever waits counts rows of the database. Two SQLite libraries in one process, COLMAP's and
-            Python's, would break each other's locks, so it cannot be this process.
-        database: The database; made where it is missing.
+        tell: Not called: the parent process counts rows of the database. This process cannot, because two SQLite
+            libraries in one process, COLMAP's and Python's, would break each other's locks.
+        database: The database; created if missing.
         photos: Folder of the photos.
-        masks: Folder of their masks, NAME.png; features are looked for where they are not zero. Empty for none.
-        groups: Photos that share a camera: "names", "width" and "height", and the "focal" length where it is known, px.
-        max_features: Most features of a photo.
-        threads: Threads, -1 for all.
-        seed: Of COLMAP's generator.
+        masks: Folder of their masks, NAME.png; features are found where a mask is not zero. Empty for none.
+        groups: Photos that share a camera: "names", "width" and "height", and the "focal" length if known, px.
+        max_features: Largest number of features per photo.
+        threads: Number of threads, -1 for all.
+        seed: Seed of COLMAP's generator.
 
     Returns:
-        "features": how many there are, by the names of the photos.
+        "features": the number of features by photo name.
     """
     pycolmap.set_random_seed(seed)
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu = threads, False
     options.sift.max_num_features = max_features
     names = sorted(name for group in groups for name in group["names"])
-    # COLMAP would number photos in the order in which its threads are done with them.
+    # Otherwise COLMAP numbers photos in the order in which its threads finish them.
     with opened(database) as db, pycolmap.DatabaseTransaction(db):
         numbers = {name: i for i, name in enumerate(names, 1)}
         for number, group in enumerate([] if db.num_images() else groups, 1):
@@ -96,17 +97,17 @@ def features(
 
 
 def matches(tell: Tell, database: str, pairs: str, threads: int, seed: int) -> dict[str, Any]:
-    """Match features and keep the matches that one geometry explains; pairs that were matched are passed over.
+    """Match features and keep the matches that one geometry explains; pairs already matched are skipped.
 
     Args:
-        tell: Not told, as for `features`.
+        tell: Not called, as for `features`.
         database: The database.
-        pairs: File with two names of photos a line.
-        threads: Threads, -1 for all.
-        seed: Of the random samples.
+        pairs: File with two photo names per line.
+        threads: Number of threads, -1 for all.
+        seed: Seed of the random samples.
 
     Returns:
-        "verified": [name, name, number of matches] of the pairs that have some.
+        "verified": [name, name, number of matches] for each pair with matches.
     """
     pycolmap.set_random_seed(seed)
     matching = pycolmap.FeatureMatchingOptions()
@@ -143,25 +144,26 @@ def mapping(
     threads: int,
     seed: int,
 ) -> dict[str, Any]:
-    """Find poses and points, in one way.
+    """Find poses and points, in one attempt.
 
     Args:
-        tell: Told how many photos have a pose.
+        tell: Called with the number of photos that have a pose.
         database: The database with features and matches; not changed.
         photos: Folder of the photos, for the colours of the points.
-        out: Folder for the models; it is empty.
-        attempt: "mapper", "incremental" or "global"; "model", the cameras' model, or "auto" to find out how much of it
-            the photos tell; "free", whether photos are placed with `FREE_LENS` before that is found out; "per_photo",
-            whether every photo has a camera of its own; "loose", whether thresholds are low.
-        shared: Cameras that are replaced by a camera of the same aspect, by their numbers.
-        threads: Threads, -1 for all.
-        seed: Of all random draws.
+        out: An empty folder for the models.
+        attempt: "mapper": "incremental" or "global"; "model": the camera model, or "auto" to choose it by
+            cross-validation; "free": map with `FREE_LENS` before that choice; "per_photo": give every photo its own
+            camera; "loose": use lower thresholds.
+        shared: For each replaced camera, the number of its replacement, which has the same aspect ratio.
+        threads: Number of threads, -1 for all.
+        seed: Seed of all random draws.
 
     Returns:
-        "models", of each: its "folder" in `out`, "names" of the photos whose pose counts, "doubtful" those of the
-        photos whose pose does not, "unclear" those of them whose focal length is why, "points", "steady", those that
-        three photos see, "agreement", the share of all matches that fit the poses, "lens", what was refined of the
-        camera with the most photos, and "error", the mean reprojection error in px of the photos that were given.
+        "models", each with its "folder" in `out`; the "names" of the photos whose pose counts; "doubtful", the photos
+        whose pose does not; "unclear", those of them with an ambiguous focal length; "points", their number; "steady",
+        the number of points that three photos see; "agreement", the fraction of all matches that fit the poses; "lens",
+        the refined lens of the camera with the most photos; and "error", the mean reprojection error in px of the given
+        photos.
     """
     pycolmap.set_random_seed(seed)
     lens = FREE_LENS if attempt["free"] else FIRST_LENS if attempt["model"] == "auto" else attempt["model"]
@@ -189,7 +191,7 @@ def _judged(
     attempt: dict[str, Any],
     options: Options,
 ) -> dict[str, Any] | None:
-    """Keep what counts of a mapper's model, refine it, and write it to a folder; None where nothing is left."""
+    """Keep the photos of a mapper's model whose pose counts, refine it, and write it; None if nothing remains."""
     auto, per_photo = attempt["model"] == "auto", attempt["per_photo"]
     placed, kin, unclear = _names(begun), dict[int, Kin](), list[str]()
     model = mended(begun, database, photos, folder, options)
@@ -223,7 +225,7 @@ def _names(model: pycolmap.Reconstruction) -> list[str]:
 
 
 def _main_camera(model: pycolmap.Reconstruction) -> int:
-    """Return the camera of most photos."""
+    """Return the camera with the most photos."""
     photos = Counter(model.image(image).camera_id for image in model.reg_image_ids())
     return max(sorted(photos), key=lambda camera: photos[camera])
 
@@ -237,26 +239,26 @@ def finish(
     scale: float,
     photos: dict[str, dict[str, Any]],
 ) -> dict[str, Any]:
-    """Write a model again, in another frame, with the pinhole cameras of the undistorted photos.
+    """Transform a model to another frame, and write it with the pinhole cameras of the undistorted photos.
 
     Args:
-        tell: Told how many photos are done.
+        tell: Called with the number of photos done.
         model: Folder of the model.
-        out: Folder to write to; made.
+        out: Folder to write to; it is created.
         rotation: R of x' = scale R x + move.
-        move: Its shift, world units.
-        scale: Its factor.
-        photos: By the names in the model, those that are kept: "name" to write, size "W" and "H", intrinsics
-            "fx", "fy", "cx", "cy" with the first pixel's centre at (0.5, 0.5), and "turns", by how many quarters
-            the photo was turned clockwise.
+        move: Translation, world units.
+        scale: Scale factor.
+        photos: The photos to keep, by their names in the model: new "name", size "W" and "H", intrinsics "fx", "fy",
+            "cx", "cy" with the first pixel's centre at (0.5, 0.5), and "turns", the number of clockwise quarter turns
+            applied to the photo.
 
     Returns:
-        "points", how many there are, and "error", their mean reprojection error in px of the new photos.
+        "points", their number, and "error", their mean reprojection error in px of the new photos.
     """
     before = pycolmap.Reconstruction(model)
     before.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(np.array(rotation)), np.array(move)))
     after, cameras = pycolmap.Reconstruction(), dict[tuple[float, ...], int]()
-    kept: dict[int, dict[int, tuple[int, int]]] = {}  # of each point, its observations
+    kept: dict[int, dict[int, tuple[int, int]]] = {}  # observations by point
     by_name = sorted(
         (photos[before.image(i).name]["name"], i)
         for i in before.reg_image_ids()
@@ -302,15 +304,15 @@ JOBS: dict[str, Callable[..., dict[str, Any]]] = {
 
 
 def main() -> int:
-    """Do the job that stdin describes."""
+    """Run the job described on stdin."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches this process too, but its parent decides
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # whatever else is printed goes to the log
+    os.dup2(2, 1)  # all other output goes to the log
 
     def answer(value: dict[str, Any]) -> None:
         try:
             print(json.dumps(value), file=answers, flush=True)
-        except OSError:  # nobody waits for the result any more
+        except OSError:  # the parent has gone
             os._exit(1)
 
     parent = os.getppid()
@@ -318,7 +320,7 @@ def main() -> int:
     def end_with_parent() -> None:
         while os.getppid() == parent:
             time.sleep(1.0)
-        os._exit(1)  # a later run must not meet this one in the database
+        os._exit(1)  # a later run must not find this process using the database
 
     threading.Thread(target=end_with_parent, daemon=True).start()
     order = json.load(sys.stdin)

@@ -1,4 +1,4 @@
-"""Which poses of a model count: those that enough points fix, and that the photos' matches do not contradict."""
+"""Decide which poses count: those that enough points determine and the photos' matches do not contradict."""
 
 from __future__ import annotations
 
@@ -10,62 +10,62 @@ import pycolmap
 from .database import opened
 
 SUPPORT = 30
-"""Points that fix a pose: COLMAP's own bound for placing a photo in a model."""
+"""Smallest number of points that determine a pose: COLMAP's own bound for registering a photo."""
 
 STEADY = 15
-"""Of these, points that two photos with a counting pose see as well. A point that only one other photo sees says
-nothing about how far apart the two photos stand: half the support may be of that kind."""
+"""Of these, smallest number that are also seen by two photos whose pose counts. A point seen by only one other
+photo does not determine the distance between the two photos; half the support may be of this kind."""
 
 SPREAD = 0.02
-"""Least standard deviation of the support in the photo, along any direction, as a share of the longer side. Points on a
-line or in one spot leave the pose open; an object that takes up a tenth of the photo's width has 0.03."""
+"""Smallest standard deviation of the supporting points in the photo, along any direction, as a fraction of the longer
+side. Points on a line or in one spot do not determine the pose. An object as wide as a tenth of the photo has 0.03."""
 
 REPROJECTED = 4.0
 """Largest reprojection error of a point that supports a pose, px: COLMAP's own bound when it filters points."""
 
 AGREED = 4.0
-"""Distance from the epipolar line up to which a match agrees with two poses, px: the bound of its verification."""
+"""Largest distance of a match from the epipolar line at which it agrees with two poses, px, as in its verification."""
 
 CONTRADICTED = 0.3
-"""Least share of a photo's matches that have to agree with its pose."""
+"""Smallest fraction of a photo's matches that have to agree with its pose."""
 
 PARALLAX = 1.5
-"""Least angle between the rays to a point, degrees: COLMAP's own bound when it filters points."""
+"""Smallest angle between the rays to a point, degrees: COLMAP's own bound when it filters points."""
 
 SCATTERED = 2.0
-"""Largest ratio of the 90th to the 10th percentile of the focal lengths where every photo has a camera of its own. For
-one lens it is about 1.1. Cameras in wrong places absorb that in their focal lengths: 2.7 on a capture of a box with
-four equal sides. In between is a zoom that was used within its range."""
+"""Largest ratio of the 90th to the 10th percentile of the focal lengths if every photo has its own camera. For one lens
+it is about 1.1. Misplaced cameras compensate with their focal lengths: 2.7 on a capture of a box with four equal sides.
+A zoom lens lies in between."""
 
 
 class Agreement(NamedTuple):
-    """How many verified matches agree with the poses, by photo."""
+    """Number of verified matches, and of those that agree with the poses, by photo."""
 
     agree: dict[int, int]
     total: dict[int, int]
 
     @property
     def share(self) -> float:
-        """Share of all matches that agree."""
+        """Fraction of all matches that agree."""
         return sum(self.agree.values()) / max(1, sum(self.total.values()))
 
     @property
     def contradictory(self) -> set[int]:
-        """Photos most of whose matches do not fit their poses."""
+        """Photos with too few matches that fit their poses."""
         return {image for image in self.total if self.agree[image] < CONTRADICTED * self.total[image]}
 
 
 def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
     """Find the photos whose poses do not count.
 
-    A pose counts if `SUPPORT` points, spread over the photo, fix it to photos whose poses count; `STEADY` of them have
-    to be seen by two such photos. The first two are those that share the most points.
+    A pose counts if the photo shares `SUPPORT` points, spread over the photo, with photos whose poses count; two such
+    photos have to see `STEADY` of them. The search starts with the two photos that share the most points.
 
     Args:
         model: The model.
 
     Returns:
-        How many points fix the pose to the others, by the numbers of the photos.
+        For each of these photos, by number, how many points it shares with photos whose poses count.
     """
     seen = {image: _observations(model, image) for image in sorted(model.reg_image_ids())}
     size = 1 + max((int(points.max()) for points, _ in seen.values() if len(points)), default=0)
@@ -85,7 +85,7 @@ def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
 def _grown(
     seen: dict[int, tuple[np.ndarray, np.ndarray]], left: set[int], size: int, model: pycolmap.Reconstruction
 ) -> set[int]:
-    """Start with the two photos that share the most points, and add what they and the added ones support."""
+    """Start with the two photos that share the most points, and repeatedly add the photos that they support."""
     first = max(sorted(left), key=lambda image: len(seen[image][0]))
     count = _counts(seen, {first}, size)
     shared = {image: int(count[seen[image][0]].sum()) for image in sorted(left - {first})}
@@ -106,7 +106,7 @@ def _grown(
 
 
 def _supported(count: np.ndarray, places: np.ndarray, longest: int) -> bool:
-    """Say whether points fix a pose, given how many counting photos see each."""
+    """Return whether points determine a pose, given how many photos whose pose counts see each."""
     if (count > 0).sum() < SUPPORT or (count > 1).sum() < STEADY:
         return False
     covariance = np.cov(places[count > 0].T)
@@ -127,18 +127,18 @@ def _longest(model: pycolmap.Reconstruction, image: int) -> int:
 
 
 def _observations(model: pycolmap.Reconstruction, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points that a photo sees where they are, and where: numbers (n,) and places (n, 2) in px."""
+    """Return the points with a small reprojection error in a photo: numbers (n,) and places (n, 2) in px."""
     points, places, errors = residuals(model, number)
     good = errors < REPROJECTED
     return points[good], places[good]
 
 
 def residuals(model: pycolmap.Reconstruction, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what a photo sees of the model, each point once.
+    """Return the points that a photo sees, each once.
 
     Args:
         model: The model.
-        number: Of the photo.
+        number: Number of the photo.
 
     Returns:
         numbers of the points (n,), places in the photo (n, 2) px, and reprojection errors (n,) px; infinite for points
@@ -160,11 +160,11 @@ def residuals(model: pycolmap.Reconstruction, number: int) -> tuple[np.ndarray, 
 
 
 def agreement(model: pycolmap.Reconstruction, database: str) -> Agreement:
-    """Compare the matches of every two photos with their poses, by the Sampson distance.
+    """Compare the matches of all pairs of photos with their poses, by the Sampson distance.
 
     Args:
         model: The model.
-        database: Holds the verified matches.
+        database: The database with the verified matches.
     """
     found = Agreement({}, {})
     registered = set(model.reg_image_ids())
@@ -191,7 +191,7 @@ def agreement(model: pycolmap.Reconstruction, database: str) -> Agreement:
 
 
 def _sampson(relative: pycolmap.Rigid3d, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return distances from the epipolar lines, to first order, on the plane at depth 1."""
+    """Return first-order distances from the epipolar lines, on the plane at depth 1."""
     E = pycolmap.essential_matrix_from_pose(relative)
     Ea, Eb = a @ E.T, b @ E
     slopes = (Ea[:, :2] ** 2).sum(axis=1) + (Eb[:, :2] ** 2).sum(axis=1)
@@ -199,10 +199,10 @@ def _sampson(relative: pycolmap.Rigid3d, a: np.ndarray, b: np.ndarray) -> np.nda
 
 
 def take_out(model: pycolmap.Reconstruction, images: set[int]) -> None:
-    """Take photos out of a model, and the points that lose what held them.
+    """Remove photos from a model, and the points that are no longer supported.
 
     Args:
-        model: Changed.
+        model: The model; changed in place.
         images: Numbers of the photos.
     """
     for image in sorted(images):
@@ -212,12 +212,12 @@ def take_out(model: pycolmap.Reconstruction, images: set[int]) -> None:
 
 
 def steady_points(model: pycolmap.Reconstruction) -> int:
-    """Count the points that three photos and more see."""
+    """Count the points seen by at least three photos."""
     return sum(model.point3D(point).track.length() >= 3 for point in model.point3D_ids())
 
 
 def scattered(model: pycolmap.Reconstruction) -> bool:
-    """Say whether the focal lengths of a model's photos, as shares of their longer sides, are all over the place."""
+    """Return whether the focal lengths of a model's photos, relative to their longer sides, vary too much."""
     cameras = [model.camera(model.image(image).camera_id) for image in sorted(model.reg_image_ids())]
     shares = [camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras]
     low, high = np.quantile(shares, (0.1, 0.9))

@@ -1,8 +1,9 @@
-"""Photos of other sizes: scaled or cropped ones of the main camera, or those of another lens.
+"""Photos of other sizes: scaled or cropped photos of the main camera, or photos of another lens.
 
-Photos of one size share a camera. A few of another size fix a focal length badly: the mapper then places them nearer or
-farther with a wrong one, and every point they see still fits. They are placed anew, beside the photos of the main
-camera only, with each focal length that scaling or cropping would give them, and with the one that suits them best.
+Photos of one size share a camera. A few photos of another size determine a focal length poorly: with a wrong one, the
+mapper places them nearer or farther, and every point they see still fits. They are therefore registered again, against
+the photos of the main camera only, with each focal length that scaling or cropping would give them, and with the one
+that fits them best.
 """
 
 from __future__ import annotations
@@ -21,32 +22,32 @@ from .lenses import Kin, adjust
 from .mappers import Options
 
 OWN = 10
-"""Photos from which a camera's focal length is its own matter."""
+"""Number of photos from which a camera's own focal length is trusted."""
 
 LEAST = 5
-"""Least photos of cameras that stand for themselves; others are compared with nothing less."""
+"""Smallest number of photos with trusted cameras that the others are compared with."""
 
 PLACED = 15
-"""Least points that place a photo here; whether its pose counts is judged afterwards."""
+"""Smallest number of points that register a photo here; `judge` decides later whether its pose counts."""
 
 INLIER = 4.0
-"""Farthest that a point may be from its place in the photo, px, as in `judge.REPROJECTED`."""
+"""Largest reprojection error of a point, px, as in `judge.REPROJECTED`."""
 
 AS_GOOD = 0.95
-"""Share of the best focal length's score from which another one explains the photos as well."""
+"""Another focal length explains the photos equally well from this fraction of the best one's score."""
 
 NEARLY_AS_GOOD = 0.9
-"""The same for those that are fitted to the photos themselves: they always explain these a little better."""
+"""The same for focal lengths fitted to the photos themselves, which always explain them slightly better."""
 
 APART = 1.1
-"""Factor from which two focal lengths are different ones."""
+"""Smallest ratio at which two focal lengths count as different."""
 
 ROUNDS = 3
-"""Photos that see only others of this kind are placed after those."""
+"""Rounds of registration: photos that overlap only with other photos of this kind follow in a later round."""
 
 
 class Seen(NamedTuple):
-    """What a photo sees of the model: places (n, 2) px, points (n, 3), by its verified matches."""
+    """The points of the model that a photo sees by its verified matches: places (n, 2) px, points (n, 3)."""
 
     places: np.ndarray
     points: np.ndarray
@@ -55,20 +56,20 @@ class Seen(NamedTuple):
 def placed_anew(
     model: pycolmap.Reconstruction, database: str, photos: str, folder: Path, options: Options
 ) -> tuple[pycolmap.Reconstruction, dict[int, Kin], set[int]]:
-    """Place the photos of cameras that have few, with a focal length that the main camera's explains.
+    """Register the photos of cameras with few photos again, if possible with a focal length related to the main one.
 
-    A camera whose photos two different focal lengths explain equally well loses them.
+    If two different focal lengths explain the photos of a camera equally well, these photos are removed.
 
     Args:
-        model: A model all of whose poses count; not changed.
-        database: With features and matches, and which focal lengths EXIF gave.
+        model: A model in which all poses count; not changed.
+        database: Features, matches, and whether EXIF gave a camera's focal length.
         photos: Folder of the photos.
-        folder: For the work.
+        folder: Work folder.
         options: Threads and seed.
 
     Returns:
-        The model, the cameras that are scaled or cropped versions of another one, and the photos that were taken out
-        because no single focal length explains them.
+        The model, the cameras that are scaled or cropped versions of another one, and the photos removed because no
+        single focal length explains them.
     """
     images = {
         camera: [i for i in sorted(model.reg_image_ids()) if model.image(i).camera_id == camera]
@@ -108,7 +109,7 @@ def _placed(
     kin: dict[int, Kin],
     seed: int,
 ) -> set[int]:
-    """Give photos poses beside the model; return which."""
+    """Register photos against the model; return those that were registered."""
     found = set[int]()
     for camera, images in sorted(left.items()):
         seen = {image: _seen(rest, database, image) for image in images}
@@ -134,7 +135,7 @@ def _placed(
 
 
 def _factors(lens: pycolmap.Camera, main: pycolmap.Camera) -> list[float]:
-    """List the ratios of focal lengths that scaling, cropping, and both give; different ones only."""
+    """List the distinct ratios of focal lengths that result from scaling, cropping, or both."""
     sides = [sorted((camera.width, camera.height)) for camera in (lens, main)]
     found = list[float]()
     for factor in (sides[0][1] / sides[1][1], sides[0][0] / sides[1][0], 1.0):
@@ -150,7 +151,7 @@ def _apart(a: float, b: float) -> bool:
 def _explained(
     lens: pycolmap.Camera, main: pycolmap.Camera, seen: dict[int, Seen], before: Kin | None, seed: int
 ) -> tuple[float | None, list[int]]:
-    """Return the focal length that explains photos, px, None where several do, and the photos that it explains."""
+    """Return the focal length that explains the photos, px (None if several do), and the photos it explains."""
     related = [factor * main.mean_focal_length() for factor in _factors(lens, main)]
     own = [focal for one in seen.values() if (focal := _own_focal(lens, one, seed)) is not None]
     scores = {
@@ -174,7 +175,7 @@ def _explained(
 
 
 def _chosen(related: list[float], scores: dict[float, np.ndarray]) -> float | None:
-    """Choose by the scores of all photos together; a focal length that another size explains is preferred."""
+    """Choose by the total score of all photos; a focal length related to the main one is preferred."""
     total = {focal: float(score.sum()) for focal, score in scores.items()}
     best = max(total, key=lambda focal: total[focal])
     most = max(total[focal] for focal in related)
@@ -185,7 +186,7 @@ def _chosen(related: list[float], scores: dict[float, np.ndarray]) -> float | No
 
 
 def _score(lens: pycolmap.Camera, main: pycolmap.Camera, focal: float, one: Seen, seed: int) -> float:
-    """Say how well a focal length explains a photo: about the number of points that lie where they are seen."""
+    """Score how well a focal length explains a photo: about the number of points with a small reprojection error."""
     trial = copy.deepcopy(lens)
     _set_lens(trial, main, focal)
     pose, _ = _pose(trial, one, seed)
@@ -193,7 +194,7 @@ def _score(lens: pycolmap.Camera, main: pycolmap.Camera, focal: float, one: Seen
 
 
 def _set_lens(lens: pycolmap.Camera, main: pycolmap.Camera, focal: float) -> None:
-    """Give a camera a focal length, and the distortion of the main one, which does not depend on the size."""
+    """Set a camera's focal length, and copy the main one's distortion, which does not depend on the size."""
     params = np.array(lens.params)
     params[list(lens.focal_length_idxs())] = focal
     if lens.model == main.model:
@@ -208,7 +209,7 @@ def _estimation(seed: int) -> pycolmap.AbsolutePoseEstimationOptions:
 
 
 def _pose(lens: pycolmap.Camera, one: Seen, seed: int) -> tuple[pycolmap.Rigid3d | None, int]:
-    """Place a photo with a known lens; return its pose and how many points agree."""
+    """Register a photo with a known lens; return its pose and the number of inliers."""
     found = pycolmap.estimate_and_refine_absolute_pose(
         one.places, one.points, copy.deepcopy(lens), _estimation(seed)
     )
@@ -218,7 +219,7 @@ def _pose(lens: pycolmap.Camera, one: Seen, seed: int) -> tuple[pycolmap.Rigid3d
 
 
 def _own_focal(lens: pycolmap.Camera, one: Seen, seed: int) -> float | None:
-    """Return the focal length that suits one photo best, px."""
+    """Return the focal length that fits one photo best, px."""
     trial, estimation = copy.deepcopy(lens), _estimation(seed)
     refinement = pycolmap.AbsolutePoseRefinementOptions()
     estimation.estimate_focal_length = refinement.refine_focal_length = True
@@ -227,7 +228,7 @@ def _own_focal(lens: pycolmap.Camera, one: Seen, seed: int) -> float | None:
 
 
 def _errors(lens: pycolmap.Camera, pose: pycolmap.Rigid3d, one: Seen) -> np.ndarray:
-    """Return the distances of points from their places, px; large for those behind the camera."""
+    """Return the reprojection errors, px; large for points behind the camera."""
     local = one.points @ pose.rotation.matrix().T + pose.translation
     ahead = local[:, 2] > 0
     found = np.array(lens.img_from_cam(np.where(ahead[:, None], local, [0.0, 0.0, 1.0])), dtype=np.float64)
@@ -236,7 +237,7 @@ def _errors(lens: pycolmap.Camera, pose: pycolmap.Rigid3d, one: Seen) -> np.ndar
 
 
 def _seen(model: pycolmap.Reconstruction, database: str, number: int) -> Seen:
-    """Collect the points of the model that a photo's matches lead to, each feature with the one named most often."""
+    """Collect the points of the model that a photo's matches refer to; each feature gets its most frequent point."""
     votes = dict[int, Counter[int]]()
     with opened(database) as reader:
         keypoints = reader.read_keypoints(number)[:, :2].astype(np.float64)
@@ -260,7 +261,7 @@ def _seen(model: pycolmap.Reconstruction, database: str, number: int) -> Seen:
 def _triangulated(
     model: pycolmap.Reconstruction, database: str, photos: str, folder: Path, options: Options
 ) -> pycolmap.Reconstruction:
-    """Find the points of all photos anew, with their poses and lenses as they are."""
+    """Triangulate the points of all photos again, with fixed poses and lenses."""
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.num_threads, pipeline.random_seed = options.threads, options.seed
     return pycolmap.triangulate_points(model, database, photos, str(folder), options=pipeline)

@@ -1,9 +1,9 @@
-"""How much of a camera the photos tell: which intrinsics are refined, judged on photos that had no part in it.
+"""Choose which intrinsics of a camera are refined, by cross-validation on its photos.
 
-Every camera begins with one focal length, one coefficient of distortion and the principal point in the middle. More
-freedom always fits the photos it was fitted to better; few photos, or poor geometry, then give intrinsics that no
-camera has. So a camera's photos are divided in two. Intrinsics found on one half are held while the poses and points of
-the other half are refined: only intrinsics that explain those photos better, both ways round, are worth having.
+Every camera starts with one focal length, one distortion coefficient and a centred principal point. More freedom always
+fits the photos used for the fit better; with few photos or poor geometry it yields implausible intrinsics. A camera's
+photos are therefore split in two halves. The intrinsics found on one half are held fixed while the poses and points of
+the other half are refined. A freer model is accepted only if it explains the other half better, in both directions.
 """
 
 from __future__ import annotations
@@ -18,35 +18,35 @@ import pycolmap
 from .judge import residuals, take_out
 
 WITNESSES = 20
-"""Photos of a camera from which more than the first lens model is considered: ten in either half."""
+"""Smallest number of photos of a camera for which freer lens models are considered: ten in each half."""
 
 HALF = 30
-"""Most photos of a half: more cost time and tell nothing new."""
+"""Largest number of photos in a half: more take time without changing the result."""
 
 SEEN = 30
-"""Points that a photo of a half has to see, median, for the half to be a judge."""
+"""Smallest median number of points seen by a half's photos for the comparison to be meaningful."""
 
 GAIN = 0.02
-"""Least share by which a freer lens has to lower the error in the other half's photos."""
+"""Smallest fraction by which a freer lens has to reduce the error in the other half's photos."""
 
 CENTRED = 0.1
-"""Farthest that a principal point may be from the middle, as a share of the size."""
+"""Largest distance of a principal point from the image centre, as a fraction of the size."""
 
 REFINEMENTS = 30
-"""Of the adjustments that judge; they begin at the solution of a simpler lens."""
+"""Iterations of the adjustments for cross-validation, which start from the solution of a simpler lens."""
 
 FOLLOWED = 2
-"""Rounds of adjusting in which cameras that follow another one take over its lens."""
+"""Rounds of adjustment in which cameras that follow another one copy its lens."""
 
 
 class Rung(NamedTuple):
-    """What is refined of a camera."""
+    """The parameters of a camera that are refined."""
 
     model: str
     centre: bool
 
     def __str__(self) -> str:
-        """Name it."""
+        """Return the name used in messages."""
         return f"{self.model}, free centre" if self.centre else self.model
 
 
@@ -56,11 +56,11 @@ LENS_LADDER = (
     Rung("OPENCV", centre=False),
     Rung("OPENCV", centre=True),
 )
-"""Lens models in the order of their freedom: 2, 3, 6 and 8 numbers."""
+"""Lens models with increasing freedom: 2, 3, 6 and 8 parameters."""
 
 
 class Kin(NamedTuple):
-    """A camera whose photos are scaled or cropped ones of another camera: that one, and the ratio of focal lengths."""
+    """Link from a camera with scaled or cropped photos to its main camera, with the ratio of focal lengths."""
 
     main: int
     factor: float
@@ -69,16 +69,16 @@ class Kin(NamedTuple):
 def refined(
     model: pycolmap.Reconstruction, climb: bool, threads: int, kin: dict[int, Kin] | None = None
 ) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
-    """Adjust everything once more, with as much freedom for each camera as its photos support.
+    """Run a final bundle adjustment, with as much freedom for each camera as its photos support.
 
     Args:
-        model: A model whose cameras all have the lens model it was mapped with.
-        climb: Whether freer lens models than that are considered; the principal point always is.
-        threads: Threads.
-        kin: Cameras that follow another one, by their numbers.
+        model: A model in which all cameras have the lens model used for mapping.
+        climb: Whether freer lens models are considered; a free principal point always is.
+        threads: Number of threads.
+        kin: Cameras that follow another one, by number.
 
     Returns:
-        The adjusted model, and by the numbers of the cameras, what was refined of each.
+        The adjusted model, and the refined parameters of each camera, by number.
     """
     photos = Counter(model.image(image).camera_id for image in model.reg_image_ids())
     kin = {camera: one for camera, one in (kin or {}).items() if camera in photos}
@@ -108,14 +108,14 @@ def refined(
 
 
 def simplified(model: pycolmap.Reconstruction, name: str, threads: int) -> None:
-    """Give all cameras a simpler lens model and the principal point in the middle, and adjust everything.
+    """Give all cameras a simpler lens model with a centred principal point, and run a bundle adjustment.
 
-    How much more their photos support can then be judged by `refined`, as in models that were mapped so.
+    `refined` can then choose the freedom that their photos support, as for models mapped with that lens model.
 
     Args:
-        model: Changed.
-        name: Of the lens model, with one focal length.
-        threads: Threads.
+        model: The model; changed in place.
+        name: Name of a lens model with one focal length.
+        threads: Number of threads.
     """
     for number, camera in model.cameras.items():
         bends = [camera.params[i] for i in camera.extra_params_idxs()]
@@ -131,7 +131,7 @@ def simplified(model: pycolmap.Reconstruction, name: str, threads: int) -> None:
 
 
 def _follow(model: pycolmap.Reconstruction, kin: dict[int, Kin]) -> None:
-    """Give cameras the lens of the one they follow, at their scale; the middle moves in proportion."""
+    """Copy to cameras the lens of the one they follow, at their scale; the principal point's offset scales too."""
     for number, one in kin.items():
         camera, main = model.camera(number), model.camera(one.main)
         params = np.array(main.params)
@@ -144,7 +144,7 @@ def _follow(model: pycolmap.Reconstruction, kin: dict[int, Kin]) -> None:
 
 
 def _climbed(model: pycolmap.Reconstruction, camera: int, climb: bool, threads: int) -> Rung:
-    """Return the last rung that explains photos better that had no part in it."""
+    """Return the freest rung that still improves the fit of held-out photos."""
     given = Rung(model.camera(camera).model_name, centre=False)
     rungs = (
         [rung for rung in LENS_LADDER if rung.model != given.model]
@@ -172,7 +172,7 @@ def _climbed(model: pycolmap.Reconstruction, camera: int, climb: bool, threads: 
 
 
 def _errors(halves: list[pycolmap.Reconstruction], rung: Rung, threads: int) -> list[float]:
-    """Return, for either half, the error of its photos with the intrinsics that the other half found."""
+    """Return, for each half, the error of its photos with the intrinsics found on the other half."""
     found = []
     for one, other in ((0, 1), (1, 0)):
         teacher, judge = copy.deepcopy(halves[one]), copy.deepcopy(halves[other])
@@ -191,13 +191,13 @@ def _errors(halves: list[pycolmap.Reconstruction], rung: Rung, threads: int) -> 
 
 
 def _error(model: pycolmap.Reconstruction) -> float:
-    """Return the mean reprojection error, px; large ones count as their root, so that no wrong match decides."""
+    """Return the mean reprojection error, px, with a soft L1 loss that limits the effect of wrong matches."""
     errors = np.concatenate([residuals(model, image)[2] for image in sorted(model.reg_image_ids())])
     return float(np.mean(2.0 * (np.sqrt(1.0 + np.minimum(errors, 1e6)) - 1.0)))
 
 
 def _part(model: pycolmap.Reconstruction, images: set[int]) -> pycolmap.Reconstruction:
-    """Return the model of some of its photos."""
+    """Return the model reduced to some of its photos."""
     part = copy.deepcopy(model)
     take_out(part, set(part.reg_image_ids()) - images)
     return part
@@ -208,7 +208,7 @@ def _median_seen(model: pycolmap.Reconstruction) -> float:
 
 
 def _change(camera: pycolmap.Camera, name: str) -> None:
-    """Give a camera another lens model that bends light as it did before; models only gain numbers here."""
+    """Change a camera's lens model without changing its distortion; the new model never has fewer parameters."""
     if camera.model_name == name:
         return
     focal, (x, y) = camera.focal_length_x, (camera.principal_point_x, camera.principal_point_y)
@@ -231,7 +231,7 @@ def adjust(
     centre: bool = False,
     fixed: set[int] | None = None,
 ) -> None:
-    """Adjust poses, points and intrinsics; those of some cameras may be held."""
+    """Adjust poses, points and intrinsics; the intrinsics of some cameras may be held fixed."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point, options.print_summary = centre, False
     options.ceres.use_gpu = False
@@ -249,6 +249,6 @@ def adjust(
 
 
 def _believable(camera: pycolmap.Camera) -> bool:
-    """Say whether intrinsics may be a camera's."""
+    """Return whether intrinsics are plausible."""
     x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
     return max(abs(x - 0.5), abs(y - 0.5)) <= CENTRED and not camera.has_bogus_params(0.1, 10.0, 1.0)

@@ -1,1 +1,1 @@
-"""Density control: where the scene needs more Gaussians, and which ones it can do without."""
+"""Density control: add Gaussians where the scene needs them and remove superfluous ones."""

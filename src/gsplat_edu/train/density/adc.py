@@ -1,6 +1,6 @@
 """Adaptive density control: clone, split and prune by the gradient of the means in the image; reset opacities.
 
-`gsplat_edu.train.config` holds its numbers.
+Its settings are in `gsplat_edu.train.config`.
 
 Chapter: 09_train_in_3d.
 """
@@ -24,21 +24,21 @@ from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.saved import check_entries, check_flag, check_statistics, check_torch_generator
 
 STATISTICS = ("norm_sums", "times_visible", "largest_radii")
-"""What is kept of each Gaussian since the last densification."""
+"""Statistics collected for each Gaussian since the last densification."""
 
 
 class AdaptiveDensityControl:
-    """Clone the small, split the large, prune the faint.
+    """Clone small Gaussians, split large ones, prune faint ones.
 
-    Where the loss pulls hard on a Gaussian's place in the image, one Gaussian is not enough: a small one is
-    copied, a large one gives way to two smaller ones drawn from it. Now and then all opacities are lowered, and
-    what nobody needs stays faint and is pruned.
+    A large gradient of a Gaussian's image-plane mean shows that one Gaussian is not enough: a small one is cloned, and
+    a large one is replaced by two smaller ones drawn from it. All opacities are lowered periodically; superfluous
+    Gaussians then stay faint and are pruned.
 
     Args:
         config: Window, thresholds and cap.
         extent: Size of the scene, world units.
         generator: Source of the split children's positions.
-        gaussians: What training starts from.
+        gaussians: The start Gaussians.
 
     Source: Kerbl et al. 2023, section 5.2.
     """
@@ -51,7 +51,7 @@ class AdaptiveDensityControl:
         self._forget(gaussians)
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
-        """Add this view's gradient norms to those of the Gaussians it shows."""
+        """Add this view's gradient norms to the sums of the Gaussians it shows."""
         if self.is_over:
             return
         self.norm_sums[output.visible] += output.means2d_grad_norms()
@@ -62,7 +62,7 @@ class AdaptiveDensityControl:
 
     @torch.no_grad()
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
-        """Clone, split, prune and reset where the schedule has it."""
+        """Clone, split, prune and reset when the schedule says so."""
         config, events = self.config, list[Change]()
         self.is_over = iteration + 1 >= config.adc.densify_stop
         if iteration >= config.adc.densify_stop:
@@ -104,7 +104,7 @@ class AdaptiveDensityControl:
         return replaced, DensifyEvent(iteration, *counts, num_gaussians=len(replaced))
 
     def _within_cap(self, pull: Tensor, hot: Bool[Tensor, " N"], num_kept: int) -> Bool[Tensor, " N"]:
-        """Leave as many as there is room for, those pulled hardest; a clone and a split each add one Gaussian."""
+        """Keep as many as the cap allows, those with the largest gradients; a clone or a split adds one Gaussian."""
         room = (
             len(pull) if self.config.max_gaussians is None else max(self.config.max_gaussians - num_kept, 0)
         )

@@ -1,4 +1,4 @@
-"""What the trainer asks of a density strategy."""
+"""The interface between the trainer and a density strategy."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from gsplat_edu.train.events import Change
 from gsplat_edu.train.optimizer import Adam
 
 State = tuple[dict[str, Tensor], dict[str, Any]]
-"""What a checkpoint keeps: tensors by name, and what JSON can hold."""
+"""The state in a checkpoint: tensors by name, and values that JSON can represent."""
 
 
 @runtime_checkable
 class DensityStrategy(Protocol):
-    """Watches every step and, now and then, changes the Gaussians.
+    """Observes every step and periodically changes the Gaussians.
 
-    The trainer calls both methods with torch on one thread, so that their answer does not depend on how many
-    there are.
+    The trainer calls `observe` and `update` with torch on one thread, so that their results do not depend on the
+    number of threads.
     """
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
-        """Look at a render whose backward has run, before the optimiser steps; a step shows every view it renders."""
+        """Observe a render after its backward pass and before the optimiser steps; called for every view of a step."""
         ...
 
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Change the Gaussians after a step, and the optimiser's moments with them.
 
         Returns:
-            The Gaussians, leaves that collect gradients, which may be those given, changed in place or not; and
-            what was done, for those who listen.
+            The Gaussians, as leaves that collect gradients: the given ones, possibly changed in place, or new ones;
+            and the changes, as events for the callbacks.
         """
         ...
 
     def state(self) -> State:
-        """Return what is needed to go on later as if nothing had happened."""
+        """Return the state from which a run resumes with identical results."""
         ...
 
     def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any], gaussians: Gaussians) -> None:
@@ -45,10 +45,10 @@ class DensityStrategy(Protocol):
 
         Args:
             tensors: The tensors, by name.
-            numbers: The rest.
+            numbers: The values that are not tensors.
             gaussians: The Gaussians that training resumes with.
 
         Raises:
-            ArgumentError: they are not what `state` returns for these Gaussians; nothing has changed.
+            ArgumentError: the state does not fit these Gaussians; nothing has changed.
         """
         ...

@@ -1,8 +1,9 @@
-"""Density control as Markov chain Monte Carlo: Gaussians are samples, and none is ever thrown away.
+"""Density control as Markov chain Monte Carlo: Gaussians are samples and are relocated, never removed.
 
-A Gaussian too faint to be seen is moved onto a living one, drawn by opacity, and the two share its place so that
-the image stays (nearly) as it was. The number grows by a few percent at a time up to a cap. Noise lets those that
-are not yet opaque wander; opacity and scale are kept small, so that superfluous ones die and are moved.
+A dead Gaussian, too faint to be visible, moves onto a living one drawn in proportion to opacity. Both get new
+opacities and scales that leave the image (nearly) unchanged. The number grows by a few percent at a time up to a cap.
+Noise moves Gaussians that are still faint. Regularisers keep opacity and scale small, so that superfluous Gaussians
+die and are relocated.
 
 Source: Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo".
 """
@@ -27,21 +28,21 @@ from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.saved import check_entries, check_torch_generator
 
 MOST_SHARERS = 51
-"""Most Gaussians that may share one place at a time; the sum below loses its digits beyond. (2024's code)"""
+"""Largest number of Gaussians that share one place; beyond it the sum below loses precision. (2024's code)"""
 
 NOISE_SHARPNESS = 100.0
-"""k of the noise's gate sigmoid(k (t - opacity)). (2024, eq. 9)"""
+"""k of the noise gate sigmoid(k (t - opacity)). (2024, eq. 9)"""
 
 NOISE_THRESHOLD = 0.005
-"""t of the gate: only Gaussians about as faint as the dead get all of the noise. (2024: 1 - 0.995)"""
+"""t of the gate: only Gaussians about as faint as dead ones get the full noise. (2024: 1 - 0.995)"""
 
 
 class MCMC:
-    """Relocate the dead, grow up to the cap, add noise; `gsplat_edu.train.objective` has its regularisers.
+    """Relocate dead Gaussians, grow up to the cap, add noise; its regularisers are in `gsplat_edu.train.objective`.
 
     Args:
         config: Window, growth and noise; `max_gaussians` has to be set.
-        generator: Source of the places and of the noise.
+        generator: Source of the draws and of the noise.
 
     Raises:
         ArgumentError: there is no cap.
@@ -53,11 +54,11 @@ class MCMC:
         self.config, self.generator, self.cap = config, generator, config.max_gaussians
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
-        """Do nothing: neither relocation nor growth asks for what the renders show."""
+        """Do nothing: neither relocation nor growth depends on the renders."""
 
     @torch.no_grad()
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
-        """Relocate and grow where the schedule has it; add noise after every step."""
+        """Relocate and grow when the schedule says so; add noise after every step."""
         config, events = self.config, list[Change]()
         due = config.densify_start < iteration < config.mcmc.stop and iteration % config.densify_every == 0
         if due and len(gaussians):
@@ -69,7 +70,7 @@ class MCMC:
         return gaussians, events
 
     def _relocate(self, gaussians: Gaussians, optimizer: Adam, dead: Int64[Tensor, " D"]) -> int:
-        """Move the dead onto living ones, in place. Where all are dead there is nowhere to go."""
+        """Move dead Gaussians onto living ones, in place. Do nothing if all are dead."""
         weights = gaussians.opacities.double()
         weights[dead] = 0.0
         if not len(dead) or not bool((weights > 0).any()):
@@ -96,14 +97,14 @@ class MCMC:
         return replace(gaussians, optimizer, keep, [newborn]), num_added
 
     def _draw(self, weights: Float[Tensor, " N"], count: int) -> Int64[Tensor, " count"]:
-        """Draw indices with replacement, each as probable as its weight."""
-        cumulated = torch.cumsum(weights.cpu(), dim=0)  # a GPU's has other bits every time
+        """Draw indices with replacement, with probabilities proportional to the weights."""
+        cumulated = torch.cumsum(weights.cpu(), dim=0)  # a GPU's sum differs from run to run
         uniform = torch.rand(count, generator=self.generator, dtype=torch.float64)
         places = torch.searchsorted(cumulated, uniform * cumulated[-1], right=True)
         return places.clamp(max=len(weights) - 1).to(weights.device)
 
     def _share(self, gaussians: Gaussians, optimizer: Adam, places: Int64[Tensor, " D"]) -> None:
-        """Make room at places for those that come: fainter and of another size, in place."""
+        """Adjust opacity and scale of the Gaussians at these places, in place, before others join them."""
         arrivals = torch.bincount(places, minlength=len(gaussians))
         hosts = torch.nonzero(arrivals)[:, 0]
         sharers = (arrivals[hosts] + 1).clamp(max=MOST_SHARERS)
@@ -117,9 +118,8 @@ class MCMC:
         """Means += rate noise sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I)."""
         means = gaussians.means
         generator = self.generator
-        if (
-            means.device.type != "cpu"
-        ):  # drawn where it is needed, from a seed that checkpoints keep on the CPU
+        # A GPU draws its own numbers, seeded by the CPU generator that checkpoints store.
+        if means.device.type != "cpu":
             seed = int(torch.randint(2**62, (1,), generator=self.generator))
             generator = torch.Generator(means.device).manual_seed(seed)
         draw = torch.randn(len(means), 3, generator=generator, dtype=means.dtype, device=means.device)
@@ -143,23 +143,23 @@ class MCMC:
 def shared_shape(
     opacities: Float[Tensor, " N"], sharers: Int64[Tensor, " N"]
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
-    """Work out what n Gaussians in one place have to be so that together they look like the one before.
+    """Compute opacity and scale factor so that n Gaussians in one place look like the single one before.
 
     o' = 1 - (1 - o)^(1/n),   scale' = scale o / (sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1))
 
     Args:
-        opacities: (N,) of the one, in (0, 1), float64.
+        opacities: (N,) opacity o of the single Gaussian, in (0, 1), float64.
         sharers: (N,) n, 1 to 51.
 
     Returns:
-        (N,) opacity of each of the n, and (N,) factor of its scales.
+        (N,) opacity of each of the n Gaussians, and (N,) factor on its scales.
 
     Source: Kheradmand et al. 2024, eq. 8 and 9.
     """
     each = 1 - (1 - opacities) ** (1 / sharers.double())
     total = torch.zeros_like(opacities)
     for k in range(MOST_SHARERS):
-        # sum_{i=k+1..n} C(i-1, k) = C(n, k+1), by the hockey stick of Pascal's triangle.
+        # sum_{i=k+1..n} C(i-1, k) = C(n, k+1), by the hockey-stick identity.
         log_binomial = _log_choose(sharers, k + 1)
         term = torch.exp(log_binomial + (k + 1) * torch.log(each)) / math.sqrt(k + 1)
         total += torch.where(sharers > k, term * (-1) ** k, 0.0)
@@ -167,6 +167,6 @@ def shared_shape(
 
 
 def _log_choose(n: Int64[Tensor, " N"], k: int) -> Float[Tensor, " N"]:
-    """Log C(n, k); where n < k the value is not used."""
+    """Return log C(n, k); the value for n < k is not used."""
     real = n.double().clamp(min=k)
     return torch.lgamma(real + 1) - math.lgamma(k + 1) - torch.lgamma(real - k + 1)

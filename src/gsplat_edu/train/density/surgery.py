@@ -1,4 +1,4 @@
-"""Cutting and adding Gaussians without losing what the optimiser knows of those that stay."""
+"""Add and remove Gaussians; the survivors keep their optimiser moments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def split_children(parents: Gaussians, shrink: float, generator: torch.Generator
 
     Args:
         parents: N Gaussians.
-        shrink: What the scales are divided by.
+        shrink: Divisor of the scales.
         generator: Source of n.
 
     Returns:
@@ -44,14 +44,14 @@ def replace(
     newborn: list[Gaussians],
     cap: int | None = None,
 ) -> Gaussians:
-    """Keep some Gaussians, add others behind them, and cut from the end what is over the cap.
+    """Keep some Gaussians, append others, and drop from the end those over the cap.
 
     Args:
-        gaussians: What there is.
-        optimizer: Its moments follow: survivors keep theirs, the newborn start from zero.
-        keep: (N,) true for those that stay.
-        newborn: What is added, in this order.
-        cap: Largest number of Gaussians afterwards; None for none.
+        gaussians: The N Gaussians.
+        optimizer: Its moments follow: survivors keep theirs, new Gaussians start from zero.
+        keep: (N,) true for the survivors.
+        newborn: Gaussians to append, in this order.
+        cap: Largest number of Gaussians afterwards; None for no cap.
 
     Returns:
         The new Gaussians, leaves that collect gradients.
