@@ -25,7 +25,7 @@ def test_right_kernels_pass_once(device, empty_cache, monkeypatch):
     assert self_check.cuda_failure(torch.device(device)) is None
     assert "triton" in empty_cache.read_text()
     self_check._failure.cache_clear()  # as a new process has it
-    monkeypatch.setattr(self_check, "difference", lambda device: "checked again")
+    monkeypatch.setattr(self_check, "kernel_error", lambda device: "checked again")
     assert self_check.cuda_failure(torch.device(device)) is None
 
 
@@ -33,7 +33,7 @@ def test_a_pass_does_not_cover_other_kernels(device, empty_cache, monkeypatch):
     empty_cache.parent.mkdir()
     for content in ("{", "[" * 100_000, '{"a": 1}', '["another device"]', "[1]"):
         empty_cache.write_text(content)
-        monkeypatch.setattr(self_check, "difference", lambda device: "checked again")
+        monkeypatch.setattr(self_check, "kernel_error", lambda device: "checked again")
         self_check._failure.cache_clear()
         assert self_check.cuda_failure(torch.device(device)) == "checked again"
 

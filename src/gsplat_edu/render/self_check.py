@@ -64,13 +64,13 @@ def _failure(device: torch.device) -> str | None:
     identity, passed = _identity(device), _passed()
     if identity in passed:
         return None
-    failure = difference(device)
+    failure = kernel_error(device)
     if failure is None:
         _remember([*passed, identity])
     return failure
 
 
-def difference(device: torch.device) -> str | None:
+def kernel_error(device: torch.device) -> str | None:
     """Render and differentiate the scene on a device, and compare the results with float64 on the CPU.
 
     Args:

@@ -80,11 +80,11 @@ class Objective:
     def backward(self, rendered: Rendered) -> dict[str, Float[Tensor, ""]]:
         """Add the gradients of the sum to the `grad` of its leaves; return the value of every term, detached."""
         values = {name: term(rendered) for name, term in self.terms.items()}
-        total(list(values.values())).backward()  # type: ignore[no-untyped-call]
+        sum_of_scalars(list(values.values())).backward()  # type: ignore[no-untyped-call]
         return {name: value.detach() for name, value in values.items()}
 
 
-def total(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
+def sum_of_scalars(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
     """Return the sum of scalars, left to right."""
     first, *others = values
     for value in others:

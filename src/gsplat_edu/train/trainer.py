@@ -26,7 +26,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.feed import Draw, ViewFeed
-from gsplat_edu.train.objective import PHOTO, Objective, Rendered, make_objective, total
+from gsplat_edu.train.objective import PHOTO, Objective, Rendered, make_objective, sum_of_scalars
 from gsplat_edu.train.optimizer import MOMENTS, Adam
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_tensor_kind, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, sh_degree
@@ -247,7 +247,7 @@ class Trainer:
             self.last_name = draw.view.name
         if len(found) == 1:
             return found[0]
-        return {name: total([values[name] for values in found]) / len(found) for name in found[0]}
+        return {name: sum_of_scalars([values[name] for values in found]) / len(found) for name in found[0]}
 
     def _rendered(self, draw: Draw) -> Rendered:
         """Render a view with the settings of the iteration, and apply the view model."""

@@ -24,11 +24,11 @@ CENTRAL_PART = 0.5
 
 
 MIDDLE_OF = 5
-"""Cameras from which they have a middle and an edge."""
+"""Fewest cameras for which a middle is looked for."""
 
-EDGE = 1.25
-"""A camera stands at the edge if it is this many times as far from the middle of all as their median is. In a closed
-ring all are about equally far."""
+FAR_FROM_MIDDLE = 1.25
+"""A camera is at the edge if its distance from the middle is more than this many times the median distance. In a closed
+ring, all distances are about equal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ def first_camera(cameras: Sequence[Camera], allowed: Sequence[int]) -> int:
         return allowed[0]
     eyes = np.stack([camera.eye for camera in cameras])
     aside = np.linalg.norm(eyes - np.median(eyes, axis=0), axis=1)
-    if aside[allowed[0]] <= EDGE * np.median(aside):
+    if aside[allowed[0]] <= FAR_FROM_MIDDLE * np.median(aside):
         return allowed[0]
     return min(allowed, key=lambda index: float(aside[index]))
 
