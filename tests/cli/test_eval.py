@@ -154,7 +154,7 @@ def test_a_copy_of_the_capture_is_the_same_and_a_changed_photo_is_named(made, ru
     (copy / "images" / "view_002.png").write_bytes((copy / "images" / "view_003.png").read_bytes())
     capsys.readouterr()
     assert cli(["eval", str(run.path), "--dataset", str(copy)]) == 2
-    assert "1 of 6 have changed since the run began, first view_002.png" in capsys.readouterr().err
+    assert "1 of 6 changed since the run started, first view_002.png" in capsys.readouterr().err
 
 
 def test_renders_of_views_that_are_not_its_own_are_removed_and_no_other_file(run, cli):

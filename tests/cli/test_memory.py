@@ -165,7 +165,7 @@ def test_what_is_free_is_the_least_of_what_the_machine_and_its_groups_leave(tmp_
     (folder / "memory.stat").write_text("total_inactive_file 7\n")
     assert available_memory() == 17
     with pytest.raises(
-        NotEnoughMemoryError, match=r"the work: needs 0\.12 GiB of memory, but 0\.00 GiB are free"
+        NotEnoughMemoryError, match=r"the work: needs 0\.12 GiB of memory, but only 0\.00 GiB are free"
     ):
         require_memory("the work", 2**27, "rest")
     require_memory("little work", 2**20, "nothing to say")
