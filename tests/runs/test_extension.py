@@ -265,8 +265,8 @@ class _Said:
 def test_antialiasing_that_does_not_match_is_told(capture, finished, tmp_path):
     gaussians = load_ply(RunFolder(finished).scene(20))
     cases = (
-        (True, [], "was trained with antialiasing, this run trains without"),
-        (False, ["--antialiased"], "was trained without antialiasing, this run trains with"),
+        (True, [], "was trained with antialiasing, but this run trains without"),
+        (False, ["--antialiased"], "was trained without antialiasing, but this run trains with"),
         (True, ["--antialiased"], None),
     )
     for i, (antialiased, words, says) in enumerate(cases):

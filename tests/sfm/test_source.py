@@ -51,7 +51,7 @@ def test_a_file_of_another_kind_and_an_empty_folder_are_told_of_photos_and_video
     out = ["--out"] if command == "train" else []
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "empty").mkdir()
-    for name, what in (("notes.txt", "is neither a photo nor a video"), ("empty", "is empty")):
+    for name, what in (("notes.txt", "is neither a photo nor a video"), ("empty", "holds no photos")):
         assert main([command, str(tmp_path / name), *out, str(tmp_path / "out")]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert f"{name}: {what}" in line and "a folder of photos" in line and "video" in line

@@ -45,7 +45,7 @@ def needs_poses(path: str | Path) -> bool:
         return False
     _check_run(path)
     if not any(place.name[0] != "." for place in entries(path)):
-        raise DatasetError(f"{path}: is empty; {OR_CAPTURE}")
+        raise DatasetError(f"{path}: holds no photos, the folder is empty; {OR_CAPTURE}")
     return bool(photo_files(path))
 
 
