@@ -249,7 +249,7 @@ def test_a_drag_of_a_quarter_of_the_window_stays_near_what_was_captured(forward)
 
 def test_who_has_flown_outside_can_orbit_there(forward):
     forward.tab.evaluate(
-        "viewer.view.camera = {...viewer.view.camera, eye: [4, 0, 4]}; viewer.view.update(-1.5, 0)"
+        "viewer.view.camera = {...viewer.view.camera, eye: [4, 0, 4]}; viewer.view.look(-1.5, 0)"
     )
     before = off_the_cameras(forward)
     assert before > 25
