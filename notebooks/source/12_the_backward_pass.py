@@ -290,7 +290,8 @@ assert len(shared) == 3 and len(slotted) == 1
 # [gsplat_edu.render.cpu](../src/gsplat_edu/render/cpu.py) does the same with vectors, adds up the slots and goes on,
 # in one pass over the splats, through conic, covariance and projection to the raw parameters. To torch all of it is
 # one function. In float64 it has to agree with autograd's way through the dense renderer, and it keeps two images
-# where that kept the table above. [Adam](../src/gsplat_edu/train/optimizer.py)'s [step](../src/gsplat_edu/adam.py) is one more pass over memory.
+# where that kept the table above.
+# [Adam](../src/gsplat_edu/train/optimizer.py)'s [step](../src/gsplat_edu/adam.py) is one more pass over memory.
 
 # %%
 cloud = random_ball(60, torch.Generator().manual_seed(5)).map(lambda tensor: tensor.double())
