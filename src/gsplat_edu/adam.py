@@ -20,8 +20,8 @@ class AdamNumbers(NamedTuple):
 
     Args:
         rate: Learning rate.
-        beta1: Decay of the first moment.
-        beta2: Decay of the second moment.
+        beta1: Decay rate of the first moment, 0 to 1.
+        beta2: Decay rate of the second moment, 0 to 1.
         eps: Floor under the root of the second moment.
         correction1: 1 - beta1^t, with t the number of steps including this one.
         correction2: 1 - beta2^t.

@@ -1,18 +1,18 @@
 """Fixtures: scenes to look at, and a real browser that has no network."""
 
 import base64
-import shutil
 
 import numpy as np
 import pytest
 import torch
 
+from browsers import chromium
 from gsplat_edu.camera import Camera, look_at
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.viewer import page
 
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 PIXELS = """async (camera) => {
   const { pixels } = await viewer.setCamera(camera);
@@ -67,14 +67,8 @@ class Visit:
 
 @pytest.fixture(scope="module")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("chromium is not installed")
-    with playwright.sync_playwright() as driver:
-        launched = driver.chromium.launch(executable_path=chromium, args=FLAGS)
+    with chromium(FLAGS) as launched:
         yield launched
-        launched.close()
 
 
 @pytest.fixture

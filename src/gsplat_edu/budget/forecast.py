@@ -34,7 +34,7 @@ class Forecast:
         iterations: Number of iterations.
         backend: The rendering backend.
         gaussians: Numbers of Gaussians at the start and at the end.
-        steps: Seconds of the first and of the last iteration.
+        steps: Duration of the first and of the last iteration, s.
         seconds: Seconds by part: "reading", "training", "judging" (intermediate evaluations), "saving", "ending".
         memory: Peak bytes by part: "program", "photos", "Gaussians", "images".
         factor: Uncertainty of the time, as a factor.

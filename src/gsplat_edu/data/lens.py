@@ -1,7 +1,7 @@
 """Lens models of captured cameras, and the conversion of photos to pinhole images.
 
-Formats place the centre of the first pixel at (0.5, 0.5); this project, like OpenCV, at (0, 0). The half pixel is
-subtracted in `lens_of` and nowhere else.
+Capture formats place the centre of the first pixel at (0.5, 0.5). This project places it at (0, 0), as OpenCV does.
+`lens_of` is the only place that subtracts the half pixel.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ class MissingPhotos:
     Args:
         missing: Number of such photos.
         total: Number of photos listed by the capture.
-        first: Name of the first one.
+        first: Name of the first such photo.
     """
 
     missing: int
@@ -53,7 +53,7 @@ class UnclearMasks:
     Args:
         photos: Number of such photos.
         total: Number of photos listed by the capture.
-        first: Name of the first one.
+        first: Name of the first such photo.
     """
 
     photos: int
