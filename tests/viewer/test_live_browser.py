@@ -203,6 +203,11 @@ def test_a_person_watches_pauses_steps_and_ends_a_training(capture, tmp_path, br
 def test_after_the_training_the_view_stays_until_ctrl_c_and_all_is_well(capture, tmp_path):
     words = ["--iterations", "3000", "--view-host", "0.0.0.0", *GROWING, *STRATEGIES["adc"]]
     with commanded(capture, tmp_path / "run", *words) as (process, url):
+        # Read here: `communicate` does not return what the pipe's reader has buffered behind the URL.
+        warning = process.stdout.readline()
+        assert warning.startswith(
+            "warning: listening on 0.0.0.0: anyone who can reach this computer and has the URL sees the training"
+        )
         with Client(SimpleNamespace(url=url)) as client:
             client.move()
             client.says(r"\*\*finished\*\*\s+iteration 3,000 of 3,000")
@@ -210,9 +215,6 @@ def test_after_the_training_the_view_stays_until_ctrl_c_and_all_is_well(capture,
             process.send_signal(signal.SIGINT)
             printed, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, complaints) == (0, "")
-        assert printed.startswith(
-            "warning: listening on 0.0.0.0: anyone who can reach this computer and has the URL sees the training"
-        )
         assert printed.endswith("the live view stays open until its last browser is closed, or Ctrl-C\n")
 
 
