@@ -8,11 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
-from gsplat_edu.budget.costs import Facts, Footprint, Measurements, Speed
+from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, Speed
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Request, choose, flags, plan, taken_up
+from gsplat_edu.budget.probe import resident_bytes
 from gsplat_edu.cli.arguments import bytes_text, seconds_text
 from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from
@@ -20,10 +22,12 @@ from gsplat_edu.data.dataset import DataSettings
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.io.ply import save_ply
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import StepEvent
+from gsplat_edu.train.initialize import random_ball
 
 MIB = 2**20
 
@@ -231,6 +235,30 @@ def test_a_capture_is_planned_from_its_files(capture, tmp_path):
     )
     assert found.resolution is None and found.by_time and found.forecast.peak < 2**32
     assert found.max_gaussians > 200 and 50 <= found.iterations <= 30_000
+
+
+@pytest.mark.parametrize(
+    ("strategy", "limits"), [("adc", Limits(2**32)), ("mcmc", Limits(None, Deadline(3_600.0)))]
+)
+def test_a_start_scene_is_planned_with_its_own_gaussians(strategy, limits, capture, tmp_path):
+    """Of points a cap selects some; a start scene has to fit whole."""
+    scene = tmp_path / "scene.ply"
+    save_ply(scene, random_ball(5_000, torch.Generator().manual_seed(0)))
+    run = dataclasses.replace(options(capture, tmp_path / "run", strategy=strategy), scene=scene)
+    found = plan(run, limits)
+    assert found.forecast.gaussians[0] == 5_000 and found.max_gaussians >= 5_000
+    assert len(CaptureRun(found.options).trainer.gaussians) == 5_000
+
+
+def test_a_start_scene_that_does_not_fit_is_refused(capture, tmp_path):
+    """The capture's points would fit into this limit, or a part of them; ten times as many Gaussians do not."""
+    scene = tmp_path / "scene.ply"
+    save_ply(scene, random_ball(200_000, torch.Generator().manual_seed(0)))
+    run = options(capture, tmp_path / "run", strategy="none")
+    limits = Limits(resident_bytes() + LATER + 150 * MIB)
+    assert plan(run, limits).max_gaussians < 200_000
+    with pytest.raises(ArgumentError, match=r"--max-memory .*: is too little for .*; \d+MiB would do"):
+        plan(dataclasses.replace(run, scene=scene), limits)
 
 
 def test_what_was_spent_before_the_plan_counts(capture, tmp_path):

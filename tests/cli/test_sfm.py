@@ -266,5 +266,5 @@ def test_points_that_are_not_there_are_named_before_poses_are_looked_for(tmp_pat
     words = ["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--points", "nowhere.ply"]
     assert main(words) == 2
     said = capsys.readouterr().err
-    assert "--points: nowhere.ply is not there" in said and said.count("\n") == 1
+    assert "--points: nowhere.ply does not exist" in said and said.count("\n") == 1
     assert not (tmp_path / "run").exists()

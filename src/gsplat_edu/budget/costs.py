@@ -60,7 +60,7 @@ class Facts:
     Args:
         train: Number of training views.
         test: Number of held-out views.
-        points: Number of start points.
+        points: Number of start points, or of Gaussians in the start scene.
         pixels: Mean pixels of a view.
         largest: Pixels of the largest view.
         full: Pixels of the largest photo as decoded, before it is downscaled.

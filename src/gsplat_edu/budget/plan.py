@@ -18,6 +18,7 @@ from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import probe, resident_bytes
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.runs.start import scene_start
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
@@ -138,6 +139,11 @@ class Request:
     factors: tuple[float, ...] = (1.0,)
 
     @property
+    def least(self) -> int:
+        """Smallest cap: a start scene is used whole, whereas of points a cap selects some."""
+        return 0 if self.options.scene is None else self.facts.points
+
+    @property
     def by_time(self) -> bool:
         """Whether the plan chooses the iterations."""
         return self.limits.seconds is not None and "iterations" not in self.given
@@ -157,7 +163,7 @@ class Request:
             config = config.changed(iterations=iterations, **scaled)
         if "max_gaussians" in self.given:
             return config
-        caps = [] if cap is None else [_rounded(cap)]
+        caps = [] if cap is None else [max(_rounded(cap), self.least)]
         if config.strategy == "mcmc" or (self.by_time and config.strategy == "adc"):
             wanted = wanted_gaussians(config, self.facts.points, self.facts.smaller(factor).pixels)
             caps.append(wanted if config.strategy == "mcmc" else _rounded(math.ceil(GUARD * wanted)))
@@ -189,6 +195,7 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
         ArgumentError: even the smallest settings exceed a limit (the message names a sufficient one), or the backend is
             the dense one.
         DatasetError: the capture cannot be read.
+        SceneFormatError: the start scene cannot be read.
         CheckpointError: the config.json of a run to resume is damaged.
     """
     if options.resume and options.folder.exists():
@@ -209,14 +216,16 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
     if "resolution" not in fixed:
         side = min(min(view.camera.W, view.camera.H) for view in (*files.train, *files.test))
         factors += tuple(factor for factor in FACTORS if factor > 1 and side / factor >= SMALLEST_SIDE)
-    request = Request(options, limits, fixed, rescale, Facts.of(dataset, files), factors)
+    facts, scene = Facts.of(dataset, files), None
+    if options.scene is not None:
+        scene, _ = scene_start(options.scene, options.config, dataset.origin)
+        facts = dataclasses.replace(facts, points=len(scene))
+    request = Request(options, limits, fixed, rescale, facts, factors)
     length = options.config.iterations
-    first = _within_memory(
-        request, resident_bytes() + LATER, START_PAIRS * len(dataset.points), length, factors
-    )
+    first = _within_memory(request, resident_bytes() + LATER, START_PAIRS * facts.points, length, factors)
     reduced = dataclasses.replace(settings, resolution=_resolution(request, first.factor), image_memory=0)
     dataset = load_dataset(options.data, reduced, points=options.points)
-    measured = probe(dataset, request.config(length, first.factor, first.cap), options.backend)
+    measured = probe(dataset, request.config(length, first.factor, first.cap), options.backend, scene)
     probed = tuple(factor for factor in factors if factor >= first.factor)
     spent = 0.0 if limits.time is None else limits.time.spent
     return choose(dataclasses.replace(request, factors=probed), measured, spent)
@@ -280,6 +289,7 @@ def _within_memory(
             enough = wanted = config.max_gaussians or wanted
         elif factor == factors[-1]:
             enough = min(wanted, LEAST_GAUSSIANS)
+        enough = max(enough, request.least)
         kept = settings.image_memory if "image_memory" in request.given else 0
         least = footprint.peak(enough, kept)
         if least > aim:
@@ -404,7 +414,7 @@ def taken_up(options: RunOptions, given: Collection[str]) -> RunOptions:
     stored = options.folder.read_config()
     sections = [stored.get(name) for name in ("train", "data")]
     if not all(isinstance(section, dict) for section in sections):
-        raise CheckpointError(f"{options.folder.config}: lacks the section train or data; mend the file")
+        raise CheckpointError(f"{options.folder.config}: lacks the section train or data; restore the file")
     train, data = (
         {name: section[name] for name in PLANNED if name in section and name not in given}  # type: ignore[index,operator]
         for section in sections
@@ -416,4 +426,4 @@ def taken_up(options: RunOptions, given: Collection[str]) -> RunOptions:
             data_settings=dataclasses.replace(options.data_settings, **data),
         )
     except ArgumentError as error:
-        raise CheckpointError(f"{options.folder.config}: {error}; mend the file") from None
+        raise CheckpointError(f"{options.folder.config}: {error}; correct the file") from None

@@ -78,7 +78,9 @@ def give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measurements:
+def probe(
+    dataset: Dataset, config: TrainConfig, backend: str = "cpu", scene: Gaussians | None = None
+) -> Measurements:
     """Train for a few seconds and discard the result: with the start scene, with more Gaussians, and on small views.
 
     The larger scene is the start scene, split until it has about as many Gaussians as the run will have (or enough to
@@ -89,6 +91,7 @@ def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measur
         dataset: The capture; a few of its photos are read.
         config: The run; its cap is respected.
         backend: Name of the rendering backend.
+        scene: Gaussians that the run starts from; None to start from the points of the capture.
 
     Raises:
         ArgumentError: the backend is the dense one, which takes minutes per iteration of a capture.
@@ -103,10 +106,12 @@ def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measur
         photo = view.read()
         reading.append(time.perf_counter() - began)
         photos.append(View(view.camera, photo.image, alpha=photo.alpha, mask=photo.mask, name=view.name))
-    start = from_points(dataset.points, dataset.colors, config)
-    by_points = from_points(dataset.points, dataset.colors, dataclasses.replace(config, strategy="none"))
+    plain = dataclasses.replace(config, strategy="none")  # mcmc starts fainter and smaller than it stays
+    start, usual = (
+        scene or from_points(dataset.points, dataset.colors, settings) for settings in (config, plain)
+    )
     pixels = sum(view.camera.W * view.camera.H for view in dataset.train) / len(dataset.train)
-    grown = _grown(by_points, int(expected_counts(config, len(start), pixels)[-1]))
+    grown = _grown(usual, int(expected_counts(config, len(start), pixels)[-1]))
     if len(grown) == len(start) > 1:
         start = start.map(lambda tensor: tensor[::2])
     trial = functools.partial(
@@ -118,8 +123,8 @@ def probe(dataset: Dataset, config: TrainConfig, backend: str = "cpu") -> Measur
         trials.append(trial(start, small))
     score, picture = judging_seconds(grown, photos[:2], config, backend)
     # scaled to the whole start scene, with a margin for views that were not measured
-    pairs = math.ceil(SPREAD * trials[0].pairs * len(by_points) / len(start))
-    del start, by_points, grown, small, photos
+    pairs = math.ceil(SPREAD * trials[0].pairs * len(usual) / len(start))
+    del start, usual, grown, small, photos
     give_back()
     return Measurements(
         backend=backend,

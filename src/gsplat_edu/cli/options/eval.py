@@ -39,4 +39,4 @@ def check(arguments: argparse.Namespace) -> None:
     """
     RunFolder(arguments.run_folder).read_config()
     if arguments.dataset is not None and not arguments.dataset.exists():
-        raise DatasetError(f"--dataset: {arguments.dataset} is not there; name the folder of a capture")
+        raise DatasetError(f"--dataset: {arguments.dataset} does not exist; give the folder of a capture")

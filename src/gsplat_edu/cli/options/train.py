@@ -222,11 +222,11 @@ def check(arguments: argparse.Namespace) -> None:
     _options(arguments, arguments.backend)
     if not arguments.data.exists():
         raise DatasetError(
-            f"{arguments.data}: is not there; name the folder of a capture, of photos, or a video"
+            f"{arguments.data}: does not exist; give the folder of a capture, of photos, or a video"
         )
     for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):
         if path is not None and not path.exists():
-            raise ArgumentError(f"{flag}: {path} is not there; check the name, or leave the option out")
+            raise ArgumentError(f"{flag}: {path} does not exist; correct the name, or omit the option")
 
 
 def options_from(arguments: argparse.Namespace) -> RunOptions:
@@ -287,11 +287,6 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         if idle := [name for name in FOR_POINTS if name in changes]:
             flag = f"--{idle[0].replace('_', '-')}"
             raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
-        if planned and not arguments.resume:
-            raise ArgumentError(
-                "--from: a start from a scene cannot be planned for --max-memory or --time-limit;"
-                " give --iterations, and --max-gaussians for less memory"
-            )
         changes = FROM_SCENE | changes
     iterations = RECIPE_ITERATIONS if arguments.iterations is None else arguments.iterations
     config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
