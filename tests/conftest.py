@@ -24,6 +24,7 @@ if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: to
 
 import slices
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
+from shape_checker import pytest_runtest_setup  # noqa: F401
 from slices import pytest_collection_modifyitems, pytest_report_header, pytest_runtest_makereport  # noqa: F401
 
 # Whatever was started in the background of a shell ignores Ctrl-C, and so would every program that is tested.

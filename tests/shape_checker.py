@@ -1,5 +1,57 @@
-"""The type checker behind the shape-checking hook: beartype, letting an int stand where a float may."""
+"""The type checker behind the shape-checking hook: beartype, which accepts an int where a float is annotated.
 
+A function is checked for its first calls in each test, then no longer: a training calls some functions a hundred
+thousand times, and checking all of those calls doubles the time of the suite. conftest.py takes the hook from here.
+"""
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
 from beartype import BeartypeConf, beartype
 
-checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
+CALLS = 200
+"""Checked calls of a function in each test."""
+
+_beartyped = beartype(conf=BeartypeConf(is_pep484_tower=True))
+_counts: dict[tuple[str, str], int] = {}
+_unchecked: list[Callable[..., Any]] = []
+
+
+def checked(stub: Callable[..., Any]) -> Callable[..., Any]:
+    """Check a function's arguments or its result; jaxtyping calls this for each, with a stub of the same signature."""
+    check = _beartyped(stub)
+    name = (stub.__module__, stub.__qualname__)
+
+    @functools.wraps(stub)
+    def counting(*arguments: Any, **keywords: Any) -> Any:
+        _counts[name] = count = _counts.get(name, 0) + 1
+        if count == CALLS and (function := _find(*name)) is not None:
+            function.__no_type_check__ = True  # jaxtyping then calls the function directly
+            _unchecked.append(function)
+        return check(*arguments, **keywords)
+
+    return counting
+
+
+def _find(module: str, qualname: str) -> Any:
+    """Return a function or a method of a module; None if its name leads elsewhere, as a local function's does."""
+    found: Any = sys.modules.get(module)
+    for part in qualname.split("."):
+        found = inspect.getattr_static(found, part, None)
+    if isinstance(found, property):
+        found = found.fget
+    if isinstance(found, (classmethod, staticmethod)):
+        found = found.__func__
+    return found if inspect.isfunction(found) and hasattr(found, "__wrapped__") else None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Check every function again from the next test on."""
+    _counts.clear()
+    while _unchecked:
+        del _unchecked.pop().__no_type_check__
