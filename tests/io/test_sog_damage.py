@@ -297,7 +297,7 @@ def test_a_json_number_beyond_float_range_is_refused(tmp_path, contents):
 
 
 def test_codebooks_that_start_with_null_are_read(tmp_path, contents):
-    """Other writers store null for infinite values. Readers extrapolate downwards by the mean step."""
+    """Codebooks of scenes with infinite values start with null, which is extrapolated downwards by the mean step."""
     entries = np.array(json.loads(contents["meta.json"])["sh0"]["codebook"])
     pixels = pixels_of(contents["sh0.webp"])
     pixels[0, 0, 0] = 0
