@@ -1,4 +1,4 @@
-"""The type checker behind the shape-checking hook: beartype, letting an int stand where a float may."""
+"""The type checker behind the shape-checking hook: beartype, which accepts an int in place of a float."""
 
 from beartype import BeartypeConf, beartype
 
