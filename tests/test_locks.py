@@ -33,14 +33,14 @@ def holder(folder, fork="none"):
     return process, max(int(line.split()[1]) for line in lines)
 
 
-def killed(process):
+def kill(process):
     process.kill()
     process.wait()
     process.stdin.close()
     process.stdout.close()
 
 
-def taken(folder):
+def lock(folder):
     with locked("--out", folder, "gsplat-edu train", pytest.fail):
         return True
 
@@ -50,10 +50,10 @@ def test_the_second_writer_learns_the_holder_and_kill_9_frees_the_lock(tmp_path)
     process, _ = holder(tmp_path / "run")
     message = rf"^--out: .*run is in use by `gsplat-edu train`, process {process.pid} on .+, since 2\d{{3}}-.*; wait"
     with pytest.raises(ArgumentError, match=message):
-        taken(tmp_path / "run")
-    killed(process)
+        lock(tmp_path / "run")
+    kill(process)
     assert (tmp_path / "run" / LOCK).exists(), "a killed process cannot remove its file"
-    assert taken(tmp_path / "run")
+    assert lock(tmp_path / "run")
     assert not (tmp_path / "run" / LOCK).exists()
 
 
@@ -62,10 +62,10 @@ def test_a_forked_child_does_not_keep_the_lock(tmp_path):
     process, child = holder(tmp_path / "run", "fork")
     try:
         with pytest.raises(ArgumentError, match=f"process {process.pid} "):
-            taken(tmp_path / "run")
-        killed(process)
+            lock(tmp_path / "run")
+        kill(process)
         os.kill(child, 0)  # the child is alive
-        assert taken(tmp_path / "run")
+        assert lock(tmp_path / "run")
     finally:
         os.kill(child, signal.SIGKILL)
 
@@ -73,18 +73,18 @@ def test_a_forked_child_does_not_keep_the_lock(tmp_path):
 def test_a_process_cannot_lock_a_folder_twice(tmp_path):
     with locked("OUT", tmp_path, "gsplat-edu sfm", pytest.fail):
         with pytest.raises(ArgumentError, match=f"^OUT: .*process {os.getpid()} "):
-            taken_as_out(tmp_path)
+            lock_as_out(tmp_path)
         assert (tmp_path / LOCK).exists()
     assert list(tmp_path.iterdir()) == []
 
 
-def taken_as_out(folder):
+def lock_as_out(folder):
     with locked("OUT", folder, "gsplat-edu sfm", pytest.fail):
         return True
 
 
 def test_a_created_folder_left_empty_is_removed(tmp_path):
-    assert taken(tmp_path / "a" / "b")
+    assert lock(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
     with locked("--out", tmp_path / "a" / "b", "gsplat-edu train", pytest.fail):
         (tmp_path / "a" / "file").write_text("kept")
@@ -102,7 +102,7 @@ def test_the_contents_of_a_damaged_lock_are_not_printed(tmp_path):
         ):
             (tmp_path / LOCK).write_text(text)
             with pytest.raises(ArgumentError, match="is in use by") as caught:
-                taken(tmp_path)
+                lock(tmp_path)
             assert str(caught.value).isprintable()
 
 

@@ -28,10 +28,10 @@ SMALLER["hundreds of layers"] = dataclasses.replace(
         for key in ("means", "quats", "log_scales", "sh", "logits")
     },
 )
-ILL = ("needles 100:1", "partly behind")
+ILL_CONDITIONED = ("needles 100:1", "partly behind")
 
 
-def everything(scene, backend, device, settings=SETTINGS):
+def images_and_gradients(scene, backend, device, settings=SETTINGS):
     """Return images, and gradients of a loss with random weights for all pixels of image, transmittance and depth."""
     dtype = torch.float32 if backend == "cuda" else torch.float64
     where = device if backend == "cuda" else "cpu"
@@ -71,7 +71,7 @@ def sensitivity(scene) -> np.ndarray:
 @pytest.mark.parametrize("name", [name for name in SMALLER if name != "ties in depth"])
 def test_images_match_the_reference(device, name):
     scene = SMALLER[name]
-    values, _, _ = everything(scene, "cuda", device)
+    values, _, _ = images_and_gradients(scene, "cuda", device)
     truth, truth_T, truth_depth = scene.truth()
     bright = max(1.0, np.abs(values["image"]).max())
     error = np.maximum(np.abs(values["image"] - truth).max(axis=-1), np.abs(values["T"] - truth_T))
@@ -86,12 +86,12 @@ def test_images_match_the_reference(device, name):
 def test_gradients_match_the_native_kernels_in_float64(device, name, antialiased):
     """Includes scenes with ties: the order is the same, and so are the float32 ties, since a camera axis is along z."""
     settings = dataclasses.replace(SETTINGS, antialiased=antialiased, jacobian_limit=1.3)
-    values, gradients, out = everything(SMALLER[name], "cuda", device, settings)
-    truths, expected, oracle = everything(SMALLER[name], "cpu", device, settings)
+    values, gradients, out = images_and_gradients(SMALLER[name], "cuda", device, settings)
+    truths, expected, oracle = images_and_gradients(SMALLER[name], "cpu", device, settings)
     assert abs(out.num_pairs - oracle.num_pairs) <= 2 and len(out.visible) == len(oracle.visible)
     for key, truth in truths.items():
         assert np.abs(values[key] - truth).max() < 1.1 * max(1.0, np.abs(truth).max()) / 255, key
-    bound = 4e-3 if name in ILL else 3e-4
+    bound = 4e-3 if name in ILL_CONDITIONED else 3e-4
     for key, truth in expected.items():
         assert np.abs(gradients[key] - truth).max() <= bound * np.abs(truth).max(), key
 
@@ -100,15 +100,15 @@ def test_gradients_match_the_native_kernels_in_float64(device, name, antialiased
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_lower_sh_degrees(device, degree):
     settings = dataclasses.replace(SETTINGS, sh_degree=degree)
-    _, gradients, _ = everything(SMALLER["random"], "cuda", device, settings)
-    _, expected, _ = everything(SMALLER["random"], "cpu", device, settings)
+    _, gradients, _ = images_and_gradients(SMALLER["random"], "cuda", device, settings)
+    _, expected, _ = images_and_gradients(SMALLER["random"], "cpu", device, settings)
     for key, truth in expected.items():
         assert np.abs(gradients[key] - truth).max() <= 3e-4 * np.abs(truth).max(), key
 
 
 def test_two_runs_give_the_same_bits(device):
     scene = random(20, (17, 33), seed=3)
-    first, second = (everything(scene, "cuda", device)[:2] for _ in range(2))
+    first, second = (images_and_gradients(scene, "cuda", device)[:2] for _ in range(2))
     for ours, other in zip(first, second, strict=True):
         for key, array in ours.items():
             np.testing.assert_array_equal(array, other[key], err_msg=key)

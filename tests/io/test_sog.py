@@ -59,7 +59,7 @@ def assert_close(original, read, meta):
 
     # Half a step of a component is e = 1 / (255 sqrt 2). Three of them are off by at most e; the fourth, d >= 1/2, by
     # (a da + b db + c dc) / d <= sqrt(3) e sqrt(1 - d^2) / d <= 3 e. The quaternion is off by sqrt(12) e, the rotation
-    # by twice that; 2 % for the higher orders.
+    # by twice that. Allow 2 % for the higher orders.
     relative = quat_to_R_t(original.quats.double()).mT @ quat_to_R_t(read.quats.double())
     angles = torch.arccos(((torch.einsum("nii->n", relative) - 1) / 2).clamp(-1, 1))
     assert float(angles.max()) <= 2 * math.sqrt(12) / (255 * math.sqrt(2)) * 1.02

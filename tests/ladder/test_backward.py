@@ -63,13 +63,13 @@ def bounds(cloud, g, parts):
     )
 
 
-def clear_of_edges(parts):
+def assert_clear_of_edges(parts):
     """Check that no alpha is so near the floor or the clamp that float32 falls on the other side."""
     raw = parts[0]
     assert all(((raw / edge - 1).abs() > 20 * EPS).all() for edge in (ALPHA_MIN, ALPHA_MAX))
 
 
-def no_tile_ends(cloud, T):
+def assert_no_tile_stops(cloud, T):
     """Check that no tile stops, because the reference never does."""
     last = torch.zeros(-(-cloud.H // TILE) * TILE, -(-cloud.W // TILE) * TILE, dtype=torch.float64)
     last[: cloud.H, : cloud.W] = T[-1]
@@ -86,8 +86,8 @@ def test_a_rung_agrees_with_autograd(rung, opaque, threads):
         cloud.opacities[::4] = 1.0
     g = weights(cloud)
     reference, parts = dense(cloud, g)
-    clear_of_edges(parts)
-    no_tile_ends(cloud, parts[2])
+    assert_clear_of_edges(parts)
+    assert_no_tile_stops(cloud, parts[2])
     assert bool((parts[1] == ALPHA_MAX).any()) == opaque and (parts[1] == 0).any()
     found = rung(cloud, forward.tight(cloud).image, g, threads)
     for name, mine, theirs, bound in zip(

@@ -21,7 +21,7 @@ from native_scenes import camera, random
 POISONS = (float("nan"), float("inf"), -float("inf"), 1e-42, 3e38, -3e38, 1e20, -1e20, 0.0)
 
 
-def python(code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
+def run_python(code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
     """Run code in a new Python process, with additions to the environment."""
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
@@ -237,7 +237,7 @@ for _ in range(300):
     turn()
 print(rss() - before)
 """
-    done = python(code, PYTHONPATH=str(Path(__file__).parents[1]))
+    done = run_python(code, PYTHONPATH=str(Path(__file__).parents[1]))
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) < 16.0
 
@@ -248,13 +248,13 @@ MAIN = "from gsplat_edu.cli.main import main; import sys; sys.exit(main(sys.argv
 @pytest.mark.own_process
 @pytest.mark.parametrize("name", _native.isas())
 def test_the_environment_forces_an_instruction_set(name):
-    done = python("from gsplat_edu import _native; print(_native.isa())", GSPLAT_EDU_ISA=name)
+    done = run_python("from gsplat_edu import _native; print(_native.isa())", GSPLAT_EDU_ISA=name)
     assert done.stdout.strip() == name
 
 
 @pytest.mark.own_process
 def test_an_unavailable_instruction_set_is_reported():
-    done = python(MAIN, "demo", "--backend", "cpu", GSPLAT_EDU_ISA="v9")
+    done = run_python(MAIN, "demo", "--backend", "cpu", GSPLAT_EDU_ISA="v9")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "GSPLAT_EDU_ISA=v9" in done.stderr and "v2" in done.stderr
 
@@ -262,7 +262,7 @@ def test_an_unavailable_instruction_set_is_reported():
 @pytest.mark.own_process
 def test_the_dense_backend_trains_without_the_native_module(tmp_path):
     budget = ["--iters", "2", "--size", "8", "--k0", "5", "--out", str(tmp_path / "x.png")]
-    done = python(MAIN, "demo", "--backend", "torch", *budget, GSPLAT_EDU_ISA="v9")
+    done = run_python(MAIN, "demo", "--backend", "torch", *budget, GSPLAT_EDU_ISA="v9")
     assert done.returncode == 0, done.stderr
 
 

@@ -203,7 +203,7 @@ def test_photos_of_many_sizes_share_a_camera():
         group(1, 401, 301),
         group(1, 280, 210),
     ]
-    assert shared_cameras(sizes) == {1: 3, 2: 3, 4: 3, 5: 3}, "scaled to the largest"
+    assert shared_cameras(sizes) == {1: 3, 2: 3, 4: 3, 5: 3}, "the largest photos lead"
     others = [group(1, 240, 320), group(1, 320, 180), group(1, 160, 120, kind="Canon"), group(10, 320, 240)]
     assert shared_cameras([*sizes, *others[:3]]) == {1: 3, 2: 3, 4: 3, 5: 3}, (
         "other aspect ratios or another camera"
@@ -215,7 +215,7 @@ def test_photos_of_many_sizes_share_a_camera():
 
 def test_attempts_stop_once_two_models_agree(mapped):
     best, tried, _ = mapped(6, 6, 7)
-    assert tried == 2 and len(best["names"]) == 6, "two models with the same six photos"
+    assert tried == 2 and len(best["names"]) == 6, "two attempts register the same six photos"
 
 
 def test_without_poses_the_error_gives_the_reason(mapped):

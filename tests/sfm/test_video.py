@@ -64,11 +64,11 @@ def test_sharp_frames_are_chosen_at_equal_steps_of_motion(walk):
     assert len(chosen) == 24
     assert sum(number < 20 for number in chosen) == 1, "one of the frames in which the camera stands still"
     fast, slow = (sum(low <= n < high for n in chosen) for low, high in ((20, 70), (70, 120)))
-    # The camera turns twice as far in the first half. The ratio is wide because the short sides move less per angle.
+    # The camera turns twice as far in the first half. Flow is not proportional to the angle: short sides move less.
     assert 1.4 < fast / slow < 2.8
 
     steps = np.diff(walk.angles[chosen])
-    # Neighbours are less than two intervals apart wherever they are in them; 1.5 allows for uneven flow.
+    # Neighbours are less than two intervals apart wherever in them they are. The factor 1.5 allows for uneven flow.
     assert steps.max() < 2 * 1.5 * walk.angles[-1] / 24
 
 

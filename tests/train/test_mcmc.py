@@ -20,7 +20,7 @@ def scene(count=60, dtype=torch.float64):
     return random_ball(count, torch.Generator().manual_seed(0), dtype).trainable()
 
 
-def made(gaussians, config=CONFIG, seed=0):
+def make(gaussians, config=CONFIG, seed=0):
     return MCMC(config, torch.Generator().manual_seed(seed)), Adam(gaussians.tensors(), config.learning_rates)
 
 
@@ -52,7 +52,7 @@ def test_copies_have_nearly_the_integral_of_the_original():
 
 def test_dead_gaussians_are_relocated_to_living_ones():
     gaussians = scene()
-    control, optimizer = made(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
+    control, optimizer = make(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
     with torch.no_grad():
         gaussians.logit_opacities[:10] = -8.0
         gaussians.logit_opacities[10:] = 1.0
@@ -75,7 +75,7 @@ def test_dead_gaussians_are_relocated_to_living_ones():
 
 def test_growth_stops_at_the_cap():
     gaussians = scene(30)
-    control, optimizer = made(gaussians)
+    control, optimizer = make(gaussians)
     counts = []
     for iteration in range(600, 5_000, 100):
         gaussians, _ = control.update(iteration, gaussians, optimizer)
@@ -90,7 +90,7 @@ def test_growth_stops_at_the_cap():
 )
 def test_relocation_happens_only_within_its_window(iteration, due):
     gaussians = scene()
-    control, optimizer = made(gaussians)
+    control, optimizer = make(gaussians)
     assert bool(control.update(iteration, gaussians, optimizer)[1]) == due
 
 
@@ -100,7 +100,7 @@ def test_noise_follows_the_covariance_of_faint_gaussians():
     gaussians.log_scales[:] = torch.tensor([-1.0, -2.0, -3.0]).double()
     gaussians.logit_opacities[:] = math.log(0.005 / 0.995)
     gaussians = gaussians.trainable()
-    control, optimizer = made(gaussians)
+    control, optimizer = make(gaussians)
     optimizer.learning_rates["means"] = 1e-6
     before = gaussians.means.detach().clone()
     changed, _ = control.update(0, gaussians, optimizer)
@@ -115,7 +115,7 @@ def test_noise_does_not_move_opaque_gaussians():
     gaussians = scene()
     with torch.no_grad():
         gaussians.logit_opacities.fill_(3.0)
-    control, optimizer = made(gaussians)
+    control, optimizer = make(gaussians)
     before = gaussians.means.detach().clone()
     changed, _ = control.update(0, gaussians, optimizer)
     assert (changed.means - before).abs().max() < 1e-12
@@ -125,7 +125,7 @@ def test_a_scene_of_dead_gaussians_is_kept():
     gaussians = scene()
     with torch.no_grad():
         gaussians.logit_opacities.fill_(-9.0)
-    control, optimizer = made(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
+    control, optimizer = make(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
     changed, (event,) = control.update(600, gaussians, optimizer)
     assert event.num_relocated == 0 and len(changed) == 60
 

@@ -77,7 +77,7 @@ def test_regularisers_match_the_paper(capture):
     for tensor in run.parameters().values():
         tensor.grad = None
     Objective({"photo": PhotoTerm(MCMC.ssim_weight)}).backward(
-        Rendered(run.gaussians, rendered.draw, *_again(run, rendered), rendered.target, 0)
+        Rendered(run.gaussians, rendered.draw, *_rendered_again(run, rendered), rendered.target, 0)
     )
     sum(expected.values()).backward()
     for name in ("logit_opacities", "log_scales"):
@@ -86,7 +86,7 @@ def test_regularisers_match_the_paper(capture):
     assert torch.equal(with_all["means"], run.gaussians.means.grad)
 
 
-def _again(run, rendered):
+def _rendered_again(run, rendered):
     from gsplat_edu.render.settings import RenderSettings
 
     settings = RenderSettings(sh_degree=0, jacobian_limit=1.3, depth=False)
