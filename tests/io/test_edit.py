@@ -27,7 +27,7 @@ def image(gaussians, camera, **changes):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("s", [0.5, 1.0, 3.0])
-def test_a_moved_camera_sees_the_same_of_a_moved_scene(degree, s):
+def test_moving_scene_and_camera_together_keeps_the_image(degree, s):
     made = native_scenes.random(40)
     scene = Scene(Filter(sh_degree=degree).apply(made.gaussians()))
     move = similarity(degree, s)

@@ -366,7 +366,7 @@ def test_a_scene_from_another_program(tmp_path, name, count):
     np.testing.assert_array_equal(sorted_rows(read), sorted_rows(again))
 
 
-def test_axes_are_those_of_a_ply(tmp_path):
+def test_axes_match_those_of_a_ply(tmp_path):
     original = load_ply(shared("plush_dog/point_cloud_29999_clean.ply"))
     sog.write(tmp_path / "a.sog", Scene(original))
     back = sog.read(tmp_path / "a.sog").gaussians

@@ -143,7 +143,7 @@ def test_zip_bombs_are_not_unpacked(tmp_path, contents):
     assert "quats.webp in it is damaged" in messages[1]
 
 
-def test_of_two_files_of_one_name_the_last_is_read(tmp_path, contents):
+def test_the_last_of_two_files_with_the_same_name_is_read(tmp_path, contents):
     path = zipped(tmp_path / "a.sog", contents | {"quats.webp": b"not an image"})
     with zipfile.ZipFile(path, "a") as bundle, pytest.warns(UserWarning, match="Duplicate name"):
         bundle.writestr("quats.webp", contents["quats.webp"])
@@ -262,7 +262,7 @@ def test_invalid_metadata_is_named(tmp_path, contents, change, expected):
         "q" * 999,
     ],
 )
-def test_names_that_lead_elsewhere_are_refused(tmp_path, contents, name):
+def test_file_names_outside_the_folder_are_refused(tmp_path, contents, name):
     changed = with_meta(contents, _set("quats.files.0", name))
     for path in (zipped(tmp_path / "a.sog", changed), in_folder(tmp_path / "a", changed)):
         assert "an entry in quats.files that is not a plain file name" in refused(path)

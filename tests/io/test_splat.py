@@ -249,7 +249,7 @@ def test_a_file_from_another_program():
 
 
 def test_a_trained_scene_is_written(tmp_path):
-    """Logits up to 400, quaternions of lengths 0.4 to 2.3."""
+    """The scene has logits up to 400 and quaternions of lengths 0.4 to 2.3."""
     scene = Scene(load_ply(shared("plush_dog/point_cloud_29999_clean.ply")))
     write(tmp_path / "a.splat", scene)
     back = read(tmp_path / "a.splat").gaussians

@@ -51,7 +51,7 @@ def outcome(script):
     return [json.loads(line) for line in printed(SCENE + script)]
 
 
-def test_few_photos_keep_one_focal_length_and_the_middle():
+def test_few_photos_keep_one_focal_length_and_a_centred_principal_point():
     script = """
 found(scene("SIMPLE_RADIAL", [815, 500, 375, 0.02], 12))
 found(scene("SIMPLE_RADIAL", [815, 500, 375, 0.02], 24))

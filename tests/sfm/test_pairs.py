@@ -22,7 +22,7 @@ def test_sequential_pairs_reach_near_and_far():
     assert sequential_pairs(1, 4) == set()
 
 
-def test_nearest_pairs_are_the_nearest():
+def test_nearest_pairs_match_brute_force():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(600, 3)) + 1e4  # several blocks, and far from the origin
     distances = np.linalg.norm(points[:, None] - points, axis=2)

@@ -332,8 +332,8 @@ def test_focal_lengths_from_exif_separate_two_cameras(tmp_path):
         assert (camera.W, camera.H) == (truth[name].W, truth[name].H)
 
 
-def test_a_camera_per_photo_and_lower_thresholds(done, tmp_path):
-    """Run the last of the attempts."""
+def test_the_last_attempt_registers_most_photos(done, tmp_path):
+    """The last attempt uses a camera per photo and lower thresholds."""
     way = attempts("auto", "auto", 14, 1, one_lens=False)[-1]
     work, told = done.out / "sfm", []
     models = call(

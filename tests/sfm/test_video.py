@@ -35,7 +35,7 @@ def write_video(path, frames):
 
 
 def turn_metadata(path, matrix):
-    """Write how the phone was held into the track header of an mp4 (ISO 14496-12, box tkhd, version 0)."""
+    """Write the phone's orientation into the track header of an mp4 (ISO 14496-12, box tkhd, version 0)."""
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 4 + 4 + 5 * 4 + 8 + 8
     assert struct.unpack_from(">9i", data, at) == (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)

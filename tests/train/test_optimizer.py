@@ -44,7 +44,7 @@ def test_gradients_are_dropped_and_parameters_without_one_do_not_move():
     torch.testing.assert_close(gaussians.quats, before, rtol=0, atol=0)
 
 
-def test_a_rate_for_something_else_is_refused():
+def test_a_rate_for_an_unknown_parameter_is_refused():
     with pytest.raises(ArgumentError, match="colour"):
         Adam(start().tensors(), {"colour": 1.0})
 
