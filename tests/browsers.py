@@ -10,7 +10,7 @@ import pytest
 
 @contextmanager
 def chromium(flags: Sequence[str] = ()) -> Iterator[Any]:
-    """Launch Chromium; skip the test, by name, where Chromium or Playwright is not installed."""
+    """Launch Chromium, or skip the test if Chromium or Playwright is not installed."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = shutil.which("chromium")
     if program is None:

@@ -1,4 +1,4 @@
-"""Checkpoints that were damaged on purpose: bytes, tensors and numbers."""
+"""Checkpoints damaged on purpose: in their bytes, tensors and numbers."""
 
 import json
 import struct
@@ -23,7 +23,7 @@ CONFIGS = {
 
 
 class Maker:
-    """Makes trainers of one kind, tiny and always the same.
+    """Makes identical tiny trainers with a given strategy.
 
     Args:
         strategy: The density strategy.
@@ -74,7 +74,7 @@ ODD += (
 
 
 def changed_tensor(tensor: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-    """Give a tensor another dtype or shape, or other numbers."""
+    """Change the dtype, shape or numbers of a tensor."""
     match int(rng.integers(0, 9)):
         case 0:
             return tensor.to(DTYPES[rng.integers(len(DTYPES))])
@@ -91,12 +91,12 @@ def changed_tensor(tensor: torch.Tensor, rng: np.random.Generator) -> torch.Tens
         case 6:
             return torch.zeros([int(n) for n in rng.integers(0, 6, rng.integers(0, 6))], dtype=tensor.dtype)
         case 7 if tensor.is_floating_point() and tensor.numel():
-            spoilt = tensor.flatten()
-            spoilt[torch.from_numpy(rng.integers(0, len(spoilt), 3))] = POISONS[rng.integers(len(POISONS))]
-            return spoilt.reshape(tensor.shape)
+            changed = tensor.flatten()
+            changed[torch.from_numpy(rng.integers(0, len(changed), 3))] = POISONS[rng.integers(len(POISONS))]
+            return changed.reshape(tensor.shape)
         case _ if tensor.numel():
             raw = tensor.contiguous().flatten().view(torch.uint8).clone()
-            # torch's generators keep what matters at both ends
+            # The important fields of torch's generator states are at both ends.
             reach = len(raw) if rng.random() < 0.5 else min(len(raw), 24)
             raw[torch.from_numpy(rng.integers(0, reach, 2))] = int(rng.integers(0, 256))
             return raw.view(tensor.dtype).reshape(tensor.shape)
@@ -104,7 +104,7 @@ def changed_tensor(tensor: torch.Tensor, rng: np.random.Generator) -> torch.Tens
 
 
 def changed_json(value: object, rng: np.random.Generator) -> object:
-    """Change one place of a JSON value: another value, an entry more or less."""
+    """Change one place in a JSON value: replace a value or remove an entry."""
     inside = isinstance(value, dict | list) and len(value) > 0 and rng.random() < 0.8
     if inside and isinstance(value, dict):
         key = sorted(value)[rng.integers(len(value))]
@@ -121,17 +121,17 @@ def changed_json(value: object, rng: np.random.Generator) -> object:
     return ODD[rng.integers(len(ODD))]
 
 
-NEST = "a place for brackets that Python could not write itself"
+NEST = "a placeholder for nesting too deep for Python's own JSON writer"
 
 
 def spelled(value: object, rng: np.random.Generator) -> str:
-    """Write JSON, with thousands of brackets where the nest is."""
+    """Write JSON, with thousands of brackets in place of NEST."""
     depth = int(rng.integers(1, 6)) * 997
     return json.dumps(value).replace(json.dumps(NEST), "[" * depth + "]" * depth)
 
 
 def mutate(data: bytes, path: Path, rng: np.random.Generator) -> None:
-    """Write a damaged copy of a checkpoint: its header's or its data's bytes, its tensors, or its numbers."""
+    """Write a checkpoint with damage to the bytes of its header or data, to its tensors, or to its numbers."""
     kind = int(rng.integers(0, 5))
     header_size = struct.unpack_from("<Q", data)[0]
     if kind == 0:  # bytes anywhere in the data

@@ -1,4 +1,4 @@
-"""Fixtures that many tests share."""
+"""Fixtures shared by many tests."""
 
 import importlib.util
 import os
@@ -7,8 +7,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-# One thread: several processes run tests at once, and threads that wait for one another burn the processors' time.
-# Tests of several threads ask for them. Set before torch is imported; the programs that tests start inherit it.
+# One thread, because several processes run tests at once, and threads that wait for one another waste CPU time. Tests
+# of several threads ask for them. This must precede the import of torch. Programs started by tests inherit it.
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import jaxtyping
@@ -27,10 +27,10 @@ from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
 from shape_checker import pytest_runtest_setup  # noqa: F401
 from slices import pytest_collection_modifyitems, pytest_report_header, pytest_runtest_makereport  # noqa: F401
 
-# Whatever was started in the background of a shell ignores Ctrl-C, and so would every program that is tested.
+# Programs started in the background of a shell ignore Ctrl-C, and every tested program would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The same examples in every run: a failure seen once is seen again. `make soak` looks at others, and at more.
+# The same examples in every run make failures reproducible. `make soak` tries more, and random ones.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=100)
 settings.register_profile("soak", deadline=None, max_examples=5_000, print_blob=True)
 settings.load_profile("soak" if slices.SOAK else "repeatable")
@@ -38,7 +38,7 @@ settings.load_profile("soak" if slices.SOAK else "repeatable")
 
 @pytest.fixture
 def as_shipped() -> Iterator[None]:
-    """Switch the shape-checking hook off, so that errors are those a user gets."""
+    """Switch the shape-checking hook off, so that tests see the errors that users get."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -46,7 +46,7 @@ def as_shipped() -> Iterator[None]:
 
 @pytest.fixture
 def random_splats():
-    """Make n random splats in front of `random_camera`, every depth different."""
+    """Make n random splats in front of `random_camera`, with distinct depths."""
 
     def make(n: int, seed: int = 0, scale: float = 0.1):
         rng = np.random.default_rng(seed)
@@ -63,5 +63,5 @@ def random_splats():
 
 @pytest.fixture
 def random_camera() -> Camera:
-    """A camera whose image is no multiple of a tile, not square, and off its centre."""
+    """A camera with an off-centre principal point, whose image is not square and not a multiple of a tile."""
     return Camera(np.eye(3), (0.1, -0.05, -3.0), fx=50.0, fy=45.0, cx=20.3, cy=16.8, H=35, W=41)

@@ -1,4 +1,4 @@
-"""Trainings with a live view, and a client of its WebSocket: what tests of the view share."""
+"""Helpers for tests of the live view: trainings that have one, and a client of its WebSocket."""
 
 import io
 import re
@@ -19,7 +19,7 @@ from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.viewer.live import LiveView
 
 PATIENCE = 180.0
-"""Seconds after which whatever is waited for counts as hanging."""
+"""Seconds after which a wait fails."""
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 CANVAS = (120, 80)
@@ -32,16 +32,16 @@ STRATEGIES = {
 
 
 def until(true, what):
-    """Wait for something, and return it."""
+    """Wait until a function returns something true, and return that."""
     deadline = time.monotonic() + PATIENCE
     while not (found := true()):
-        assert time.monotonic() < deadline, f"never came: {what}"
+        assert time.monotonic() < deadline, f"timed out waiting for: {what}"
         time.sleep(0.01)
     return found
 
 
 class Training:
-    """A training in a thread of its own, with its live view."""
+    """A training in its own thread, with its live view."""
 
     def __init__(self, capture, out, *words):
         parsed = build_parser(["train"]).parse_args(["train", str(capture), "--out", str(out), *words])
@@ -62,7 +62,7 @@ class Training:
         return self.run.trainer.iteration
 
     def ended(self):
-        """Wait for the end, which has to be a good one."""
+        """Wait for the training to end, and check that it ended without an error."""
         self.thread.join(PATIENCE)
         assert not self.thread.is_alive() and self.failure is None, self.failure
 
@@ -85,7 +85,7 @@ OWN = object()
 
 
 class Client:
-    """What a browser's half of viser does, as far as it matters here: a WebSocket of MessagePack."""
+    """The part of viser's browser client that these tests need: a WebSocket that carries MessagePack."""
 
     def __init__(self, view, origin=OWN, url=None, **headers):
         self.socket = websockets.sync.client.connect(
@@ -119,7 +119,7 @@ class Client:
         self.send("GuiUpdateMessage", uuid=self.buttons[label], updates={"value": True})
 
     def options(self, label):
-        """Return what a list offers."""
+        """Return the options of a dropdown list."""
         return until(lambda: self.listened().lists.get(label), label)[1]
 
     def choose(self, label, option):
@@ -127,7 +127,7 @@ class Client:
         self.send("GuiUpdateMessage", uuid=self.lists[label][0], updates={"value": option})
 
     def listened(self):
-        """Take in what has come so far."""
+        """Read all messages that have arrived so far."""
         while True:
             try:
                 data = self.socket.recv(timeout=0.01)
@@ -156,7 +156,7 @@ class Client:
             self.shared.append(message)
 
     def picture(self, width=None):
-        """Return the next picture, or the next one of a width."""
+        """Return the next picture, or the next one of a given width."""
         self.pictures.clear()
         return until(
             lambda: [p for p in self.listened().pictures if width in (None, p.shape[1])], "a picture"

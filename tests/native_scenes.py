@@ -1,4 +1,4 @@
-"""Hard scenes for kernels, and their truth: the NumPy reference with exact extents and tile stops."""
+"""Hard scenes for kernels, and their true images from the NumPy reference with exact extents and tile stops."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ class Scene:
 
 
 def camera(W: int, H: int) -> Camera:
-    """A camera three units in front of the origin that sees it off the middle of its image."""
+    """Return a camera three units in front of the origin, with the principal point off the image centre."""
     R = quat_to_R_batch([(1.0, 0.02, -0.03, 0.1)])[0]
     return Camera(R, (0.1, -0.05, -3.0), fx=1.1 * W, fy=1.2 * W, cx=0.52 * W, cy=0.47 * H, H=H, W=W)
 
 
 def random(n: int, size: tuple[int, int] = (41, 35), seed: int = 0, **changes: np.ndarray) -> Scene:
-    """n random Gaussians of depths that all differ, with harmonics of degree 3."""
+    """Return n random Gaussians with distinct depths and harmonics of degree 3."""
     rng = np.random.default_rng(seed)
     means = rng.uniform(-0.8, 0.8, (n, 3))
     means[:, 2] = rng.permutation(n) / max(n, 1) - 0.5
@@ -76,7 +76,7 @@ def random(n: int, size: tuple[int, int] = (41, 35), seed: int = 0, **changes: n
 
 
 def _spread(n: int) -> np.ndarray:
-    """Differences between the axes, so that a rotation has an effect and a gradient."""
+    """Return differences between the axes, so that rotations have an effect and a gradient."""
     return np.random.default_rng(n).uniform(-0.4, 0.4, (n, 3))
 
 
@@ -87,7 +87,7 @@ def _needles() -> Scene:
 
 
 def _layers(n: int = 3000) -> Scene:
-    """Thousands of faint layers over the same few pixels."""
+    """Return thousands of faint layers over the same few pixels."""
     rng = np.random.default_rng(2)
     means = np.stack([rng.normal(size=n) * 0.05, rng.normal(size=n) * 0.05, np.linspace(-1, 1, n)], axis=1)
     return random(n, (20, 18), seed=2, means=means, logits=rng.normal(size=n) - 3.0)
@@ -109,7 +109,7 @@ SCENES = {
     "one Gaussian": random(1, seed=10),
     "partly behind": random(80, seed=11, means=np.random.default_rng(11).uniform(-4, 4, (80, 3))),
 }
-"""By what is hard about them. Scenes with ties use one camera axis along z, so that they tie exactly."""
+"""Scenes by what is hard about them. In the scene with ties, a camera axis is along z, so that depths tie exactly."""
 
 SCENES["ties in depth"] = Scene(
     **{

@@ -1,8 +1,8 @@
-"""Processes that start at once: forked from one that has imported the package.
+"""Processes that start fast, because they are forked from one that has imported the package.
 
-Importing torch and the commands takes several seconds of a processor, and a test that kills a run thirteen times would
-import them thirteen times. multiprocessing's fork server imports them once for each process that runs tests. It is a
-process of its own, without the hook that checks shapes, and its children end, or are killed, as any other program.
+Importing torch and the commands takes several seconds of CPU time, and a test that kills a run thirteen times would
+import them thirteen times. multiprocessing's fork server imports them once per process that runs tests. It is a
+separate process without the shape-checking hook, and its children end or are killed like any other program.
 """
 
 import multiprocessing
@@ -17,7 +17,7 @@ CONTEXT.set_forkserver_preload(["processes", "gsplat_edu.cli.main", "gsplat_edu.
 
 
 def _run(code: str, words: Sequence[str], threads: int, out: Path, err: Path) -> None:
-    """Run a program in this process as `python -c CODE WORDS` would, its output going into two files."""
+    """Run a program in this process as `python -c CODE WORDS` would, with its output in two files."""
     for path, number in ((out, 1), (err, 2)):
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(file, number)
@@ -31,13 +31,13 @@ def _run(code: str, words: Sequence[str], threads: int, out: Path, err: Path) ->
 
 
 class Program:
-    """A Python program that runs in a process of its own.
+    """A Python program that runs in its own process.
 
     Args:
         code: The program.
         words: Its arguments, sys.argv[1:].
-        folder: Where its output goes, into files that the next program there writes over.
-        threads: torch's and the kernels' threads.
+        folder: Where to write the output. The next program with the same folder overwrites it.
+        threads: Number of threads of torch and the kernels.
     """
 
     def __init__(self, code: str, words: Sequence[object], folder: Path, threads: int = 1) -> None:
@@ -54,7 +54,7 @@ class Program:
         os.kill(self.process.pid, number)
 
     def ended(self, patience: float = 120.0) -> tuple[int, str, str]:
-        """Wait for the end; return the exit code, negative for a signal, and what was written to both streams."""
+        """Wait for the end; return the exit code (negative for a signal), stdout and stderr."""
         self.process.join(patience)
-        assert not self.process.is_alive(), "it hangs"
+        assert not self.process.is_alive(), "the program hangs"
         return self.process.exitcode, self._out.read_text(), self._err.read_text()

@@ -1,4 +1,4 @@
-"""Scenes and files that the tests of scene formats share."""
+"""Scenes and files shared by the tests of scene formats."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ RUN_UP = np.array([0.0, -0.6, 0.8])
 
 
 def random_scene(count: int, rest: int = 15, seed: int = 0) -> Scene:
-    """Random Gaussians of sizes, opacities and colours as scenes have them."""
+    """Return random Gaussians with realistic sizes, opacities and colours."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -52,7 +52,7 @@ def small_folder(folder: Path) -> Path:
 def make_run(
     path: Path, origin: tuple[float, float, float] = (0.0, 0.0, 0.0), count: int = 5
 ) -> tuple[RunFolder, Gaussians, list[Camera]]:
-    """A run whose cameras look at the origin from a ring around RUN_UP; its scene, and the cameras in their order."""
+    """Make a run whose cameras look at the origin from a ring around RUN_UP; return it, its scene and the cameras."""
     folder = RunFolder(path)
     side = np.array([1.0, 0.0, 0.0])
     views = []

@@ -1,8 +1,8 @@
-"""Train for a few hundred iterations; print the resident memory after each as JSON. train/test_memory.py runs it.
+"""Train for a few hundred iterations and print the resident memory after each as JSON, for train/test_memory.py.
 
     python soak.py CASE FOLDER
 
-It runs in a process of its own, since what other tests leave in the heap would hide or imitate growth.
+It runs in its own process, because other tests' remains in the heap could hide or imitate growth.
 """
 
 import functools
@@ -25,7 +25,7 @@ from gsplat_edu.views import View
 
 ITERATIONS = 240
 SIZES = {"one": [(320, 240)], "mixed": [(320, 240), (240, 320), (304, 304), (360, 200)]}
-"""(W, H) of the photos, by turns."""
+"""(W, H) of the photos, in rotation."""
 
 CASES = {
     # Photos, their sizes, masks, kept in memory, random background, strategy.

@@ -1,4 +1,4 @@
-"""Scenes that tests of runs and commands share."""
+"""Scenes shared by tests of runs and commands."""
 
 import torch
 
@@ -7,7 +7,7 @@ from gsplat_edu.gaussians import Gaussians
 
 
 def splats_on(points, colors) -> Gaussians:
-    """Put a ball of one size on every point, of the point's colour."""
+    """Return a ball of fixed size on every point, in the point's colour."""
     count = len(points)
     return Gaussians(
         means=torch.tensor(points, dtype=torch.float32),

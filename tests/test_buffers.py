@@ -1,4 +1,4 @@
-"""Buffers are used again when nothing refers to them any more, and not a moment before."""
+"""Buffers are reused once nothing refers to them, and not before."""
 
 import subprocess
 import sys
@@ -16,11 +16,11 @@ LIKE = torch.zeros(())
 
 
 def address():
-    """Take a buffer, let it go, and return where it was."""
+    """Take a buffer, release it, and return its address."""
     return reusable_tensor(SHAPE, LIKE).data_ptr()
 
 
-def test_a_buffer_that_nobody_holds_is_used_again():
+def test_an_unreferenced_buffer_is_reused():
     with reused_buffers():
         assert address() == address()
 
@@ -35,7 +35,7 @@ def test_a_buffer_that_nobody_holds_is_used_again():
         lambda tensor: (torch.ones_like(tensor, requires_grad=True) * tensor).sum(),  # saved by autograd
     ],
 )
-def test_a_buffer_that_somebody_holds_stays_as_it_is(hold):
+def test_a_referenced_buffer_is_not_reused(hold):
     with reused_buffers():
         first = reusable_tensor(SHAPE, LIKE).fill_(7.0)
         held, where = hold(first), first.data_ptr()
@@ -56,8 +56,8 @@ def test_a_tensor_outlives_the_block():
     assert bool((image == 3.0).all())
 
 
-def test_what_outlives_the_block_goes_back_one_by_one(monkeypatch):
-    """One tensor that is kept, a render to look at, keeps no other's memory."""
+def test_buffers_that_outlive_the_block_are_freed_individually(monkeypatch):
+    """A kept tensor, for example a render on display, does not keep the memory of others."""
     made, mapped = [], buffers._mapped
     monkeypatch.setattr(buffers, "_mapped", lambda nbytes: made.append(mapped(nbytes)) or made[-1])
     with reused_buffers():
@@ -71,7 +71,7 @@ def test_what_outlives_the_block_goes_back_one_by_one(monkeypatch):
     assert [ref() is not None for ref in found] == [True, False, True, False]
 
 
-def test_small_ones_and_those_outside_the_block_are_torchs():
+def test_small_buffers_and_those_outside_a_block_come_from_torch():
     with reused_buffers():
         assert reusable_tensor((LARGE // 4 - 1,), LIKE).untyped_storage().resizable()
         assert not reusable_tensor((LARGE // 4,), LIKE).untyped_storage().resizable()
@@ -87,7 +87,7 @@ def test_shape_and_dtype(dtype):
     assert reusable_tensor((0, 3), LIKE).shape == (0, 3)
 
 
-def test_blocks_inside_one_another_share_and_threads_do_not():
+def test_nested_blocks_share_buffers_and_threads_do_not():
     with reused_buffers():
         where = address()
         with reused_buffers():
@@ -99,11 +99,11 @@ def test_blocks_inside_one_another_share_and_threads_do_not():
         )
         thread.start()
         thread.join()
-        assert seen == [True], "a thread that is not in a block takes its memory from torch"
+        assert seen == [True], "a thread outside a block gets its memory from torch"
 
 
-def test_no_more_is_held_than_was_once_in_use():
-    """Two at a time, of sizes that never come again: nothing fits, and what waits has to go."""
+def test_the_pool_holds_no_more_than_the_peak_in_use():
+    """Two buffers at a time, of sizes that never recur: none can be reused, so unused ones must be freed."""
     pool = buffers._Pool()
     largest = 0
     for i in range(300):
@@ -111,11 +111,11 @@ def test_no_more_is_held_than_was_once_in_use():
         pair = [pool.take(size), pool.take(2 * size)]
         largest = max(largest, sum(-(-a.nbytes // 4096) * 4096 for a in pair))
         del pair
-        # A buffer that is handed out again may be SLACK larger than the request.
+        # A reused buffer may be up to SLACK times as large as the request.
         assert pool.nbytes <= buffers.SLACK * largest
 
 
-def test_what_is_not_wanted_any_more_goes_back():
+def test_unused_buffers_are_freed_in_time():
     pool = buffers._Pool()
     many = [pool.take(LARGE) for _ in range(50)]
     del many
@@ -127,7 +127,7 @@ def test_what_is_not_wanted_any_more_goes_back():
 
 @pytest.mark.own_process
 @pytest.mark.skipif(sys.platform == "win32", reason="no fork")
-def test_a_forked_child_has_a_copy():
+def test_a_forked_child_has_its_own_copy():
     code = """
 import os, torch
 from gsplat_edu.buffers import reusable_tensor, reused_buffers

@@ -21,7 +21,7 @@ def test_look_at_rows_are_right_down_forward():
         assert R[1] @ (0, -1, 0) < 0, "down points away from up"
 
 
-def test_looking_at_puts_the_target_in_the_middle_and_up_at_the_top():
+def test_looking_at_centres_the_target_with_up_at_the_top():
     cam = Camera.looking_at(eye=(1, -2, -3), target=(0.5, 0, 1), fx=100, fy=90, H=60, W=80)
     u, v, z = cam.project(cam.world_to_cam([(0.5, 0, 1), (0.5, -0.1, 1)]))
     np.testing.assert_allclose((u[0], v[0]), (40, 30), rtol=0, atol=1e-12)
@@ -29,16 +29,16 @@ def test_looking_at_puts_the_target_in_the_middle_and_up_at_the_top():
     np.testing.assert_allclose(z[0], np.linalg.norm([-0.5, 2, 4]))
 
 
-def test_another_up_turns_the_image():
+def test_up_decides_the_orientation_of_the_image():
     upright = Camera.looking_at((0, 0, -3), (0, 0, 0), 10, 10, 8, 8)
     turned = Camera.looking_at((0, 0, -3), (0, 0, 0), 10, 10, 8, 8, up=(1, 0, 0))
     u, v, _ = upright.project(upright.world_to_cam((1, 0, 0)))
     assert (u > 4) and v == 4
     u, v, _ = turned.project(turned.world_to_cam((1, 0, 0)))
-    assert abs(u - 4) < 1e-12 and v < 4, "what was right is now up"
+    assert abs(u - 4) < 1e-12 and v < 4, "right has become up"
 
 
-def test_project_is_the_pinhole_and_keeps_leading_axes():
+def test_project_is_a_pinhole_and_keeps_leading_axes():
     cam = Camera(np.eye(3), (0, 0, 0), fx=10, fy=20, cx=3, cy=4, H=5, W=6)
     points = np.array([[[1.0, 2.0, 4.0]], [[-1.0, 0.5, 2.0]]])
     u, v, z = cam.project(points)
@@ -65,7 +65,7 @@ def test_a_camera_keeps_its_own_read_only_copies():
         cam.R[0, 0] = 2.0
 
 
-def test_orbit_camera_stands_on_its_sphere_and_looks_at_the_centre():
+def test_orbit_camera_is_on_its_sphere_and_looks_at_the_centre():
     for azimuth in np.linspace(0, 6, 7):
         cam = orbit_camera(azimuth, 0.3, size=32, fx=40, radius=2.5)
         np.testing.assert_allclose(np.linalg.norm(cam.eye), 2.5)

@@ -1,4 +1,4 @@
-"""Degenerate input to every public function: the documented result, or an error that names the argument."""
+"""Degenerate input to every public function gives the documented result or an error that names the argument."""
 
 import inspect
 import re
@@ -48,7 +48,7 @@ def camera(**changes):
     return {"R": I3, "eye": (0, 0, 0), "fx": 1, "fy": 1, "cx": 0, "cy": 0, "H": 2, "W": 2} | changes
 
 
-# function, arguments, the error, the argument it names
+# function, arguments, the error, the argument that it names
 REJECTED = [
     (look_at, {"eye": (0, 0), "target": (0, 0, 1)}, ShapeError, "eye"),
     (look_at, {"eye": (0, 0, 1), "target": (0, 0, 1)}, ArgumentError, "target"),
@@ -145,7 +145,7 @@ REJECTED = [
 
 
 @pytest.mark.parametrize(("function", "arguments", "error", "names"), REJECTED)
-def test_rejected_by_name(function, arguments, error, names):
+def test_bad_arguments_are_rejected_by_name(function, arguments, error, names):
     with pytest.raises(error) as caught:
         function(**arguments)
     assert str(caught.value).startswith(f"{names}:")
@@ -161,7 +161,7 @@ def test_every_public_function_is_covered():
     assert functions <= {function.__name__ for function, *_ in REJECTED}
 
 
-def test_nothing_at_all():
+def test_empty_input():
     empty = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0)
     image, T = render_gaussians(CAM, *empty, bg=(0.1, 0.2, 0.3))
     assert image.shape == (8, 9, 3) and (image == (0.1, 0.2, 0.3)).all() and (T == 1).all()
@@ -175,27 +175,27 @@ def test_nothing_at_all():
     assert [a.shape for a in CAM.project(np.zeros((0, 3)))] == [(0,)] * 3
 
 
-def test_just_one():
+def test_a_single_element():
     image, T = render_gaussians(CAM, *SPLAT)
     assert T.min() < 0.6 and image.max() > 0.4
     assert [len(a) for a in sphere_shell(n=1)] == [1, 1, 1, 1]
     assert quat_to_R_batch([(1, 0, 0, 0)]).shape == (1, 3, 3)
 
 
-def test_behind_the_camera_is_not_drawn():
+def test_a_gaussian_behind_the_camera_is_not_drawn():
     image, T = render_gaussians(**splat(means=[[0, 0, -1.0]]))
     assert (image == 0).all() and (T == 1).all()
     u, v, z = CAM.project((0, 0, -1))
     assert np.isnan(u) and np.isnan(v) and z == -1
 
 
-def test_a_flat_gaussian_is_a_gaussian():
+def test_a_gaussian_without_extent_is_drawn():
     assert (build_cov3d((0, 0, 0), I3) == 0).all()
     _, T = render_gaussians(**splat(cov3ds=[np.zeros((3, 3))]))
-    assert T[4, 4] == 0.5, "the dilation alone"
+    assert T[4, 4] == 0.5, "only the dilation is drawn"
 
 
-def test_far_outside_the_image_is_not_drawn_and_does_not_overflow():
+def test_a_gaussian_far_outside_the_image_does_not_overflow():
     for x in (1e3, 1e30, -1e30):
         _, T = render_gaussians(**splat(means=[[x, 0, 1.0]], cov3ds=[np.zeros((3, 3))]))
         assert (T == 1).all()
@@ -205,15 +205,15 @@ FIRST = {"means": [[0, 0, 1.0]] * 2, "colors": np.ones((2, 3)), "opacities": [0.
 
 
 @pytest.mark.parametrize("length", [1e12, 1e20, 1e60, 1e200, 1e300])
-def test_an_ellipse_that_float64_cannot_hold_is_named(length):
-    """NumPy's own LinAlgError said neither which Gaussian it was nor what was wrong with it."""
+def test_a_covariance_beyond_float64_is_named(length):
+    """NumPy's LinAlgError would name neither the Gaussian nor the problem."""
     along = np.array([0.6, 0.8, 0.0])
     needle = length * np.outer(along, along)
     with pytest.raises(ArgumentError, match=r"cov3ds\[1\]: "):
         render_gaussians(**splat(**FIRST, cov3ds=[I3, needle]))
 
 
-def test_a_place_that_float64_cannot_hold_is_named():
+def test_a_position_beyond_float64_is_named():
     with pytest.raises(ArgumentError, match=r"means\[1\], cov3ds\[1\]: "):
         render_gaussians(**splat(**FIRST | {"means": [[0, 0, 1.0], [1e200, 0, 1.0]]}, cov3ds=[I3, I3]))
     far = Camera(I3, (0, 0, -1.7e308), 10.0, 10.0, 4.0, 4.0, 8, 9)
@@ -223,8 +223,8 @@ def test_a_place_that_float64_cannot_hold_is_named():
         )
 
 
-def test_extreme_scenes_raise_no_error_of_numpys():
-    """300 scenes of scales over 40 decades: an image, or an ArgumentError that has the Gaussian's number."""
+def test_extreme_scenes_raise_no_numpy_error():
+    """Each of 300 scenes, with scales over 40 decades, gives an image or an ArgumentError that names the Gaussian."""
     refused = 0
     for seed in range(300):
         rng = np.random.default_rng(seed)
@@ -245,12 +245,12 @@ def test_extreme_scenes_raise_no_error_of_numpys():
     assert 0 < refused < 300
 
 
-def test_wider_than_the_image_covers_it():
+def test_a_gaussian_wider_than_the_image_covers_it():
     _, T = render_gaussians(**splat(cov3ds=[I3 * 1e6]))
     np.testing.assert_allclose(T, 0.5, rtol=1e-4)  # exponent at the corner: 20 px² / (2 x 1e8 px²) = 1e-7
 
 
-# The torch half.
+# Functions of torch tensors.
 
 DIRS = torch.ones(1, 3)
 T1 = {
@@ -293,7 +293,7 @@ REJECTED_TENSORS = [
 
 
 @pytest.mark.parametrize(("function", "arguments", "error", "names"), REJECTED_TENSORS)
-def test_tensors_rejected_by_name(function, arguments, error, names):
+def test_bad_tensors_are_rejected_by_name(function, arguments, error, names):
     with pytest.raises(error) as caught:
         function(**arguments)
     assert str(caught.value).startswith(f"{names}:")
@@ -314,14 +314,14 @@ def gaussians(n, **changes):
 @pytest.mark.parametrize(
     ("name", "shape"), [("quats", (2, 3)), ("sh0", (2, 3)), ("sh_rest", (2, 5, 3)), ("logit_opacities", (3,))]
 )
-def test_gaussians_of_unequal_shapes(name, shape):
+def test_gaussians_of_inconsistent_shapes_are_refused(name, shape):
     with pytest.raises(ShapeError, match=f"^{name}: "):
         gaussians(2, **{name: torch.zeros(shape)})
 
 
 @pytest.mark.parametrize("case", ["empty", "culled"])
 def test_nothing_visible_gives_the_background_and_zero_gradients(case):
-    scene = gaussians(0 if case == "empty" else 3).trainable()  # means at the origin, where the camera is
+    scene = gaussians(0 if case == "empty" else 3).trainable()  # means at the origin, like the camera
     out = render(scene, CAM, settings=RenderSettings(background=(0.1, 0.2, 0.3)))
     torch.testing.assert_close(out.image, torch.tensor([0.1, 0.2, 0.3]).expand(8, 9, 3))
     assert (out.transmittance == 1).all() and len(out.visible) == 0
@@ -339,25 +339,25 @@ def test_nothing_visible_gives_the_background_and_zero_gradients(case):
         ({"logit_opacities": torch.zeros(2, dtype=torch.int64)}, "logit_opacities"),
     ],
 )
-def test_gaussians_of_other_types(changes, names):
+def test_gaussians_of_wrong_types_are_refused(changes, names):
     with pytest.raises(ArgumentError, match=f"^{names}: "):
         gaussians(2, **changes)
 
 
-def test_a_long_or_short_quaternion_is_the_rotation_it_was():
+def test_the_length_and_sign_of_a_quaternion_do_not_matter():
     expected = quat_to_R_t(torch.tensor([[1.0, 1, 0, 0]]))
     for factor in (1e20, 1e-30, -1.0):
         torch.testing.assert_close(quat_to_R_t(factor * torch.tensor([[1.0, 1, 0, 0]])), expected)
 
 
-def test_a_needle_is_a_covariance():
-    """Its 2D determinant cancels, but it is symmetric and positive semi-definite, and so it is drawn."""
+def test_a_needle_is_drawn():
+    """Its 2D determinant suffers cancellation, but it is symmetric and positive semi-definite, so it is drawn."""
     direction = np.array([0.6, 0.8, 0.0])
     _, T = render_gaussians(**splat(cov3ds=[1e4 * np.outer(direction, direction)]))
     assert T.min() < 0.6
 
 
-def test_losses_and_scene_files(tmp_path):
+def test_losses_and_scene_files_refuse_bad_input(tmp_path):
     with pytest.raises(ShapeError, match="^target: "):
         l1(torch.zeros(2, 2, 3), torch.zeros(1, 1, 3))
     bad = gaussians(2, log_scales=torch.full((2, 3), NAN))
@@ -366,7 +366,7 @@ def test_losses_and_scene_files(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_gradient_norms_before_backward():
+def test_gradient_norms_before_backward_are_refused():
     out = render(gaussians(1, means=torch.tensor([[0.0, 0, 2]])).trainable(), CAM)
     with pytest.raises(ArgumentError, match="backward"):
         out.means2d_grad_norms()

@@ -11,7 +11,7 @@ from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.files import check_writable, described, unreadable, written_aside
 
 
-def test_parents_are_made_and_the_file_appears_whole(tmp_path):
+def test_parent_folders_are_made_and_the_file_appears_complete(tmp_path):
     path = tmp_path / "a" / "b" / "c.txt"
     with written_aside(path) as aside:
         aside.write_text("new")
@@ -30,7 +30,7 @@ def test_permissions_are_those_of_any_new_file(tmp_path):
     assert stat.S_IMODE((tmp_path / "x").stat().st_mode) == 0o644
 
 
-def test_a_failure_leaves_what_was_there(tmp_path):
+def test_a_failure_leaves_the_old_file(tmp_path):
     path = tmp_path / "x"
     path.write_text("old")
     with pytest.raises(RuntimeError), written_aside(path) as aside:
@@ -39,7 +39,7 @@ def test_a_failure_leaves_what_was_there(tmp_path):
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_check_writable_says_why_not(tmp_path):
+def test_check_writable_gives_the_reason(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ArgumentError, match=r"^--out: cannot write .*; choose another place$"):
         check_writable("--out", tmp_path / "file" / "x.png")
@@ -50,7 +50,7 @@ def test_check_writable_says_why_not(tmp_path):
     assert list((tmp_path / "new").iterdir()) == []
 
 
-def test_an_error_names_the_file_that_was_asked_for_and_the_reason_in_words(tmp_path, monkeypatch):
+def test_an_error_names_the_requested_file_and_the_reason(tmp_path, monkeypatch):
     def refuse(*words, **options):
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".scene.ab12cd34.ply"))
 
@@ -61,12 +61,12 @@ def test_an_error_names_the_file_that_was_asked_for_and_the_reason_in_words(tmp_
             monkeypatch.undo()
         with pytest.raises(OSError) as caught, written_aside(tmp_path / "scene.ply") as aside:
             raise PermissionError(errno.EACCES, "Permission denied", str(aside))
-        said = described(caught.value)
-        assert said.startswith(f"{tmp_path / 'scene.ply'}: permission denied; choose another place")
+        message = described(caught.value)
+        assert message.startswith(f"{tmp_path / 'scene.ply'}: permission denied; choose another place")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_errors_are_described_without_numbers():
+def test_errors_are_described_without_error_numbers():
     assert described(OSError(errno.ENOSPC, "No space left on device", "a.png")) == (
         "a.png: no space left on device; make room, or choose another place"
     )
@@ -75,7 +75,7 @@ def test_errors_are_described_without_numbers():
     assert described(OSError(errno.EIO, "Input/output error")) == "input/output error"
 
 
-def test_the_command_line_prints_the_name_that_was_asked_for(tmp_path, capsys):
+def test_the_command_line_prints_the_requested_name(tmp_path, capsys):
     def command():
         (tmp_path / "file").write_text("")
         with written_aside(tmp_path / "file" / "scene.ply"):
@@ -92,7 +92,7 @@ def test_the_command_line_prints_the_name_that_was_asked_for(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("number", "advice"), [(errno.EACCES, "check its permissions"), (errno.EIO, "check the file")]
 )
-def test_what_cannot_be_read_is_one_wording(number, advice):
+def test_unreadable_files_have_one_wording(number, advice):
     error = OSError(number, os.strerror(number), "elsewhere")
     assert unreadable(Path("a.bin"), error) == f"a.bin: cannot be read ({os.strerror(number)}); {advice}"
     assert "cannot be read (gone); check the file" in unreadable(Path("a.bin"), OSError("gone"))

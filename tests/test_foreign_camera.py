@@ -1,4 +1,4 @@
-"""Cameras of another class: a chapter's own, with the chapter's fields and methods, lists and NumPy scalars."""
+"""Cameras of a foreign class, as written in a chapter, whose members are lists and NumPy scalars."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_t
 
-pytestmark = pytest.mark.usefixtures("as_shipped")  # else annotations are checked before the arguments are
+pytestmark = pytest.mark.usefixtures("as_shipped")  # otherwise annotations are checked before the arguments
 
 OURS = Camera(
     [[0.8, 0, -0.6], [0, 1, 0], [0.6, 0, 0.8]], (0.1, -0.05, -3.0), 50.0, 45.5, 20.25, 16.75, 35, 41
@@ -19,7 +19,7 @@ OURS = Camera(
 
 
 class ChapterCamera:
-    """What a chapter writes for itself."""
+    """A camera class as a chapter defines it."""
 
     def __init__(self):
         self.R, self.eye = OURS.R.tolist(), OURS.eye.tolist()
@@ -84,7 +84,7 @@ def test_the_backends_render_the_same(backend):
         sh_rest=draw(9, 3, 3),
         logit_opacities=draw(9),
     )
-    # NumPy's scalars stand in for settings, too.
+    # Settings accept NumPy scalars too.
     plain = RenderSettings(sh_degree=1, antialiased=True, jacobian_limit=1.3)
     numpy = RenderSettings(sh_degree=np.int64(1), antialiased=np.True_, jacobian_limit=np.float64(1.3))
     assert numpy == plain and hash(numpy) == hash(plain)
@@ -122,7 +122,7 @@ def test_a_missing_member_is_named(missing):
         ("R", 1.0, ShapeError),
     ],
 )
-def test_a_member_that_cannot_be_used_is_named(member, value, error):
+def test_an_invalid_member_is_named(member, value, error):
     camera = ChapterCamera()
     setattr(camera, member, value)
     with pytest.raises(error, match=rf"^cam\.{member}: "):

@@ -16,13 +16,13 @@ SCALES = np.exp(RNG.normal(size=(64, 3)) * 0.3 - 2.0)
 
 
 def product(p, q):
-    """Hamilton's product of two quaternions (w, x, y, z)."""
+    """Return the Hamilton product of two quaternions (w, x, y, z)."""
     return np.concatenate(
         [[p[0] * q[0] - p[1:] @ q[1:]], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])]
     )
 
 
-def test_rotations_are_rotations():
+def test_rotation_matrices_are_orthogonal_with_determinant_one():
     R = quat_to_R_batch(QUATS)
     np.testing.assert_allclose(
         R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), R.shape), rtol=0, atol=1e-14
@@ -30,7 +30,7 @@ def test_rotations_are_rotations():
     np.testing.assert_allclose(np.linalg.det(R), 1.0)
 
 
-def test_rotation_is_the_sandwich_product():
+def test_rotation_equals_the_sandwich_product():
     for quat, point in zip(QUATS[:8], RNG.normal(size=(8, 3)), strict=True):
         unit = quat / np.linalg.norm(quat)
         rotated = product(product(unit, np.concatenate([[0.0], point])), unit * (1, -1, -1, -1))
@@ -66,7 +66,7 @@ def test_projection_is_the_covariance_of_the_linearised_pinhole():
     cam = Camera(quat_to_R(QUATS[1]), (0.1, 0.2, 0.3), fx=120, fy=90, cx=5, cy=6, H=8, W=9)
     means_cam = np.array([[0.3, -0.2, 2.0], [-1.0, 0.5, 4.0]])
     cov3ds = build_cov3d_batch(SCALES[:2], quat_to_R_batch(QUATS[:2]))
-    h = 1e-6  # central differences: truncation h², rounding eps / h, both far below 1e-6 of the values
+    h = 1e-6  # truncation h² and rounding eps / h of central differences are far below 1e-6 of the values
     for cov3d, mean in zip(cov3ds, means_cam, strict=True):
         step = [np.subtract(*(cam.project(mean + s * e)[:2] for s in (h, -h))) / (2 * h) for e in np.eye(3)]
         JW = np.stack(step, axis=-1) @ cam.R

@@ -1,4 +1,4 @@
-"""Intrinsics as a value: what scaling, turning and undistortion do to a pinhole, and where each camera has them."""
+"""Intrinsics as a value: scaling, turning and undistorting a pinhole, and the intrinsics of each camera class."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def test_a_camera_is_a_pose_and_intrinsics():
     x, y, z = 0.1, -0.2, 2.0
     column, row, one = PINHOLE.K @ np.array([x / z, y / z, 1.0])
     u, v, _ = camera.project((x, y, z))
-    # both are one product and one sum of the same float64 numbers, grouped differently: two roundings of about 20
+    # Both are a product and a sum of the same float64 numbers, grouped differently: two roundings of about 20.
     assert one == 1.0 and abs(column - u) < 1e-14 and abs(row - v) < 1e-14
 
 
@@ -41,7 +41,7 @@ def test_scaling_keeps_the_edges_of_the_image_in_place():
     assert small.scaled(40, 30) == PINHOLE, "powers of two and their inverse are exact here"
 
 
-def test_a_lens_has_intrinsics_and_more():
+def test_a_lens_is_intrinsics_with_distortion():
     lens = Lens(40, 30, 50.0, 45.5, 18.25, 16.5, (-0.05, 0.01))
     assert isinstance(lens, Intrinsics) and lens != PINHOLE
     half = lens.scaled(20, 15)
@@ -58,7 +58,7 @@ def test_turning_four_times_changes_nothing():
 
 
 @pytest.mark.parametrize(("fy", "uneven"), [(50.0, False), (46.0, False), (45.0, True), (56.0, True)])
-def test_one_bound_decides_which_pixels_are_not_square(fy, uneven):
+def test_pixels_are_not_square_beyond_one_bound(fy, uneven):
     assert UNEVEN == 1.1
     assert Intrinsics(40, 30, 50.0, fy, 20.0, 15.0).uneven is uneven
     assert Lens(40, 30, 50.0, fy, 20.0, 15.0).uneven is uneven
@@ -67,7 +67,7 @@ def test_one_bound_decides_which_pixels_are_not_square(fy, uneven):
 @pytest.mark.parametrize(
     "change", [{"W": 0}, {"H": -1}, {"fx": 0.0}, {"fy": -2.0}, {"cx": float("nan")}, {"fx": float("inf")}]
 )
-def test_values_that_no_camera_has_are_refused(change):
+def test_implausible_values_are_refused(change):
     (name,) = change
     with pytest.raises(ArgumentError, match=f"^{name}: is "):
         dataclasses.replace(PINHOLE, **change)
@@ -82,7 +82,7 @@ class OtherCamera:
     fx, fy, cx, cy, H, W = 50.0, 45.5, 18.25, 16.5, 30, 40
 
 
-@pytest.mark.usefixtures("as_shipped")  # else annotations are checked
+@pytest.mark.usefixtures("as_shipped")  # otherwise annotations are checked
 def test_cameras_of_other_classes_are_resized_and_moved():
     assert resized(OtherCamera(), 20).intrinsics == PINHOLE.scaled(20, 15)
     moved = Similarity(np.eye(3), 2.0, np.array([1.0, 0.0, 0.0])).camera(OtherCamera())

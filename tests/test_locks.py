@@ -1,4 +1,4 @@
-"""One writer per folder: the second is told who is there, and nothing outlives its process."""
+"""A folder has one writer: a second one learns who holds the lock, and no lock outlives its process."""
 
 import errno
 import fcntl
@@ -26,72 +26,72 @@ with locked("--out", Path(sys.argv[1]), "gsplat-edu train", print):
 
 
 def holder(folder, fork="none"):
-    words = [sys.executable, "-c", HOLDS, str(folder), fork]
-    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, "-c", HOLDS, str(folder), fork]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     lines = [process.stdout.readline() for _ in range(2 if fork == "fork" else 1)]
     assert all(line.startswith("held") for line in lines), lines
     return process, max(int(line.split()[1]) for line in lines)
 
 
-def killed(process):
+def kill(process):
     process.kill()
     process.wait()
     process.stdin.close()
     process.stdout.close()
 
 
-def taken(folder):
+def lock(folder):
     with locked("--out", folder, "gsplat-edu train", pytest.fail):
         return True
 
 
 @pytest.mark.own_process
-def test_the_second_is_told_who_holds_it_and_kill_9_frees_it(tmp_path):
+def test_the_second_writer_learns_the_holder_and_kill_9_frees_the_lock(tmp_path):
     process, _ = holder(tmp_path / "run")
-    says = rf"^--out: .*run is in use by `gsplat-edu train`, process {process.pid} on .+, since 2\d{{3}}-.*; wait"
-    with pytest.raises(ArgumentError, match=says):
-        taken(tmp_path / "run")
-    killed(process)
-    assert (tmp_path / "run" / LOCK).exists(), "nobody could remove it"
-    assert taken(tmp_path / "run")
+    message = rf"^--out: .*run is in use by `gsplat-edu train`, process {process.pid} on .+, since 2\d{{3}}-.*; wait"
+    with pytest.raises(ArgumentError, match=message):
+        lock(tmp_path / "run")
+    kill(process)
+    assert (tmp_path / "run" / LOCK).exists(), "a killed process cannot remove its file"
+    assert lock(tmp_path / "run")
     assert not (tmp_path / "run" / LOCK).exists()
 
 
 @pytest.mark.own_process
-def test_a_forked_child_does_not_keep_it(tmp_path):
+def test_a_forked_child_does_not_keep_the_lock(tmp_path):
     process, child = holder(tmp_path / "run", "fork")
     try:
         with pytest.raises(ArgumentError, match=f"process {process.pid} "):
-            taken(tmp_path / "run")
-        killed(process)
-        os.kill(child, 0)  # it lives
-        assert taken(tmp_path / "run")
+            lock(tmp_path / "run")
+        kill(process)
+        os.kill(child, 0)  # the child is alive
+        assert lock(tmp_path / "run")
     finally:
         os.kill(child, signal.SIGKILL)
 
 
-def test_the_same_process_does_not_get_it_twice(tmp_path):
+def test_a_process_cannot_lock_a_folder_twice(tmp_path):
     with locked("OUT", tmp_path, "gsplat-edu sfm", pytest.fail):
         with pytest.raises(ArgumentError, match=f"^OUT: .*process {os.getpid()} "):
-            taken_as_out(tmp_path)
+            lock_as_out(tmp_path)
         assert (tmp_path / LOCK).exists()
     assert list(tmp_path.iterdir()) == []
 
 
-def taken_as_out(folder):
+def lock_as_out(folder):
     with locked("OUT", folder, "gsplat-edu sfm", pytest.fail):
         return True
 
 
-def test_a_folder_that_was_made_and_left_empty_is_removed(tmp_path):
-    assert taken(tmp_path / "a" / "b")
+def test_a_created_folder_left_empty_is_removed(tmp_path):
+    assert lock(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
     with locked("--out", tmp_path / "a" / "b", "gsplat-edu train", pytest.fail):
         (tmp_path / "a" / "file").write_text("kept")
     assert [path.name for path in tmp_path.rglob("*")] == ["a", "file"]
 
 
-def test_what_a_damaged_lock_says_is_not_printed(tmp_path):
+def test_the_contents_of_a_damaged_lock_are_not_printed(tmp_path):
     with locked("--out", tmp_path, "gsplat-edu train", pytest.fail):
         for text in (
             '{"pid": "\x1b[31m", "host": "\n", "what": 1, "since": []}',
@@ -102,12 +102,12 @@ def test_what_a_damaged_lock_says_is_not_printed(tmp_path):
         ):
             (tmp_path / LOCK).write_text(text)
             with pytest.raises(ArgumentError, match="is in use by") as caught:
-                taken(tmp_path)
+                lock(tmp_path)
             assert str(caught.value).isprintable()
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
-def test_a_file_system_without_locks_costs_one_sentence(tmp_path, monkeypatch, number):
+def test_a_file_system_without_locks_gives_one_message(tmp_path, monkeypatch, number):
     def refuse(handle, how):
         raise OSError(number, os.strerror(number))
 

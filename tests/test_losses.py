@@ -16,7 +16,7 @@ def test_l1_is_the_mean_over_pixels_and_channels():
 
 
 def by_convolution(x, y, weight):
-    """SSIM from its definition, by torch's own convolution."""
+    """Compute the loss from the definition of SSIM, with torch's convolution."""
     taps = torch.exp(-((torch.arange(11, dtype=x.dtype) - 5) ** 2) / (2 * 1.5**2))
     window = torch.outer(taps, taps) / taps.sum() ** 2
     kernel = window[None, None].repeat(3, 1, 1, 1)
@@ -33,8 +33,8 @@ def by_convolution(x, y, weight):
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (33, 17), (70, 141)])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_l1_ssim_is_the_definition_in_value_and_gradient(size, weight):
-    """float64; sizes below the window, and above one band of rows and one strip of columns."""
+def test_l1_ssim_matches_the_definition_in_value_and_gradient(size, weight):
+    """float64, with sizes below the window and above one band of rows and one strip of columns."""
     generator = torch.Generator().manual_seed(0)
     x, y = (torch.rand(*size, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
@@ -46,15 +46,15 @@ def test_l1_ssim_is_the_definition_in_value_and_gradient(size, weight):
 
 
 def test_l1_ssim_gradcheck():
-    """Smooth: no pixel is within the step of its target, where |x - y| has a corner."""
+    """The loss is smooth here: no pixel is so near its target that a step crosses the corner of |x - y|."""
     generator = torch.Generator().manual_seed(1)
     x, y = (torch.rand(7, 9, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     assert (x - y).abs().min() > 1e-4
     assert torch.autograd.gradcheck(lambda x: l1_ssim(x, y), x.requires_grad_(), eps=1e-6, atol=1e-8)
 
 
-def test_bytes_are_0_to_1_and_float_is_near_double():
-    """float32: variances are differences of numbers up to 1, each with 11 + 11 roundings: 22 eps over C2 = 9e-4."""
+def test_bytes_are_scaled_to_1_and_float32_is_near_float64():
+    """float32 variances are differences of numbers up to 1 with 11 + 11 roundings each: 22 eps over C2 = 9e-4."""
     generator = torch.Generator().manual_seed(2)
     x = torch.rand(40, 30, 3, generator=generator)
     photo = torch.randint(0, 256, (40, 30, 3), generator=generator, dtype=torch.uint8)
@@ -64,7 +64,7 @@ def test_bytes_are_0_to_1_and_float_is_near_double():
 
 
 @pytest.mark.parametrize("threads", [2, 5])
-def test_threads_change_no_bit(threads):
+def test_the_loss_does_not_depend_on_threads(threads):
     before = torch.get_num_threads()
     x = torch.rand(200, 150, 3, generator=torch.Generator().manual_seed(3)).requires_grad_()
     y = torch.rand(200, 150, 3, generator=torch.Generator().manual_seed(4))

@@ -1,4 +1,4 @@
-"""Properties of the image that hold for every scene, searched by hypothesis."""
+"""Properties of the image that hold for every scene, tested by hypothesis."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R, quat_to_R_batch, render_gaussians
 
-pytestmark = pytest.mark.sliced  # a soak looks for many more examples
+pytestmark = pytest.mark.sliced  # a soak tries many more examples
 
 CAM = Camera(np.eye(3), (0, 0, 0), fx=20, fy=22, cx=9.3, cy=6.8, H=14, W=19)
 
@@ -18,13 +18,13 @@ def floats(shape, low, high):
 
 
 def unit_quats(shape):
-    """Quaternions that are never near zero, where they would have no direction."""
+    """Generate quaternions that are never near zero, where they would have no direction."""
     return floats(shape, 0.1, 1.0)
 
 
 @st.composite
 def scenes(draw):
-    """Up to six splats in front of CAM, at depths that differ by at least 0.1 and so cannot tie."""
+    """Generate up to six splats in front of CAM, at depths that differ by at least 0.1 and so cannot tie."""
     n = draw(st.integers(1, 6))
     depths = 1.0 + 0.2 * np.arange(n) + draw(floats(n, 0.0, 0.1))
     means = np.concatenate([draw(floats((n, 2), -1.0, 1.0)), depths[:, None]], axis=1)
@@ -41,11 +41,11 @@ def splats(scene):
 def test_moving_the_world_and_the_camera_together_changes_nothing(scene, quat, shift):
     """x -> Q x + t for the means, Sigma -> Q Sigma Q', R -> R Q', eye -> Q eye + t.
 
-    extent="exact", stop="none": the chapter's boxes are made of whole pixels and may grow by one when a mean
-    moves by a rounding error. Rounding: coordinates up to 12 carry 12 eps; times fx / z = 22 that is 6e-14
-    px; the slope of alpha is at most 1 / sqrt(0.3 e) = 1.1 per px; relative errors of Sigma2d (up to 2e2 px²)
-    reach the exponent as 16 eps x 2e2 / 0.3. All of it stays below 1e-10. Where alpha is exactly at the floor
-    it may be dropped on one side only, so at such a pixel 1/255 is allowed.
+    extent="exact" and stop="none" are used because the chapter's boxes consist of whole pixels and may grow by one
+    when a mean moves by a rounding error. Rounding: coordinates up to 12 have errors of 12 eps, which fx / z = 22 turns
+    into 6e-14 px. The slope of alpha is at most 1 / sqrt(0.3 e) = 1.1 per px. Relative errors of Sigma2d (up to 2e2
+    px²) enter the exponent as 16 eps x 2e2 / 0.3. All of this stays below 1e-10. An alpha exactly at the floor may be
+    dropped on one side only, so such a pixel may differ by 1/255.
     """
     means, cov3ds, colors, opacities = splats(scene)
     Q = quat_to_R(quat)
@@ -64,7 +64,7 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(scene, quat, s
     st.sampled_from(["box", "tile", "none"]),
     floats(3, 0.0, 1.0),
 )
-def test_alpha_stays_in_0_to_1_and_colours_between_those_given(scene, extent, stop, bg):
+def test_transmittance_and_colours_stay_in_range(scene, extent, stop, bg):
     _, _, colors, _ = scene = splats(scene)
     image, T = render_gaussians(CAM, *scene, bg=bg, extent=extent, stop=stop)
     assert (T >= 0).all() and (T <= 1).all()

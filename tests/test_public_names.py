@@ -36,7 +36,7 @@ def bare_signature(function) -> str:
     return str(signature.replace(parameters=bare, return_annotation=inspect.Signature.empty))
 
 
-def test_signatures_are_the_chapters():
+def test_signatures_match_the_chapters():
     assert {name: bare_signature(getattr(gsplat_edu, name)) for name in SIGNATURES} == SIGNATURES
     assert {name: bare_signature(getattr(gsplat_edu.Camera, name)) for name in METHODS} == METHODS
 
@@ -50,7 +50,7 @@ def test_all_lists_every_public_name_once_and_nothing_else():
     assert sorted(public) == sorted(gsplat_edu.__all__)
 
 
-def test_every_public_object_says_what_it_does():
+def test_every_public_object_has_a_docstring():
     for name in gsplat_edu.__all__:
         value = getattr(gsplat_edu, name)
         if callable(value):
@@ -66,7 +66,7 @@ def test_the_constants():
         "T_STOP": 1e-4,
         "TILE": 16,
         "C0": 0.28209479177387814,
-        # As in the field: C1 is one number, the others have one for each harmonic, from m = -l to l.
+        # The field's convention: C1 is one number, C2 and C3 have one per harmonic, from m = -l to l.
         "C1": pytest.approx(0.4886025119029199),
         "C2": pytest.approx(
             (

@@ -15,16 +15,16 @@ def directions(n, seed=0):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def test_basis_is_orthonormal_over_the_sphere():
+def test_the_basis_is_orthonormal_over_the_sphere():
     """Monte Carlo: 4 pi E[b_i b_j] = delta_ij.
 
-    E[(b_i b_j)²] <= max E[b_i^4] by Cauchy and Schwarz, and the fourth moments are computed here from the
-    samples. So the estimate's standard deviation is at most 4 pi sqrt(max E[b^4] / SAMPLES), near 2.5e-3, and
-    five of those have to do.
+    E[(b_i b_j)²] <= max E[b_i^4] by Cauchy and Schwarz, and the fourth moments are computed here from the samples.
+    So the standard deviation of the estimate is at most 4 pi sqrt(max E[b^4] / SAMPLES), near 2.5e-3. Allow five of
+    those.
     """
     basis = sh_basis(directions(SAMPLES))
     deviation = 4 * np.pi * np.sqrt((basis**4).mean(axis=0).max() / SAMPLES)
-    assert deviation < 3e-3, "the samples are enough to tell"
+    assert deviation < 3e-3, "there are enough samples"
     gram = 4 * np.pi * basis.T @ basis / SAMPLES
     np.testing.assert_allclose(gram, np.eye(16), rtol=0, atol=5 * deviation)
 
@@ -43,7 +43,7 @@ def real_harmonic(degree, m, dirs):
     return (-1) ** order * np.sqrt(factor) * legendre * angular
 
 
-def test_order_and_signs_are_those_of_the_field():
+def test_order_and_signs_follow_the_convention():
     dirs = directions(200)
     orders = [(degree, m) for degree in range(4) for m in range(-degree, degree + 1)]
     expected = np.stack([real_harmonic(degree, m, dirs) for degree, m in orders], axis=-1)
@@ -51,7 +51,7 @@ def test_order_and_signs_are_those_of_the_field():
     assert (sh_basis(dirs)[:, 0] == C0).all()
 
 
-def test_degrees_are_eigenfunctions_of_rotation():
+def test_the_power_of_each_degree_is_constant():
     """The sum of squares over one degree is (2 l + 1) / (4 pi) in every direction (Unsöld's theorem)."""
     basis = sh_basis(directions(100))
     for degree in range(4):
@@ -60,7 +60,7 @@ def test_degrees_are_eigenfunctions_of_rotation():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colours_are_the_floored_sum(degree):
+def test_colours_are_the_sum_floored_at_zero(degree):
     rng = np.random.default_rng(1)
     dirs, sh = directions(50), rng.normal(size=(50, 16, 3))
     colors = eval_sh(degree, sh, dirs)
@@ -68,7 +68,7 @@ def test_colours_are_the_floored_sum(degree):
     for n in range(50):
         total = sum(basis[n, i] * sh[n, i] for i in range((degree + 1) ** 2)) + 0.5
         np.testing.assert_allclose(colors[n], np.maximum(total, 0), rtol=0, atol=1e-14)
-    assert (colors == 0).any(), "the floor was reached"
+    assert (colors == 0).any(), "some colours reach the floor"
     just_enough = eval_sh(degree, sh[:, : (degree + 1) ** 2], dirs)
     np.testing.assert_allclose(just_enough, colors, rtol=0, atol=1e-15)
 
@@ -79,8 +79,8 @@ def test_leading_axes_are_kept():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_turned_coefficients_are_the_turned_function(degree):
-    """Both sides are sums of some dozen products of numbers of order 1 in float64."""
+def test_rotated_coefficients_give_the_rotated_function(degree):
+    """Both sides are float64 sums of about a dozen products of numbers of order 1."""
     turn = Rotation.random(random_state=degree).as_matrix()
     M = sh_rotation(degree, turn)
     count = (degree + 1) ** 2

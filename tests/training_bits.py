@@ -1,10 +1,10 @@
-"""Short trainings whose every bit is known: run by tests/golden/test_training_bits.py, recorded by this file.
+"""Short trainings with known results to the bit, run by tests/golden/test_training_bits.py, recorded by this file.
 
     python tests/training_bits.py --record
 
-writes the hashes of every instruction set that this machine can run into tests/golden/training_bits.json. A change of
-the trainer that is meant to keep the numbers must keep the hashes; one that changes them records them again, and its
-commit says why.
+writes the hashes for every instruction set of this machine into tests/golden/training_bits.json. A change of the
+trainer that is meant to keep the numbers must keep the hashes. A change that alters them records them again, and its
+commit explains why.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from gsplat_edu.train.trainer import Trainer, TrainResult
 RECORDS = Path(__file__).parent / "golden" / "training_bits.json"
 
 CAPABILITIES = {"v2": "default", "v3": "avx2", "v4": "avx512"}
-"""What torch uses on a machine whose best instruction set is this one of ours."""
+"""Torch's capability on a machine whose best instruction set is this one of ours."""
 
 RENDER = functools.partial(render, backend="cpu")
 SCHEDULE = {"densify_start": 5, "densify_every": 10, "densify_stop": 100, "mcmc_stop": 100, "sh_every": 20}
@@ -54,19 +54,19 @@ def train_capture(config, events) -> tuple[Trainer, TrainResult]:
 
 
 def train_adc(events):
-    """Clone, split, prune by opacity, scale and size in the image; two resets; random backgrounds."""
+    """Clone, split, and prune by opacity, scale and size in the image, with two resets and random backgrounds."""
     numbers = {"reset_every": 40, "grad_threshold": 5e-5, "prune_screen_size": 40.0, "min_opacity": 0.02}
     return train_capture(recipe(120, random_background=True, **numbers, **SCHEDULE), events)
 
 
 def train_mcmc(events):
-    """Relocate, grow up to the cap, add noise, regularise."""
+    """Relocate, grow up to the cap, add noise, and regularise."""
     numbers = {"max_gaussians": 150, "min_opacity": 0.4, "mcmc_growth": 1.1}
     return train_capture(recipe(120, strategy="mcmc", **numbers, **SCHEDULE), events)
 
 
 def train_sphere(events):
-    """The course's run, shorter, with densifications more often, and a cap that cuts."""
+    """A shorter version of the course's run, with more frequent densification and a cap that drops Gaussians."""
     config = course_config(iterations=120, max_gaussians=400)
     config = config.changed(densify_every=20, densify_stop=100)
     generator = torch.Generator().manual_seed(9)
@@ -82,7 +82,7 @@ CASES: dict[str, Callable] = {"adc": train_adc, "mcmc": train_mcmc, "sphere": tr
 
 
 def took_part(name: str, events: list) -> bool:
-    """Say whether the density control that a case is about really happened in it."""
+    """Return whether the density control that a case is meant to cover really happened."""
     if name == "mcmc":
         moved = [event for event in events if isinstance(event, RelocateEvent)]
         return any(event.num_relocated for event in moved) and any(event.num_added for event in moved)
@@ -95,7 +95,7 @@ def took_part(name: str, events: list) -> bool:
 
 
 def digest(name: str) -> str:
-    """Train, and return a hash of every parameter's bits, every loss and every count."""
+    """Train, and return a hash of the bits of all parameters, losses and counts."""
     events = []
     trainer, result = CASES[name](events)
     assert took_part(name, events), [event for event in events if not isinstance(event, StepEvent)]
@@ -109,17 +109,17 @@ def digest(name: str) -> str:
 
 
 def compiler() -> str:
-    """Return what compiled the native module, as its file says: another one may fuse other products and sums."""
+    """Return the compiler named in the native module's file. Another compiler may fuse other products and sums."""
     data = Path(kernels.native().__file__).read_bytes()
     found = re.search(rb"GCC: \([^)]*\) [\d.]+|clang version [\d.]+", data)
     return found[0].decode() if found else sys.platform
 
 
 def arithmetic() -> str:
-    """Name what a training's bits depend on besides our own code: a new name is another machine, not a mistake.
+    """Name what a training's bits depend on besides our own code. A new name means another machine, not a bug.
 
-    The libraries' exponentials, roots, products of matrices and generators differ from one CPU to another. Their
-    results are part of the name, so a CPU that computes as a known one does is known too.
+    The libraries' exponentials, roots, matrix products and generators differ between CPUs. Their results are part of
+    the name, so a CPU that computes like a known one has the same name.
     """
     probe, rng = hashlib.sha256(), np.random.default_rng(0)
     numbers = rng.normal(size=4099)
@@ -149,7 +149,7 @@ def recorded() -> dict[str, dict[str, str]]:
 
 
 def record() -> None:
-    """Record this machine's hashes under every instruction set it has."""
+    """Record this machine's hashes for each of its instruction sets."""
     found = recorded() if RECORDS.exists() else {}
     for isa in kernels.native().isas():
         env = {**os.environ, "GSPLAT_EDU_ISA": isa, "ATEN_CPU_CAPABILITY": CAPABILITIES[isa]}
@@ -160,7 +160,7 @@ def record() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Print the hashes of this process as JSON.")
-    parser.add_argument("--record", action="store_true", help="write those of every instruction set")
+    parser.add_argument("--record", action="store_true", help="record the hashes of every instruction set")
     if parser.parse_args().record:
         record()
     else:

@@ -1,4 +1,4 @@
-"""Splats and pictures that the tests of fit2d share."""
+"""Fixtures shared by the tests of fit2d."""
 
 import numpy as np
 import pytest
@@ -9,10 +9,10 @@ from gsplat_edu.fit2d.splats import Splats2D, render_2d
 
 @pytest.fixture
 def smooth():
-    """Splats, a picture's size and a background where nothing jumps.
+    """Splats, an image size and a background without discontinuities.
 
-    Every splat is wider than the picture, so no alpha is near the floor; no opacity is near the clamp; the order is
-    the index. A nudge of any parameter moves every pixel smoothly.
+    Every splat is wider than the image, so no alpha is near the floor. No opacity is near the clamp, and the order is
+    that of the indices. So every pixel depends smoothly on every parameter.
     """
     rng = np.random.default_rng(21)
     splats = Splats2D(
@@ -29,7 +29,7 @@ def smooth():
 
 @pytest.fixture
 def rough():
-    """Splats that are none of that: needles, specks, some outside, some at the clamp, some below the floor."""
+    """Splats with discontinuities: needles, specks, some outside, some at the clamp, some below the floor."""
     rng = np.random.default_rng(22)
     count = 60
     logits = rng.normal(0, 3, count)

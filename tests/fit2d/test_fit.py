@@ -1,4 +1,4 @@
-"""The fit: it gets better, by how much, and the same each time."""
+"""The 2D fit improves by a known amount, reproducibly."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from gsplat_edu.fit2d.splats import Splats2D, random_splats_2d
 
 
 def picture(height=28, width=36):
-    """A disk, a bar and a slope, each of a colour: things that ellipses can be."""
+    """Draw a disk and a bar on a gradient: shapes that ellipses can fit."""
     v, u = np.mgrid[:height, :width] / (height - 1)
     image = np.stack([0.2 + 0.3 * u, 0.1 + 0.2 * v, 0.6 - 0.2 * u], axis=-1)
     image[np.hypot(u - 0.5, v - 0.4) < 0.25] = (0.9, 0.7, 0.2)
@@ -24,7 +24,7 @@ def fitted(iterations=60, seed=5, callbacks=()):
     return fit_2d(picture(), start, Fit2DSettings(iterations), callbacks)
 
 
-def test_sixty_steps_are_worth_eight_decibels_and_the_curves_say_so():
+def test_sixty_steps_gain_eight_decibels_and_are_reported():
     steps = []
     fit = fitted(callbacks=[steps.append])
     assert fit.psnrs[-1] > fit.psnrs[0] + 8 and fit.losses[-1] < 0.2 * fit.losses[0]
@@ -34,7 +34,7 @@ def test_sixty_steps_are_worth_eight_decibels_and_the_curves_say_so():
     assert fit.psnrs[-1] == psnr_2d(fit.image, picture())
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_does_not():
+def test_the_seed_determines_the_fit():
     one, two, other = fitted(12), fitted(12), fitted(12, seed=6)
     assert one.losses == two.losses and np.array_equal(one.image, two.image)
     for name, array in one.splats.arrays().items():
@@ -42,7 +42,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not():
     assert one.losses != other.losses
 
 
-def test_psnr_is_that_of_the_metrics():
+def test_psnr_equals_that_of_the_metrics():
     rng = np.random.default_rng(7)
     image, target = rng.normal(0.5, 0.5, (9, 8, 3)), rng.uniform(size=(9, 8, 3))
     assert np.isclose(psnr_2d(image, target), metrics.psnr(image, target), rtol=1e-14)
@@ -50,8 +50,8 @@ def test_psnr_is_that_of_the_metrics():
     assert SQUARED_ERROR_FLOOR == metrics.MSE_FLOOR
 
 
-def test_adam_does_what_its_equations_say():
-    """Three steps written out for one number, with another rate for each parameter."""
+def test_adam_follows_its_equations():
+    """Three steps written out, with a different rate for each parameter."""
     rng = np.random.default_rng(8)
     splats = random_splats_2d(4, 9, 9, rng)
     settings = AdamSettings(betas=(0.8, 0.95), eps=1e-3)
@@ -97,23 +97,23 @@ def test_settings_and_targets_are_checked(as_shipped):
         fit_2d(np.zeros((0, 4, 3)), start)
 
 
-def test_splats_of_another_count_cannot_follow(as_shipped):
+def test_gradients_of_another_count_are_refused(as_shipped):
     few, many = (random_splats_2d(n, 4, 4, np.random.default_rng(0)) for n in (2, 3))
     with pytest.raises(ShapeError, match="gradients: has 3 splats, but there are 2"):
         adam_step_2d(few, many, AdamState.fresh(few), AdamSettings())
 
 
-def test_photos_shrink_to_means_of_what_they_cover():
+def test_photos_are_shrunk_by_area_averaging():
     pixels = np.random.default_rng(9).integers(0, 256, (40, 60, 3), dtype=np.uint8)
     small = shrunk_photo(pixels, 30)
     assert small.shape == (20, 30, 3)
     means = pixels.reshape(20, 2, 30, 2, 3).mean(axis=(1, 3)) / 255
-    assert np.abs(small - means).max() < 0.51 / 255, "rounded to bytes"
+    assert np.abs(small - means).max() < 0.51 / 255, "means, rounded to bytes"
     assert np.array_equal(shrunk_photo(pixels, 100), pixels / 255), "nothing is enlarged"
     assert shrunk_photo(pixels[:1], 7).shape == (1, 7, 3)
 
 
-def test_fitting_needs_no_splat_to_reach_the_image():
+def test_fitting_survives_splats_outside_the_image():
     away = random_splats_2d(3, 4, 4, np.random.default_rng(0)).arrays() | {"means": np.full((3, 2), 1e6)}
     fit = fit_2d(np.full((4, 4, 3), 0.5), Splats2D(**away), Fit2DSettings(2))
     assert np.array_equal(fit.image, np.zeros((4, 4, 3)))

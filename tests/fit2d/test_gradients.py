@@ -1,4 +1,4 @@
-"""Every gradient against finite differences where the picture is smooth, and against autograd where it is not."""
+"""Gradients against finite differences where the image is smooth, and against autograd where it is not."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def moved(splats, name, index, step):
 
 @pytest.mark.parametrize("name", PER_SPLAT)
 def test_every_parameter_against_central_differences(smooth, name):
-    """Truncation h² |L'''| / 6 and rounding eps |L| / h, with h = eps^(1/3): below eps^(2/3), since L < 1."""
+    """With h = eps^(1/3) and L < 1, the truncation h² |L'''| / 6 and the rounding eps |L| / h are below eps^(2/3)."""
     splats, height, width, background = smooth
     target = np.random.default_rng(1).uniform(size=(height, width, 3))
 
@@ -35,12 +35,12 @@ def test_every_parameter_against_central_differences(smooth, name):
         there, back = (loss(moved(splats, name, index, sign * NUDGE)) for sign in (1, -1))
         measured[index] = (there - back) / (2 * NUDGE)
     assert loss(splats) < 1
-    assert np.abs(derived).min() > 100 * NUDGE**2, "slopes that could be told from zero"
+    assert np.abs(derived).min() > 100 * NUDGE**2, "no gradient is too small to measure"
     assert np.abs(derived - measured).max() < NUDGE**2
 
 
 def lifted(splats, height, width):
-    """Put 2D splats before a camera that sees them as they are: flat, parallel to the image, near to far."""
+    """Place 2D splats in front of a camera as flat Gaussians, parallel to the image and ordered by depth."""
     count, focal = len(splats["angles"]), 40.0
     z = torch.linspace(2.0, 5.0, count, dtype=torch.float64)
     camera = Camera.looking_at((0, 0, 0), (0, 0, 1), focal, focal, height, width)
@@ -71,7 +71,7 @@ def test_floor_and_clamp_against_autograd_through_the_dense_renderer(rough):
         assert np.abs(derived - expected).max() < 1e-11 * np.abs(expected).max(), name
 
 
-def test_the_error_and_its_slope_are_those_of_the_equation():
+def test_the_squared_error_and_its_gradient_follow_the_equation():
     rng = np.random.default_rng(3)
     image, target = rng.uniform(size=(2, 5, 7, 3))
     error, slope = squared_error(image, target)
@@ -93,7 +93,7 @@ def test_a_splat_that_reaches_no_pixel_has_no_gradient():
     assert gradients.colors[2].all() and gradients.logit_opacities[2] != 0
 
 
-def test_no_splats_are_the_background_and_have_no_gradients():
+def test_no_splats_give_the_background_and_no_gradients():
     none = Splats2D(**{name: np.zeros((0, *shape)) for name, shape in PER_SPLAT.items()})
     rendered = render_2d(none, 4, 6, (0.1, 0.2, 0.3))
     assert np.array_equal(rendered.image, np.broadcast_to((0.1, 0.2, 0.3), (4, 6, 3)))

@@ -1,4 +1,4 @@
-"""The picture: against the renderer that everything is measured against."""
+"""Images of 2D splats against the reference renderer."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,8 @@ from gsplat_edu.fit2d.splats import Splats2D, ellipses_2d, random_splats_2d, ren
 
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (0.9, 0.2, 0.4)])
-def test_the_picture_is_that_of_render_gaussians(rough, background):
-    """Flat splats parallel to the image have the 2D covariance s² f² / z² anywhere in it: nothing is approximated."""
+def test_the_image_matches_render_gaussians(rough, background):
+    """Flat splats parallel to the image have the exact 2D covariance s² f² / z² anywhere, without approximation."""
     height, width, focal = 37, 43, 40.0
     z = np.linspace(2.0, 5.0, len(rough))
     camera = Camera(np.eye(3), (0, 0, 0), focal, focal, 21.5, 18.5, height, width)
@@ -25,7 +25,7 @@ def test_the_picture_is_that_of_render_gaussians(rough, background):
     assert np.abs(ours.transmittance - transmittance).max() < 1e-12
 
 
-def test_the_covariance_is_the_turned_square_of_the_scales():
+def test_the_covariance_is_the_rotated_squared_scales():
     splats = Splats2D(np.zeros((1, 2)), np.log([[3.0, 0.5]]), np.array([0.7]), np.ones((1, 3)), np.zeros(1))
     c, s = np.cos(0.7), np.sin(0.7)
     R = np.array([[c, -s], [s, c]])
@@ -33,7 +33,7 @@ def test_the_covariance_is_the_turned_square_of_the_scales():
     assert np.allclose(splats.factors[0], R @ np.diag([3.0, 0.5]), rtol=1e-14)
 
 
-def test_ellipses_lie_where_the_exponent_says(rough):
+def test_ellipses_are_level_sets_of_the_exponent(rough):
     curves = ellipses_2d(rough, deviations=2.0)
     d = curves - rough.means[:, None]
     levels = np.einsum("npi,nij,npj->np", d, np.linalg.inv(rough.cov2d), d)
@@ -61,13 +61,13 @@ def test_the_start_covers_the_image():
         ("colors", np.full((3, 3), np.nan), r"colors\[0, 0\]: is nan"),
     ],
 )
-def test_what_is_no_splat_is_named(as_shipped, name, value, match):
+def test_invalid_splats_are_refused(as_shipped, name, value, match):
     splats = random_splats_2d(3, 4, 4, np.random.default_rng(0))
     with pytest.raises(ArgumentError, match=match):
         Splats2D(**splats.arrays() | {name: value})
 
 
-def test_a_scale_beyond_all_numbers_is_named():
+def test_an_overflowing_scale_is_named():
     splats = random_splats_2d(3, 4, 4, np.random.default_rng(0))
     arrays = splats.arrays() | {"log_scales": np.array([[0, 0], [0, 400.0], [0, 0]])}
     with pytest.raises(ArgumentError, match=r"log_scales\[1\]: is too large"):

@@ -1,4 +1,4 @@
-"""The course's script, run as a user runs it."""
+"""The course's script train_2d.py, run as a user runs it."""
 
 import importlib.util
 import os
@@ -20,7 +20,7 @@ QUICK = ("--splats", "30", "--iters", "60", "--size", "32")
 def main():
     spec = importlib.util.spec_from_file_location("train_2d", SCRIPT)
     module = importlib.util.module_from_spec(spec)
-    sys.modules["train_2d"] = module  # where dataclasses look up their annotations
+    sys.modules["train_2d"] = module  # dataclasses look up their annotations here
     spec.loader.exec_module(module)
     yield module.main
     del sys.modules["train_2d"]
@@ -43,7 +43,9 @@ def test_the_portrait_is_fitted_and_written(main, tmp_path, capsys):
     assert lines[5] == f"wrote {out}, {out.with_name('portrait_curves.png')}"
     assert {path.name for path in out.parent.iterdir()} == {"portrait.png", "portrait_curves.png"}
     with Image.open(out) as picture:
-        assert picture.size == (2 * 16 * 27 + 4, 16 * 32), "target and fit, each pixel a square of 16"
+        assert picture.size == (2 * 16 * 27 + 4, 16 * 32), (
+            "target and fit side by side, each pixel enlarged to 16 x 16"
+        )
     with Image.open(out.with_name("portrait_curves.png")) as curves:
         assert curves.width > 2 * curves.height
 
@@ -53,8 +55,8 @@ def test_the_same_seed_gives_the_same_bytes(main, tmp_path, capsys):
     for name in ("one", "two"):
         out = tmp_path / name / "x.png"
         assert main([*QUICK, "--iters", "15", "--seed", "3", "--out", str(out)]) == 0
-        said = capsys.readouterr().out.splitlines()
-        written.append(([line for line in said if line.startswith(("iter ", "PSNR"))], out.read_bytes()))
+        lines = capsys.readouterr().out.splitlines()
+        written.append(([line for line in lines if line.startswith(("iter ", "PSNR"))], out.read_bytes()))
     assert written[0] == written[1] and len(written[0][0]) == 2
 
 
@@ -71,9 +73,9 @@ print(hashlib.sha256(b"".join(array.tobytes() for array in fit.splats.arrays().v
 
 
 @pytest.mark.own_process
-def test_a_fit_gives_the_same_bits_on_any_number_of_threads():
-    """Nothing in the loop calls BLAS, whose sums are split by threads; nor is torch needed."""
-    said = set()
+def test_a_fit_does_not_depend_on_threads():
+    """The loop never calls BLAS, which splits sums among threads, and needs no torch."""
+    digests = set()
     for threads in ("1", "4"):
         many = {f"{name}_NUM_THREADS": threads for name in ("OMP", "OPENBLAS", "MKL")}
         path = {"PYTHONPATH": str(ROOT / "src")}
@@ -85,8 +87,8 @@ def test_a_fit_gives_the_same_bits_on_any_number_of_threads():
             check=False,
         )
         assert done.returncode == 0, done.stderr
-        said.add(done.stdout)
-    assert len(said) == 1
+        digests.add(done.stdout)
+    assert len(digests) == 1
 
 
 def test_transparent_and_gray_pictures_are_fitted(main, tmp_path, capsys):
@@ -120,7 +122,7 @@ def test_transparent_and_gray_pictures_are_fitted(main, tmp_path, capsys):
         (["--image", "good.png", "--out", "good.png"], "--out: good.png is the picture itself"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(main, tmp_path, monkeypatch, capsys, arguments, line):
+def test_bad_input_gives_one_line_and_exit_code_2(main, tmp_path, monkeypatch, capsys, arguments, line):
     monkeypatch.chdir(tmp_path)
     noise = np.random.default_rng(0).integers(0, 256, (25, 40, 3), dtype=np.uint8)
     Image.fromarray(noise).save("good.png")
@@ -134,7 +136,7 @@ def test_bad_input_is_one_line_and_exit_code_2(main, tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize("arguments", [["--splats", "many"], ["--sizes", "4"], ["x.jpg"]])
-def test_a_bad_command_line_is_one_line_and_exit_code_2(main, capsys, arguments):
+def test_a_bad_command_line_gives_one_line_and_exit_code_2(main, capsys, arguments):
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     assert stop.value.code == 2

@@ -1,6 +1,6 @@
-"""Damaged checkpoints: whatever the damage, one line or a training that goes on.
+"""Damaged checkpoints: any damage ends in a one-line error or in a training that continues.
 
-Also run on the build with sanitizers (tools/sanitize.sh): a step follows every checkpoint that was taken.
+Also run on the build with sanitizers (tools/sanitize.sh), so one step follows every checkpoint that was loaded.
 """
 
 import json
@@ -19,8 +19,8 @@ MUTATIONS = slices.count("GSPLAT_EDU_FUZZ_CHECKPOINTS", 50, 2_000)
 SEEDS = range(slices.SEED, slices.SEED + MUTATIONS)
 
 
-def as_it_stands(trainer):
-    """Return all that a trainer is, to compare: tensors by identity, numbers by value."""
+def snapshot(trainer):
+    """Return the whole state of a trainer for comparison: tensors by identity, numbers by value."""
     tensors, numbers = trainer.state()
     kept = {key: tensor.data_ptr() for key, tensor in tensors.items() if key != "density.generator"}
     return kept, tensors["density.generator"].tolist(), json.dumps(numbers), id(trainer.gaussians)
@@ -35,8 +35,8 @@ def test_damaged_checkpoints(tmp_path, strategy):
     step(trainer, 3)
     data = save_checkpoint(tmp_path / "whole", trainer, 1.5).read_bytes()
     path = tmp_path / "iteration_3.safetensors"
-    fresh, taken = make(), 0
-    before = as_it_stands(fresh)
+    fresh, loaded = make(), 0
+    before = snapshot(fresh)
     for seed in SEEDS:
         mutate(data, path, np.random.default_rng(seed))
         try:
@@ -45,11 +45,11 @@ def test_damaged_checkpoints(tmp_path, strategy):
         except CheckpointError as error:
             message = str(error)
             assert str(path) in message and message.isprintable() and len(message) < 600, seed
-            assert as_it_stands(fresh) == before, seed
+            assert snapshot(fresh) == before, seed
         else:
-            taken += 1
+            loaded += 1
             if fresh.iteration < fresh.config.iterations:
                 step(fresh)
             fresh = make()
-            before = as_it_stands(fresh)
-    assert 0 < taken < MUTATIONS
+            before = snapshot(fresh)
+    assert 0 < loaded < MUTATIONS

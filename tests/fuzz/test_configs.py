@@ -1,4 +1,4 @@
-"""Damaged config.json: `train --resume` exits with 0, or with 2 after one line; other readers refuse it in one line."""
+"""Damaged config.json: `train --resume` exits with 0, or with 2 and one line; other readers refuse it in one line."""
 
 import contextlib
 import io
@@ -17,7 +17,7 @@ from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.source import open_source
 
 MUTATIONS = slices.count("GSPLAT_EDU_FUZZ_CONFIGS", 25, 1_000)
-"""Damaged files."""
+"""Number of damaged files."""
 
 SEEDS = range(slices.SEED, slices.SEED + MUTATIONS)
 

@@ -1,4 +1,4 @@
-"""Damaged scene files: whatever the damage, a scene of finite numbers or one line, and memory stays small."""
+"""Damaged scene files: any damage ends in a finite scene or a one-line error, and memory stays small."""
 
 import tracemalloc
 import zipfile
@@ -17,14 +17,14 @@ FILES = slices.count("GSPLAT_EDU_FUZZ", 100, 20_000)
 SEEDS = range(slices.SEED, slices.SEED + FILES)
 
 MOST_MEMORY = 24 << 20
-"""Bytes: files here have at most 32 KiB; their allowance is 1 MiB of contents, and float32 copies of those."""
+"""Bytes. Files here have at most 32 KiB; they are allowed 1 MiB of contents, plus float32 copies of those."""
 
 
 def mutated(data, rng):
-    """Damage some bytes: flipped bits, other numbers, pieces that are cut out, doubled, zeroed or cut off."""
+    """Damage some bytes: flip bits, change numbers, or delete, repeat, randomise or truncate pieces."""
     damaged = bytearray(data)
     for _ in range(int(rng.integers(1, 5))):
-        # half of the damage goes where headers are
+        # Half of the damage goes to the region of the headers.
         reach = len(damaged) if rng.random() < 0.5 else min(len(damaged), 400)
         if reach < 2:
             break
@@ -77,7 +77,7 @@ def test_damaged_files(tmp_path, suffix):
 
 @pytest.mark.sliced
 def test_damage_inside_a_sog(tmp_path):
-    """A zip has checksums: damage to its parts is put in before they are zipped."""
+    """A zip has checksums, so its parts are damaged before they are zipped."""
     parts = {}
     with zipfile.ZipFile(small_file(tmp_path, ".sog")) as bundle:
         for name in bundle.namelist():

@@ -1,11 +1,11 @@
-"""The chapter's run with its seeds, up to the first densification: the same numbers, draw for draw.
+"""The chapter's run with its seeds reproduces the printed numbers up to the first densification.
 
-float32 on another machine adds in another order; 2e-4 leaves room for that and for the four printed digits,
-and is a hundredth of what the losses differ by from one view to the next. The count of the first
-densification is exact because no gradient norm is near the threshold of 2e-4: the nearest is 4.9e-7 away, a
-quarter of a per cent, and the faintest Gaussian has opacity 0.042 where 0.005 is pruned.
+Other machines add float32 numbers in another order. The tolerance of 2e-4 covers that and the four printed digits; it
+is a hundredth of the difference between the losses of two views. The count of the first densification is exact,
+because no gradient norm is near the threshold of 2e-4: the nearest is 4.9e-7 away, a quarter of a per cent. The
+faintest Gaussian has opacity 0.042, and only those below 0.005 are pruned.
 
-The native kernels stop a tile below 1e-4 and stop nothing else; they get 1e-3, and the same first densification.
+The native kernels also stop a tile below 1e-4. Their tolerance is 1e-3, and their first densification is the same.
 """
 
 import functools
@@ -52,7 +52,7 @@ def test_the_first_hundred_iterations(backend):
         0.2360, abs=TOLERANCE[backend]
     )
 
-    with one_thread():  # torch's threads wait for one another, for minutes where other programs run
+    with one_thread():  # on a busy machine, torch's threads wait minutes for one another
         losses = trainer.run().losses
     assert {i: losses[i] for i in CHAPTER} == pytest.approx(CHAPTER, abs=TOLERANCE[backend])
     assert densified == [
@@ -64,8 +64,8 @@ def test_the_first_hundred_iterations(backend):
 def test_the_whole_run_on_the_kernels(tmp_path, capsys):
     """800 iterations end at 1,600 Gaussians and a held-out L1 of at most 0.0100.
 
-    Five seeds gave 0.0076 to 0.0090, mean 0.0084, standard deviation 0.0005 (benchmarks/RESULTS.md); the chapter's
-    seed 0.0087. 0.0100 is three deviations above the mean.
+    Five seeds gave 0.0076 to 0.0090, mean 0.0084, standard deviation 0.0005 (benchmarks/RESULTS.md). The chapter's
+    seed gave 0.0087. The limit of 0.0100 is three standard deviations above the mean.
     """
     assert main(["demo", "--backend", "cpu", "--out", str(tmp_path / "x.png")]) == 0
     printed = capsys.readouterr().out

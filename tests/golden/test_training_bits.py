@@ -1,8 +1,8 @@
-"""The trainer gives the bits it gave before: adc, mcmc and the sphere, on one thread and on two.
+"""Training gives the recorded bits: adc, mcmc and the sphere, on one thread and on two.
 
-The hashes were recorded before the trainer was taken apart into groups, objective and view model. They hold for one
-instruction set, compiler and arithmetic of torch and NumPy (`training_bits.arithmetic`); on another machine, where
-nothing is known, the tests say so and are skipped.
+The hashes were recorded before the trainer was split into groups, objective and view model. They hold for one
+combination of instruction set, compiler and arithmetic of torch and NumPy (`training_bits.arithmetic`). The tests are
+skipped on machines without recorded hashes.
 """
 
 import pytest
@@ -21,13 +21,13 @@ def threads(request):
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", CASES)
-def test_a_training_gives_the_recorded_bits(name):
+def test_training_gives_the_recorded_bits(name):
     known = recorded().get(machine := arithmetic())
     if known is None:
         pytest.skip(f"no hashes are recorded for {machine}; tests/training_bits.py --record makes them")
     assert digest(name) == known[name]
 
 
-def test_recorded_cases_are_those_that_are_run():
+def test_every_case_has_a_recorded_hash():
     for machine, hashes in recorded().items():
         assert list(hashes) == list(CASES), machine

@@ -1,7 +1,7 @@
-"""Compile every kernel for a GPU that need not be there: python compile_kernels.py CAPABILITY
+"""Compile every kernel for a GPU that may be absent: python compile_kernels.py CAPABILITY
 
-Prints the name of each, and the bytes per thread that its numbers do not fit into registers, as the assembler says.
-Run by test_compile.py in a process of its own, because the interpreter is chosen when a kernel is imported.
+Prints the name of each kernel and the bytes per thread that it spills from registers, as the assembler reports.
+test_compile.py runs this in a new process, because importing a kernel fixes the choice of the interpreter.
 """
 
 import re
@@ -34,11 +34,11 @@ def spilled(ptx: str) -> int:
         file.write_text(ptx)
         for tool in sorted((Path(nvidia.__file__).parent / "bin").glob("ptxas*")):
             architecture = f"-arch=sm_{CAPABILITY}{'a' if CAPABILITY == 90 else ''}"
-            words = [tool, "-v", architecture, file, "-o", file.with_suffix(".cubin")]
-            said = subprocess.run(words, check=False, capture_output=True, text=True)
-            if said.returncode == 0:
-                return sum(int(number) for number in re.findall(r"(\d+) bytes spill", said.stderr))
-    raise RuntimeError(said.stderr)
+            command = [tool, "-v", architecture, file, "-o", file.with_suffix(".cubin")]
+            done = subprocess.run(command, check=False, capture_output=True, text=True)
+            if done.returncode == 0:
+                return sum(int(number) for number in re.findall(r"(\d+) bytes spill", done.stderr))
+    raise RuntimeError(done.stderr)
 
 
 def build(kernel, kinds, constants=None, warps=4) -> None:

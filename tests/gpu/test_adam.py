@@ -3,7 +3,7 @@ import torch
 
 from gsplat_edu import ArgumentError, kernels
 
-# Not `triton`: without its wheel that name is this folder.
+# Not `triton`: without its wheel, that name means this folder.
 pytest.importorskip("triton.language", reason="triton is not installed")
 
 from gsplat_edu.adam import AdamNumbers
@@ -21,7 +21,7 @@ def numbers(t):
 
 
 def gradients(shape, seed=0):
-    """Of very different sizes: some 0 throughout, some small enough for eps to matter; no g² underflows."""
+    """Return gradients of very different sizes: some always 0, some so small that eps matters. No g² underflows."""
     generator = torch.Generator().manual_seed(seed)
     sizes = 10.0 ** torch.randint(-9, 3, shape, generator=generator)
     sizes[torch.rand(shape, generator=generator) < 0.1] = 0.0
@@ -31,12 +31,12 @@ def gradients(shape, seed=0):
 
 
 def in_float64(start, all_gradients):
-    """Parameter and moments after the steps in float64, and how far float32 may be from each.
+    """Return parameter and moments after the steps in float64, and the allowed error of float32 for each.
 
-    |m| is bounded by M, the same mean of |g|; a step rounds each of its terms in its factor, its product and the
-    sum, 3 U, and one more for 1 - b: so m is off by 4 U t M after t steps. v is positive, with one more rounding in g²:
-    5 U t of itself. In the step, m's error counts as it is, v's halved by the root, and factors, products, root, sum
-    and quotient round 8 times; moving the parameter rounds once, by U of it. 1/10 for the higher orders.
+    |m| is bounded by M, the same mean of |g|. A step rounds each term of m in its factor, its product and the sum (3 U)
+    and in 1 - b (U), so m is off by 4 U t M after t steps. v is positive and has one more rounding, in g²: it is off by
+    5 U t v. In the step, the error of m counts in full, that of v is halved by the root, and factors, products, root,
+    sum and quotient round 8 times. Updating the parameter p rounds once, by U |p|. 1/10 covers the higher orders.
     """
     p, m, v, M = start.double(), *torch.zeros(3, *start.shape, dtype=torch.float64)
     e_p = torch.zeros_like(p)
@@ -64,8 +64,8 @@ def natively(parameter, m, v, gradient, numbers):
 
 
 @pytest.mark.parametrize("shape", [(1,), (7, 3), (1500, 3), (2, 1024)])
-def test_twenty_steps_are_those_of_float64(device, shape):
-    """Below a block, above it, and two blocks to the number."""
+def test_twenty_steps_match_float64(device, shape):
+    """Sizes below one block, above one block, and exactly two blocks."""
     start = torch.randn(shape, generator=torch.Generator().manual_seed(1))
     drawn = gradients(shape)
     ours = walk(adam_triton, start.clone().to(device), [g.to(device) for g in drawn])
@@ -78,8 +78,8 @@ def test_twenty_steps_are_those_of_float64(device, shape):
             assert ((a.cpu() - b).abs() <= 2 * e).all()
 
 
-def test_steps_are_those_of_torch(device):
-    """torch's own optimiser in float64 as the second witness."""
+def test_steps_match_torch(device):
+    """torch's own optimiser in float64 is a second reference."""
     start, drawn = torch.randn(40, generator=torch.Generator().manual_seed(2)), gradients((40,), seed=3)
     theirs = start.double().requires_grad_()
     optimizer = torch.optim.Adam([theirs], lr=RATE, betas=(B1, B2), eps=EPS)
@@ -91,7 +91,7 @@ def test_steps_are_those_of_torch(device):
     assert ((parameter.cpu().double() - theirs.detach()).abs() <= allowed).all()
 
 
-def test_two_walks_give_the_same_bits_and_neighbours_keep_theirs(device):
+def test_steps_are_reproducible_and_leave_neighbouring_memory_alone(device):
     drawn = [g.to(device) for g in gradients((1500,))]
     walks = []
     for _ in range(2):
@@ -105,13 +105,13 @@ def test_two_walks_give_the_same_bits_and_neighbours_keep_theirs(device):
     assert (walks[0][:, :50] == 7.0).all() and (walks[0][:, 1550:] == 7.0).all()
 
 
-def test_where_nothing_ever_pulled_nothing_moves(device):
+def test_zero_gradients_move_nothing(device):
     start = torch.randn(9, device=device)
     parameter, m, v = walk(adam_triton, start.clone(), [torch.zeros(9, device=device)] * 3)
     assert torch.equal(parameter, start) and not m.any() and not v.any()
 
 
-def test_autograd_hears_of_the_step_and_gradients_may_be_strided(device):
+def test_autograd_notices_the_step_and_gradients_may_be_strided(device):
     parameter = torch.zeros(5, 3, device=device, requires_grad=True)
     m, v = torch.zeros(5, 3, device=device), torch.zeros(5, 3, device=device)
     gradient = torch.randn(3, 5, device=device)
@@ -125,13 +125,13 @@ def test_autograd_hears_of_the_step_and_gradients_may_be_strided(device):
 
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (4, 0, 3)])
 def test_an_empty_parameter_is_left_alone(device, shape):
-    """(N, 0, 3): sh_rest of degree 0."""
+    """For example (N, 0, 3), the shape of sh_rest at degree 0."""
     empty = torch.zeros(shape, device=device)
     adam_triton(empty, empty.clone(), empty.clone(), empty.clone(), numbers(1))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU to wait for")
-def test_nothing_waits_for_the_device(device):
+def test_a_step_does_not_synchronise(device):
     tensors = torch.zeros(4, 3000, device=device)
     adam_triton(*tensors, numbers(1))  # compiles
     torch.cuda.set_sync_debug_mode("error")

@@ -6,7 +6,7 @@ import torch
 from gsplat_edu import ArgumentError, kernels
 from gsplat_edu.losses import l1_ssim
 
-# Not `triton`: without its wheel that name is this folder.
+# Not `triton`: without its wheel, that name means this folder.
 pytest.importorskip("triton.language", reason="triton is not installed")
 
 from gsplat_edu.render.triton import loss as module
@@ -17,7 +17,7 @@ U = 2.0**-24
 
 
 def blur(planes):
-    """G along both axes of (H, W, 3), as two products with dense matrices."""
+    """Blur (H, W, 3) along both axes, as two products with dense matrices."""
 
     def matrix(n):
         apart = torch.arange(n, dtype=torch.float64)[:, None] - torch.arange(n)
@@ -28,7 +28,7 @@ def blur(planes):
 
 
 def maps(x, y):
-    """The means, and the four factors of S."""
+    """Return the means and the four factors of S."""
     mx, my = blur(x), blur(y)
     v, c = blur(x * x + y * y) - mx * mx - my * my, blur(x * y) - mx * my
     return mx, my, 2 * mx * my + 0.01**2, 2 * c + 0.03**2, mx * mx + my * my + 0.01**2, v + 0.03**2
@@ -43,18 +43,18 @@ def natively(x, y, weight):
     return l1_ssim(x, y, weight)
 
 
-WITNESSES = [by_definition] if kernels.REASON else [by_definition, natively]
+REFERENCES = [by_definition] if kernels.REASON else [by_definition, natively]
 
 
 def bounds(x, y, weight):
-    """How far float32 may be from float64: the loss, and the gradient at each number. Images are 0 or more.
+    """Bound the error of float32 against float64, for the loss and for each number of the gradient. Images are >= 0.
 
-    To first order in U, worst case, with 1/10 for the higher orders; e_z is the error of z, r_z the relative one.
-    A blur along one axis rounds a term in its tap, its pair's sum, its product and five additions: 8 U, and 16 U along
-    both; a square or product of bytes / 255 brings at most 8 more. So every blurred moment is off by 24 U of itself.
-    The rest is the rule of products and sums, with a rounding per operation and 4 U for the GPU's division.
-    What is off in dS/dv and dS/dc comes back in dS/dmx = free - 2 mx dS/dv - my dS/dc: together, the gradient at x
-    feels e_dv times 2 |x - mx|, which is at most 2 |x - a| + 2 |mx - a| for any a, and e_dc likewise.
+    The bound is the worst case to first order in U, plus 1/10 for the higher orders; e_z is the error of z, r_z the
+    relative one. A blur along one axis rounds a term in its tap, its pair's sum, its product and five additions: 8 U,
+    so 16 U along both. A square or product of bytes / 255 adds at most 8 U. So every blurred moment has a relative
+    error of 24 U. The rest follows the rules for products and sums, with one rounding per operation and 4 U for the
+    GPU's division. Errors of dS/dv and dS/dc recur in dS/dmx = free - 2 mx dS/dv - my dS/dc. Together, they change
+    the gradient at x by e_dv times 2 |x - mx|, which is at most 2 |x - a| + 2 |mx - a| for any a, and by e_dc likewise.
     """
     mx, my, A1, A2, B1, B2 = maps(x, y)
     squares, product = blur(x * x + y * y), blur(x * y)
@@ -71,7 +71,7 @@ def bounds(x, y, weight):
     dv, dc = S.abs() / B2, 2 * A1 * inverse
     e_dv = B1 * inverse * e_S + dv * (r_B1 + r_inverse + 2 * U)
     e_dc = dc * (r_A1 + r_inverse + 2 * U)
-    # free = 2 (my A2 - mx S B2) / (B1 B2), and S B2 = A2 A1 / B1, whatever B2's error.
+    # free = 2 (my A2 - mx S B2) / (B1 B2), and S B2 = A2 A1 / B1 independently of B2's error.
     slope = (my - mx * A1 / B1).abs()
     sizes = A2.abs() * (my + mx * A1 / B1)
     e_free = e_A2 * slope + A2.abs() * (e_my + A1 / B1 * e_mx + mx * A1 / B1 * (r_A1 + r_B1)) + 10 * U * sizes
@@ -84,13 +84,13 @@ def bounds(x, y, weight):
         e_d += (values - a).abs() * blur(e) + blur((means - a).abs() * e)
     n = x.numel()
     e_gradient = (1 - weight) / n * 3 * U + weight / n * e_d
-    # A sum is a tree or pairwise: 32 additions at most on a number's way within its block, as many among blocks.
+    # Sums are trees or pairwise: a number takes part in at most 32 additions within its block and as many among blocks.
     lost = weight / n * (e_S + U + 70 * U * (1 - S).abs()) + (1 - weight) / n * 73 * U * (x + y)
     return 1.1 * lost.sum(), 1.1 * e_gradient
 
 
 def images(size, kind, seed=0):
-    """An image and a target whose difference has a sign in float32 too, so that L1 is smooth."""
+    """Return an image and a target that differ by more than float32 rounding at every number, so that L1 is smooth."""
     generator = torch.Generator().manual_seed(seed)
     image = torch.rand(*size, 3, generator=generator)
     target = torch.rand(*size, 3, generator=generator)
@@ -117,21 +117,21 @@ def value_and_gradient(loss, image, target, weight):
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (19, 23), (33, 48)])
 @pytest.mark.parametrize("kind", ["floats", "bytes", "flat"])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_value_and_gradient_are_those_of_float64(device, size, kind, weight):
+def test_value_and_gradient_match_float64(device, size, kind, weight):
     """Sizes below the window and above one block; none is a multiple of a block."""
     image, target = images(size, kind)
     value, gradient = value_and_gradient(l1_ssim_triton, image.to(device), target.to(device), weight)
     x, y = image.double(), as_double(target)
     e_value, e_gradient = bounds(x, y, weight)
-    for witness in WITNESSES:
-        true_value, true_gradient = value_and_gradient(witness, x, y, weight)
+    for reference in REFERENCES:
+        true_value, true_gradient = value_and_gradient(reference, x, y, weight)
         assert e_value < 0.01 and e_gradient.max() < 0.04 * true_gradient.abs().max()
         assert (value - true_value).abs() <= e_value
         assert ((gradient - true_gradient).abs() <= e_gradient).all()
 
 
-def test_the_bound_would_notice_another_window(monkeypatch):
-    """A tap that falls off 1% too fast is beyond it, so it is no rubber band."""
+def test_a_slightly_wrong_window_exceeds_the_bound(monkeypatch):
+    """Taps that fall off 1% too fast exceed the bound, so it is tight enough to find errors."""
     x, y = (t.double() for t in images((19, 23), "floats"))
     e_value, e_gradient = bounds(x, y, 0.2)
     exp = torch.exp
@@ -144,11 +144,11 @@ def test_the_bound_would_notice_another_window(monkeypatch):
 
 @pytest.mark.sliced(1)
 @pytest.mark.parametrize("weight", [0.0, 0.2])
-def test_two_runs_give_the_same_bits_whatever_stood_in_memory(device, weight):
+def test_results_are_reproducible_and_independent_of_memory_contents(device, weight):
     image, target = (t.to(device) for t in images((19, 23), "bytes"))
     plain = value_and_gradient(l1_ssim_triton, image, target, weight)
     again = value_and_gradient(l1_ssim_triton, image, target, weight)
-    torch.use_deterministic_algorithms(True)  # torch fills new memory with NaN then
+    torch.use_deterministic_algorithms(True)  # makes torch fill new memory with NaN
     try:
         assert image.new_empty(1).isnan()
         filled = value_and_gradient(l1_ssim_triton, image, target, weight)
@@ -157,7 +157,7 @@ def test_two_runs_give_the_same_bits_whatever_stood_in_memory(device, weight):
     assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(plain, again, filled, strict=True))
 
 
-def test_without_weight_nothing_is_blurred(device, monkeypatch):
+def test_without_ssim_weight_nothing_is_blurred(device, monkeypatch):
     for name in ("_moments_across", "_similarity_down", "_maps_across"):
         monkeypatch.setattr(module, name, None)
     image, target = (t.to(device) for t in images((3, 5), "floats"))
@@ -166,8 +166,8 @@ def test_without_weight_nothing_is_blurred(device, monkeypatch):
     torch.testing.assert_close(gradient, torch.sign(image - target).cpu().double() / 45, rtol=2 * U, atol=0)
 
 
-def test_where_image_and_target_are_equal_the_loss_is_0_and_has_no_slope(device):
-    """S is 1 up to rounding, (1 - k) times the corner of |x - y| counts as 0: what is left is the bound."""
+def test_equal_image_and_target_give_zero_loss_and_gradient(device):
+    """S is 1 up to rounding, and |x - y| has slope 0 at its corner, so only rounding within the bound is left."""
     image, _ = images((19, 23), "floats")
     value, gradient = value_and_gradient(l1_ssim_triton, image.to(device), image.to(device), 0.2)
     e_value, e_gradient = bounds(image.double(), image.double(), 0.2)
@@ -175,7 +175,7 @@ def test_where_image_and_target_are_equal_the_loss_is_0_and_has_no_slope(device)
     assert (gradient.abs() <= e_gradient).all()
 
 
-def test_backward_scales_and_strides_do_not_matter(device):
+def test_the_gradient_scales_and_ignores_strides(device):
     image, target = (t.to(device) for t in images((19, 23), "bytes"))
     _, gradient = value_and_gradient(l1_ssim_triton, image, target, 0.2)
     strided = image.transpose(0, 1).contiguous().transpose(0, 1).requires_grad_()
@@ -185,7 +185,7 @@ def test_backward_scales_and_strides_do_not_matter(device):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])
-def test_an_image_without_pixels_has_no_mean(device, weight):
+def test_the_loss_of_an_empty_image_is_nan(device, weight):
     image = torch.zeros(0, 5, 3, device=device, requires_grad=True)
     loss = l1_ssim_triton(image, torch.zeros(0, 5, 3, device=device), weight)
     loss.backward()
@@ -193,7 +193,7 @@ def test_an_image_without_pixels_has_no_mean(device, weight):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU to wait for")
-def test_nothing_waits_for_the_device(device):
+def test_the_loss_does_not_synchronise(device):
     image, target = (t.to(device) for t in images((33, 48), "bytes"))
     image.requires_grad_()
     l1_ssim_triton(image, target, 0.2).backward()  # compiles

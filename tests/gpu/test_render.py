@@ -1,10 +1,9 @@
 """The backend cuda against the NumPy reference and the native kernels in float64.
 
-On a machine without a GPU the kernels run in Triton's interpreter, on the same scenes as the native kernels, with
-the bounds that the native float32 kernels have (tests/native): forward, four times what moves of 4 eps of the
-parameters do to each pixel, plus the rounding of the sum; backward, 3e-4 of the largest gradient, 4e-3 where conics
-are ill conditioned. Batches are 16 Gaussians, so that most scenes have tiles with several; 41 x 35 and 17 x 33 px are
-no multiples of a tile.
+On a machine without a GPU the kernels run in Triton's interpreter. Scenes and bounds are those of the native float32
+kernels (tests/native). Forward: four times each pixel's change when the parameters move by 4 eps, plus the rounding of
+the sum. Backward: 3e-4 of the largest gradient, or 4e-3 for ill-conditioned conics. Batches hold 16 Gaussians, so most
+scenes have tiles with several. 41 x 35 and 17 x 33 px are not multiples of a tile.
 """
 
 import dataclasses
@@ -29,11 +28,11 @@ SMALLER["hundreds of layers"] = dataclasses.replace(
         for key in ("means", "quats", "log_scales", "sh", "logits")
     },
 )
-ILL = ("needles 100:1", "partly behind")
+ILL_CONDITIONED = ("needles 100:1", "partly behind")
 
 
-def everything(scene, backend, device, settings=SETTINGS):
-    """Images and gradients of a loss that weighs every pixel of image, transmittance and depth at random."""
+def images_and_gradients(scene, backend, device, settings=SETTINGS):
+    """Return images, and gradients of a loss with random weights for all pixels of image, transmittance and depth."""
     dtype = torch.float32 if backend == "cuda" else torch.float64
     where = device if backend == "cuda" else "cpu"
     gaussians = scene.gaussians(dtype).to(torch.device(where)).trainable()
@@ -56,7 +55,7 @@ def everything(scene, backend, device, settings=SETTINGS):
 
 
 def sensitivity(scene) -> np.ndarray:
-    """Largest change of each pixel over eight perturbations of the parameters by 4 float32 eps."""
+    """Return the largest change of each pixel over eight perturbations of the parameters by 4 float32 eps."""
     rng = np.random.default_rng(0)
     exact = scene.gaussians()
     base = render(exact, scene.camera, settings=SETTINGS, backend="cpu").image.numpy()
@@ -70,9 +69,9 @@ def sensitivity(scene) -> np.ndarray:
 
 @pytest.mark.sliced(2)
 @pytest.mark.parametrize("name", [name for name in SMALLER if name != "ties in depth"])
-def test_images_are_the_references(device, name):
+def test_images_match_the_reference(device, name):
     scene = SMALLER[name]
-    values, _, _ = everything(scene, "cuda", device)
+    values, _, _ = images_and_gradients(scene, "cuda", device)
     truth, truth_T, truth_depth = scene.truth()
     bright = max(1.0, np.abs(values["image"]).max())
     error = np.maximum(np.abs(values["image"] - truth).max(axis=-1), np.abs(values["T"] - truth_T))
@@ -84,32 +83,32 @@ def test_images_are_the_references(device, name):
 @pytest.mark.sliced(3)
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("name", SMALLER)
-def test_gradients_are_those_of_the_native_kernels_in_double(device, name, antialiased):
-    """Scenes with ties too: the same order, and in float32 the same ties, since one camera axis is along z."""
+def test_gradients_match_the_native_kernels_in_float64(device, name, antialiased):
+    """Includes scenes with ties: the order is the same, and so are the float32 ties, since a camera axis is along z."""
     settings = dataclasses.replace(SETTINGS, antialiased=antialiased, jacobian_limit=1.3)
-    values, gradients, out = everything(SMALLER[name], "cuda", device, settings)
-    truths, expected, oracle = everything(SMALLER[name], "cpu", device, settings)
+    values, gradients, out = images_and_gradients(SMALLER[name], "cuda", device, settings)
+    truths, expected, oracle = images_and_gradients(SMALLER[name], "cpu", device, settings)
     assert abs(out.num_pairs - oracle.num_pairs) <= 2 and len(out.visible) == len(oracle.visible)
     for key, truth in truths.items():
         assert np.abs(values[key] - truth).max() < 1.1 * max(1.0, np.abs(truth).max()) / 255, key
-    bound = 4e-3 if name in ILL else 3e-4
+    bound = 4e-3 if name in ILL_CONDITIONED else 3e-4
     for key, truth in expected.items():
         assert np.abs(gradients[key] - truth).max() <= bound * np.abs(truth).max(), key
 
 
 @pytest.mark.sliced(1)
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_lower_degrees(device, degree):
+def test_lower_sh_degrees(device, degree):
     settings = dataclasses.replace(SETTINGS, sh_degree=degree)
-    _, gradients, _ = everything(SMALLER["random"], "cuda", device, settings)
-    _, expected, _ = everything(SMALLER["random"], "cpu", device, settings)
+    _, gradients, _ = images_and_gradients(SMALLER["random"], "cuda", device, settings)
+    _, expected, _ = images_and_gradients(SMALLER["random"], "cpu", device, settings)
     for key, truth in expected.items():
         assert np.abs(gradients[key] - truth).max() <= 3e-4 * np.abs(truth).max(), key
 
 
 def test_two_runs_give_the_same_bits(device):
     scene = random(20, (17, 33), seed=3)
-    first, second = (everything(scene, "cuda", device)[:2] for _ in range(2))
+    first, second = (images_and_gradients(scene, "cuda", device)[:2] for _ in range(2))
     for ours, other in zip(first, second, strict=True):
         for key, array in ours.items():
             np.testing.assert_array_equal(array, other[key], err_msg=key)
@@ -126,7 +125,7 @@ def test_several_cameras_and_no_depth(device):
 
 @pytest.mark.sliced(2)
 @pytest.mark.parametrize("kind", ["empty", "behind", "faint", "one"])
-def test_scenes_of_almost_nothing(device, kind):
+def test_almost_empty_scenes(device, kind):
     scene = random(0 if kind == "empty" else 1 if kind == "one" else 9, (17, 33), seed=2)
     gaussians = scene.gaussians(torch.float32).to(torch.device(device))
     if kind == "behind":
@@ -154,9 +153,9 @@ POISON = (
 
 
 @pytest.mark.sliced(1)
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # NumPy's, in the interpreter
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # from NumPy, in the interpreter
 @pytest.mark.parametrize(("name", "value"), POISON)
-def test_one_bad_gaussian_spoils_nothing(device, name, value):
+def test_one_bad_gaussian_does_not_affect_others(device, name, value):
     scene = random(20, (17, 33), seed=3)
     good = scene.gaussians(torch.float32).to(torch.device(device))
     bad = good.map(torch.clone)
@@ -173,7 +172,7 @@ def test_one_bad_gaussian_spoils_nothing(device, name, value):
 
 
 def test_means_far_outside_their_tiles(device):
-    """A wide Gaussian whose mean is 400 px beside the image: moments are moved a long way without losing digits."""
+    """A wide Gaussian with its mean 400 px outside the image: moments are shifted far without losing digits."""
     scene = random(4, (41, 35), seed=6)
     far = scene.gaussians(torch.float64)
     far.means[0, 0] += 25.0
@@ -190,14 +189,14 @@ def test_means_far_outside_their_tiles(device):
         assert float((found[0][key] - truth).abs().max()) <= 3e-4 * float(truth.abs().max()), key
 
 
-def test_double_is_refused(device):
+def test_float64_is_refused(device):
     scene = random(3, (8, 8))
     with pytest.raises(ArgumentError, match=r"^means: are torch.float64"):
         render(scene.gaussians(torch.float64).to(torch.device(device)), scene.camera, backend="cuda")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_without_a_gpu_auto_stays_away_and_asking_says_why(monkeypatch):
+def test_without_a_gpu_auto_uses_the_cpu_and_cuda_is_refused(monkeypatch):
     assert resolve_backend("auto") == "cpu"
     monkeypatch.setenv("TRITON_INTERPRET", "0")
     assert resolve_backend("auto") == "cpu"
@@ -205,7 +204,7 @@ def test_without_a_gpu_auto_stays_away_and_asking_says_why(monkeypatch):
         resolve_backend("cuda")
 
 
-def test_the_camera_is_sent_once(device):
+def test_a_camera_is_uploaded_once(device):
     from gsplat_edu.render.triton.rasterize import _camera_rows
 
     scene = random(3, (8, 8))

@@ -1,4 +1,4 @@
-"""The check that the backend cuda has to pass on a device before it is used there."""
+"""The check that the backend cuda must pass on a device before it is used there."""
 
 import pytest
 import torch
@@ -21,10 +21,10 @@ def empty_cache(monkeypatch, tmp_path):
     self_check._failure.cache_clear()
 
 
-def test_right_kernels_pass_once(device, empty_cache, monkeypatch):
+def test_correct_kernels_are_checked_once(device, empty_cache, monkeypatch):
     assert self_check.cuda_failure(torch.device(device)) is None
     assert "triton" in empty_cache.read_text()
-    self_check._failure.cache_clear()  # as a new process has it
+    self_check._failure.cache_clear()  # as in a new process
     monkeypatch.setattr(self_check, "kernel_error", lambda device: "checked again")
     assert self_check.cuda_failure(torch.device(device)) is None
 
@@ -57,21 +57,21 @@ def test_a_gradient_that_is_one_percent_too_large_fails(device, monkeypatch, nam
     right = rasterize.render_triton
 
     def wrong(gaussians, camera, settings, background):
-        def spoilt(tensor):
+        def perturbed(tensor):
             moved = tensor * 1.0
             if tensor is gaussians.tensors()[name]:
                 moved.register_hook(lambda gradient: 1.01 * gradient)
             return moved
 
-        return right(gaussians.map(spoilt), camera, settings, background)
+        return right(gaussians.map(perturbed), camera, settings, background)
 
     monkeypatch.setattr(rasterize, "render_triton", wrong)
     assert f"the gradient of {name} is wrong by 0.01" in self_check.cuda_failure(torch.device(device))
 
 
 @pytest.mark.skipif(kernels.REASON is None and torch.cuda.is_available(), reason="this machine has a GPU")
-def test_auto_takes_the_cpu_where_the_kernels_do_not_run(monkeypatch, tmp_path, capsys):
-    """torch's CPU build stands for a GPU whose driver fails: the first call of CUDA raises."""
+def test_auto_uses_the_cpu_if_the_kernels_do_not_run(monkeypatch, tmp_path, capsys):
+    """torch's CPU build stands in for a GPU whose driver fails: the first CUDA call raises."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setenv("TRITON_INTERPRET", "0")
     with pytest.warns(
@@ -84,8 +84,8 @@ def test_auto_takes_the_cpu_where_the_kernels_do_not_run(monkeypatch, tmp_path, 
     backends._warn_once.cache_clear()
     save_ply(tmp_path / "a.ply", self_check.check_scene(torch.float32))
     out = tmp_path / "frames"
-    words = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--out", str(out)]
-    assert main(words) == 0
+    command = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--out", str(out)]
+    assert main(command) == 0
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith(
         "gsplat-edu render: the GPU is not used: its kernels failed"

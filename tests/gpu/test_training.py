@@ -1,4 +1,4 @@
-"""Training on the backend cuda: deterministic, along the native trajectory, and able to change backends on the way."""
+"""Training on the backend cuda is deterministic, follows the native backend, and can resume on another backend."""
 
 import functools
 
@@ -31,7 +31,7 @@ def tensors(run):
     return {name: tensor.detach().cpu() for name, tensor in run.gaussians.tensors().items()}
 
 
-def test_twenty_iterations_give_the_same_bits_twice(views, device):
+def test_twenty_iterations_are_reproducible(views, device):
     runs = [trainer(views, "cuda", device) for _ in range(2)]
     losses = [run.run().losses for run in runs]
     assert losses[0] == losses[1]
@@ -40,9 +40,9 @@ def test_twenty_iterations_give_the_same_bits_twice(views, device):
 
 
 def test_twenty_iterations_follow_the_native_backend(views, device):
-    """Gradients agree to 3e-4 (test_render.py), and Adam divides by their size: a rate's worth of difference is the
-    most that a step can make where a gradient is all rounding, and 3e-4 of one elsewhere. After 20 steps of rates
-    up to 5e-2 few parameters differ by more than 1 % of the way they could have gone; the loss by far less.
+    """Gradients agree to 3e-4 (test_render.py), and Adam divides by their size. So a step differs by at most one rate
+    where a gradient is pure rounding, and by 3e-4 of it elsewhere. After 20 steps at rates up to 5e-2, few parameters
+    differ by more than 1 % of the distance they could have moved, and the loss differs by far less.
     """
     ours, native = trainer(views, "cuda", device), trainer(views, "cpu", "cpu")
     losses = ours.run().losses, native.run().losses
@@ -52,15 +52,15 @@ def test_twenty_iterations_follow_the_native_backend(views, device):
     for name, expected in tensors(native).items():
         if not expected.numel():
             continue
-        way = 20 * rates[name] * (EXTENT if name == "means" else 1.0)
+        reach = 20 * rates[name] * (EXTENT if name == "means" else 1.0)
         difference = (tensors(ours)[name] - expected).abs()
-        assert float(difference.median()) < 1e-3 * way, name
-        assert float((difference > 0.01 * way).float().mean()) < 0.05, name
-        assert float((expected - start[name]).abs().max()) > 0.1 * way, "it moved"
+        assert float(difference.median()) < 1e-3 * reach, name
+        assert float((difference > 0.01 * reach).float().mean()) < 0.05, name
+        assert float((expected - start[name]).abs().max()) > 0.1 * reach, "the parameters moved"
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
-def test_strategies_run_and_checkpoints_change_backends(views, device, tmp_path, strategy):
+def test_checkpoints_resume_on_either_backend(views, device, tmp_path, strategy):
     config = TrainConfig().changed(
         iterations=24,
         strategy=strategy,

@@ -1,8 +1,8 @@
 """Autograd of the dense renderer against finite differences, in float64.
 
-The scenes are smooth where it matters, and each test asserts why: the alpha floor is off (a step has no
-finite difference), no alpha reaches the clamp at 0.99, no colour reaches the floor at 0, and no two splats
-swap places in depth under the step of 1e-6.
+The scenes are smooth, and each test asserts why: the alpha floor is off (finite differences fail at a jump), no alpha
+reaches the clamp at 0.99, no colour reaches the floor at 0, and no two splats swap places in depth under the step of
+1e-6.
 """
 
 import pytest

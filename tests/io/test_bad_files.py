@@ -1,4 +1,4 @@
-"""What every reader does with files that are not what their names say."""
+"""How every reader handles files whose contents do not match their names."""
 
 import tracemalloc
 
@@ -10,10 +10,10 @@ from gsplat_edu.io.formats import FORMATS, format_of, read_scene, write_scene
 from scene_files import random_scene, small_file
 
 SLACK = 8 << 20
-"""Bytes that a reader may use for a file however small: imports, buffers and the toys' allowance."""
+"""Bytes that a reader may use for even the smallest file: imports, buffers and the minimum allowance."""
 
 TIMES = 100
-"""A reader may allocate this many times the file's size: 64 for what is compressed, and a copy in float32."""
+"""A reader may allocate this many times the file's size: 64 for compressed contents, and a copy in float32."""
 
 every_format = pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 
@@ -30,7 +30,7 @@ def refused(path):
 def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
     path = small_file(tmp_path, suffix)
     data = path.read_bytes()
-    odd = 7 if suffix == ".splat" else 0  # it has no header: cut between two splats it is a smaller scene
+    odd = 7 if suffix == ".splat" else 0  # no header: a cut between two splats leaves a valid scene
     for end in range(0, len(data), 64):
         if end + odd < len(data) and end + odd > 0:
             path.write_bytes(data[: end + odd])
@@ -74,7 +74,7 @@ def test_a_missing_file_stays_an_oserror(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat", ".glb"])
-def test_numbers_that_are_none_are_refused(tmp_path, suffix):
+def test_files_with_nan_or_infinity_are_refused(tmp_path, suffix):
     path = small_file(tmp_path, suffix)
     data = bytearray(path.read_bytes())
     before = {".splat": b"", ".glb": b"BIN\0"}.get(suffix, b"end_header\n")
@@ -86,7 +86,7 @@ def test_numbers_that_are_none_are_refused(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
-def test_nothing_is_written_of_a_scene_that_is_not_finite(tmp_path, suffix):
+def test_a_scene_that_is_not_finite_is_not_written(tmp_path, suffix):
     scene = random_scene(5)
     scene.gaussians.log_scales[3, 1] = torch.nan
     with pytest.raises(ArgumentError, match="log_scales"):
@@ -104,7 +104,7 @@ def test_names_without_a_format_are_refused(tmp_path):
 
 @every_format
 def test_memory_stays_a_small_multiple_of_the_file(tmp_path, suffix):
-    """The counts a file claims are raised to 2^31 - 1 wherever they stand, as text or as 32 bits."""
+    """Every count in the file, as text or as 32 bits, is raised to 2^31 - 1 in turn."""
     path = small_file(tmp_path, suffix)
     data, claims = path.read_bytes(), 0
     for count in (b"40", (40).to_bytes(4, "little")):
@@ -123,4 +123,4 @@ def test_memory_stays_a_small_multiple_of_the_file(tmp_path, suffix):
                 tracemalloc.stop()
             assert peak < SLACK + TIMES * len(data)
             at = data.find(count, at + 1)
-    assert claims or suffix == ".splat", "it says somewhere how many splats it holds"
+    assert claims or suffix == ".splat", "the file must state its number of splats somewhere"

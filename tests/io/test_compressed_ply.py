@@ -21,11 +21,11 @@ XYZ = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
 SCALES = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
 RGB = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-HALF = 0.5  # of a step: what rounding to the nearest is off by at most
+HALF = 0.5  # steps: the largest error of rounding to nearest
 
 
 def parse(path):
-    """Take a file apart as a viewer would that knows only what we write."""
+    """Parse a file with a minimal reader that accepts only this package's layout."""
     header, body = path.read_bytes().split(b"end_header\n", 1)
     lines = [line for line in header.decode("ascii").splitlines() if not line.startswith("comment")]
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -78,8 +78,8 @@ WORDS = {
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("colored", [True, False])
-def test_what_a_file_made_by_hand_says(tmp_path, colored, order):
-    """Properties shuffled, others between them, elements in another order: all is found by name."""
+def test_a_handmade_file_is_read(tmp_path, colored, order):
+    """Properties and elements are found by name, in any order and among unknown ones."""
     chunk = chunk_element(BOUNDS | (COLORS if colored else {}), "f8" if order == ">" else "f4")
     vertex = [("extra", "u1", [1, 2]), *((name, "u4", WORDS[name]) for name in reversed(PACKED))]
     path = tmp_path / "a.compressed.ply"
@@ -91,7 +91,7 @@ def test_what_a_file_made_by_hand_says(tmp_path, colored, order):
     scene = read(path)
     g = scene.gaussians
     assert (scene.antialiased, scene.up, g.sh_degree) == (None, None, 0)
-    np.testing.assert_array_equal(g.means.numpy(), [[1, -2, 20], [-1, 2, 10]])  # axes are the file's own
+    np.testing.assert_array_equal(g.means.numpy(), [[1, -2, 20], [-1, 2, 10]])  # the file's axes are kept
     middle = -5 + 4 * 1024 / 2047
     np.testing.assert_allclose(g.log_scales.numpy(), [[-5, -2, 3], [middle, -6, -7]], rtol=1e-6)
     rgb = np.array([[1.0, 0.0, 0.2], [0.0, 1.0, 0.4]])
@@ -104,11 +104,13 @@ def test_what_a_file_made_by_hand_says(tmp_path, colored, order):
     code = np.sqrt(2.0) * (np.array([[512, 100, 900], [0, 1023, 100]]) / 1023 - 0.5)
     np.testing.assert_allclose(first[1:], code[0], atol=1e-7)  # w is the largest
     assert first[0] == pytest.approx(np.sqrt(1 - (code[0] ** 2).sum()), abs=1e-7)
-    np.testing.assert_allclose(second, [*code[1], 0.0], atol=1e-7)  # z, but the others leave nothing for it
+    np.testing.assert_allclose(
+        second, [*code[1], 0.0], atol=1e-7
+    )  # z is left out, but the others leave no length for it
 
 
 @pytest.mark.parametrize("rest", [3, 8, 15])
-def test_sh_bytes_are_channel_by_channel(tmp_path, rest):
+def test_sh_bytes_are_stored_channel_by_channel(tmp_path, rest):
     codes = np.arange(2 * 3 * rest).reshape(2, 3 * rest)
     codes[0, :2], codes[1, 0] = (255, 128), 0
     sh = [(f"f_rest_{i}", "u1", codes[:, i]) for i in range(3 * rest)][::-1]
@@ -126,7 +128,7 @@ def test_sh_bytes_are_channel_by_channel(tmp_path, rest):
 
 
 def matched(scene, back):
-    """Return the given splats in the order of those that came back: nearest means; none may be met twice."""
+    """Return the given splats in the order of those read back, matched one to one by the nearest mean."""
     _, nearest = cKDTree(scene.gaussians.means.numpy()).query(back.gaussians.means.numpy())
     if len(nearest):
         assert len(set(nearest.tolist())) == len(scene.gaussians)
@@ -148,7 +150,7 @@ def check_values(path, given):
     assert (
         np.abs(after - before) <= HALF * extents[2] / 255 / C0 + 4 * rounding * (1 + np.abs(before))
     ).all()
-    # inside, a coefficient is read as the middle of its step of 1/32; bytes 0 and 255 are read as the ends of theirs
+    # A coefficient is read as the middle of its step of 1/32, except bytes 0 and 255, which are read as the outer ends.
     before, after = (x.sh_rest.numpy() for x in (given, back))
     assert (np.abs(after - np.clip(before, -4, 4)) <= np.where(np.abs(after) == 4, 1 / 32, 1 / 64)).all()
     before, after = (x.opacities.double().numpy() for x in (given, back))
@@ -160,14 +162,14 @@ def check_rotations(before, after):
     assert (after.norm(dim=1) - 1).abs().max() < 1e-6 if len(after) else True
     before = torch.nn.functional.normalize(before.double(), dim=1)
     after = after.double() * torch.sign((before * after).sum(dim=1, keepdim=True))
-    # Three components are rounded to steps of sqrt(2) / 1023. The fourth makes up the length: it is the largest, so it
-    # is off by no more than the three together.
+    # Three components are rounded to steps of sqrt(2) / 1023. The fourth follows from the unit length; being the
+    # largest, it is off by no more than the three together.
     assert ((after - before).abs() <= 3 * HALF * np.sqrt(2) / 1023 + 1e-6).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 1000])
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
-def test_what_is_written_comes_back_within_half_a_step(tmp_path, rest, count):
+def test_a_round_trip_stays_within_half_a_step(tmp_path, rest, count):
     scene, path = random_scene(count, rest), tmp_path / "new" / "a.compressed.ply"
     write(path, scene)
     bounds, words, sh = parse(path)
@@ -185,21 +187,21 @@ def test_bytes_are_the_same_every_time(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 1, 256, 257, 3000])
-def test_what_was_rounded_once_is_not_rounded_again(tmp_path, count):
+def test_a_second_round_trip_changes_nothing(tmp_path, count):
     first, second = tmp_path / "a.compressed.ply", tmp_path / "b.compressed.ply"
     write(first, random_scene(count, 8))
     write(second, read(first))
     (bounds, words, sh), (bounds2, words2, sh2) = parse(first), parse(second)
     np.testing.assert_array_equal(words[:, [0, 2, 3]], words2[:, [0, 2, 3]])
     np.testing.assert_array_equal(sh, sh2)
-    np.testing.assert_allclose(bounds, bounds2, atol=1e-6)  # colours go through f_dc and back in float32
-    # where two components are about equally large the other one may be left out the second time
+    np.testing.assert_allclose(bounds, bounds2, atol=1e-6)  # colours pass through f_dc in float32
+    # If the two largest components are nearly equal, the second write may leave out the other one.
     assert np.count_nonzero(words[:, 1] != words2[:, 1]) <= count // 100
     check_rotations(read(first).gaussians.quats, read(second).gaussians.quats)
 
 
 def with_means(means):
-    """Splats at given means, told apart by their scales: the number as two digits of 100."""
+    """Return splats at given means whose scales encode their number as two digits of base 100."""
     number = torch.arange(len(means))
     tags = torch.stack([number // 100, 0 * number, number % 100], dim=1) / 10 - 5
     means = torch.as_tensor(np.asarray(means), dtype=torch.float32)
@@ -207,14 +209,14 @@ def with_means(means):
 
 
 def order_of(scene, path):
-    """Return which splat of the scene comes first, second, ... in the file."""
+    """Return the order of the scene's splats in the file."""
     write(path, scene)
     digits = np.rint(10 * (read(path).gaussians.log_scales.double().numpy() + 5)).astype(int)
     return 100 * digits[:, 0] + digits[:, 2]
 
 
 def test_splats_are_sorted_along_a_morton_curve(tmp_path):
-    """300 splats in each corner of a cube, shuffled: x changes first, then y, then z; a corner keeps its order."""
+    """300 splats in each corner of a cube, shuffled. x varies fastest, then y, then z; a corner keeps its order."""
     corner = np.random.default_rng(0).permutation(np.repeat(np.arange(8), 300))
     means = np.stack([corner & 1, corner >> 1 & 1, corner >> 2], axis=1)
     order = order_of(with_means(means), tmp_path / "a.compressed.ply")
@@ -222,15 +224,15 @@ def test_splats_are_sorted_along_a_morton_curve(tmp_path):
 
 
 def test_chunks_are_tight(tmp_path):
-    """Also in a crowd that a far splat makes small: it is one cell of the first curve, and sorted by itself."""
+    """Also in a crowd next to an outlier: the crowd is a single cell of the first curve and is sorted again."""
     rng = np.random.default_rng(0)
     means = np.concatenate([rng.uniform(0, 1, (8 * 8 * 8 * 256, 3)), [[1e6, 1e6, 1e6]]])
     path = tmp_path / "a.compressed.ply"
     write(path, with_means(means))
     bounds, _, _ = parse(path)
     extents = bounds[:-1, 1] - bounds[:-1, 0]
-    # 512 chunks of equal counts in a cube: were they cubes, their edges would be 1/8; a chunk that crosses the border
-    # of two cells of the curve is longer
+    # 512 chunks of equal counts in a unit cube. Cubes would have edges of 1/8; a chunk that crosses the border of two
+    # cells of the curve is longer.
     assert np.median(extents) < 0.2
 
 
@@ -247,14 +249,14 @@ def test_a_sorted_scene_keeps_its_order(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 2, 600])
-def test_all_in_one_point(tmp_path, count):
+def test_all_means_in_one_point(tmp_path, count):
     scene, path = with_means(np.full((count, 3), 1234.5678)), tmp_path / "a.compressed.ply"
     write(path, scene)
-    check_values(path, scene.gaussians)  # there is nothing to sort
+    check_values(path, scene.gaussians)  # the order is kept
     np.testing.assert_array_equal(read(path).gaussians.means.numpy(), scene.gaussians.means.numpy())
 
 
-def test_all_in_one_plane(tmp_path):
+def test_all_means_in_one_plane(tmp_path):
     means = np.random.default_rng(0).normal(size=(600, 3))
     means[:, 1] = 2.5
     scene, path = with_means(means), tmp_path / "a.compressed.ply"
@@ -270,7 +272,7 @@ def test_extents_at_the_ends_of_float32(tmp_path, size):
     check_values(path, scene.gaussians.map(lambda tensor: tensor[torch.from_numpy(order)]))
 
 
-def test_what_does_not_fit_is_clamped(tmp_path):
+def test_values_out_of_range_are_clamped(tmp_path):
     g = random_scene(4, 3).gaussians
     log_scales = g.log_scales.clone()
     log_scales[0], log_scales[1] = -1e30, 1e30
@@ -288,7 +290,7 @@ def test_what_does_not_fit_is_clamped(tmp_path):
     check_rotations(torch.tensor([[1.0, 0, 0, 0], [1, 1, 0, 0], [-1, 0, 0, 0], [0, 1, 0, -1]]), back.quats)
 
 
-def test_gradients_and_float64_are_no_obstacle(tmp_path):
+def test_trainable_float64_scenes_can_be_written(tmp_path):
     scene = random_scene(300)
     write(tmp_path / "a.compressed.ply", scene)
     write(
@@ -299,18 +301,18 @@ def test_gradients_and_float64_are_no_obstacle(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "message"),
     [
         ("quats", 0.0, r"quats\[3\]: has zero length"),
         ("means", np.nan, r"means\[3, 0\]: is NaN or infinite"),
         ("means", 1e300, r"means\[3, 0\]: is NaN or infinite"),
     ],
 )
-def test_what_cannot_be_written_is_named(tmp_path, name, value, says):
+def test_values_that_cannot_be_written_are_named(tmp_path, name, value, message):
     path = tmp_path / "a.compressed.ply"
     scene = Scene(random_scene(5).gaussians.map(torch.Tensor.double))
     scene.gaussians.tensors()[name][3] = value
-    with pytest.raises(ArgumentError, match=says):
+    with pytest.raises(ArgumentError, match=message):
         write(path, scene)
     assert list(tmp_path.iterdir()) == []
 
@@ -324,7 +326,7 @@ def refused(path):
 
 
 @pytest.mark.parametrize("rest", [0, 3])
-def test_cut_anywhere_it_is_refused(tmp_path, rest):
+def test_truncated_files_are_refused(tmp_path, rest):
     path = tmp_path / "a.compressed.ply"
     write(path, random_scene(300, rest))
     whole = path.read_bytes()
@@ -336,7 +338,7 @@ def test_cut_anywhere_it_is_refused(tmp_path, rest):
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({b"ply\n": b"PK\x03\x04\n"}, "is not a PLY: its first line is not 'ply'"),
         ({b"ply\n": b"version https://git-lfs.github.com/spec/v1\n"}, "is a Git LFS pointer"),
@@ -371,7 +373,7 @@ def test_cut_anywhere_it_is_refused(tmp_path, rest):
         ({b"gsplat_edu up 0.0": b"gsplat_edu up x"}, "is not a direction"),
     ],
 )
-def test_damage_is_named(tmp_path, changes, says):
+def test_damage_is_named(tmp_path, changes, message):
     path = tmp_path / "a.compressed.ply"
     write(path, random_scene(300, 3))
     data = path.read_bytes()
@@ -379,12 +381,12 @@ def test_damage_is_named(tmp_path, changes, says):
         assert old in data
         data = data.replace(old, new, 1)
     path.write_bytes(data)
-    assert says in refused(path)
+    assert message in refused(path)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("place", range(18))
-def test_bounds_that_are_no_numbers_are_named(tmp_path, place, value):
+def test_bounds_that_are_not_finite_are_named(tmp_path, place, value):
     path = tmp_path / "a.compressed.ply"
     write(path, random_scene(300, 0))
     data = bytearray(path.read_bytes())
@@ -399,7 +401,7 @@ def test_bounds_beyond_float32_are_named(tmp_path):
     vertex = [(name, "u4", values) for name, values in WORDS.items()]
     by_hand(path, {"chunk": chunk_element(BOUNDS | {"max_y": 1e300}, "f8"), "vertex": vertex})
     assert "chunk 0: max_y is 1e+300; " in refused(path)
-    # within it, but coefficients of such colours are not
+    # This bound is within float32, but the SH coefficients of such colours are not.
     by_hand(path, {"chunk": chunk_element(BOUNDS | COLORS | {"max_r": 3e38}), "vertex": vertex})
     with pytest.raises(SceneFormatError, match="1 splats have NaN or infinite values"):
         read_scene(path)
@@ -426,8 +428,8 @@ def shared(name):
     return path
 
 
-def test_the_same_scene_by_supersplat_and_uncompressed(tmp_path):
-    """SuperSplat wrote this file from that one; what we write from it has the same numbers."""
+def test_a_file_by_supersplat_matches_its_source_and_ours(tmp_path):
+    """SuperSplat compressed the PLY. Our compressed file of the same PLY has the same numbers."""
     theirs = shared("plush_dog/point_cloud_29999_clean.compressed.ply")
     original = Scene(load_ply(shared("plush_dog/point_cloud_29999_clean.ply")))
     scene = read(theirs)
@@ -455,5 +457,5 @@ def test_a_scene_without_sh():
         "plush_dog/point_cloud_29999_clean.ply",
     ],
 )
-def test_files_of_the_world_that_are_not_compressed(name):
+def test_real_files_that_are_not_compressed_are_refused(name):
     refused(shared(name))

@@ -27,24 +27,24 @@ def image(gaussians, camera, **changes):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("s", [0.5, 1.0, 3.0])
-def test_a_moved_camera_sees_the_same_of_a_moved_scene(degree, s):
-    hard = native_scenes.random(40)
-    scene = Scene(Filter(sh_degree=degree).apply(hard.gaussians()))
+def test_moving_scene_and_camera_together_keeps_the_image(degree, s):
+    made = native_scenes.random(40)
+    scene = Scene(Filter(sh_degree=degree).apply(made.gaussians()))
     move = similarity(degree, s)
-    before = image(scene.gaussians, hard.camera, jacobian_limit=1.3)
-    after = image(move.scene(scene).gaussians, move.camera(hard.camera), jacobian_limit=1.3)
+    before = image(scene.gaussians, made.camera, jacobian_limit=1.3)
+    after = image(move.scene(scene).gaussians, move.camera(made.camera), jacobian_limit=1.3)
     # float64 throughout: some hundred operations, each within 1e-16 of values of order 1
     assert (before - after).abs().max() < 1e-12
-    unmoved = image(move.scene(scene).gaussians, hard.camera, jacobian_limit=1.3)
-    assert (before - unmoved).abs().max() > 1e-2, "it has moved"
+    unmoved = image(move.scene(scene).gaussians, made.camera, jacobian_limit=1.3)
+    assert (before - unmoved).abs().max() > 1e-2, "the scene has moved"
 
 
-def test_half_a_turn_is_the_similarity_of_that_name():
-    hard = native_scenes.random(40)
-    gaussians = hard.gaussians()
+def test_half_turned_equals_the_similarity():
+    made = native_scenes.random(40)
+    gaussians = made.gaussians()
     turned = half_turned(gaussians)
-    before = image(gaussians, hard.camera)
-    assert (before - image(turned, HALF_TURN.camera(hard.camera))).abs().max() < 1e-13
+    before = image(gaussians, made.camera)
+    assert (before - image(turned, HALF_TURN.camera(made.camera))).abs().max() < 1e-13
     by_matrix = HALF_TURN.scene(Scene(gaussians)).gaussians
     assert torch.equal(by_matrix.means, turned.means)
     torch.testing.assert_close(by_matrix.sh_rest, turned.sh_rest, rtol=0, atol=1e-13)
@@ -52,7 +52,7 @@ def test_half_a_turn_is_the_similarity_of_that_name():
         assert torch.equal(tensor, gaussians.tensors()[name]), name
 
 
-def test_one_after_the_other_is_their_product():
+def test_similarities_compose():
     scene = Scene(native_scenes.random(20).gaussians(), up=(0.0, -1.0, 0.0))
     first, second = similarity(1, 2.0), similarity(2, 0.3)
     one_by_one, at_once = second.scene(first.scene(scene)), second.after(first).scene(scene)
@@ -62,7 +62,7 @@ def test_one_after_the_other_is_their_product():
     np.testing.assert_allclose(at_once.up, second.R @ first.R @ (0.0, -1.0, 0.0), atol=1e-14)
 
 
-def test_a_matrix_is_taken_apart():
+def test_a_matrix_is_decomposed():
     move = similarity(3, 2.5)
     rows = np.hstack([move.s * move.R, move.t[:, None]])
     for matrix in (rows, np.vstack([rows, (0.0, 0.0, 0.0, 1.0)])):
@@ -73,7 +73,7 @@ def test_a_matrix_is_taken_apart():
 
 
 @pytest.mark.parametrize(
-    ("A", "says"),
+    ("A", "message"),
     [
         (np.diag([1.0, 1.0, -1.0]), "mirrors"),
         (np.zeros((3, 3)), "singular"),
@@ -81,8 +81,8 @@ def test_a_matrix_is_taken_apart():
         (np.array([[1.0, 0.01, 0], [0, 1.0, 0], [0, 0, 1.0]]), "shears or scales"),
     ],
 )
-def test_what_gaussians_cannot_do_is_refused(A, says):
-    with pytest.raises(ArgumentError, match=says):
+def test_matrices_that_are_not_similarities_are_refused(A, message):
+    with pytest.raises(ArgumentError, match=message):
         Similarity.of_matrix(np.hstack([A, np.zeros((3, 1))]))
 
 
@@ -93,7 +93,7 @@ def test_a_matrix_of_columns_or_another_shape_is_refused():
         Similarity.of_matrix(np.eye(3))
 
 
-def test_filters_keep_what_they_say_in_order():
+def test_filters_keep_the_matching_splats_in_order():
     gaussians = native_scenes.random(200).gaussians(torch.float32)
     assert Filter().apply(gaussians).means is gaussians.means
     kept = Filter(min_opacity=0.4, box=(-0.5, -0.4, -0.3, 0.5, 0.4, 0.3), sh_degree=1).apply(gaussians)
@@ -113,7 +113,7 @@ def test_filters_out_of_range_are_refused(wrong):
         Filter(**wrong)
 
 
-def test_joining_keeps_the_order_and_fills_harmonics_up():
+def test_joining_keeps_the_order_and_pads_harmonics():
     first = Scene(native_scenes.random(5).gaussians(), True, (0.0, -1.0, 0.0))
     low = Filter(sh_degree=1).apply(native_scenes.random(7, seed=1).gaussians())
     both = joined([first, Scene(low, None, (0.0, -1.0, 0.0))])
@@ -127,7 +127,7 @@ def test_joining_keeps_the_order_and_fills_harmonics_up():
         joined([first, replace(first, antialiased=False)])
 
 
-def test_doing_nothing_changes_nothing_but_rounding():
+def test_the_identity_changes_only_rounding():
     scene = Scene(native_scenes.random(9).gaussians(torch.float32))
     moved = IDENTITY.scene(scene).gaussians
     for name, tensor in moved.tensors().items():

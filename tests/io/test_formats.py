@@ -17,7 +17,7 @@ def threads():
 
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 def test_bytes_do_not_depend_on_threads(tmp_path, threads, suffix):
-    """40,000 splats: torch divides what is longer than 32,768 numbers."""
+    """40,000 splats, because torch splits work on more than 32,768 numbers among threads."""
     move = Similarity.of_matrix([[0, 0, 1, 0.1], [1, 0, 0, 0.2], [0, 1, 0, 0.3]])
     written = []
     for count in (1, 2):
@@ -29,7 +29,7 @@ def test_bytes_do_not_depend_on_threads(tmp_path, threads, suffix):
 
 
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
-def test_reading_what_was_written_and_writing_it_again_gives_the_same_scene(tmp_path, suffix):
+def test_a_second_round_trip_gives_the_same_scene(tmp_path, suffix):
     write_scene(tmp_path / f"1{suffix}", random_scene(300))
     first = read_scene(tmp_path / f"1{suffix}")
     write_scene(tmp_path / f"2{suffix}", first)
@@ -37,11 +37,11 @@ def test_reading_what_was_written_and_writing_it_again_gives_the_same_scene(tmp_
     assert (again.antialiased, again.up) == (first.antialiased, first.up)
     order = [torch.from_numpy(scene.gaussians.means.numpy()).sum(dim=1).argsort() for scene in (first, again)]
     a, b = (scene.gaussians.means[rows] for scene, rows in zip((first, again), order, strict=True))
-    # a second rounding to the same steps: at most one of the coarsest, 11 bits of a chunk's 8 units
+    # The second rounding moves a value by at most one step; the coarsest is 11 bits over a chunk's 8 units.
     assert (a - b).abs().max() < 8 / 2**11
 
 
-def test_what_a_format_leaves_out_is_said(tmp_path):
+def test_losses_of_a_format_are_reported(tmp_path):
     scene = random_scene(3)
     assert losses("a.ply", scene) == []
     assert "up to degree 0; degrees up to 3 are dropped" in losses("a.splat", scene)[0]
@@ -49,7 +49,7 @@ def test_what_a_format_leaves_out_is_said(tmp_path):
 
 @pytest.mark.parametrize("suffix", [found.suffix for found in FORMATS])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_antialiasing_is_kept_or_said_to_be_lost(tmp_path, suffix, antialiased):
+def test_antialiasing_is_kept_or_reported_lost(tmp_path, suffix, antialiased):
     scene = replace(random_scene(3, 0), antialiased=antialiased)
     write_scene(tmp_path / f"a{suffix}", scene)
     kept = read_scene(tmp_path / f"a{suffix}").antialiased
@@ -57,7 +57,7 @@ def test_antialiasing_is_kept_or_said_to_be_lost(tmp_path, suffix, antialiased):
     assert len(said) == (0 if bool(kept) == antialiased else 1)
 
 
-def test_a_sog_in_a_folder_is_named_by_either(tmp_path):
+def test_an_unpacked_sog_is_read_by_its_folder_or_its_meta_json(tmp_path):
     path = tmp_path / "scene" / "meta.json"
     write_scene(path, random_scene(30))
     for name in (path, path.parent):

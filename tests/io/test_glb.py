@@ -1,4 +1,4 @@
-"""Binary glTF, read back by its layout: twelve bytes, a chunk of JSON, a chunk of numbers."""
+"""Binary glTF: a header of twelve bytes, a chunk of JSON, a chunk of numbers."""
 
 import json
 import struct
@@ -33,7 +33,7 @@ def random_gaussians(count, rest):
 
 
 def parse(path):
-    """Take a file apart as a viewer does; every offset has to be where it is said."""
+    """Parse a file as a viewer does, checking every size and offset."""
     data = path.read_bytes()
     assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
     size, kind = struct.unpack_from("<I4s", data, 12)
@@ -69,13 +69,13 @@ def attributes(document, body):
 
 @pytest.mark.parametrize("count", [1, 2, 1000])
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
-def test_what_is_stored_decodes_to_the_parameters(tmp_path, rest, count):
+def test_stored_values_decode_to_the_parameters(tmp_path, rest, count):
     g = random_gaussians(count, rest)
     glb.write(tmp_path / "new" / "a.glb", Scene(g))
     arrays = parse(tmp_path / "new" / "a.glb")[1]
     x, y, z = g.means.numpy().T
     np.testing.assert_array_equal(arrays["POSITION"], np.stack([x, -y, -z], axis=1))
-    # one rounding to float32, 2^-24 of the number, and a bit for NumPy's and torch's own
+    # One rounding to float32, 2^-24 of the number, and a margin for NumPy's and torch's own.
     scales, opacities = torch.exp(g.log_scales.double()), torch.sigmoid(g.logit_opacities.double())
     np.testing.assert_allclose(arrays[PREFIX + "SCALE"], scales.numpy(), rtol=2**-23)
     np.testing.assert_allclose(arrays[PREFIX + "OPACITY"][:, 0], opacities.numpy(), rtol=2**-23)
@@ -85,7 +85,7 @@ def test_what_is_stored_decodes_to_the_parameters(tmp_path, rest, count):
     names = [f"{PREFIX}SH_DEGREE_{d}_COEF_{n}" for d in range(degrees + 1) for n in range(2 * d + 1)]
     assert set(arrays) == {"POSITION", *(PREFIX + name for name in ("ROTATION", "SCALE", "OPACITY")), *names}
 
-    # The ellipsoids, and the colours seen along a direction, are the scene's half a turn about x away.
+    # Ellipsoids and view-dependent colours are those of the scene, turned by half a turn about x.
     H = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
     covariances = cov3d_t(g.log_scales.double(), g.quats.double())
     turned = cov3d_t(torch.log(torch.tensor(arrays[PREFIX + "SCALE"]).double()), stored[:, [3, 0, 1, 2]])
@@ -98,14 +98,14 @@ def test_what_is_stored_decodes_to_the_parameters(tmp_path, rest, count):
     np.testing.assert_allclose(theirs, ours, atol=1e-12)
 
 
-def test_the_document_is_what_the_extension_asks_for(tmp_path):
+def test_the_document_follows_the_extension(tmp_path):
     glb.write(tmp_path / "a.glb", Scene(random_gaussians(9, 3)))
     document, arrays = parse(tmp_path / "a.glb")
     assert document["asset"] == {"version": "2.0", "generator": "gsplat-edu"}
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
     assert "extensionsRequired" not in document
     assert document["scenes"][document["scene"]] == {"nodes": [0]}
-    assert document["nodes"] == [{"mesh": 0}], "no transformation: not every viewer turns harmonics along"
+    assert document["nodes"] == [{"mesh": 0}], "no transformation, because not every viewer rotates harmonics"
     (primitive,) = document["meshes"][0]["primitives"]
     assert primitive["mode"] == 0
     assert primitive["extensions"]["KHR_gaussian_splatting"] == {
@@ -128,26 +128,26 @@ def test_the_document_is_what_the_extension_asks_for(tmp_path):
     ],
 )
 @pytest.mark.parametrize("count", [0, 3])
-def test_facts_of_the_scene_are_extras(tmp_path, count, facts, extras):
+def test_antialiasing_and_up_are_stored_in_extras(tmp_path, count, facts, extras):
     glb.write(tmp_path / "a.glb", Scene(random_gaussians(count, 0), **facts))
     read = parse(tmp_path / "a.glb")[0]["asset"]["extras"]
-    assert json.dumps(read) == json.dumps(extras), "and no -0.0"
+    assert json.dumps(read) == json.dumps(extras), "also without -0.0"
 
 
-def test_nothing_is_a_file_without_a_mesh(tmp_path):
+def test_an_empty_scene_is_a_file_without_a_mesh(tmp_path):
     glb.write(tmp_path / "a.glb", Scene(random_gaussians(0, 15)))
     document, arrays = parse(tmp_path / "a.glb")
     assert not arrays and not {"meshes", "accessors", "bufferViews", "buffers"} & set(document)
 
 
-def test_the_same_scene_is_the_same_bytes(tmp_path):
+def test_the_same_scene_gives_the_same_bytes(tmp_path):
     g = random_gaussians(50, 8)
     glb.write(tmp_path / "a.glb", Scene(g, antialiased=True))
     glb.write(tmp_path / "b.glb", Scene(half_turned(half_turned(g)).trainable(), antialiased=True))
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
 
 
-def test_extremes_stay_numbers(tmp_path):
+def test_extreme_values_stay_finite(tmp_path):
     g = random_gaussians(3, 0).map(torch.Tensor.double)
     g.log_scales[:] = torch.tensor([[-800.0], [800.0], [0.0]])
     g.logit_opacities[:] = torch.tensor([-800.0, 800.0, 0.0])
@@ -159,43 +159,43 @@ def test_extremes_stay_numbers(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(arrays[PREFIX + "ROTATION"], axis=1), 1.0, rtol=1e-6)
 
 
-def test_what_gltf_cannot_hold_is_refused_and_the_old_file_stays(tmp_path):
+def test_refused_scenes_leave_the_old_file(tmp_path):
     path = tmp_path / "a.glb"
     g = random_gaussians(3, 0)
     glb.write(path, Scene(g))
     before = path.read_bytes()
     far = g.map(torch.Tensor.double)
     far.means[1] = 1e300
-    for scene, says in (
+    for scene, message in (
         (Scene(replace(g, quats=torch.zeros(3, 4))), r"quats\[0\]: has zero length"),
         (Scene(far), r"means\[1, 0\]: is NaN or infinite"),
     ):
-        with pytest.raises(ArgumentError, match=says):
+        with pytest.raises(ArgumentError, match=message):
             glb.write(path, scene)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("count", [0, 1, 100])
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
-def test_what_was_written_is_read(tmp_path, count, rest):
+def test_a_round_trip(tmp_path, count, rest):
     g = random_gaussians(count, rest)
     glb.write(tmp_path / "a.glb", Scene(g, True, (0.6, -0.8, 0.0)))
     scene = glb.read(tmp_path / "a.glb")
     assert scene.antialiased is True and scene.up == pytest.approx((0.6, -0.8, 0.0))
     back = scene.gaussians
-    assert back.sh_degree == (g.sh_degree if count else 0), "a file without splats says no degree"
+    assert back.sh_degree == (g.sh_degree if count else 0), "a file without splats stores no degree"
     if not count:
         return
     assert torch.equal(back.means, g.means) and torch.equal(back.sh, g.sh)
     torch.testing.assert_close(back.quats, g.quats / g.quats.norm(dim=1, keepdim=True), rtol=0, atol=2e-7)
-    # the scale is rounded to float32, 6e-8 of it, and its logarithm to float32, at most 7 here
+    # The scale is rounded to float32 (6e-8, relative), and so is its logarithm, which is at most 7 here.
     torch.testing.assert_close(back.log_scales, g.log_scales, rtol=1e-7, atol=6e-7)
-    # opacities are 6e-8 apart at most; of a logit that is d / (o (1 - o))
+    # Opacities o are off by at most 6e-8 = d, logits by d / (o (1 - o)).
     slack = 6e-8 / (g.opacities * (1 - g.opacities)) + 1e-6
     assert bool(((back.logit_opacities - g.logit_opacities).abs() < slack).all())
 
 
-def test_opacities_of_nought_and_one_stay_finite(tmp_path):
+def test_opacities_of_zero_and_one_get_finite_logits(tmp_path):
     g = replace(random_gaussians(2, 0), logit_opacities=torch.tensor([400.0, -400.0]))
     glb.write(tmp_path / "a.glb", Scene(g))
     logits = glb.read(tmp_path / "a.glb").gaussians.logit_opacities
@@ -203,7 +203,7 @@ def test_opacities_of_nought_and_one_stay_finite(tmp_path):
 
 
 def edited(path, change):
-    """Write a glTF again with its JSON changed."""
+    """Rewrite a glTF with its JSON changed."""
     data = path.read_bytes()
     size = struct.unpack_from("<I", data, 12)[0]
     document = json.loads(data[20 : 20 + size])
@@ -217,7 +217,7 @@ def edited(path, change):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda d: d["nodes"][0].update(rotation=[1, 0, 0, 0]), "by a node"),
         (lambda d: d["accessors"][1].update(componentType=5121), "not float32"),
@@ -244,12 +244,12 @@ def edited(path, change):
         (lambda d: d.update(accessors="none"), "does not describe"),
     ],
 )
-def test_what_is_stored_otherwise_is_refused(tmp_path, change, says):
+def test_unsupported_documents_are_refused(tmp_path, change, message):
     path = tmp_path / "a.glb"
     glb.write(path, Scene(random_gaussians(5, 3)))
     edited(path, lambda document: None)
     assert len(glb.read(path).gaussians) == 5, "editing alone does no harm"
     edited(path, change)
-    with pytest.raises(SceneFormatError, match=says) as caught:
+    with pytest.raises(SceneFormatError, match=message) as caught:
         glb.read(path)
     assert str(path) in str(caught.value)

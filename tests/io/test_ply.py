@@ -41,7 +41,7 @@ def parse(path):
 
 
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
-def test_properties_are_inrias_by_name(tmp_path, rest):
+def test_properties_have_inrias_names_and_order(tmp_path, rest):
     gaussians = random_gaussians(7, rest)
     save_ply(tmp_path / "new" / "scene.ply", gaussians)
     names, table = parse(tmp_path / "new" / "scene.ply")
@@ -62,12 +62,12 @@ def test_properties_are_inrias_by_name(tmp_path, rest):
             np.testing.assert_array_equal(values, gaussians.sh_rest[:, k, channel].numpy())
 
 
-def test_an_empty_scene_is_a_file(tmp_path):
+def test_an_empty_scene_can_be_saved(tmp_path):
     save_ply(tmp_path / "empty.ply", random_gaussians(0, 15))
     assert len(parse(tmp_path / "empty.ply")[1]) == 0
 
 
-def test_gradients_and_float64_are_no_obstacle(tmp_path):
+def test_trainable_float64_scenes_can_be_saved(tmp_path):
     save_ply(tmp_path / "a.ply", random_gaussians(3, 0).map(torch.Tensor.double).trainable())
     assert len(parse(tmp_path / "a.ply")[1]) == 3
 
@@ -85,7 +85,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path], "and nothing beside it"
+    assert list(tmp_path.iterdir()) == [path], "and no temporary file is left"
 
 
 def assert_equal(a, b):
@@ -99,7 +99,7 @@ def assert_equal(a, b):
 
 @pytest.mark.parametrize("count", [0, 1, 9])
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
-def test_what_is_saved_is_loaded_to_the_bit(tmp_path, rest, count):
+def test_a_round_trip_is_exact_to_the_bit(tmp_path, rest, count):
     gaussians = random_gaussians(count, rest)
     if count:
         gaussians.means[0, 1] = -0.0
@@ -119,14 +119,14 @@ def test_an_origin_moves_the_means_in_float64(tmp_path):
     exact = gaussians.means.numpy().astype(np.float64) + origin
     np.testing.assert_array_equal(moved.means.numpy(), exact.astype(np.float32))
     back = load_ply(tmp_path / "moved.ply", origin)
-    # the file holds float32: half a unit in the last place of 3e5 is 2^-6; the subtraction adds nothing of its size
+    # The file holds float32: half a unit in the last place of 3e5 is 2^-6. The subtraction adds far less.
     np.testing.assert_allclose(back.means.numpy(), gaussians.means.numpy(), atol=2**-6 + 1e-6)
     with pytest.raises(ShapeError, match="origin"):
         load_ply(tmp_path / "moved.ply", (1, 2))
 
 
 def written(path, table, form="binary_little_endian", newline="\n", before=b"", extra_header=()):
-    """Write a structured table as a PLY in any of its forms."""
+    """Write a structured table as a PLY in the given format."""
     kinds = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int32"}
     lines = ["ply", f"format {form} 1.0", "comment made by hand", "obj_info none", *extra_header]
     lines += [f"element vertex {len(table)}"]
@@ -142,7 +142,7 @@ def written(path, table, form="binary_little_endian", newline="\n", before=b"", 
 
 
 def shuffled_table(gaussians, kind="f4", more=()):
-    """The columns of a scene without normals, in an order nobody expects, between columns nobody knows."""
+    """Return the columns of a scene without normals, in random order, between unknown columns."""
     columns = {
         **{n: gaussians.means[:, i] for i, n in enumerate("xyz")},
         **{f"rot_{i}": gaussians.quats[:, i] for i in range(4)},
@@ -164,8 +164,8 @@ def shuffled_table(gaussians, kind="f4", more=()):
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
 @pytest.mark.parametrize("kind", ["f4", "f8"])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_any_order_any_byte_order_and_what_is_not_ours(tmp_path, form, kind, newline):
-    """ASCII holds the shortest decimal that reads back as the same number, so it loses nothing either."""
+def test_any_property_order_byte_order_and_unknown_properties_are_read(tmp_path, form, kind, newline):
+    """ASCII is lossless too: it holds the shortest decimal that reads back as the same number."""
     gaussians = random_gaussians(6, 8)
     written(tmp_path / "a.ply", shuffled_table(gaussians, kind, more=("segment",)), form, newline)
     assert_equal(gaussians, load_ply(tmp_path / "a.ply"))
@@ -187,7 +187,7 @@ def refused(path):
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_every_cut_is_told(tmp_path, form):
+def test_truncated_files_are_refused(tmp_path, form):
     path = tmp_path / "a.ply"
     written(path, shuffled_table(random_gaussians(4, 0)), form)
     whole = path.read_bytes()
@@ -208,8 +208,8 @@ def test_absurd_counts_allocate_nothing(tmp_path, form):
     whole = path.read_bytes()
     for count in (10**10, 10**30):
         path.write_bytes(whole.replace(b"element vertex 3", b"element vertex %d" % count))
-        said = refused(path)
-        assert "truncated" in said or "rows of vertex" in said or "more than any file holds" in said
+        message = refused(path)
+        assert "truncated" in message or "rows of vertex" in message or "more than any file holds" in message
     chunk = b"element chunk %d\nproperty int a\nelement vertex 3" % 10**30
     path.write_bytes(whole.replace(b"element vertex 3", chunk))
     assert "element chunk of" in refused(path)
@@ -217,16 +217,16 @@ def test_absurd_counts_allocate_nothing(tmp_path, form):
 
 @pytest.mark.parametrize("form", ["ascii", "binary_big_endian"])
 @pytest.mark.parametrize(("value", "text"), [(np.nan, "nan"), (-np.inf, "-inf"), (1e300, "inf")])
-def test_what_is_not_finite_is_named(tmp_path, form, value, text):
+def test_values_that_are_not_finite_are_named(tmp_path, form, value, text):
     table = shuffled_table(random_gaussians(5, 3), "f8", more=("unused",))
-    table["unused"] = np.nan  # nobody reads it
+    table["unused"] = np.nan  # not read
     table["scale_1"][3] = value
     written(tmp_path / "a.ply", table, form)
     assert f"vertex 3: scale_1 is {text} (1 such vertices in all)" in refused(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ((b"ply\n", b"PK\x03\x04\n"), "is not a PLY: its first line is not 'ply'"),
         ((b"ply\n", b"version https://git-lfs.github.com/spec/v1\n"), "is a Git LFS pointer"),
@@ -257,17 +257,17 @@ def test_what_is_not_finite_is_named(tmp_path, form, value, text):
         ((b"end_header\n", b"comment\n" * 11000), "no end_header in 10000 lines"),
     ],
 )
-def test_damage_is_named(tmp_path, change, says):
+def test_damage_is_named(tmp_path, change, message):
     path = tmp_path / "a.ply"
     written(path, shuffled_table(random_gaussians(3, 3)))
     whole = path.read_bytes()
     assert change[0] in whole
     path.write_bytes(whole.replace(*change, 1))
-    assert says in refused(path)
+    assert message in refused(path)
 
 
 @pytest.mark.parametrize(("old", "new"), [(b" 200", b" two"), (b"200 ", b""), (b"200 ", b"1 200 ")])
-def test_ascii_rows_that_do_not_fit_are_told(tmp_path, old, new):
+def test_malformed_ascii_rows_are_refused(tmp_path, old, new):
     path = tmp_path / "a.ply"
     written(path, shuffled_table(random_gaussians(3, 0)), "ascii")
     header, body = path.read_bytes().split(b"end_header\n")
@@ -283,14 +283,14 @@ def shared(name):
     return path
 
 
-def test_a_trained_scene_of_somebody_else():
+def test_a_trained_scene_from_another_program():
     gaussians = load_ply(shared("plush_dog/point_cloud_29999_clean.ply"))
     assert (len(gaussians), gaussians.sh_degree) == (15_105, 3)
     assert float(gaussians.quats.norm(dim=1).min()) >= 0.36 and float(gaussians.logit_opacities.max()) == 400
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
         ("odd/lfs_pointer_point_cloud.ply", "is a Git LFS pointer"),
         ("odd/no_colour_value_weight.ply", "is not a splat scene: lacks f_dc_0, f_dc_1, f_dc_2, opacity;"),
@@ -300,13 +300,13 @@ def test_a_trained_scene_of_somebody_else():
         ("formats/biker.compressed.ply", "is a compressed splat PLY"),
     ],
 )
-def test_files_of_the_world_that_are_no_scene(name, says):
-    assert says in refused(shared(name))
+def test_real_files_that_are_not_scenes_are_refused(name, message):
+    assert message in refused(shared(name))
 
 
 @pytest.mark.parametrize("antialiased", [None, False, True])
 @pytest.mark.parametrize("up", [None, (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
-def test_what_has_no_property_travels_in_comments(tmp_path, antialiased, up):
+def test_antialiasing_and_up_are_kept_in_comments(tmp_path, antialiased, up):
     path = tmp_path / "scene.ply"
     write(path, Scene(random_gaussians(3, 3), antialiased, up))
     scene = read(path)
@@ -322,7 +322,7 @@ def test_what_has_no_property_travels_in_comments(tmp_path, antialiased, up):
         (["Exported from Brush", "SH degree: 3", "SplatRenderMode: default"], False),
         (["antialiased 1"], True),  # Postshot
         (["antialiased 0"], False),
-        (["gsplat_edu antialiased 1"], True),  # this package before it wrote the other two
+        (["gsplat_edu antialiased 1"], True),  # older versions of this package
         (["  SPLATRENDERMODE:  MIP  "], True),
         (["antialiased 1", "SplatRenderMode: default"], False),  # the last one wins
         (["SplatRenderMode: default", "antialiased 1"], True),
@@ -332,7 +332,7 @@ def test_what_has_no_property_travels_in_comments(tmp_path, antialiased, up):
     ],
 )
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
-def test_antialiasing_as_other_programs_say_it(tmp_path, suffix, lines, antialiased):
+def test_antialiasing_comments_of_other_programs_are_read(tmp_path, suffix, lines, antialiased):
     path = tmp_path / f"scene{suffix}"
     write_scene(path, Scene(random_gaussians(3, 3)))
     comment = "".join(f"comment {line}\n" for line in lines).encode()
@@ -356,11 +356,11 @@ def test_antialiasing_is_written_as_other_programs_read_it(tmp_path, suffix, ant
     assert [line for line in header.splitlines() if line.startswith(b"comment")] == lines
 
 
-@pytest.mark.parametrize("said", ["up 1 2", "up a b c", "up 0 0 0", "up nan 0 0", "up inf 0 0"])
-def test_a_comment_of_ours_that_is_none_is_refused(tmp_path, said):
+@pytest.mark.parametrize("up", ["up 1 2", "up a b c", "up 0 0 0", "up nan 0 0", "up inf 0 0"])
+def test_a_malformed_up_comment_is_refused(tmp_path, up):
     path = tmp_path / "scene.ply"
     save_ply(path, random_gaussians(1, 0))
-    data = path.read_bytes().replace(b"element", f"comment gsplat_edu {said}\nelement".encode(), 1)
+    data = path.read_bytes().replace(b"element", f"comment gsplat_edu {up}\nelement".encode(), 1)
     path.write_bytes(data)
     with pytest.raises(SceneFormatError, match="is not a direction"):
         read(path)
@@ -368,8 +368,8 @@ def test_a_comment_of_ours_that_is_none_is_refused(tmp_path, said):
     assert read(path).up is None
 
 
-def test_infinite_logits_are_opaque_or_not_there(tmp_path):
-    """Programs that keep opacities in a byte write the logits of 0 and 1."""
+def test_infinite_logits_become_opaque_or_transparent(tmp_path):
+    """Programs that store opacities in bytes write the logits of 0 and 1."""
     path = tmp_path / "scene.ply"
     save_ply(path, random_gaussians(3, 0))
     data = bytearray(path.read_bytes())

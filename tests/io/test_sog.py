@@ -36,30 +36,30 @@ def arrays(gaussians):
 
 
 def in_their_order(original, read):
-    """The original's splats in the order in which they were read: which mean is nearest."""
+    """Return the original's splats in the order in which they were read, matched by the nearest mean."""
     nearest = torch.cdist(read.means.double(), original.means.double()).argmin(dim=1)
-    assert sorted(nearest.tolist()) == list(range(len(original))), "each splat is there once"
+    assert sorted(nearest.tolist()) == list(range(len(original))), "each splat appears once"
     return original.map(lambda tensor: tensor[nearest])
 
 
 def assert_nearest(values, read, entries):
-    """What was read is an entry of the codebook, and none is nearer to what was written."""
+    """Check that each value was read as the codebook entry nearest to the written one."""
     entries = np.array(entries)
     distances = np.abs(values.astype(np.float64)[..., None] - entries.astype(np.float32))
     np.testing.assert_array_equal(np.abs(values.astype(np.float64) - read), distances.min(axis=-1))
 
 
 def assert_close(original, read, meta):
-    """Up to 1024 splats: each attribute is off by at most half a step of what it is rounded to."""
+    """Check up to 1024 splats: each attribute is off by at most half a step of its quantisation."""
     a, b = arrays(original), arrays(read)
-    # half of a 65535th of the range of log(1 + |x|), in x: d/dv (e^v - 1) = 1 + |x|; and float32
+    # Half of 1/65535 of the range of log(1 + |x|), converted to x by d/dv (e^v - 1) = 1 + |x|, plus float32 rounding.
     width = np.subtract(meta["means"]["maxs"], meta["means"]["mins"])
     margin = (1 + np.abs(a["means"])) * np.expm1(width / 65535 / 2) + 2**-23 * np.abs(a["means"])
     assert (np.abs(a["means"] - b["means"]) <= margin * (1 + 1e-6)).all()
 
     # Half a step of a component is e = 1 / (255 sqrt 2). Three of them are off by at most e; the fourth, d >= 1/2, by
     # (a da + b db + c dc) / d <= sqrt(3) e sqrt(1 - d^2) / d <= 3 e. The quaternion is off by sqrt(12) e, the rotation
-    # by twice that; 2 % for the higher orders.
+    # by twice that. Allow 2 % for the higher orders.
     relative = quat_to_R_t(original.quats.double()).mT @ quat_to_R_t(read.quats.double())
     angles = torch.arccos(((torch.einsum("nii->n", relative) - 1) / 2).clamp(-1, 1))
     assert float(angles.max()) <= 2 * math.sqrt(12) / (255 * math.sqrt(2)) * 1.02
@@ -68,13 +68,13 @@ def assert_close(original, read, meta):
     assert float(opacities.abs().max()) <= 0.5 / 255 + 1e-6
     assert_nearest(a["log_scales"], b["log_scales"], meta["scales"]["codebook"])
     assert_nearest(a["sh0"], b["sh0"], meta["sh0"]["codebook"])
-    if "shN" in meta:  # up to 1024 vectors the palette holds all, so that only its codebook rounds
+    if "shN" in meta:  # the palette holds all of up to 1024 vectors, so only its codebook rounds
         assert_nearest(a["sh_rest"], b["sh_rest"], meta["shN"]["codebook"])
 
 
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
 @pytest.mark.parametrize("count", [1, 2, 1000])
-def test_what_is_written_is_read_within_the_formats_steps(tmp_path, count, rest):
+def test_a_round_trip_stays_within_half_a_step(tmp_path, count, rest):
     scene = random_scene(count, rest)
     scene.gaussians.means[:, 1] *= 30
     scene.gaussians.logit_opacities[:20] = -50.0  # transparent pixels keep their colours
@@ -85,13 +85,13 @@ def test_what_is_written_is_read_within_the_formats_steps(tmp_path, count, rest)
     assert back.gaussians.sh_rest.shape == (count, rest, 3)
     original = in_their_order(scene.gaussians, back.gaussians)
     assert_close(original, back.gaussians, meta)
-    if count <= 2:  # fewer numbers than a codebook has
+    if count <= 2:  # fewer values than codebook entries
         for name in ("log_scales", "sh0", "sh_rest"):
             np.testing.assert_array_equal(arrays(original)[name], arrays(back.gaussians)[name])
 
 
 @pytest.mark.parametrize("rest", [0, 8])
-def test_a_scene_without_splats_is_a_file(tmp_path, rest):
+def test_an_empty_scene_can_be_written(tmp_path, rest):
     sog.write(tmp_path / "a.sog", random_scene(0, rest))
     back = sog.read(tmp_path / "a.sog")
     assert len(back.gaussians) == 0 and back.gaussians.sh_rest.shape[1] == rest
@@ -112,7 +112,7 @@ def test_antialiasing_and_up_are_kept(tmp_path, antialiased, up):
 @pytest.mark.parametrize(
     ("model", "antialiased"), [("antialiased", True), ("default", False), ("2dgs", None), (7, None)]
 )
-def test_the_model_of_splat_transform_says_antialiasing(tmp_path, model, antialiased):
+def test_antialiasing_is_read_from_the_model_of_splat_transform(tmp_path, model, antialiased):
     folder = tmp_path / "scene"
     write_scene(folder / "meta.json", Scene(random_scene(3, 0).gaussians))
     meta = json.loads((folder / "meta.json").read_bytes())
@@ -120,7 +120,7 @@ def test_the_model_of_splat_transform_says_antialiasing(tmp_path, model, antiali
     assert read_scene(folder).antialiased is antialiased
 
 
-def test_the_same_scene_is_the_same_bytes_in_a_zip_and_in_a_folder(tmp_path):
+def test_zip_and_folder_hold_the_same_bytes_every_time(tmp_path):
     scene = random_scene(1500, 3)
     for name in ("a.sog", "b.sog"):
         sog.write(tmp_path / name, scene)
@@ -137,8 +137,8 @@ def test_the_same_scene_is_the_same_bytes_in_a_zip_and_in_a_folder(tmp_path):
         np.testing.assert_array_equal(values, b[name])
 
 
-def test_a_scene_is_read_as_the_specification_says(tmp_path):
-    """Every number by hand, in loops, from the pixels."""
+def test_a_scene_is_read_as_specified(tmp_path):
+    """Decode every number from the pixels in plain loops."""
     scene = random_scene(70, 3)
     sog.write(tmp_path / "a.sog", scene)
     files = unzipped(tmp_path / "a.sog")
@@ -180,7 +180,7 @@ def test_a_scene_is_read_as_the_specification_says(tmp_path):
 
 
 def test_rotations_are_stored_w_first():
-    """The largest of (w, x, y, z) is what alpha counts from 252; the zero in between is 127.5, rounded up."""
+    """Alpha minus 252 is the index of the largest of (w, x, y, z). Zero lies at 127.5, rounded up."""
     quats = np.array(
         [[2, 0, 0, 0], [0, -3, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1e-30], [1, 1, 0, 0]], dtype=np.float32
     )
@@ -188,14 +188,14 @@ def test_rotations_are_stored_w_first():
     assert quats_to_pixels(quats).tolist() == [*expected, [255, 128, 128, 252]]
 
 
-def test_splats_are_in_mortons_order():
+def test_splats_are_in_morton_order():
     steps = np.random.default_rng(0).integers(0, 65536, (300, 3)).astype(np.uint16)
     steps[:40] = steps[40:80]
 
     def code(row):
         return sum((int(row[axis]) >> bit & 1) << (3 * bit + axis) for bit in range(16) for axis in range(3))
 
-    expected = sorted(range(300), key=lambda i: code(steps[i]))  # stable, as it has to be
+    expected = sorted(range(300), key=lambda i: code(steps[i]))  # stable, as required
     assert morton_order(steps).tolist() == expected
 
 
@@ -203,7 +203,7 @@ def test_splats_are_in_mortons_order():
     ("values", "optimum"),
     [
         (np.random.default_rng(0).uniform(0, 1, 200_000), 1 / 256 / math.sqrt(12)),  # equal steps
-        # Panter and Dite for a normal density: sqrt(3) pi / 2 / 256^2, right for many entries
+        # Panter and Dite, for many entries of a normal density: sqrt(3) pi / 2 / 256^2
         (np.random.default_rng(0).normal(size=200_000), math.sqrt(math.sqrt(3) * math.pi / 2) / 256),
     ],
 )
@@ -212,11 +212,11 @@ def test_codebooks_are_nearly_optimal(values, optimum):
     entries = codebook(values)
     assert (np.diff(entries) >= 0).all()
     error = values - entries[nearest_in_codebook(values, entries)]
-    # a finite sample lets entries fit it: a little below the density's optimum; random gaps cost about a per cent
+    # Entries fitted to a finite sample do slightly better than the density's optimum; random gaps cost about 1 %.
     assert 0.97 * optimum < math.sqrt(np.mean(error**2)) < 1.02 * optimum
 
 
-def test_codebooks_keep_what_fits():
+def test_codebooks_keep_few_values_exactly():
     few = np.array([3.0, -1e38, 3.0, 0.5, 1e-40], dtype=np.float32)
     entries = codebook(few)
     np.testing.assert_array_equal(entries[nearest_in_codebook(few, entries)], few)
@@ -226,7 +226,7 @@ def test_codebooks_keep_what_fits():
     assert np.abs(error).max() < 1 / 100, "neither the zeros nor the outlier take entries from the rest"
 
 
-def test_palettes_keep_what_fits():
+def test_palettes_keep_few_vectors_exactly():
     rng = np.random.default_rng(0)
     few = rng.normal(size=(1500, 9)).astype(np.float32)
     vectors = few[rng.integers(0, 1500, 5000)]
@@ -240,8 +240,8 @@ def test_palettes_keep_what_fits():
 
 @pytest.mark.parametrize("size", [1e-38, 1.0, 1e36])
 @pytest.mark.parametrize("spread", [0.0, 1.0])
-def test_palettes_are_better_than_a_choice_of_vectors(size, spread):
-    """5000 vectors near a subspace of 3 dimensions, some heavier than others: 4096 entries do not hold them all."""
+def test_palettes_beat_a_subset_of_the_vectors(size, spread):
+    """5000 vectors near a 3-dimensional subspace, with unequal weights: 4096 entries cannot hold them all."""
     rng = np.random.default_rng(0)
     vectors = rng.normal(size=(5000, 3)) @ rng.normal(size=(3, 24)) + 0.05 * rng.normal(size=(5000, 24))
     weights = np.exp(spread * rng.normal(size=5000)).astype(np.float32)
@@ -253,12 +253,12 @@ def test_palettes_are_better_than_a_choice_of_vectors(size, spread):
 
     kept = vectors[
         np.argsort(-weights, kind="stable")[:4096]
-    ]  # the heaviest, and every other at the nearest of them
+    ]  # the baseline keeps the heaviest vectors and maps the others to the nearest of them
     nearest = np.argmin((kept**2).sum(axis=1) - 2 * vectors @ kept.T, axis=1)
     assert loss(entries[labels].astype(np.float64) / size) < 0.8 * loss(kept[nearest])
 
 
-def test_picks_are_as_many_as_asked_for_whatever_the_chances():
+def test_the_number_of_picks_is_exact_for_any_chances():
     rng = np.random.default_rng(0)
     for _ in range(200):
         chances = 10 ** rng.uniform(-40, 20, 50) * rng.integers(0, 2, 50)
@@ -266,7 +266,7 @@ def test_picks_are_as_many_as_asked_for_whatever_the_chances():
         picked = _picked(chances, count)
         assert picked.sum() == count
         if count * chances.max() >= chances.sum() > 0:
-            assert picked[chances.argmax()], "it is due more than once"
+            assert picked[chances.argmax()], "its share is at least one pick"
     even = _picked(np.ones(100), 20)
     assert np.diff(np.flatnonzero(even)).tolist() == [5] * 19
 
@@ -278,11 +278,11 @@ def test_many_vectors_get_a_palette_within_sixteen_bits(tmp_path):
     assert 1024 < meta["shN"]["count"] <= 2048
     back = sog.read(tmp_path / "a.sog").gaussians
     error = (in_their_order(scene.gaussians, back).sh_rest - back.sh_rest).square().mean()
-    assert float(error) < 0.25 * float(scene.gaussians.sh_rest.var())  # 9 dimensions, 1.5 splats an entry
+    assert float(error) < 0.25 * float(scene.gaussians.sh_rest.var())  # 9 dimensions, 1.5 splats per entry
 
 
-def test_harmonics_of_what_is_seen_are_kept_best(tmp_path):
-    """Every other splat is a hundredth as large as its neighbours, and nearly transparent."""
+def test_harmonics_of_visible_splats_are_kept_best(tmp_path):
+    """Every other splat is a hundredth as large as the rest and nearly transparent."""
     scene = random_scene(3000, 8)
     scene.gaussians.log_scales[::2] -= 4.6
     scene.gaussians.logit_opacities[::2] = -4.0
@@ -294,7 +294,7 @@ def test_harmonics_of_what_is_seen_are_kept_best(tmp_path):
     assert float(errors[~hidden].mean()) < 0.1 * float(errors[hidden].mean())
 
 
-def test_what_no_file_can_hold_is_refused(tmp_path):
+def test_scenes_that_a_sog_cannot_hold_are_refused(tmp_path):
     gaussians = random_scene(5).gaussians
     gaussians.quats[3] = 0
     with pytest.raises(ArgumentError, match=r"quats\[3\]: has zero length"):
@@ -309,7 +309,7 @@ def test_what_no_file_can_hold_is_refused(tmp_path):
 
 
 def test_numbers_at_the_ends_of_float32_survive(tmp_path):
-    """Sizes that overflow when they are squared, or have no square at all."""
+    """Numbers whose squares overflow or underflow."""
     gaussians = random_scene(2000, 3).gaussians
     largest = float(np.finfo(np.float32).max)
     for tensor in gaussians.tensors().values():
@@ -346,13 +346,13 @@ def shared(name):
 
 
 @pytest.mark.parametrize(("name", "count"), [("playbot_lod3_0", 31_000), ("playbot_lod6_0", 1_873)])
-def test_a_scene_of_somebody_else(tmp_path, name, count):
-    """Once read, its numbers are few, so that writing it again loses nothing but the order."""
+def test_a_scene_from_another_program(tmp_path, name, count):
+    """A scene read from a SOG has few distinct values, so writing it again loses only the order."""
     scene = sog.read(shared(f"formats/{name}.sog"))
     read = arrays(scene.gaussians)
     assert (len(scene.gaussians), scene.gaussians.sh_degree) == (count, 2)
     assert (scene.antialiased, scene.up) == (None, None)
-    # y is down, as in the PLY it was made from: the robot stands at 0 and is 1 unit high
+    # y points down, as in the source PLY: the robot stands at 0 and is 1 unit high.
     assert -1.1 < read["means"][:, 1].min() < -1.0 and 0.0 < read["means"][:, 1].max() < 0.05
 
     sog.write(tmp_path / "a.sog", scene)
@@ -366,17 +366,17 @@ def test_a_scene_of_somebody_else(tmp_path, name, count):
     np.testing.assert_array_equal(sorted_rows(read), sorted_rows(again))
 
 
-def test_axes_are_those_of_a_ply(tmp_path):
+def test_axes_match_those_of_a_ply(tmp_path):
     original = load_ply(shared("plush_dog/point_cloud_29999_clean.ply"))
     sog.write(tmp_path / "a.sog", Scene(original))
     back = sog.read(tmp_path / "a.sog").gaussians
-    # 16 bits of a logarithmic range of about 1: well below a thousandth
+    # 16 bits over a logarithmic range of about 1: an error well below 1e-3.
     distance = torch.cdist(back.means[:500], original.means)
     assert float(distance.min(dim=1).values.max()) < 1e-4
     same = Gaussians.concatenated([original.map(lambda t: t[distance.argmin(dim=1)])])
     turns = quat_to_R_t(same.quats.double()).mT @ quat_to_R_t(back.quats[:500].double())
     assert float(torch.einsum("nii->n", turns).min()) > 2.99
-    # the palette holds half as many vectors as there are splats, and the unseen ones are far off
+    # The palette holds half as many vectors as there are splats, and approximates unseen ones coarsely.
     assert (
         float(torch.corrcoef(torch.stack([same.sh_rest.flatten(), back.sh_rest[:500].flatten()]))[0, 1]) > 0.9
     )

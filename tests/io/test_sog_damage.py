@@ -18,7 +18,7 @@ COUNT = 40
 
 @pytest.fixture(scope="module")
 def contents(tmp_path_factory):
-    """The files of a small scene by their names."""
+    """The files of a small scene, by name."""
     path = tmp_path_factory.mktemp("sog") / "meta.json"
     sog.write(path, random_scene(COUNT, 3))
     return {file.name: file.read_bytes() for file in sorted(path.parent.iterdir())}
@@ -56,7 +56,7 @@ def in_folder(folder, contents):
 
 
 def with_meta(contents, change):
-    """The same files with a changed meta.json."""
+    """Return the same files with a changed meta.json."""
     meta = json.loads(contents["meta.json"])
     change(meta)
     return contents | {"meta.json": json.dumps(meta).encode()}
@@ -72,7 +72,7 @@ def webp(pixels, **options):
     return file.getvalue()
 
 
-def test_every_cut_of_a_bundle_is_told(tmp_path, contents):
+def test_truncated_bundles_are_refused(tmp_path, contents):
     path = zipped(tmp_path / "a.sog", contents)
     whole = path.read_bytes()
     assert len(whole) < 16 * 1024 and len(sog.read(path).gaussians) == COUNT
@@ -81,7 +81,7 @@ def test_every_cut_of_a_bundle_is_told(tmp_path, contents):
         refused(path)
 
 
-def test_every_cut_of_a_file_in_a_folder_is_told(tmp_path, contents):
+def test_truncated_files_in_a_folder_are_refused(tmp_path, contents):
     path = in_folder(tmp_path / "a", contents)
     for name, data in contents.items():
         for length in range(0, len(data), 64):
@@ -91,8 +91,8 @@ def test_every_cut_of_a_file_in_a_folder_is_told(tmp_path, contents):
     sog.read(path)
 
 
-def test_changed_bytes_are_told_or_read(tmp_path, contents):
-    """A file may be damaged such that it is whole; nothing but a SceneFormatError may come of the others."""
+def test_changed_bytes_are_refused_or_harmless(tmp_path, contents):
+    """A damaged file may still be a valid scene. Any other outcome must be a SceneFormatError."""
     path = in_folder(tmp_path / "a", contents)
     bundle = zipped(tmp_path / "a.sog", contents)
     rng = np.random.default_rng(0)
@@ -121,13 +121,13 @@ def test_deflated_zips_are_read(tmp_path, contents):
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_other_methods_of_zip_are_refused(tmp_path, contents, method):
-    said = refused(zipped(tmp_path / "a.sog", contents, method))
-    assert "meta.json is neither stored nor deflated; zip it again" in said
+def test_other_zip_methods_are_refused(tmp_path, contents, method):
+    message = refused(zipped(tmp_path / "a.sog", contents, method))
+    assert "meta.json is neither stored nor deflated; zip it again" in message
 
 
-def test_bombs_do_not_go_off(tmp_path, contents):
-    """300 MB of zeros in 300 kB, told as such; and told as 100 bytes in both of the zip's headers."""
+def test_zip_bombs_are_not_unpacked(tmp_path, contents):
+    """300 MB of zeros in 300 kB, first declared as such, then declared as 100 bytes in both headers of the zip."""
     path = zipped(tmp_path / "a.sog", contents | {"quats.webp": bytes(300 << 20)}, zipfile.ZIP_DEFLATED)
     bomb = path.read_bytes()
 
@@ -143,22 +143,22 @@ def test_bombs_do_not_go_off(tmp_path, contents):
     assert "quats.webp in it is damaged" in messages[1]
 
 
-def test_of_two_files_of_one_name_the_last_is_read(tmp_path, contents):
+def test_the_last_of_two_files_with_the_same_name_is_read(tmp_path, contents):
     path = zipped(tmp_path / "a.sog", contents | {"quats.webp": b"not an image"})
     with zipfile.ZipFile(path, "a") as bundle, pytest.warns(UserWarning, match="Duplicate name"):
         bundle.writestr("quats.webp", contents["quats.webp"])
     assert len(sog.read(path).gaussians) == COUNT
 
 
-def test_odd_fields_of_a_zips_directory_are_no_warning(tmp_path, contents):
-    """An empty Unicode path, of which newer versions of Python warn."""
+def test_odd_fields_of_a_zip_directory_cause_no_warning(tmp_path, contents):
+    """An empty Unicode path, about which newer versions of Python warn."""
     path = tmp_path / "a.sog"
     with zipfile.ZipFile(path, "w") as bundle:
         for name, data in contents.items():
             entry = zipfile.ZipInfo(name)
             entry.extra = b"\x75\x70\x05\x00\x01" + zlib.crc32(name.encode()).to_bytes(4, "little")
             bundle.writestr(entry, data)
-    with contextlib.suppress(SceneFormatError):  # some versions do not read it
+    with contextlib.suppress(SceneFormatError):  # some versions of Python refuse it
         assert len(sog.read(path).gaussians) == COUNT
 
 
@@ -176,7 +176,7 @@ def test_missing_files_are_named(tmp_path, contents, name):
         assert f"{name} is missing" in refused(path)
 
 
-def test_what_is_no_sog_is_called_so(tmp_path, contents):
+def test_other_files_are_refused_by_kind(tmp_path, contents):
     path = tmp_path / "a.sog"
     for data in (b"", b"ply\nformat", bytes(100), contents["sh0.webp"]):
         path.write_bytes(data)
@@ -185,8 +185,8 @@ def test_what_is_no_sog_is_called_so(tmp_path, contents):
     path.write_bytes(pointer)
     assert "git lfs pull" in refused(path)
     folder = in_folder(tmp_path / "a", contents | {"quats.webp": pointer})
-    said = refused(folder)
-    assert "quats.webp: is a Git LFS pointer" in said
+    message = refused(folder)
+    assert "quats.webp: is a Git LFS pointer" in message
 
 
 def _set(dotted, value):
@@ -206,7 +206,7 @@ NUMBERS = ["scales.codebook", "sh0.codebook", "shN.codebook", "means.mins", "mea
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "expected"),
     [
         *((_set(key, [0.0] * 255), f"numbers in {key}") for key in NUMBERS),
         *((_set(key, None), f"numbers in {key}") for key in NUMBERS),
@@ -215,7 +215,7 @@ NUMBERS = ["scales.codebook", "sh0.codebook", "shN.codebook", "means.mins", "mea
             for key in NUMBERS
             for value in (1e39, None, "1", True, 10**400)
         ),
-        (_set("means.mins.0", 88.8), "in means.mins[0]"),  # e^88.8 is more than float32 has
+        (_set("means.mins.0", 88.8), "in means.mins[0]"),  # e^88.8 overflows float32
         (_set("means", [1, 2]), "numbers in means.mins"),
         (_set("version", 3), "is SOG of version 3, but only version 2 is supported"),
         (_set("version", "2"), "is SOG of no version"),
@@ -241,8 +241,8 @@ NUMBERS = ["scales.codebook", "sh0.codebook", "shN.codebook", "means.mins", "mea
         (_set("quats.files.0", "meta.json"), "meta.json is not a WebP image"),
     ],
 )
-def test_what_metadata_cannot_say_is_named(tmp_path, contents, change, says):
-    assert says in refused(zipped(tmp_path / "a.sog", with_meta(contents, change)))
+def test_invalid_metadata_is_named(tmp_path, contents, change, expected):
+    assert expected in refused(zipped(tmp_path / "a.sog", with_meta(contents, change)))
 
 
 @pytest.mark.parametrize(
@@ -262,14 +262,14 @@ def test_what_metadata_cannot_say_is_named(tmp_path, contents, change, says):
         "q" * 999,
     ],
 )
-def test_names_that_lead_elsewhere_are_refused(tmp_path, contents, name):
+def test_file_names_outside_the_folder_are_refused(tmp_path, contents, name):
     changed = with_meta(contents, _set("quats.files.0", name))
     for path in (zipped(tmp_path / "a.sog", changed), in_folder(tmp_path / "a", changed)):
         assert "an entry in quats.files that is not a plain file name" in refused(path)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         (b"", "is not JSON"),
         (b"\xff\xfe\x00", "is not JSON"),
@@ -283,11 +283,11 @@ def test_names_that_lead_elsewhere_are_refused(tmp_path, contents, name):
         (b" " * (1 << 21) + b"{}", "its metadata has 2,097,154 bytes"),
     ],
 )
-def test_metadata_that_is_none_is_refused(tmp_path, contents, text, says):
-    assert says in refused(zipped(tmp_path / "a.sog", contents | {"meta.json": text}))
+def test_unreadable_metadata_is_refused(tmp_path, contents, text, expected):
+    assert expected in refused(zipped(tmp_path / "a.sog", contents | {"meta.json": text}))
 
 
-def test_a_number_that_json_has_but_floats_have_not_is_refused(tmp_path, contents):
+def test_a_json_number_beyond_float_range_is_refused(tmp_path, contents):
     text = contents["meta.json"].replace(b'"mins":[', b'"mins":[1e999,')
     start, rest = text.split(b'"mins":[')
     first, second, *others = rest.split(b",")
@@ -297,7 +297,7 @@ def test_a_number_that_json_has_but_floats_have_not_is_refused(tmp_path, content
 
 
 def test_codebooks_that_start_with_null_are_read(tmp_path, contents):
-    """Written of scenes with infinite numbers; others go on downwards by the mean step."""
+    """Codebooks of scenes with infinite values start with null, which is extrapolated downwards by the mean step."""
     entries = np.array(json.loads(contents["meta.json"])["sh0"]["codebook"])
     pixels = pixels_of(contents["sh0.webp"])
     pixels[0, 0, 0] = 0
@@ -307,7 +307,7 @@ def test_codebooks_that_start_with_null_are_read(tmp_path, contents):
     assert float(read.sh0[0, 0, 0]) == pytest.approx(expected, rel=1e-6)
 
 
-def test_somebody_elses_extras_are_left_alone(tmp_path, contents):
+def test_invalid_extras_of_other_programs_are_ignored(tmp_path, contents):
     for value in ("y", [0, 1], [0, 0, 0], [0, "1", 0], [1e39, 0, 0], None, {"x": 1}):
         changed = with_meta(contents, _set("asset.extras.up", value))
         assert sog.read(zipped(tmp_path / "a.sog", changed)).up is None
@@ -315,31 +315,31 @@ def test_somebody_elses_extras_are_left_alone(tmp_path, contents):
     assert sog.read(zipped(tmp_path / "a.sog", longer)).up == (0.0, -0.6, 0.8)
 
 
-def test_rotations_of_no_kind_are_refused(tmp_path, contents):
+def test_unknown_rotation_encodings_are_refused(tmp_path, contents):
     pixels = pixels_of(contents["quats.webp"])
-    assert (pixels.reshape(-1, 4)[COUNT:] == 0).all(), "beyond the splats it does not matter"
+    assert (pixels.reshape(-1, 4)[COUNT:] == 0).all(), "pixels beyond the last splat are zero"
     pixels[1, 2, 3] = 251
-    said = refused(zipped(tmp_path / "a.sog", contents | {"quats.webp": webp(pixels)}))
-    assert f"splat {pixels.shape[1] + 2}: its rotation has an unknown encoding" in said
+    message = refused(zipped(tmp_path / "a.sog", contents | {"quats.webp": webp(pixels)}))
+    assert f"splat {pixels.shape[1] + 2}: its rotation has an unknown encoding" in message
 
 
 def test_images_of_other_sizes_are_refused(tmp_path, contents):
     pixels = pixels_of(contents["scales.webp"])
     twice = webp(np.concatenate([pixels, pixels]))
-    said = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": twice}))
-    assert "its images differ in size" in said
+    message = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": twice}))
+    assert "its images differ in size" in message
     huge = webp(np.zeros((300, 300, 3), dtype=np.uint8))
     assert "has 300x300 pixels for 40 splats" in refused(
         zipped(tmp_path / "b.sog", contents | {"scales.webp": huge})
     )
     tall = webp(np.zeros((1025, 192, 3), dtype=np.uint8))
-    said = refused(zipped(tmp_path / "c.sog", contents | {"shN_centroids.webp": tall}))
-    assert "has 192x1025 pixels, but 40 entries" in said
+    message = refused(zipped(tmp_path / "c.sog", contents | {"shN_centroids.webp": tall}))
+    assert "has 192x1025 pixels, but 40 entries" in message
 
 
 @pytest.mark.parametrize("kind", ["lossless", "extended", "lossy"])
 def test_absurd_sizes_are_refused_before_anything_is_decoded(tmp_path, contents, kind):
-    """The largest sizes that the three kinds of header have."""
+    """Each of the three kinds of header declares its largest size."""
     if kind == "lossless":
         data = bytearray(contents["scales.webp"])
         assert data[12:16] == b"VP8L"
@@ -366,15 +366,15 @@ def test_absurd_sizes_are_refused_before_anything_is_decoded(tmp_path, contents,
 def test_other_images_are_refused(tmp_path, contents):
     png = io.BytesIO()
     Image.fromarray(pixels_of(contents["scales.webp"])).save(png, "PNG")
-    said = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": png.getvalue()}))
-    assert "scales.webp is not a WebP image" in said
+    message = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": png.getvalue()}))
+    assert "scales.webp is not a WebP image" in message
     broken = contents["scales.webp"][:30] + bytes(len(contents["scales.webp"]) - 30)
-    said = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": broken}))
-    assert "scales.webp is a damaged WebP image" in said
+    message = refused(zipped(tmp_path / "a.sog", contents | {"scales.webp": broken}))
+    assert "scales.webp is a damaged WebP image" in message
 
 
 def test_lossy_images_are_read(tmp_path, contents):
-    """Opaque ones and, of rotations, ones whose alpha is exact: the decoders' three headers are all known."""
+    """Opaque lossy images, and rotations with lossy colour but exact alpha: all three WebP headers are supported."""
     lossy = {
         "means_u.webp": webp(pixels_of(contents["means_u.webp"])[:, :, :3], lossless=False),
         "quats.webp": webp(pixels_of(contents["quats.webp"]), lossless=False, alpha_quality=100),
@@ -387,7 +387,7 @@ def test_lossy_images_are_read(tmp_path, contents):
 
 
 def test_images_may_be_larger_than_the_scene(tmp_path, contents):
-    """A square with a power of two for its edge, as some write; splats still come row by row."""
+    """Some writers use squares with a power of two as edge. Splats are still stored row by row."""
     wide = {}
     for name, data in contents.items():
         if name.endswith(".webp") and name != "shN_centroids.webp":

@@ -24,27 +24,27 @@ def by_hand(path, rows):
 
 
 def importance(gaussians):
-    """Opacity times volume: what comes first in a file."""
+    """Return opacity times volume, by which a file is sorted."""
     return gaussians.opacities.double() * torch.exp(gaussians.log_scales.double().sum(dim=1))
 
 
-def test_what_a_file_made_by_hand_says(tmp_path):
+def test_a_handmade_file_is_read(tmp_path):
     by_hand(tmp_path / "a.splat", [GOOD, ((-4, -5, -6), (1, 1, 1), (0, 102, 0, 0), (128, 128, 128, 128))])
     scene = read(tmp_path / "a.splat")
     g = scene.gaussians
     assert (scene.antialiased, scene.up, g.sh_degree, g.sh_rest.shape) == (None, None, 0, (2, 0, 3))
     assert {tensor.dtype for tensor in g.tensors().values()} == {torch.float32}
-    np.testing.assert_array_equal(g.means.numpy(), [[1, 2, 3], [-4, -5, -6]])  # axes are the file's own
+    np.testing.assert_array_equal(g.means.numpy(), [[1, 2, 3], [-4, -5, -6]])  # the file's axes are kept
     np.testing.assert_allclose(g.log_scales.numpy(), [np.log([0.5, 1, 2]), [0, 0, 0]], rtol=1e-6)
     colors = np.array([[1, 0, 0.2], [0, 0.4, 0]])
     np.testing.assert_allclose(g.sh0.numpy()[:, 0], (colors - 0.5) / C0, rtol=1e-5)
-    # 0 is a quarter of a step above 0, so that its logit is finite
+    # Byte 0 is read as a quarter of a step above 0, so that its logit is finite.
     np.testing.assert_allclose(g.opacities.numpy(), [0.8, 0.25 / 255], rtol=1e-5)
-    # w, x, y, z in steps of 1/128; four zeros are no rotation
+    # w, x, y, z in steps of 1/128. A quaternion of four zeros becomes the identity.
     np.testing.assert_array_equal(g.quats.numpy(), [[0, -1, 0.5, 127 / 128], [1, 0, 0, 0]])
 
 
-def test_layout_of_what_is_written(tmp_path):
+def test_the_layout_of_a_written_file(tmp_path):
     g = random_scene(1, 3).gaussians
     path = tmp_path / "new" / "a.splat"
     write(path, Scene(replace(g, quats=torch.tensor([[0.0, -2.0, 0.0, 0.0]]))))
@@ -60,7 +60,7 @@ def test_layout_of_what_is_written(tmp_path):
 
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 1000])
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
-def test_what_is_written_comes_back_within_half_a_step(tmp_path, rest, count):
+def test_a_round_trip_stays_within_half_a_step(tmp_path, rest, count):
     scene, path = random_scene(count, rest), tmp_path / "a.splat"
     write(path, scene)
     assert path.stat().st_size == 32 * count
@@ -74,21 +74,21 @@ def test_what_is_written_comes_back_within_half_a_step(tmp_path, rest, count):
     given = scene.gaussians.map(lambda tensor: tensor[order])
     assert len(set(order.tolist())) == count
 
-    # a float32 of the scale, and one of its logarithm: both are off by 2^-24 of themselves
+    # The scale and its logarithm are both rounded to float32: each is off by 2^-24 of itself.
     before, after = given.log_scales.double(), back.log_scales.double()
     assert ((after - before).abs() <= 2.0**-24 * (2 + before.abs() + after.abs())).all()
     assert ((back.opacities - given.opacities).abs() <= 0.5 / 255 + 1e-6).all()
     colors = (C0 * given.sh0 + 0.5).clamp(0, 1)
     assert ((C0 * back.sh0 + 0.5 - colors).abs() <= 0.5 / 255 + 1e-6).all()
     quats = torch.nn.functional.normalize(given.quats, dim=1)
-    # half a step of 1/128; the largest that a byte holds is 127/128
+    # Half a step of 1/128. The largest value of a byte is 127/128.
     assert ((back.quats - quats.clamp(max=127 / 128)).abs() <= 0.5 / 128 + 1e-6).all()
 
 
-def test_what_matters_most_comes_first(tmp_path):
+def test_splats_are_sorted_by_importance(tmp_path):
     write(tmp_path / "a.splat", random_scene(500))
     values = importance(read(tmp_path / "a.splat").gaussians)
-    # bytes 0 and 255 are read a quarter of a step inside: what is sorted is as the file holds it
+    # Splats are sorted by the stored bytes, but bytes 0 and 255 are read a quarter of a step inside.
     assert (values[1:] <= values[:-1] * (1 + 0.25 / 254) + 1e-12).all()
 
 
@@ -113,21 +113,19 @@ def test_bytes_are_the_same_every_time(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 1, 1000])
-def test_what_was_rounded_once_is_not_rounded_again(tmp_path, count):
+def test_a_second_round_trip_changes_almost_nothing(tmp_path, count):
     first, second = tmp_path / "a.splat", tmp_path / "b.splat"
     write(first, random_scene(count))
     write(second, read(first))
     one, two = (np.frombuffer(path.read_bytes(), dtype=ROW) for path in (first, second))
     for name in ("position", "rgba"):
         np.testing.assert_array_equal(one[name], two[name])
-    np.testing.assert_allclose(
-        one["scales"], two["scales"], rtol=1e-6
-    )  # through a logarithm and back in float32
-    # normalised once more: rounded components make up a length within 4 * 1/256 of 1
+    np.testing.assert_allclose(one["scales"], two["scales"], rtol=1e-6)  # log and exp in float32
+    # Normalised once more: the rounded components have a length within 4 * 1/256 of 1.
     assert np.abs(one["quat"].astype(int) - two["quat"]).max(initial=0) <= 2
 
 
-def test_what_does_not_fit_is_clamped(tmp_path):
+def test_values_out_of_range_are_clamped(tmp_path):
     g = random_scene(4, 0).gaussians
     scene = Scene(
         replace(
@@ -145,24 +143,24 @@ def test_what_does_not_fit_is_clamped(tmp_path):
     np.testing.assert_allclose(back.logit_opacities.numpy(), np.log(254.75 / 0.25), rtol=1e-6)
 
 
-def test_a_scale_of_zero_is_the_smallest_there_is(tmp_path):
+def test_a_scale_of_zero_becomes_the_smallest_float(tmp_path):
     by_hand(tmp_path / "a.splat", [((0, 0, 0), (0, -0.0, 1e-45), (0, 0, 0, 0), (255, 128, 128, 128))])
     log_scales = read(tmp_path / "a.splat").gaussians.log_scales
     np.testing.assert_allclose(log_scales.numpy(), np.log(2.0**-149), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "message"),
     [
         ("quats", 0.0, r"quats\[3\]: has zero length"),
         ("log_scales", np.inf, r"log_scales\[3, 0\]: is NaN or infinite"),
         ("means", 1e300, r"means\[3, 0\]: is NaN or infinite"),
     ],
 )
-def test_what_cannot_be_written_is_named(tmp_path, name, value, says):
+def test_values_that_cannot_be_written_are_named(tmp_path, name, value, message):
     scene = Scene(random_scene(5).gaussians.map(torch.Tensor.double))
     scene.gaussians.tensors()[name][3] = value
-    with pytest.raises(ArgumentError, match=says):
+    with pytest.raises(ArgumentError, match=message):
         write(tmp_path / "a.splat", scene)
     assert list(tmp_path.iterdir()) == []
 
@@ -175,7 +173,7 @@ def refused(path):
     return message
 
 
-def test_cut_inside_a_splat_it_is_refused(tmp_path):
+def test_a_file_cut_inside_a_splat_is_refused(tmp_path):
     path = tmp_path / "a.splat"
     write(path, random_scene(100))
     whole = path.read_bytes()
@@ -187,7 +185,7 @@ def test_cut_inside_a_splat_it_is_refused(tmp_path):
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("name", "value", "message"),
     [
         *[("position", value, "a position that is NaN or infinite") for value in (np.nan, np.inf, -np.inf)],
         *[
@@ -196,24 +194,24 @@ def test_cut_inside_a_splat_it_is_refused(tmp_path):
         ],
     ],
 )
-def test_numbers_that_are_none_are_named(tmp_path, name, value, says, axis):
+def test_invalid_numbers_are_named(tmp_path, name, value, message, axis):
     rows = np.array([GOOD] * 5, dtype=ROW)
     rows[name][[2, 4], axis] = value
     by_hand(tmp_path / "a.splat", rows)
-    assert f"splat 2 has {says} (2 such splats in all)" in refused(tmp_path / "a.splat")
+    assert f"splat 2 has {message} (2 such splats in all)" in refused(tmp_path / "a.splat")
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "message"),
     [
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n   ", "is a Git LFS pointer"),
         (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n".ljust(64), "is a PLY, not a .splat"),
         (b"<!DOCTYPE html><html>not found</html>", "37 bytes, 5 more than whole splats of 32"),
     ],
 )
-def test_other_files_are_called_what_they_are(tmp_path, content, says):
+def test_other_files_are_refused_by_kind(tmp_path, content, message):
     (tmp_path / "a.splat").write_bytes(content)
-    assert says in refused(tmp_path / "a.splat")
+    assert message in refused(tmp_path / "a.splat")
 
 
 def test_a_missing_file_stays_an_oserror(tmp_path):
@@ -234,7 +232,7 @@ def test_the_same_splats_as_in_a_ply():
     ply = load_ply(shared(f"{name}.ply"))
     np.testing.assert_array_equal(splats.means.numpy(), ply.means.numpy())
     np.testing.assert_allclose(splats.log_scales.numpy(), ply.log_scales.numpy(), rtol=1e-6)
-    # its writer cuts off where ours rounds: within a step
+    # Its writer truncates where ours rounds, so values differ by up to a step.
     colors = (C0 * ply.sh0 + 0.5).clamp(0, 1)
     assert ((C0 * splats.sh0 + 0.5 - colors).abs() <= 1 / 255 + 1e-6).all()
     assert ((splats.opacities - ply.opacities).abs() <= 1 / 255 + 1e-6).all()
@@ -242,7 +240,7 @@ def test_the_same_splats_as_in_a_ply():
     assert ((splats.quats - quats).abs() <= 1 / 128 + 1e-6).all()
 
 
-def test_a_file_of_somebody_else():
+def test_a_file_from_another_program():
     g = read(shared("formats/splat_fixtures/minimal.splat")).gaussians
     np.testing.assert_array_equal(g.means.numpy(), [[-1, 0, -1], [0, 0, -1], [-1, 0, 0], [0, 0, 0]])
     np.testing.assert_allclose(g.scales.numpy(), 0.1, rtol=1e-6)
@@ -250,8 +248,8 @@ def test_a_file_of_somebody_else():
     np.testing.assert_allclose(g.opacities.numpy(), 230 / 255, rtol=1e-6)
 
 
-def test_a_trained_scene(tmp_path):
-    """Logits up to 400, quaternions of lengths 0.4 to 2.3."""
+def test_a_trained_scene_is_written(tmp_path):
+    """The scene has logits up to 400 and quaternions of lengths 0.4 to 2.3."""
     scene = Scene(load_ply(shared("plush_dog/point_cloud_29999_clean.ply")))
     write(tmp_path / "a.splat", scene)
     back = read(tmp_path / "a.splat").gaussians

@@ -1,4 +1,4 @@
-"""SPZ against its layout, told here once more in other words, against files of others, and damaged."""
+"""SPZ against an independent writer in this file, against files from other programs, and with damage."""
 
 import gzip
 import os
@@ -27,10 +27,11 @@ HALF_COLOR = 0.5 / (0.15 * 255)
 HALF_HARMONIC = 0.5 / 128
 HALF_SCALE = 0.5 / 16
 HALF_OPACITY = 0.5 / 255
-ROUNDING = 1e-6  # of float32, beside which the steps above are large
+ROUNDING = 1e-6  # of float32, small against the steps above
 
-# Half a step of each of three components, 1 / (511 sqrt(2)): the quaternion moves by |e| across and, along its largest
-# component c >= 1/2, by at most (2 |s| |e| + |e|²) / 2c, |s| <= sqrt(3/4). A rotation's angle is twice as large.
+# The three small components s of a quaternion have steps of 1 / (511 sqrt(2)). An error e of half a step each moves the
+# quaternion by |e| across and by at most (2 |s| |e| + |e|²) / 2c along its largest component c >= 1/2, where
+# |s| <= sqrt(3/4). The rotation's angle is off by twice as much.
 E3 = np.sqrt(3) * 0.5 / (511 * np.sqrt(2))
 ANGLE = 2 * np.hypot(E3, np.sqrt(3) * E3 + E3**2)
 
@@ -53,14 +54,14 @@ def random_scene(count, rest, seed=0, **facts):
 
 
 def angles(a, b):
-    """Angle between rotations given as quaternions, from the chord: exact where it is small."""
+    """Return the angles between rotations, computed from the chord, which is accurate for small angles."""
     a, b = (torch.nn.functional.normalize(q.double(), dim=1) for q in (a, b))
     chord = torch.minimum((a - b).norm(dim=1), (a + b).norm(dim=1))
     return 4 * torch.asin(chord / 2)
 
 
 def assert_close(read, given, mean_step, angle=ANGLE):
-    """Compare what was read with what was given: every attribute within half a step."""
+    """Check that every attribute read is within half a step of the given one."""
     assert all(t.dtype == torch.float32 and t.is_contiguous() for t in read.tensors().values())
     assert (len(read), read.sh_degree) == (len(given), given.sh_degree)
     if not len(given):
@@ -77,8 +78,8 @@ def assert_close(read, given, mean_step, angle=ANGLE):
     assert worst("logit_opacities", torch.sigmoid) <= HALF_OPACITY + ROUNDING
     assert float(angles(read.quats, given.quats).max()) <= angle
 
-    # Sigma's entries are at most its largest variance v: scales off by a factor f = exp(1/32) change it by f² - 1 of v,
-    # and a rotation by t turns it by at most 2 t f² v.
+    # Entries of Sigma are at most its largest variance v. A factor f = exp(1/32) on the scales changes them by at most
+    # (f² - 1) v, and a rotation by an angle t by at most 2 t f² v.
     a, b = (cov3d_t(g.log_scales.double(), g.quats.double()) for g in (read, given))
     f2 = np.exp(2 * HALF_SCALE)
     largest = torch.exp(2 * given.log_scales.double().amax(dim=1))
@@ -93,7 +94,7 @@ def test_a_round_trip_stays_within_half_a_step(tmp_path, rest, count):
     spz.write(path, scene)
     read = spz.read(path)
     bits = path.read_bytes()[13]
-    assert bits == 24 if not count else 19 <= bits <= 22  # 2^22 / 2^19 = 8 < 12, 3 sigma 4 at most
+    assert bits == 24 if not count else 19 <= bits <= 22  # means have sigma 3, and 19 bits hold up to 16
     assert_close(read.gaussians, scene.gaussians, 2.0**-bits)
 
 
@@ -106,14 +107,14 @@ def test_a_second_round_trip_changes_nothing(tmp_path):
     for name, tensor in once.gaussians.tensors().items():
         if name != "quats":
             assert torch.equal(tensor, twice.gaussians.tensors()[name]), name
-    # where two components are nearly the largest, the other one may be left out the second time
+    # If the two largest components are nearly equal, the second write may leave out the other one.
     assert float(angles(once.gaussians.quats, twice.gaussians.quats).max()) <= ANGLE
     before = path.read_bytes()
     spz.write(path, once)
     assert path.read_bytes() == before
 
 
-def test_version_4_by_its_layout(tmp_path):
+def test_the_layout_of_version_4(tmp_path):
     scene = random_scene(5, 8, antialiased=True)
     spz.write(tmp_path / "a.spz", scene)
     data = (tmp_path / "a.spz").read_bytes()
@@ -132,7 +133,7 @@ def test_version_4_by_its_layout(tmp_path):
     g = scene.gaussians
     x, y, z = (int.from_bytes(contents[0][i : i + 3], "little", signed=True) / 2**bits for i in (0, 3, 6))
     np.testing.assert_allclose((x, -y, -z), g.means[0].numpy(), atol=2.0**-bits)
-    # The second coefficient of degree 1 belongs to z, which the half turn changes the sign of; its green is byte 4.
+    # The second coefficient of degree 1 belongs to z, whose sign the half turn changes. Its green value is byte 4.
     assert contents[5][4] == round(128 - 128 * float(g.sh_rest[0, 1, 1]))
     assert contents[1][0] == round(255 * float(g.opacities[0]))
 
@@ -141,7 +142,7 @@ def test_version_4_by_its_layout(tmp_path):
     ("largest", "bits"),
     [(0.1, 24), (0.499, 24), (1.0, 22), (2047.9, 12), (2048.0, 11), (8_388_607.0, 0)],
 )
-def test_fractional_bits_are_as_many_as_hold_the_scene(tmp_path, largest, bits):
+def test_as_many_fractional_bits_as_the_scene_allows(tmp_path, largest, bits):
     scene = random_scene(3, 0)
     scene.gaussians.means[:] = torch.tensor([[0.0, 0.05, -largest], [largest, 0, 0], [-0.0, 0, 0.01]])
     spz.write(tmp_path / "a.spz", scene)
@@ -149,7 +150,7 @@ def test_fractional_bits_are_as_many_as_hold_the_scene(tmp_path, largest, bits):
     assert_close(spz.read(tmp_path / "a.spz").gaussians, scene.gaussians, 2.0**-bits)
 
 
-def test_what_spz_cannot_hold_is_clamped_or_refused(tmp_path):
+def test_values_out_of_range_are_clamped_or_refused(tmp_path):
     path = tmp_path / "a.spz"
     g = random_scene(2, 3).gaussians.map(torch.Tensor.double)
     for tensor in (g.log_scales, g.sh0, g.sh_rest, g.logit_opacities):
@@ -158,7 +159,7 @@ def test_what_spz_cannot_hold_is_clamped_or_refused(tmp_path):
     read = spz.read(path).gaussians
     assert read.log_scales[:, 0].tolist() == [-10.0, 255 / 16 - 10]
     assert read.sh0[:, 0, 0].tolist() == pytest.approx([-0.5 / 0.15, 0.5 / 0.15])
-    # the half turn changes the sign of the first coefficient and not of the third
+    # The half turn changes the sign of the first coefficient but not of the third.
     assert read.sh_rest[:, 2, 0].tolist() == [-1.0, 127 / 128]
     assert read.sh_rest[:, 0, 0].tolist() == [-127 / 128, 1.0]
     assert bool(read.logit_opacities.isfinite().all())
@@ -181,22 +182,22 @@ def test_quaternions_of_any_length_and_float64(tmp_path):
     assert float(angles(read.quats, given.quats.detach()).max()) <= ANGLE
 
 
-@pytest.mark.parametrize(("given", "said"), [(None, False), (False, False), (True, True)])
-def test_facts_of_the_scene(tmp_path, given, said):
+@pytest.mark.parametrize(("given", "stored"), [(None, False), (False, False), (True, True)])
+def test_antialiasing_is_kept_and_up_is_fixed(tmp_path, given, stored):
     spz.write(tmp_path / "a.spz", random_scene(2, 0, antialiased=given, up=(1.0, 0.0, 0.0)))
     read = spz.read(tmp_path / "a.spz")
-    assert (read.antialiased, read.up) == (said, (0.0, -1.0, 0.0))
+    assert (read.antialiased, read.up) == (stored, (0.0, -1.0, 0.0))
 
 
-def test_the_half_turn_is_one_for_eyes():
-    """Turned Gaussians in front of the turned camera: the same image, harmonics and all."""
+def test_a_half_turned_scene_renders_the_same():
+    """Turned Gaussians in front of the turned camera give the same image, including view-dependent colour."""
     g = random_scene(40, 15).gaussians.map(torch.Tensor.double)
     camera = Camera.looking_at((1.0, -2.0, -9.0), (0.2, 0.1, 0.0), 30.0, 31.0, 24, 28)
     turn = np.diag((1.0, -1.0, -1.0))
     turned = Camera(camera.R @ turn, turn @ camera.eye, 30.0, 31.0, camera.cx, camera.cy, 24, 28)
     image = render(g, camera, backend="torch").image
     assert float(image.max()) > 0.2
-    # float64 rounds in another order; the degrees' signs are wrong by a tenth where one is
+    # Only the order of float64 rounding differs. A single wrong sign of a degree would cost about 0.1.
     torch.testing.assert_close(
         render(half_turned(g), turned, backend="torch").image, image, rtol=0, atol=1e-9
     )
@@ -205,11 +206,11 @@ def test_the_half_turn_is_one_for_eyes():
     assert all(torch.equal(t, again.tensors()[name]) for name, t in g.tensors().items())
 
 
-# What follows writes SPZ once more: version by version, splat by splat.
+# An independent writer of SPZ: every version, splat by splat.
 
 
 def planes(version, g, bits=12, degree_4=False):
-    """The streams of a version, from Gaussians in its own axes."""
+    """Return the streams of a version, for Gaussians in the file's axes."""
     positions, rotations, harmonics = b"", b"", b""
     for i in range(len(g)):
         for value in g.means[i].tolist():
@@ -256,7 +257,7 @@ def new_file(g, flags=0, zone=b"", degree_4=False):
     return b"".join([header, zone, *sizes, *packed])
 
 
-# Bytes of x, y, z in the first versions: half a step is 1/255 each. w >= 1/2 moves by (2 |s| |e| + |e|²) / 2w.
+# Versions 1 and 2 store x, y, z as bytes: half a step is 1/255 each. w >= 1/2 moves by (2 |s| |e| + |e|²) / 2w.
 E2 = np.sqrt(3) / 255
 ANGLE_2 = 2 * np.hypot(E2, np.sqrt(3) * E2 + E2**2)
 
@@ -271,16 +272,16 @@ def test_older_versions(tmp_path, version, rest):
     path.write_bytes(gzip.compress(old_body(version, half_turned(g), flags=1), mtime=0))
     read = spz.read(path)
     assert read.antialiased
-    # float16 has 11 bits: half a step of numbers up to 16 is 2^-8
+    # float16 has 11 significant bits: half a step of numbers up to 16 is 2^-8.
     assert_close(read.gaussians, g, 2.0**-7 if version == 1 else 2.0**-12, ANGLE if version == 3 else ANGLE_2)
     path.write_bytes(old_body(version, half_turned(g), flags=1))  # without the gzip
     again = spz.read(path).gaussians
     assert all(torch.equal(t, again.tensors()[name]) for name, t in read.gaussians.tensors().items())
 
 
-def test_a_number_that_is_none_is_left_to_who_reads_the_scene(tmp_path):
+def test_nan_and_infinity_are_left_to_the_caller(tmp_path):
     body = bytearray(old_body(1, random_scene(2, 0).gaussians))
-    body[16:20] = b"\x01\x7c\x00\xfc"  # a NaN that signals, minus infinity
+    body[16:20] = b"\x01\x7c\x00\xfc"  # signalling NaN, minus infinity
     (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(body)))
     assert spz.read(tmp_path / "a.spz").gaussians.finite_rows().tolist() == [False, True]
 
@@ -301,7 +302,7 @@ def record(kind, payload):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_extensions_are_skipped_save_the_one_for_axes(tmp_path, version):
+def test_extensions_other_than_axes_are_skipped(tmp_path, version):
     g = random_scene(6, 15).gaussians
     path = tmp_path / "a.spz"
 
@@ -341,7 +342,7 @@ def files(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["new", "gzip", "bare"])
-def test_every_cut_and_every_byte_too_many_is_told(tmp_path, files, kind):
+def test_truncated_and_extended_files_are_refused(tmp_path, files, kind):
     path, whole = tmp_path / "a.spz", files[kind]
     for length in [*range(40), *range(64, len(whole), 64), len(whole) - 1]:
         path.write_bytes(whole[:length])
@@ -354,7 +355,7 @@ def test_every_cut_and_every_byte_too_many_is_told(tmp_path, files, kind):
 
 
 @pytest.mark.parametrize("kind", ["new", "gzip", "bare"])
-def test_damage_anywhere_is_told_or_harmless(tmp_path, files, kind):
+def test_random_damage_is_refused_or_harmless(tmp_path, files, kind):
     path, chance = tmp_path / "a.spz", random.Random(0)
     for _ in range(300):
         data = bytearray(files[kind])
@@ -368,7 +369,7 @@ def test_damage_anywhere_is_told_or_harmless(tmp_path, files, kind):
 
 
 @pytest.mark.parametrize(
-    ("at", "new", "says"),
+    ("at", "new", "message"),
     [
         (0, b"PK\x03\x04", "is not an SPZ file: it begins with neither NGSP nor gzip"),
         (0, b"version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer"),
@@ -389,14 +390,14 @@ def test_damage_anywhere_is_told_or_harmless(tmp_path, files, kind):
         (128, b"\0\0\0\0", "its positions cannot be unpacked"),
     ],
 )
-def test_damage_is_named(tmp_path, files, at, new, says):
+def test_damage_is_named(tmp_path, files, at, new, message):
     data = bytearray(files["new"])
     data[at : at + len(new)] = new
     (tmp_path / "a.spz").write_bytes(data)
-    assert says in refused(tmp_path / "a.spz")
+    assert message in refused(tmp_path / "a.spz")
 
 
-def test_bytes_after_a_streams_end_are_told(tmp_path):
+def test_bytes_after_the_end_of_a_stream_are_refused(tmp_path):
     g = random_scene(3, 0).gaussians
     data = new_file(g)
     (packed,) = struct.unpack_from("<Q", data, 32)
@@ -409,7 +410,7 @@ def test_bytes_after_a_streams_end_are_told(tmp_path):
 
 def test_damage_of_older_versions_is_named(tmp_path, files):
     path, body = tmp_path / "a.spz", files["bare"]
-    for data, says in (
+    for data, message in (
         (gzip.compress(body.replace(b"NGSP", b"PSGN", 1)), "is not an SPZ file"),
         (gzip.compress(body.replace(b"\x03", b"\x04", 1)), "is of version 4, but in one gzip"),
         (gzip.compress(body + b"!"), "holds more than its header declares"),
@@ -423,7 +424,7 @@ def test_damage_of_older_versions_is_named(tmp_path, files):
         ),
     ):
         path.write_bytes(data)
-        assert says in refused(path)
+        assert message in refused(path)
     with pytest.raises(FileNotFoundError):
         spz.read(tmp_path / "nowhere.spz")
 
@@ -431,20 +432,20 @@ def test_damage_of_older_versions_is_named(tmp_path, files):
 def bombs():
     zeros = bytes(1 << 24)
     one = random_scene(1, 0).gaussians
-    yield gzip.compress(old_body(3, one) + zeros)  # more than it says
+    yield gzip.compress(old_body(3, one) + zeros)  # more than it declares
     yield gzip.compress(old_body(3, one, flags=2) + zeros)  # as extensions
     yield gzip.compress(
         old_body(3, one)[:8] + struct.pack("<IBBBB", 1 << 20, 0, 12, 0, 0) + zeros
-    )  # as much as it says
-    for said in (True, False):  # the frame says how much it holds, or does not
-        packed = zstandard.ZstdCompressor(write_content_size=said).compress(zeros)
+    )  # as much as it declares
+    for declared in (True, False):  # whether the frame declares its size
+        packed = zstandard.ZstdCompressor(write_content_size=declared).compress(zeros)
         data = new_file(one)
         sizes = list(struct.iter_unpack("<QQ", data[32:112]))
         rest = data[112 + sizes[0][0] :]
         yield data[:32] + struct.pack("<QQ", len(packed), 9) + data[48:112] + packed + rest
 
 
-def test_bombs_are_not_unpacked(tmp_path):
+def test_compression_bombs_are_not_unpacked(tmp_path):
     for i, data in enumerate(bombs()):
         path = tmp_path / f"{i}.spz"
         path.write_bytes(data)
@@ -453,7 +454,7 @@ def test_bombs_are_not_unpacked(tmp_path):
         refused(path)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        assert peak < 1 << 22, "a quarter of what it would be"
+        assert peak < 1 << 22, "a quarter of the unpacked size"
 
 
 def shared(name):
@@ -464,11 +465,11 @@ def shared(name):
 
 
 def test_the_same_scene_as_compressed_ply():
-    """152,746 splats that somebody else wrote in both formats, in the same order and with 12 fractional bits."""
+    """Another program wrote these 152,746 splats in both formats, in the same order and with 12 fractional bits."""
     read = spz.read(shared("biker.spz"))
     other = compressed_ply.read(shared("biker.compressed.ply"))
     assert (len(read.gaussians), read.gaussians.sh_degree, read.antialiased) == (152_746, 0, False)
-    there = other.gaussians.log_scales >= -10  # the rest is clamped
+    there = other.gaussians.log_scales >= -10  # SPZ clamps the rest
     assert float(there.float().mean()) > 0.999
     scales = torch.where(there, other.gaussians.log_scales, read.gaussians.log_scales)
     assert_close(read.gaussians, replace(other.gaussians, log_scales=scales), 2.0**-12)
@@ -478,15 +479,15 @@ def test_three_splats_as_ply():
     folder = "metalsplatter_3splats/test-splat.3-points-from-train"
     read = spz.read(shared(f"{folder}.spz")).gaussians
     other = ply.load_ply(shared(f"{folder}.ply"))
-    # degree 1 was rounded to 5 bits and the others to 4: bins of 8 and 16 bytes
+    # Their writer rounded degree 1 to 5 bits and the others to 4: bins of 8 and 16 byte values.
     wide = torch.tensor([8.0] * 3 + [16.0] * 12)[:, None] / 2 / 128 + HALF_HARMONIC
     assert bool(((read.sh_rest - other.sh_rest).abs() <= wide).all())
     assert_close(replace(read, sh_rest=other.sh_rest.contiguous()), other, 2.0**-12)
 
 
 @pytest.mark.parametrize(("name", "z"), [("raw", 1), ("v2", 1), ("v3", -1), ("v4", -1)])
-def test_the_smallest_files_of_others(name, z):
-    """Corners of a square, as their makers have them; the first two files were made with another sign of z."""
+def test_minimal_files_from_other_programs(name, z):
+    """The four corners of a square, as their writers define them. The first two files have the opposite sign of z."""
     read = spz.read(shared(f"splat_fixtures/minimal-{name}.spz")).gaussians
     assert read.sh_degree == 0
     assert read.means.tolist() == [[-1, 0, z], [0, 0, z], [-1, 0, 0], [0, 0, 0]]

@@ -1,4 +1,4 @@
-"""The ladder lives beside the package, in benchmarks/, which is on no path; compilers are not always there."""
+"""Put benchmarks/, where the ladder lives, on the import path, and skip without a C++ compiler."""
 
 import os
 import shutil

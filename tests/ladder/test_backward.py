@@ -1,4 +1,4 @@
-"""The backward rungs against autograd in float64, and slots against themselves on other threads."""
+"""The backward rungs against autograd in float64, and slots on other threads and in other orders."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ EPS = 2.0**-23  # float32
 
 
 def weights(cloud):
-    """The loss is sum(g * image)."""
+    """Return random weights g of the loss sum(g * image)."""
     return np.random.default_rng(1).normal(size=(cloud.H, cloud.W, 3)).astype(np.float32)
 
 
 def dense(cloud, g):
-    """Composite in float64 without tiles, boxes or stop; return autograd's gradients and what bounds are made of."""
+    """Composite in float64 without tiles, boxes or stop; return autograd's gradients and the parts of the bounds."""
     leaves = [torch.tensor(array, dtype=torch.float64, requires_grad=True) for array in cloud[:4]]
     means2d, conics, colors, opacities = leaves
     y, x = torch.meshgrid(torch.arange(cloud.H).double(), torch.arange(cloud.W).double(), indexing="ij")
@@ -32,11 +32,11 @@ def dense(cloud, g):
 
 
 def bounds(cloud, g, parts):
-    """What float32 may lose: n eps of a pixel's light over 1 - alpha in each h, and as much again in the sums.
+    """Bound the float32 error by n eps of a pixel's light over 1 - alpha in each h, with a factor of 4.
 
-    A pixel's R begins at most at sum_k |g_k| times the light that its n splats take, colours being at most 1; each of
-    n subtractions loses half an eps of that at most, and dL/dalpha has R / (1 - alpha). T and the sums over the pixels
-    are within the factor of 4.
+    A pixel's R starts at no more than sum_k |g_k| times the light that its n splats take, since colours are at most 1.
+    Each of n subtractions loses at most half an eps of that, and dL/dalpha contains R / (1 - alpha). The factor of 4
+    covers T and the sums over pixels.
     """
     _, alphas, T, dx, dy = parts
     layers = int((alphas > 0).sum(0).max())
@@ -53,7 +53,7 @@ def bounds(cloud, g, parts):
         dim=1,
     )
     conics = torch.stack([moment(dx * dx) / 2, moment(dx * dy), moment(dy * dy) / 2], dim=1)
-    # w g: each weight is a product of n factors, and at most `layers` and its tiles' pixels are summed.
+    # Of w g: each weight is a product of at most `layers` factors, and the pixels of its tiles are summed.
     colors = 4 * layers * EPS * (T[:-1] * alphas / (1 - alphas) * strength).sum((1, 2))
     return (
         means,
@@ -63,14 +63,14 @@ def bounds(cloud, g, parts):
     )
 
 
-def clear_of_edges(parts):
-    """Check that the scene is smooth here: no alpha so near floor or clamp that float32 decides otherwise."""
+def assert_clear_of_edges(parts):
+    """Check that no alpha is so near the floor or the clamp that float32 falls on the other side."""
     raw = parts[0]
     assert all(((raw / edge - 1).abs() > 20 * EPS).all() for edge in (ALPHA_MIN, ALPHA_MAX))
 
 
-def no_tile_ends(cloud, T):
-    """Check that the reference, which never stops, may be compared."""
+def assert_no_tile_stops(cloud, T):
+    """Check that no tile stops, because the reference never does."""
     last = torch.zeros(-(-cloud.H // TILE) * TILE, -(-cloud.W // TILE) * TILE, dtype=torch.float64)
     last[: cloud.H, : cloud.W] = T[-1]
     tiles = last.reshape(last.shape[0] // TILE, TILE, last.shape[1] // TILE, TILE)
@@ -82,12 +82,12 @@ def no_tile_ends(cloud, T):
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_rung_agrees_with_autograd(rung, opaque, threads):
     cloud = splats.scene(220, 52, seed=3, stretch=3.0)._replace(W=45)  # tiles are cut on the right and below
-    if opaque:  # the clamp is active, and what is behind it is a difference of nearly equal numbers
+    if opaque:  # clamped: light behind such a splat is a difference of nearly equal numbers
         cloud.opacities[::4] = 1.0
     g = weights(cloud)
     reference, parts = dense(cloud, g)
-    clear_of_edges(parts)
-    no_tile_ends(cloud, parts[2])
+    assert_clear_of_edges(parts)
+    assert_no_tile_stops(cloud, parts[2])
     assert bool((parts[1] == ALPHA_MAX).any()) == opaque and (parts[1] == 0).any()
     found = rung(cloud, forward.tight(cloud).image, g, threads)
     for name, mine, theirs, bound in zip(
@@ -95,11 +95,11 @@ def test_a_rung_agrees_with_autograd(rung, opaque, threads):
     ):
         error = (torch.tensor(mine).double() - theirs).abs()
         assert (error <= bound).all(), f"{name}: {float((error / bound).max()):.2f} of the bound"
-        # and the bound would notice a wrong formula
+        # The bound is tight enough to reveal a wrong formula.
         assert (theirs.abs() > 100 * bound).double().mean() > 0.2, name
 
 
-def test_slots_give_the_same_bits_on_any_threads_in_any_order():
+def test_slots_give_the_same_bits_for_any_threads_and_order():
     cloud = splats.scene(3000, 128, seed=5)
     g, image = weights(cloud), forward.tight(cloud).image
     tiles = np.arange(backward.num_tiles(cloud))
@@ -110,8 +110,8 @@ def test_slots_give_the_same_bits_on_any_threads_in_any_order():
     assert len(found) == 1
 
 
-def test_shared_sums_depend_on_the_order_of_the_tiles():
-    """No luck is asserted: one thread, two orders of the same additions."""
+def test_atomic_sums_depend_on_the_order_of_the_tiles():
+    """This is deterministic: one thread adds the same numbers in two orders."""
     cloud = splats.scene(3000, 128, seed=5)
     g, image = weights(cloud), forward.tight(cloud).image
     tiles = np.arange(backward.num_tiles(cloud))
@@ -119,8 +119,8 @@ def test_shared_sums_depend_on_the_order_of_the_tiles():
     assert len(found) == 2
 
 
-def test_a_tile_that_goes_dark_gives_nothing_to_what_is_behind_it():
-    """As in the forward pass: the replay ends where that did."""
+def test_splats_behind_a_stopped_tile_get_no_gradient():
+    """The replay ends where the forward pass stopped."""
     cloud = splats.scene(40, 16, seed=7)
     wide = np.array([[1e-6, 0.0, 1e-6]] * 40, np.float32)
     cloud = cloud._replace(conics=wide, opacities=np.full(40, 0.9, np.float32))
@@ -130,11 +130,11 @@ def test_a_tile_that_goes_dark_gives_nothing_to_what_is_behind_it():
     for rung in backward.RUNGS.values():
         gradient = rung(cloud, drawn.image, g)
         seen = int(np.count_nonzero(gradient.colors.any(axis=1)))
-        assert 4 <= seen <= 6, "0.1^4 is the stop"
+        assert 4 <= seen <= 6, "the tile stops at 0.1^4"
         assert not gradient.opacities[seen:].any() and not gradient.means2d[seen:].any()
 
 
-def test_what_does_not_fit_is_refused():
+def test_invalid_arguments_are_refused():
     cloud = splats.scene(4, 32)
     g = weights(cloud)
     with pytest.raises(ValueError, match="have to be"):

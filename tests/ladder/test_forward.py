@@ -1,4 +1,4 @@
-"""Every rung of the ladder draws what the float64 oracle draws, within what float32 may lose."""
+"""Every rung of the ladder matches the float64 oracle within float32 rounding."""
 
 import importlib.util
 
@@ -23,7 +23,7 @@ TILED = [rung for rung in ORACLES if rung != "naive"]
 
 
 def odd(count: int, seed: int, stretch: float) -> Splats:
-    """A scene whose sides are no multiples of a tile, with splats on and beyond its edges."""
+    """Return a scene whose sides are not multiples of a tile, with splats on and beyond its edges."""
     return scene(count, 45, seed, stretch)._replace(H=37)
 
 
@@ -31,7 +31,9 @@ def check(rung: str, splats: Splats) -> None:
     rendered = forward.RUNGS[rung](splats)
     image, T = oracle(splats, **ORACLES[rung])
     image_bound, T_bound = tolerance(splats, conics_again=rung == "package")
-    assert image_bound.max() < 1e-2 and np.median(image_bound) < 1e-4, "or the bound says nothing"
+    assert image_bound.max() < 1e-2 and np.median(image_bound) < 1e-4, (
+        "the bound is tight enough to mean something"
+    )
     assert (np.abs(rendered.image - image) <= image_bound).all()
     assert (np.abs(rendered.transmittance - T) <= T_bound).all()
 
@@ -43,12 +45,12 @@ def test_every_rung_has_an_oracle():
 @pytest.mark.sliced(5)
 @pytest.mark.parametrize("rung", ORACLES)
 @pytest.mark.parametrize(("count", "stretch"), [(1, 1.0), (150, 1.0), (150, 8.0), (900, 3.0)])
-def test_a_rung_draws_what_the_oracle_draws(rung, count, stretch):
+def test_a_rung_matches_the_oracle(rung, count, stretch):
     check(rung, odd(count, seed=count, stretch=stretch))
 
 
 @pytest.mark.parametrize("rung", ORACLES)
-def test_no_splats_is_an_empty_image(rung):
+def test_no_splats_give_an_empty_image(rung):
     rendered = forward.RUNGS[rung](odd(0, seed=0, stretch=1.0))
     assert not rendered.image.any() and (rendered.transmittance == 1).all()
 
@@ -65,7 +67,7 @@ def test_splats_off_the_screen_and_below_the_floor_draw_nothing(rung):
 
 @pytest.mark.parametrize("rung", TILED)
 def test_a_dark_tile_stops(rung):
-    """Eight opaque splats darken every pixel; what stands behind them is in the lists and is not drawn."""
+    """Eight opaque splats darken every pixel. The one behind them is in the tiles' lists but is not drawn."""
     wide = np.tile(1e4 * np.eye(2), (9, 1, 1))
     colors = np.repeat([[1.0, 0, 0], [0, 1.0, 0]], [8, 1], axis=0)
     splats = from_cov2d(np.full((9, 2), 20.0), wide, colors, np.full(9, 0.95), (37, 45))
@@ -77,13 +79,13 @@ def test_a_dark_tile_stops(rung):
         assert rendered.counts.mattered < 9 * splats.pixels
 
 
-def test_the_naive_counts_are_those_of_the_oracle():
+def test_the_counts_of_the_naive_rung_are_exact():
     splats = odd(200, seed=3, stretch=2.0)
     y, x = np.mgrid[: splats.H, : splats.W]
     dx, dy = (p[..., None] - splats.means2d[:, k].astype(float) for k, p in enumerate((x, y)))
     A, B, C = splats.conics.astype(float).T
     alpha = splats.opacities * np.exp(-0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy)
-    assert np.abs(alpha / ALPHA_MIN - 1).min() > 1e-5, "rounding decides nothing here"
+    assert np.abs(alpha / ALPHA_MIN - 1).min() > 1e-5, "rounding decides no alpha"
     counts = forward.naive(splats).counts
     assert counts.pairs == 0
     assert counts.evaluated == 200 * 37 * 45
@@ -91,7 +93,7 @@ def test_the_naive_counts_are_those_of_the_oracle():
     assert counts.bytes == 24 * counts.evaluated + 12 * counts.mattered + 16 * 37 * 45
 
 
-def test_each_rung_looks_at_less():
+def test_each_rung_evaluates_fewer_splats():
     splats = odd(150, seed=5, stretch=6.0)
     counts = {rung: forward.RUNGS[rung](splats).counts for rung in forward.RUNGS}
     assert counts["tiled"].evaluated < counts["naive"].evaluated / 2
@@ -104,12 +106,12 @@ def test_each_rung_looks_at_less():
     assert counts["tight"].pairs <= counts["package"].pairs <= 1.1 * counts["tight"].pairs
 
 
-def test_projected_splats_are_those_of_the_reference_renderer():
+def test_projected_splats_match_the_reference_renderer():
     camera = Camera.looking_at(eye=[0, -1, -3], target=[0, 0, 0], fx=60, fy=60, H=37, W=45)
     means, cov3ds, colors, opacities = sphere_shell()
     splats = projected(camera, means, cov3ds, colors, opacities)
     expected, _ = render_gaussians(camera, means, cov3ds, colors, opacities, extent="exact", stop="none")
-    # Rounding a mean at 45 px to float32 moves it by 2e-6 px, an alpha by less than that, and by 1/255 at the floor.
+    # Rounding a mean at 45 px to float32 moves it by 2e-6 px and an alpha by less, except by 1/255 at the floor.
     difference = np.abs(oracle(splats)[0] - expected)
     assert np.median(difference) < 1e-5 and difference.max() < 2 * ALPHA_MIN
 
@@ -134,7 +136,7 @@ def test_timing_returns_what_was_drawn():
     assert np.array_equal(rendered.image, forward.tight(splats).image)
 
 
-def test_no_compiler_is_one_line(monkeypatch):
+def test_a_missing_compiler_is_reported_in_one_line(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     build.library.cache_clear()
     with pytest.raises(BackendUnavailableError, match="install g") as caught:

@@ -8,7 +8,7 @@ from gsplat_edu import _native
 
 @pytest.fixture(params=_native.isas())
 def isa(request) -> Iterator[str]:
-    """Run the test once with every instruction set of this machine."""
+    """Run the test once for each instruction set of this machine."""
     before = _native.isa()
     _native.choose_isa(request.param)
     yield request.param

@@ -1,4 +1,4 @@
-"""The native module refuses wrong arguments, whoever calls it, and names the argument."""
+"""The native module refuses wrong arguments from any caller and names the argument."""
 
 import numpy as np
 import pytest
@@ -91,14 +91,14 @@ EVERY = [(call, name) for call, names in CALLS.items() for name in names]
 
 
 @pytest.mark.parametrize("call", CALLS, ids=lambda call: call.__name__)
-def test_the_arguments_of_these_tests_are_right(call):
+def test_the_default_arguments_of_these_tests_are_accepted(call):
     call()
     with pytest.raises(TypeError, match="does not know extra"):
         call(extra=1)
 
 
 @pytest.mark.parametrize(("call", "name"), EVERY, ids=lambda value: getattr(value, "__name__", value))
-def test_a_missing_or_senseless_argument_is_named(call, name, monkeypatch):
+def test_a_missing_or_invalid_argument_is_named(call, name, monkeypatch):
     with pytest.raises((TypeError, ValueError), match=rf": {name}: "):
         call(**{name: "nonsense"})
     monkeypatch.setitem(call.__globals__, "_native", Dropping(_native, name))
@@ -107,7 +107,7 @@ def test_a_missing_or_senseless_argument_is_named(call, name, monkeypatch):
 
 
 class Dropping:
-    """The native module, whose calls lose one of their arguments on the way."""
+    """The native module, with one argument removed from every call."""
 
     def __init__(self, source, name):
         self.source, self.name = source, name
@@ -128,8 +128,8 @@ ARRAYS |= {loss: CALLS[loss][:3], visible: CALLS[visible]}
 EACH_ARRAY = [(call, name) for call, names in ARRAYS.items() for name in names]
 
 
-def right(call, name):
-    """Return a right array of this argument."""
+def valid_array(call, name):
+    """Return a valid array for this argument."""
     if call in (scene, gradients) and name in RAW:
         return parameters()[name].clone()
     shapes = {"means2d_norm": (N,), "background": (3,), "ids": (N,), "radii": (N, 2), "depth": (H, W)}
@@ -145,7 +145,7 @@ def strided(tensor):
 
 
 def unaligned(tensor):
-    # NumPy makes what torch refuses to: an array that begins between two numbers.
+    # Unlike torch, NumPy can make an array at an unaligned address.
     room = np.zeros(tensor.numel() * tensor.element_size() + 1, np.uint8)
     return room[1:].view(tensor.numpy().dtype).reshape(tensor.shape)
 
@@ -166,19 +166,19 @@ WRONG = {
 
 @pytest.mark.parametrize("wrong", WRONG)
 @pytest.mark.parametrize(("call", "name"), EACH_ARRAY, ids=lambda value: getattr(value, "__name__", value))
-def test_an_array_of_another_kind_is_refused(call, name, wrong):
-    given = right(call, name)
+def test_an_unsuitable_array_is_refused(call, name, wrong):
+    given = valid_array(call, name)
     call(**{name: given})
     optional = call is images and name != "image" and wrong == "absent"
     if optional or (wrong in ("strided", "unaligned") and not given.numel()):
-        return  # that is right
-    # The first array sets the size: where only its size is wrong, it is the next one that does not fit.
+        return  # these arrays are valid
+    # The first array sets the size. If only its size is wrong, the error names the next array.
     leads = name in ("means", "parameter", "image") and wrong in ("empty", "one more", "flat", "nine axes")
     with pytest.raises(ValueError, match=r": \w+: has to be" if leads else rf": {name}: has to be"):
         call(**{name: WRONG[wrong](given)})
 
 
-def test_numpy_arrays_are_taken_and_read_only_ones_only_to_read():
+def test_numpy_arrays_are_accepted_and_read_only_ones_only_as_inputs():
     arrays = {name: np.zeros((N, 3), np.float32) for name in ("parameter", "first", "second", "gradient")}
     for name, array in arrays.items():
         array.flags.writeable = False
@@ -190,13 +190,13 @@ def test_numpy_arrays_are_taken_and_read_only_ones_only_to_read():
         array.flags.writeable = True
 
 
-def test_a_leaf_is_moved_in_place():
+def test_a_leaf_is_updated_in_place():
     leaf = torch.zeros(N, 3, requires_grad=True)
     adam(parameter=leaf, gradient=torch.ones(N, 3))
     assert (leaf.detach() < 0).all()
 
 
-def test_a_frame_takes_what_fits_it():
+def test_arguments_that_do_not_fit_the_frame_are_refused():
     cases = (
         ("scene", _native.Scene(**parameters(torch.float64)), "dtype"),
         ("scene", _native.Scene(**{name: tensor[:3] for name, tensor in parameters().items()}), "shape"),
@@ -230,7 +230,7 @@ def test_a_frame_takes_what_fits_it():
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_capsules_of_older_torch_give_the_same_bits(monkeypatch, degree):
-    """Versions of torch before DLPack's C interface hand over capsules, of leaves that need a gradient too."""
+    """Versions of torch without DLPack's C interface pass capsules, also for leaves that require a gradient."""
     cam = orbit_camera(0.3, 0.2, 24, 30.0)
     target = torch.randint(0, 256, (24, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     found = []

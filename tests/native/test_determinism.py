@@ -1,4 +1,4 @@
-"""The promise: the same bits on any number of threads, and from run to run."""
+"""Results are the same to the bit on any number of threads, and from run to run."""
 
 import functools
 
@@ -13,8 +13,8 @@ from gsplat_edu.train.trainer import Trainer
 from native_scenes import random
 
 
-def test_300_iterations_of_training(set_threads):
-    """Two densifications included; 1, 2 and 5 threads, and the first of them twice."""
+def test_300_training_iterations_do_not_depend_on_threads(set_threads):
+    """The runs include two densifications. They use 1, 2 and 5 threads, and 1 thread twice."""
     views, config = sphere_capture(64).train, course_config(iterations=300, max_gaussians=800)
     runs = []
     for threads in (1, 1, 2, 5):
@@ -32,8 +32,8 @@ def test_300_iterations_of_training(set_threads):
             assert torch.equal(tensor, runs[0][name]), name
 
 
-def test_a_scene_of_many_blocks_and_chunks(set_threads):
-    """12,000 Gaussians at 400 x 260: dozens of blocks to project, a dozen chunks to sort into 425 tiles."""
+def test_a_render_of_many_blocks_does_not_depend_on_threads(set_threads):
+    """12,000 Gaussians at 400 x 260 px: dozens of blocks to project, a dozen chunks to sort into 425 tiles."""
     scene = random(12_000, (400, 260), seed=1)
     results = []
     for threads in (1, 2, 5):

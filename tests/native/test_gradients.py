@@ -1,12 +1,11 @@
 """Gradients of the native kernels.
 
-In double, against finite differences and against autograd through the dense renderer. The scenes are smooth,
-and each check says why: every alpha that is drawn stays away from the floor 1/255 by more than the step can move
-it (the Gaussians are so wide, and the images so small, that none of them reaches its rim), no alpha is clamped,
-no colour is floored, no depths swap.
+float64 is tested against finite differences and against autograd through the dense renderer. The scenes are smooth:
+every alpha stays further above the floor 1/255 than the step can move it (no Gaussian's rim is inside the small
+image), no alpha is clamped, no colour is floored, and no depths swap.
 
-In float, against double. Replaying the forward pass loses digits behind nearly opaque layers: the error of
-R / (1 - alpha) is about eps |R0| / (1 - alpha) (native/composite_backward.cpp), so it is bounded absolutely.
+float32 is tested against float64. Replaying the forward pass loses digits behind nearly opaque layers: the error of
+R / (1 - alpha) is about eps |R0| / (1 - alpha) (native/composite_backward.cpp), so the bound is absolute.
 """
 
 import dataclasses
@@ -24,7 +23,7 @@ PARAMETERS = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities
 
 
 def smooth_scene(seed: int, n: int = 5) -> Scene:
-    """A few Gaussians, each wider than the image: alpha is far above the floor at every pixel."""
+    """Return a few Gaussians, each wider than the image, so that alpha is far above the floor at every pixel."""
     rng = np.random.default_rng(seed)
     sh = rng.normal(size=(n, 16, 3)) * 0.05
     sh[:, 0] += 0.5
@@ -45,14 +44,14 @@ def assert_smooth(scene: Scene, settings: RenderSettings) -> None:
     for i in range(len(gaussians)):
         alone = gaussians.map(lambda t, i=i: t[i : i + 1])
         alpha = 1 - render(alone, scene.camera, settings=settings, backend="cpu").transmittance
-        assert alpha.min() > 1.5 / 255 and alpha.max() < 0.95, "neither the floor nor the clamp is near"
+        assert alpha.min() > 1.5 / 255 and alpha.max() < 0.95, "alphas stay away from the floor and the clamp"
         assert render(alone, scene.camera, settings=RenderSettings(), backend="cpu").image.min() > 0.0
     assert len(render(gaussians, scene.camera, backend="cpu").visible) == len(gaussians)
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_gradcheck_of_everything(isa, antialiased, seed):
+def test_gradcheck_of_all_parameters(isa, antialiased, seed):
     scene = smooth_scene(seed)
     settings = RenderSettings(antialiased=antialiased)
     assert_smooth(scene, settings)
@@ -86,8 +85,8 @@ def test_gradcheck_of_lower_degrees(degree):
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gradcheck_of_the_lower_door(isa, antialiased):
-    """Covariances are moved along symmetric directions: S = B B' + 0.1 I."""
+def test_gradcheck_of_render_covariances(isa, antialiased):
+    """Covariances are perturbed symmetrically, as S = B B' + 0.3 I."""
     generator = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
     means = torch.stack(
@@ -125,12 +124,11 @@ def gradients(scene, backend, dtype=torch.float64, antialiased=False):
     return found | {"background": background.grad, "means2d": norms}
 
 
-# Where a tile stops, the dense renderer goes on: what lies behind has weights below 1e-4 there, and no gradient
-# here.
+# Behind a tile's stop, the dense renderer continues with weights below 1e-4; the kernels give no gradient there.
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "opaque, tiles stop"])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_double_agrees_with_autograd_through_the_dense_renderer(name, antialiased):
-    """Floors, clamps and needles included: both take the same branches. To 1e-9 of the largest gradient."""
+def test_float64_agrees_with_autograd_through_the_dense_renderer(name, antialiased):
+    """Agreement to 1e-9 of the largest gradient, even at floors, clamps and needles: both take the same branches."""
     ours = gradients(SCENES[name], "cpu", antialiased=antialiased)
     theirs = gradients(SCENES[name], "torch", antialiased=antialiased)
     for key, gradient in theirs.items():
@@ -141,13 +139,13 @@ def test_double_agrees_with_autograd_through_the_dense_renderer(name, antialiase
 
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "ties in depth"])
-def test_float_agrees_with_double(isa, name):
-    """Absolute: 3e-4 of the parameter's largest gradient. Ties are left out: rounding decides who is nearer.
+def test_float32_agrees_with_float64(isa, name):
+    """The bound is 3e-4 of each parameter's largest gradient. Ties in depth are left out: rounding decides their order.
 
-    R loses eps |R0| / (1 - alpha) at a layer, 1.2e-7 x 100 = 1.2e-5 of R0 behind the clamp of 0.99; a pixel lets two
-    such layers through before its tile stops, and some twenty fainter ones with a tenth of that each. Needles, and
-    what passes close by the camera, have conics with ac / det up to some 200: 8 eps times that times exponents of
-    up to 20 is 4e-3, which is what they get.
+    R loses eps |R0| / (1 - alpha) at a layer: 1.2e-7 x 100 = 1.2e-5 of R0 behind one clamped at 0.99. A pixel passes
+    two such layers before its tile stops, and about twenty fainter ones that lose a tenth of that each. Needles and
+    Gaussians close to the camera have conics with ac / det up to about 200. With exponents up to 20 they lose up to
+    8 eps x 200 x 20 = 4e-3, which is their bound.
     """
     bound = 4e-3 if name in ("needles 100:1", "partly behind") else 3e-4
     single, double = (gradients(SCENES[name], "cpu", dtype) for dtype in (torch.float32, torch.float64))
@@ -157,7 +155,7 @@ def test_float_agrees_with_double(isa, name):
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_threads_change_no_bit(set_threads, threads):
+def test_gradients_do_not_depend_on_threads(set_threads, threads):
     set_threads(1)
     alone = gradients(SCENES["random"], "cpu", torch.float32)
     set_threads(threads)

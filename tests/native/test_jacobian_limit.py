@@ -1,7 +1,7 @@
-"""The clamp of x/z and y/z inside the Jacobian, which captures are trained with: values and gradients.
+"""Values and gradients with the clamp of x/z and y/z inside the Jacobian, which training on captures uses.
 
-Half of the Gaussians here stand outside the enlarged image, on all four sides, so that every clamp is active
-somewhere; none is near enough to a bound for a finite difference to step over it.
+Four Gaussians are outside the enlarged image, one on each side, so every clamp is active for one of them. None is so
+near to a bound that a finite difference crosses it.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ SETTINGS = RenderSettings(background=BACKGROUND, jacobian_limit=LIMIT)
 
 
 def outside_scene() -> Scene:
-    """Wide Gaussians, half of them beyond the bounds: each still covers the whole image."""
+    """Return five wide Gaussians, four of them beyond the bounds; each still covers the whole image."""
     rng = np.random.default_rng(5)
     means = np.array([[0.1, 0.1, 0], [2.2, 0, 0.3], [-2.3, 0.1, -0.3], [0.2, 2.0, 0.5], [0.1, -2.1, -0.5]])
     sh = rng.normal(size=(5, 16, 3)) * 0.05
@@ -39,7 +39,7 @@ def test_the_bounds_are_the_enlarged_image():
     cam = Camera(np.eye(3), (0, 0, 0), fx=50.0, fy=40.0, cx=20.3, cy=16.8, H=35, W=41)
     (x_low, x_high), (y_low, y_high) = cam.jacobian_bounds(1.3)
     ends = [cam.fx * x + cam.cx for x in (x_low, x_high)], [cam.fy * y + cam.cy for y in (y_low, y_high)]
-    # Columns run from -0.5 to 40.5; enlarged by 1.3 around their middle, 20: from 20 - 26.65 to 20 + 26.65.
+    # Columns run from -0.5 to 40.5. Enlarged by 1.3 around their middle, 20, they run from 20 - 26.65 to 20 + 26.65.
     np.testing.assert_allclose(ends[0], (20 - 26.65, 20 + 26.65))
     np.testing.assert_allclose(ends[1], (17 - 22.75, 17 + 22.75))
     centred = Camera(np.eye(3), (0, 0, 0), 50.0, 50.0, 31.5, 31.5, 64, 64)
@@ -48,7 +48,7 @@ def test_the_bounds_are_the_enlarged_image():
 
 
 @pytest.mark.parametrize("name", ["partly behind", "larger than the image", "outside"])
-def test_double_is_the_reference(isa, name):
+def test_float64_matches_the_reference(isa, name):
     scene = outside_scene() if name == "outside" else SCENES[name]
     covs = build_cov3d_batch(np.exp(scene.log_scales), quat_to_R_batch(scene.quats))
     toward = scene.means - scene.camera.eye
@@ -68,7 +68,9 @@ def test_gradcheck(isa):
     x, y = ratios(scene)
     clamped = (x < x_low) | (x > x_high) | (y < y_low) | (y > y_high)
     assert clamped.sum() == 4
-    assert np.abs(np.stack([x - x_low, x - x_high, y - y_low, y - y_high])).min() > 0.01, "no kink is near"
+    assert np.abs(np.stack([x - x_low, x - x_high, y - y_low, y - y_high])).min() > 0.01, (
+        "no ratio is near a kink"
+    )
     gaussians = scene.gaussians()
     for i in range(len(gaussians)):
         alone = gaussians.map(lambda t, i=i: t[i : i + 1])

@@ -1,13 +1,12 @@
 """The native forward pass against the NumPy reference, with exact extents and tile stops.
 
-float64: sums of at most a few thousand terms of order 1 in another order: 1e-12.
+float64: sums of at most a few thousand terms of order 1, in another order, agree to 1e-12.
 
-float32: the kernels compute with a few roundings per step what the double render computes without; to a rounding
-each step is exact for parameters that are a few eps away (backward stability: projections, exponents and products
-are sums and products without cancellation beyond that of their input). So the error of a pixel is bounded by how much
-it moves when the parameters move by 4 eps, times 4 for what eight random moves may have missed, plus the rounding of
-the sum over its layers, eps times the largest colour times their number in sequence (a hundred). A pixel where an
-alpha is within that of the floor may gain or lose 1/255 of a colour: two such pixels a scene are allowed.
+float32: every step is backward stable: up to a rounding, its result is exact for parameters that differ by a few eps,
+because projections, exponents and products have no cancellation beyond that of their inputs. So the error of a pixel
+is bounded by its change when the parameters move by 4 eps (times 4, because only eight random moves are tried), plus
+the rounding of the sum over its layers: eps times the largest colour times the number of layers (a hundred). A pixel
+with an alpha that close to the floor may gain or lose 1/255 of a colour: two such pixels per scene are allowed.
 """
 
 import numpy as np
@@ -28,14 +27,14 @@ def rendered(scene, dtype=torch.float64, settings=SETTINGS):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_double_is_the_reference(isa, name):
+def test_float64_matches_the_reference(isa, name):
     scene = SCENES[name]
     for ours, truth in zip(rendered(scene), scene.truth(), strict=True):
         np.testing.assert_allclose(ours, truth, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_every_degree(isa, degree):
+def test_every_sh_degree_matches_the_reference(isa, degree):
     scene = SCENES["random"]
     settings = RenderSettings(background=BACKGROUND, sh_degree=degree)
     np.testing.assert_allclose(
@@ -44,14 +43,14 @@ def test_every_degree(isa, degree):
 
 
 @pytest.mark.parametrize("name", ["random", "smaller than a pixel", "needles 100:1", "larger than the image"])
-def test_antialiased(isa, name):
+def test_antialiasing_matches_the_reference(isa, name):
     scene = SCENES[name]
     settings = RenderSettings(background=BACKGROUND, antialiased=True)
     for ours, truth in zip(rendered(scene, settings=settings), scene.truth(antialiased=True), strict=True):
         np.testing.assert_allclose(ours, truth, rtol=0, atol=1e-12)
 
 
-def test_a_large_image(isa):
+def test_a_large_image_matches_the_reference(isa):
     scene = random(300, (331, 217), seed=20)
     for ours, truth in zip(rendered(scene), scene.truth(), strict=True):
         np.testing.assert_allclose(ours, truth, rtol=0, atol=1e-12)
@@ -59,7 +58,7 @@ def test_a_large_image(isa):
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("name", ["random", "thousands of layers", "17 x 33"])
-def test_threads_change_no_bit(set_threads, threads, name):
+def test_images_do_not_depend_on_threads(set_threads, threads, name):
     set_threads(1)
     alone = rendered(SCENES[name], torch.float32)
     set_threads(threads)
@@ -68,7 +67,7 @@ def test_threads_change_no_bit(set_threads, threads, name):
 
 
 def sensitivity(scene) -> np.ndarray:
-    """Largest change of each pixel over eight perturbations of the parameters by 4 float32 eps."""
+    """Return the largest change of each pixel over eight perturbations of the parameters by 4 float32 eps."""
     rng = np.random.default_rng(0)
     exact = scene.gaussians()
     base = rendered(scene)[0]
@@ -82,8 +81,8 @@ def sensitivity(scene) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "ties in depth"])
-def test_float_stays_within_its_rounding(isa, name):
-    """Ties are left out: rounding decides which of two equal depths is nearer."""
+def test_float32_stays_within_rounding(isa, name):
+    """Ties in depth are left out, because rounding decides which of two equal depths is nearer."""
     scene = SCENES[name]
     image, T, _ = rendered(scene, torch.float32)
     truth, truth_T, _ = scene.truth()

@@ -1,8 +1,8 @@
-"""What float32 costs where it is hardest: scenes over many decades of focal length, distance, place and scale.
+"""Errors of float32 in hard scenes, whose focal lengths, distances, positions and scales span many decades.
 
-The scenes and the search for discontinuities are those of benchmarks/precision.py; docs/PRECISION.md has the classes.
-A difference of float32 from float64 is within the bound on rounding, or the scene has a discontinuity that a rounding
-of that size can step over, and the difference is within that step.
+The scenes and the search for discontinuities are those of benchmarks/precision.py; docs/PRECISION.md lists the classes.
+A float32 result differs from float64 by at most the bound on rounding, unless the scene has a discontinuity so near
+that rounding can cross it. Then the difference is at most the step of that discontinuity.
 """
 
 import sys
@@ -15,19 +15,20 @@ import precision
 SEED = 24
 
 
-def test_float_stays_within_rounding_or_steps_over_a_tie(isa):
+def test_float32_errors_are_rounding_or_a_near_tie(isa):
     verdicts = {k: precision.judge(*precision.extreme_scene(SEED, k)) for k in range(30)}
     unexplained = {k: v for k, v in verdicts.items() if v.error > v.allowed}
     assert not unexplained
-    # Ties are rare: they do not excuse a slice.
+    # Ties are rare, so they must not explain away many errors.
     assert sum(v.error > v.bound for v in verdicts.values()) <= 1
-    assert max(v.bound for v in verdicts.values()) < 5e-3, "the bound itself stays below what is visible"
+    assert max(v.bound for v in verdicts.values()) < 5e-3, "the bound itself stays invisible"
 
 
-def test_a_needle_across_a_photo_keeps_its_edges(isa):
-    """A standard deviation of 1000 px along the diagonal of 640 x 640, less than one across, the mean outside.
+def test_a_needle_across_a_photo_is_accurate(isa):
+    """Standard deviations of 1000 px along the diagonal of 640 x 640 px and below 1 px across; the mean is outside.
 
-    The exponent's polynomial had terms of (1000 px)² / 0.6 px², which float32 holds to 0.1: the image was off by 0.024.
+    The terms of the exponent's polynomial reach (1000 px)² / 0.6 px², which float32 resolves to 0.1. Evaluating them
+    directly caused an error of 0.024.
     """
     camera, needle = precision.needle(640)
     verdict = precision.judge(camera, needle)
@@ -35,8 +36,8 @@ def test_a_needle_across_a_photo_keeps_its_edges(isa):
     assert verdict.error < 1e-3
 
 
-def test_double_agrees_with_the_oracle_as_far_as_covariances_allow():
-    """The oracle multiplies covariances out, which costs it the condition number of the ellipse; the kernels do not."""
+def test_float64_agrees_with_the_oracle_up_to_the_condition_of_covariances():
+    """The oracle multiplies covariances out and loses the condition number of the ellipse; the kernels do not."""
     results = [precision.oracle_error(*precision.extreme_scene(SEED, k)) for k in range(40)]
     numbers = [result for result in results if not isinstance(result, str)]
     assert len(numbers) >= 30
@@ -44,8 +45,8 @@ def test_double_agrees_with_the_oracle_as_far_as_covariances_allow():
     assert sum(error < 1e-9 for error, _ in numbers) >= 0.8 * len(numbers)
 
 
-def test_double_gradients_agree_with_autograd_wherever_no_tile_stops():
-    """To 1e-8 of the parameter's largest. Behind a tile's stop the dense renderer goes on, and the kernels do not."""
+def test_float64_gradients_agree_with_autograd_if_no_tile_stops():
+    """Agreement is to 1e-8 of the largest gradient. Only the dense renderer continues behind a tile's stop."""
     compared = 0
     for k in range(24):
         scene = precision.extreme_scene(SEED, k)

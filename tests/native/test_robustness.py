@@ -1,4 +1,4 @@
-"""What must not happen: crashes, hangs, leaks, and one bad Gaussian spoiling the others."""
+"""No crashes, hangs or leaks, and no bad Gaussian that spoils the others."""
 
 import dataclasses
 import os
@@ -21,14 +21,14 @@ from native_scenes import camera, random
 POISONS = (float("nan"), float("inf"), -float("inf"), 1e-42, 3e38, -3e38, 1e20, -1e20, 0.0)
 
 
-def python(code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
-    """Run Python once more, with additions to the environment."""
+def run_python(code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
+    """Run code in a new Python process, with additions to the environment."""
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
 
 
 def poisoned(gaussians: Gaussians, victims: torch.Tensor, rng: np.random.Generator) -> Gaussians:
-    """Put a poison into one random number of one parameter of every victim."""
+    """Replace one random number of every victim by a poison."""
     changed = gaussians.map(torch.clone)
     names = list(changed.tensors())
     for victim in victims.tolist():
@@ -38,11 +38,11 @@ def poisoned(gaussians: Gaussians, victims: torch.Tensor, rng: np.random.Generat
 
 
 @pytest.mark.parametrize("block", range(8))
-def test_poison_stays_where_it_is(block):
-    """25 seeds a block, 200 in all: where no victim is drawn, image and gradients are those without the victims.
+def test_bad_parameters_do_not_affect_other_gaussians(block):
+    """25 seeds per block, 200 in all. If no victim is drawn, image and gradients equal those without the victims.
 
-    A victim is still drawn where its numbers can be (a scale of 0, an opacity of 1): then it is part of the image,
-    and image and gradients have to stay finite.
+    A victim whose numbers remain valid (a scale of 0, an opacity of 1) is still drawn. Then the image and the others'
+    gradients must stay finite.
     """
     for seed in range(25 * block, 25 * block + 25):
         rng = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def test_poison_stays_where_it_is(block):
                 assert torch.equal(tensor.grad[others], clean.tensors()[name].grad), (seed, name)
 
 
-def test_a_gaussian_that_is_not_finite_is_left_out_with_zero_gradient():
+def test_non_finite_gaussians_are_not_drawn_and_get_zero_gradients():
     scene = random(10)
     gaussians = scene.gaussians()
     gaussians.quats[3] = 0.0
@@ -81,7 +81,7 @@ def test_a_gaussian_that_is_not_finite_is_left_out_with_zero_gradient():
         assert (tensor.grad[[3, 5, 7]] == 0).all(), name
 
 
-def test_a_mean_at_the_end_of_all_numbers_does_not_reach_the_depth():
+def test_a_mean_near_the_float_maximum_does_not_reach_the_depth():
     scene = random(10)
     gaussians = scene.gaussians(torch.float32)
     R = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
@@ -90,8 +90,8 @@ def test_a_mean_at_the_end_of_all_numbers_does_not_reach_the_depth():
     assert torch.isfinite(out.depth).all() and 4 not in out.visible.tolist()
 
 
-def test_thin_splats_far_off_stay_between_nothing_and_everything(isa):
-    """The terms of their exponents cancel to more than the opacity allows; alpha may not follow."""
+def test_transmittance_of_thin_distant_splats_stays_in_range(isa):
+    """Cancellation in the exponent may leave a positive value; alpha must still not exceed the opacity."""
     rng = np.random.default_rng(0)
     for _ in range(30):
         direction = rng.normal(size=3)
@@ -114,8 +114,8 @@ def test_thin_splats_far_off_stay_between_nothing_and_everything(isa):
         assert all(torch.isfinite(t.grad).all() for t in one.tensors().values())
 
 
-def test_backward_finds_the_tensors_where_they_are_then():
-    """Checkpointing throws the forward pass's tensors away and makes them again elsewhere."""
+def test_backward_reads_tensors_recreated_by_checkpointing():
+    """Checkpointing frees the tensors of the forward pass and recreates them elsewhere."""
     scene = random(60)
     found = []
     for wrap in (False, True):
@@ -129,14 +129,14 @@ def test_backward_finds_the_tensors_where_they_are_then():
             result = torch.utils.checkpoint.checkpoint(image, gaussians.means, use_reentrant=False)
         else:
             result = image(gaussians.means)
-        torch.rand(200_000)  # takes what was freed
+        torch.rand(200_000)  # reuses freed memory
         result.square().sum().backward()
         found.append({name: t.grad for name, t in gaussians.tensors().items()})
     for name, gradient in found[0].items():
         assert torch.equal(gradient, found[1][name]), name
 
 
-def test_a_second_backward_adds_to_the_norms():
+def test_a_second_backward_accumulates_gradient_norms():
     scene = random(20)
     out = render(scene.gaussians().trainable(), scene.camera, backend="cpu")
     out.image.sum().backward(retain_graph=True)
@@ -146,7 +146,7 @@ def test_a_second_backward_adds_to_the_norms():
 
 
 @pytest.mark.parametrize("case", ["none", "all culled"])
-def test_nothing_to_draw(case):
+def test_an_empty_view_shows_the_background(case):
     scene = random(0 if case == "none" else 20)
     gaussians = scene.gaussians(torch.float32)
     gaussians.means[:, 2] -= 100.0
@@ -161,7 +161,7 @@ def test_nothing_to_draw(case):
     assert out.means2d_grad_norms().shape == (0,)
 
 
-def test_gradients_may_be_asked_for_in_part():
+def test_backward_from_a_single_output():
     scene = random(20)
     full, part = (scene.gaussians().trainable() for _ in range(2))
     render(full, scene.camera, backend="cpu").depth.sum().backward()
@@ -192,7 +192,7 @@ def test_other_dtypes_are_refused():
         )
 
 
-def test_several_cameras_give_their_views_stacked():
+def test_several_cameras_give_stacked_views():
     scene = random(30)
     cameras = [camera(41, 35), Camera.looking_at((2, 0, -2), (0, 0, 0), 40, 40, 35, 41)]
     gaussians = scene.gaussians().trainable()
@@ -211,10 +211,10 @@ def test_several_cameras_give_their_views_stacked():
 
 
 @pytest.mark.own_process
-def test_memory_stays_flat():
-    """Renders of changing size, in a process of their own: 100 to warm up, then 300 that may not grow by 16 MiB.
+def test_memory_does_not_grow():
+    """Render scenes of changing size in a new process: after 100 warm-up renders, 300 more may not add 16 MiB.
 
-    The largest, which the warm-up begins with, needs about 30 MiB; kept once per render that would be gigabytes.
+    The warm-up begins with the largest, which needs about 30 MiB. A leak per render would add up to gigabytes.
     """
     code = """
 import resource, numpy as np, torch
@@ -237,7 +237,7 @@ for _ in range(300):
     turn()
 print(rss() - before)
 """
-    done = python(code, PYTHONPATH=str(Path(__file__).parents[1]))
+    done = run_python(code, PYTHONPATH=str(Path(__file__).parents[1]))
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) < 16.0
 
@@ -248,13 +248,13 @@ MAIN = "from gsplat_edu.cli.main import main; import sys; sys.exit(main(sys.argv
 @pytest.mark.own_process
 @pytest.mark.parametrize("name", _native.isas())
 def test_the_environment_forces_an_instruction_set(name):
-    done = python("from gsplat_edu import _native; print(_native.isa())", GSPLAT_EDU_ISA=name)
+    done = run_python("from gsplat_edu import _native; print(_native.isa())", GSPLAT_EDU_ISA=name)
     assert done.stdout.strip() == name
 
 
 @pytest.mark.own_process
-def test_an_instruction_set_that_is_not_there_is_said_so():
-    done = python(MAIN, "demo", "--backend", "cpu", GSPLAT_EDU_ISA="v9")
+def test_an_unavailable_instruction_set_is_reported():
+    done = run_python(MAIN, "demo", "--backend", "cpu", GSPLAT_EDU_ISA="v9")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "GSPLAT_EDU_ISA=v9" in done.stderr and "v2" in done.stderr
 
@@ -262,15 +262,15 @@ def test_an_instruction_set_that_is_not_there_is_said_so():
 @pytest.mark.own_process
 def test_the_dense_backend_trains_without_the_native_module(tmp_path):
     budget = ["--iters", "2", "--size", "8", "--k0", "5", "--out", str(tmp_path / "x.png")]
-    done = python(MAIN, "demo", "--backend", "torch", *budget, GSPLAT_EDU_ISA="v9")
+    done = run_python(MAIN, "demo", "--backend", "torch", *budget, GSPLAT_EDU_ISA="v9")
     assert done.returncode == 0, done.stderr
 
 
-def test_an_interrupt_while_the_renderer_asks_for_memory_ends_it():
-    """9,000 splats that fill 64 x 64 tiles are 295 MB of pairs: Python is asked before any block of 256 MiB.
+def test_an_exception_from_the_memory_check_ends_the_render():
+    """9,000 splats in 64 x 64 tiles need 295 MB for pairs, and Python is asked before any block of 256 MiB.
 
-    Ctrl-C comes as a KeyboardInterrupt in whatever Python code runs. That there is too little memory to ask, or no
-    module left to import, only means that nobody knows.
+    Ctrl-C raises KeyboardInterrupt in whatever Python code is running, so it must end the render. A MemoryError or an
+    ImportError only means that the available memory is unknown, so rendering continues.
     """
     count = 9_000
     screens = Gaussians(
@@ -291,7 +291,7 @@ def test_an_interrupt_while_the_renderer_asks_for_memory_ends_it():
         return ask
 
     try:
-        for error in (KeyboardInterrupt("stop"), ZeroDivisionError("a fault of ours")):
+        for error in (KeyboardInterrupt("stop"), ZeroDivisionError("a bug in the check")):
             _native.ask_before_large_blocks(failing(error))
             with pytest.raises(type(error), match=str(error)):
                 render(screens, view, backend="cpu")

@@ -22,7 +22,7 @@ def tensors(*arrays):
     return [torch.tensor(a) for a in arrays]
 
 
-def test_batched_pieces():
+def test_rotations_and_covariances():
     rng = np.random.default_rng(9)
     quats, log_scales = rng.normal(size=(64, 4)), rng.normal(size=(64, 3)) * 0.3 - 2.0
     Rs = quat_to_R_batch(quats)
@@ -42,7 +42,7 @@ def test_spherical_harmonics(degree):
 
 
 def test_camera_8_of_the_chapter():
-    """The figures are a property of the two renderers: the box cuts tails that the dense one keeps."""
+    """The differences are inherent in the two renderers: the box cuts off tails that the dense renderer keeps."""
     cam, shell = sphere_cameras(128)[8], sphere_shell()
     dense = render_t(*tensors(*shell), cam)
     boxed, _ = render_gaussians(cam, *shell)
@@ -56,7 +56,7 @@ def test_camera_8_of_the_chapter():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_random_scenes_and_an_odd_camera(random_splats, random_camera, seed):
+def test_random_scenes_from_a_random_camera(random_splats, random_camera, seed):
     splats = random_splats(80, seed=seed, scale=0.3)
     dense = render_t(*tensors(*splats), random_camera)
     exact, T = render_gaussians(random_camera, *splats, extent="exact", stop="none")
@@ -64,7 +64,7 @@ def test_random_scenes_and_an_odd_camera(random_splats, random_camera, seed):
     np.testing.assert_allclose(dense.transmittance.numpy(), T, rtol=0, atol=1e-12)
 
 
-def test_ties_in_depth_keep_the_order_given(random_splats, random_camera):
+def test_ties_in_depth_keep_their_order(random_splats, random_camera):
     means, *rest = random_splats(40, scale=0.3)
     means[:, 2] = 0.0
     dense = render_t(*tensors(means, *rest), random_camera)
@@ -74,21 +74,21 @@ def test_ties_in_depth_keep_the_order_given(random_splats, random_camera):
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 79, 80, 1000])
-def test_the_chunk_changes_nothing_but_rounding(random_splats, random_camera, chunk):
+def test_the_chunk_size_changes_only_rounding(random_splats, random_camera, chunk):
     splats = tensors(*random_splats(80, scale=0.3))
     whole, part = (render_t(*splats, random_camera, chunk=c) for c in (80, chunk))
     torch.testing.assert_close(part.image, whole.image, rtol=0, atol=1e-14)
     torch.testing.assert_close(part.transmittance, whole.transmittance, rtol=0, atol=1e-14)
 
 
-def test_float32_stays_within_its_rounding(random_splats, random_camera):
-    """Bound the error of a float32 image by the conditioning of what it computes.
+def test_float32_stays_within_rounding(random_splats, random_camera):
+    """Bound the error of a float32 image by the conditioning of its computation.
 
-    The conic carries a few eps times ac / det, the cancellation in its determinant, into the terms of the
-    exponent, A dx²/2, C dy²/2 and B dx dy; u and v carry a few eps of their size, times the exponent's slope.
-    Eight eps for "a few", and alpha errs by e = 8 eps (ac / det) (terms + slope max(|u|, |v|)) alpha. A pixel
-    mixes colours in [0, 1], so the errors of its splats at most add up. Where an alpha is within e of the
-    floor it may be dropped or kept: 1/255 more for each such splat.
+    Cancellation in the determinant gives the conic an error of a few eps times ac / det, which enters the terms of
+    the exponent, A dx²/2, C dy²/2 and B dx dy. u and v have errors of a few eps of their size, which the exponent's
+    slope multiplies. With 8 eps for "a few", the error of alpha is e = 8 eps (ac / det) (terms + slope max(|u|, |v|))
+    alpha. A pixel mixes colours in [0, 1], so the errors of its splats at most add up. An alpha within e of the floor
+    may be dropped or kept, which adds 1/255 per splat.
     """
     splats = random_splats(80, scale=0.3)
     double = render_t(*tensors(*splats), random_camera).image
@@ -113,4 +113,4 @@ def test_float32_stays_within_its_rounding(random_splats, random_camera):
     bound = (error * drawn).sum(axis=0) + near_floor.sum(axis=0) / 255
     difference = (single.double() - double).abs().numpy().max(axis=-1)
     assert (difference <= bound).all()
-    assert np.median(bound) < 2e-3, "the bound is far below what a wrong formula would do"
+    assert np.median(bound) < 2e-3, "the bound is far below the error of a wrong formula"

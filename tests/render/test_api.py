@@ -1,4 +1,4 @@
-"""render(): raw parameters in, against the NumPy functions by hand."""
+"""render() with raw parameters against a manual chain of the NumPy functions."""
 
 import numpy as np
 import pytest
@@ -36,8 +36,8 @@ def scene(count=30, rest=15, dtype=torch.float64) -> Gaussians:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_image_is_the_references(random_camera, degree):
-    """Colours depend on the direction from the camera to the mean; the image is the oracle's to rounding."""
+def test_the_image_matches_the_reference(random_camera, degree):
+    """Colours depend on the direction from the camera to the mean; the image matches the oracle up to rounding."""
     gaussians = scene()
     raw = {name: tensor.numpy() for name, tensor in gaussians.tensors().items()}
     toward = raw["means"] - random_camera.eye
@@ -63,13 +63,13 @@ def test_the_image_is_the_references(random_camera, degree):
     np.testing.assert_array_equal(np.sort(out.visible.numpy()), np.arange(30))
 
 
-def test_a_lower_degree_is_what_is_stored(random_camera):
+def test_the_stored_degree_limits_the_rendered_one(random_camera):
     gaussians = scene(rest=3)
     full, same = (render(gaussians, random_camera, settings=RenderSettings(sh_degree=d)) for d in (3, 1))
     assert gaussians.sh_degree == 1 and torch.equal(full.image, same.image)
 
 
-def test_auto_is_a_backend_and_an_unknown_one_is_refused(random_camera):
+def test_auto_uses_the_cpu_and_unknown_backends_are_refused(random_camera):
     gaussians = scene(3)
     assert torch.equal(
         render(gaussians, random_camera).image, render(gaussians, random_camera, backend="cpu").image
@@ -79,7 +79,7 @@ def test_auto_is_a_backend_and_an_unknown_one_is_refused(random_camera):
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities"])
-def test_a_bad_number_is_refused_by_the_parameters_own_name(random_camera, name):
+def test_a_value_that_is_not_finite_is_refused_by_parameter_name(random_camera, name):
     gaussians = scene(4)
     gaussians.tensors()[name].view(4, -1)[2, 0] = float("nan")
     with pytest.raises(ArgumentError, match=rf"^{name}\[2"):

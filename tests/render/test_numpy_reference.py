@@ -1,4 +1,4 @@
-"""The oracle against formulas written out again here, pixel by pixel."""
+"""The NumPy oracle against an independent implementation of its formulas, pixel by pixel."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def by_the_book(cam, means, cov3ds, colors, opacities, bg=(0.0, 0.0, 0.0), tile=
     return image + T[..., None] * np.asarray(bg), T
 
 
-def test_exact_without_stop_is_the_formula(random_splats, random_camera):
+def test_exact_extent_without_stop_follows_the_formula(random_splats, random_camera):
     splats = random_splats(30)
     image, T = render_gaussians(random_camera, *splats, bg=(0.2, 0.4, 0.9), extent="exact", stop="none")
     expected, expected_T = by_the_book(random_camera, *splats, bg=(0.2, 0.4, 0.9))
@@ -41,7 +41,7 @@ def test_exact_without_stop_is_the_formula(random_splats, random_camera):
     np.testing.assert_allclose(T, expected_T, **TIGHT)
 
 
-def test_tile_stop_is_the_loop_over_tiles(random_splats, random_camera):
+def test_tile_stop_follows_the_loop_over_tiles(random_splats, random_camera):
     means, cov3ds, colors, _ = random_splats(60, seed=4, scale=3.0)
     opacities = np.linspace(0.7, 1.0, 60)
     splats = means, cov3ds, colors, opacities
@@ -51,23 +51,23 @@ def test_tile_stop_is_the_loop_over_tiles(random_splats, random_camera):
     np.testing.assert_allclose(T, expected_T, rtol=1e-12, atol=0)
     _, unstopped = render_gaussians(random_camera, *splats, extent="exact", stop="none")
     assert (unstopped < T).any(), "some tile did stop"
-    assert T[unstopped < T].max() < 1e-4, "only where nothing can be seen"
+    assert T[unstopped < T].max() < 1e-4, "the stop affects only invisible light"
 
 
 @pytest.fixture
 def wide_splat():
-    """One splat, a little off a pixel, so wide that its 3-sigma box cuts it where alpha is still 0.01."""
+    """One splat slightly off a pixel centre, so wide that its 3-sigma box cuts it off where alpha is still 0.01."""
     cam = Camera(np.eye(3), (0, 0, 0), fx=100, fy=100, cx=50.25, cy=44.5, H=90, W=100)
     return cam, ([[0, 0, 10]], [np.diag([0.987, 0.597, 0.01])], [[1, 1, 1]], [1.0])
 
 
-def test_the_box_of_the_chapter(wide_splat):
+def test_the_three_sigma_box_of_the_chapter(wide_splat):
     """Sigma2d = diag(99, 60), lambda_max = 99, r = ceil(3 sqrt(99)) = 30."""
     cam, splat = wide_splat
     _, T = render_gaussians(cam, *splat)
     rows, columns = np.nonzero(T < 1)
     assert (columns.min(), columns.max()) == (50 - 30, 51 + 30)
-    # The box ends 30 rows away too, but there alpha fell below 1/255 before:
+    # The box also ends 30 rows away, but alpha falls below 1/255 before that:
     reach = np.sqrt(2 * np.log(255) * 60)
     assert (rows.min(), rows.max()) == (np.ceil(44.5 - reach), np.floor(44.5 + reach))
     np.testing.assert_allclose(T[44, 20], 1 - np.exp(-0.5 * (30.25**2 / 99 + 0.25 / 60)), **TIGHT)
@@ -92,8 +92,8 @@ def test_exact_reaches_every_pixel_above_the_floor(wide_splat):
     np.testing.assert_array_equal(T < 1, alpha >= 1 / 255)
 
 
-def test_box_stop_skips_what_is_wholly_hidden():
-    """Three walls of alpha 0.99 leave 1e-6; the splat behind them is skipped, one that peeks out is not."""
+def test_box_stop_skips_hidden_splats():
+    """Three walls of alpha 0.99 leave a transmittance of 1e-6, so the splat behind them is skipped."""
     cam = Camera(np.eye(3), (0, 0, 0), fx=100, fy=100, cx=15.5, cy=15.5, H=32, W=32)
     wall, small = np.diag([1e4, 1e4, 1e-6]), np.diag([1e-4, 1e-4, 1e-6])
     means = [[0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, 4]]
@@ -111,7 +111,7 @@ def test_alpha_is_clamped_and_floored():
     assert (T == 1).all()
 
 
-def test_nearer_covers_farther_and_ties_keep_the_order_given():
+def test_nearer_splats_come_first_and_ties_keep_their_order():
     cam = Camera(np.eye(3), (0, 0, 0), 10, 10, 0, 0, 1, 1)
     cov3ds, opacities = [np.eye(3) * 1e-4] * 2, [0.5, 0.5]
     red, blue = [1.0, 0, 0], [0, 0, 1.0]
@@ -121,7 +121,7 @@ def test_nearer_covers_farther_and_ties_keep_the_order_given():
     np.testing.assert_allclose(image[0, 0], [0.5, 0, 0.25])
 
 
-def test_the_near_plane_culls_at_it_and_before_it():
+def test_splats_at_or_before_the_near_plane_are_culled():
     cam = Camera(np.eye(3), (0, 0, 0), 10, 10, 2, 2, 5, 5)
     splat = [np.eye(3) * 1e-4], [[1, 1, 1]], [0.5]
     for z, drawn in ((-1.0, False), (0.0, False), (0.05, False), (0.0501, True)):
@@ -138,7 +138,7 @@ def test_the_image_is_not_clipped():
 
 
 def test_the_sphere_is_round_and_coloured_by_position():
-    """Looking along +z from z = -3: the right of the image is +x, which is red; the bottom is +y, green."""
+    """The camera looks along +z from z = -3: the right of the image is +x (red), the bottom is +y (green)."""
     cam = Camera.looking_at((0, 0, -3), (0, 0, 0), 75, 75, 64, 64)
     image, T = render_gaussians(cam, *sphere_shell())
     rows, columns = np.nonzero(T < 0.5)

@@ -1,4 +1,4 @@
-"""What the tests of structure from motion share: photos of a box, and the capture that becomes of them."""
+"""Fixtures of the tests of structure from motion: photos of a box, and the capture made from them."""
 
 import importlib.util
 from types import SimpleNamespace
@@ -14,26 +14,26 @@ from sfm.textured_box import LIMIT
 
 @pytest.fixture(scope="session")
 def colmap():
-    """Skip where pycolmap is not installed. It is not imported here: its libraries do not get along with Pillow's."""
+    """Skip if pycolmap is not installed. It is not imported here, because its libraries conflict with Pillow's."""
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("pycolmap is not installed")
 
 
 @pytest.fixture(scope="session")
 def phone(tmp_path_factory):
-    """14 photos as a phone writes them: the sensor's pixels, and how it was held in EXIF; half of them upright."""
+    """14 photos as a phone writes them: pixels as on the sensor, orientation in EXIF. Half are portraits."""
     folder = tmp_path_factory.mktemp("phone") / "photos"
     truth = {}
     landscape, portrait = box_orbit(14), box_orbit(14, size=(240, 320))
     for i in range(14):
-        # a name with a space, and an ending in capitals
+        # Names have spaces, and some suffixes are in capitals.
         name = f"walk {i % 3} IMG_{i:02d}.{'JPG' if i % 5 else 'png'}"
         truth[name] = portrait[i] if i % 2 else landscape[i]
         pixels = photograph_box(truth[name])
         exif = Image.Exif()
         if i % 2:
             pixels = np.ascontiguousarray(np.rot90(pixels))  # the sensor lies on its side
-            exif[0x0112] = 6  # to be turned clockwise
+            exif[0x0112] = 6  # display turned clockwise
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels).save(folder / name, quality=95, exif=exif)
     return SimpleNamespace(folder=folder, truth=truth)
@@ -41,7 +41,7 @@ def phone(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def done(colmap, phone, tmp_path_factory):
-    """The capture of the phone's photos, and what was said and told on the way."""
+    """The capture made from the phone's photos, with the messages (said) and progress (told) of the run."""
     out = tmp_path_factory.mktemp("done") / "capture"
     said, told = [], []
     options = SfmOptions(phone.folder, out, max_features=LIMIT)

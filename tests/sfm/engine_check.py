@@ -1,4 +1,4 @@
-"""Run a script beside the engine, in a process of its own: pycolmap is not loaded into that of the tests."""
+"""Run a script that can import the engine in its own process, so that the tests' process never loads pycolmap."""
 
 import subprocess
 import sys

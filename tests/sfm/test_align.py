@@ -9,7 +9,7 @@ from gsplat_edu.sfm.align import upright
 
 
 def ring(count=8, radius=3.0, height=1.0, inwards=True):
-    """Level cameras around the origin, or in the middle of a room and looking out."""
+    """Level cameras on a circle, looking at the origin or outwards, as from the middle of a room."""
     cameras = []
     for angle in 2 * np.pi * np.arange(count) / count:
         eye = np.array([radius * np.sin(angle), -height, -radius * np.cos(angle)])
@@ -19,12 +19,12 @@ def ring(count=8, radius=3.0, height=1.0, inwards=True):
 
 
 POINTS = np.random.default_rng(0).normal(0, 0.3, (200, 3))
-ANYHOW = Similarity(Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix(), 0.37, np.array([5.0, -3.0, 80.0]))
+MOVE = Similarity(Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix(), 0.37, np.array([5.0, -3.0, 80.0]))
 
 
-def test_up_is_up_zero_is_looked_at_and_cameras_are_five_away():
-    moved = [ANYHOW.camera(camera) for camera in ring()]
-    points = ANYHOW.s * POINTS @ ANYHOW.R.T + ANYHOW.t
+def test_cameras_are_level_five_away_and_look_at_the_origin():
+    moved = [MOVE.camera(camera) for camera in ring()]
+    points = MOVE.s * POINTS @ MOVE.R.T + MOVE.t
     back = upright(moved, points)
     np.testing.assert_allclose(back.R @ back.R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(back.R) > 0
@@ -32,11 +32,11 @@ def test_up_is_up_zero_is_looked_at_and_cameras_are_five_away():
     for camera in cameras:
         np.testing.assert_allclose(camera.R[0, 1], 0.0, atol=1e-9, err_msg="right is level")
         np.testing.assert_allclose(np.linalg.norm(camera.eye), 5.0, rtol=1e-9)
-        assert camera.eye[1] < 0, "above what it looks at: y points down"
+        assert camera.eye[1] < 0, "above its target, since y points down"
     assert abs(cameras[0].R[2, 0]) < 1e-9 and cameras[0].R[2, 2] > 0
 
 
-def test_looking_outwards_zero_is_among_the_cameras_and_the_walls_are_five_away():
+def test_for_cameras_looking_outwards_the_origin_is_their_centre_and_walls_are_five_away():
     rng = np.random.default_rng(1)
     walls = rng.normal(size=(2000, 3))
     walls *= 20.0 / np.linalg.norm(walls, axis=1, keepdims=True)
@@ -44,11 +44,11 @@ def test_looking_outwards_zero_is_among_the_cameras_and_the_walls_are_five_away(
     move = upright(cameras, walls)
     eyes = np.stack([move.camera(camera).eye for camera in cameras])
     np.testing.assert_allclose(eyes.mean(axis=0), 0.0, atol=1e-9)
-    # The image shows 26 degrees to each side: depths of a sphere of 20, seen from near its middle, are 16 to 20.
+    # The image shows 26 degrees to each side. A sphere of radius 20, seen from near its centre, has depths of 16 to 20.
     assert 5 / 20 <= move.s <= 5 / 16
 
 
-def test_a_camera_that_looks_straight_down_has_a_front_too():
+def test_a_camera_looking_straight_down_is_aligned():
     eye = np.array([0.0, -3.0, 0.0])
     camera = Camera(look_at(eye, np.zeros(3), up=(0.0, 0.0, 1.0)), eye, 100.0, 100.0, 49.5, 49.5, 100, 100)
     move = upright([camera], POINTS)
@@ -56,7 +56,7 @@ def test_a_camera_that_looks_straight_down_has_a_front_too():
     np.testing.assert_allclose(move.R @ move.R.T, np.eye(3), atol=1e-12)
 
 
-def test_nothing_cannot_be_aligned():
+def test_aligning_no_cameras_or_no_points_is_refused():
     with pytest.raises(ArgumentError, match="empty"):
         upright([], POINTS)
     with pytest.raises(ArgumentError, match="empty"):

@@ -1,4 +1,4 @@
-"""Which poses count: models are spoiled in one way each, and what is found is what was spoiled."""
+"""Which poses count: each test spoils a model in one way and expects exactly the spoiled poses to be found."""
 
 import json
 
@@ -11,7 +11,7 @@ pytestmark = pytest.mark.usefixtures("colmap")
 
 @pytest.fixture(scope="module")
 def work(done):
-    """The folders of a finished run, as the beginning of a script."""
+    """The beginning of a script that loads the model of a finished run."""
     stages = json.loads((done.out / "sfm" / "stages.json").read_text())["stages"]
     chosen = done.out / "sfm" / stages["mapping"]["facts"]["folder"]
     return f"""
@@ -62,20 +62,20 @@ print(sorted(found), all(count < 30 for count in found.values()))
     assert printed(work + script) == ["[5, 9] True"]
 
 
-def test_points_on_a_line_fix_no_pose(work):
+def test_points_on_a_line_do_not_support_a_pose(work):
     script = """
 from engine.judge import _supported
 line = np.column_stack([np.linspace(0, 300, 60), np.linspace(0, 200, 60)])
 spread = np.random.default_rng(0).uniform(0, 240, (60, 2))
 count = np.full(60, 2)
 print(_supported(count, line, 320), _supported(count, spread, 320))
-print(_supported(np.where(np.arange(60) < 10, 2, 1), spread, 320))  # two photos see ten of them, one the others
+print(_supported(np.where(np.arange(60) < 10, 2, 1), spread, 320))  # only ten points are seen by two photos
 """
     assert printed(work + script) == ["False True", "False"]
 
 
-def test_of_two_parts_that_share_too_little_the_larger_is_kept(work):
-    """Each part supports itself; what one says about the other's place is a handful of points."""
+def test_of_two_weakly_connected_parts_the_larger_is_kept(work):
+    """Each part supports itself, but only a handful of points connect them."""
     script = """
 part = {1, 2, 3, 4, 5}
 names = {i: model.image(i).name for i in model.reg_image_ids()}
@@ -94,8 +94,8 @@ print(set(judge.unsupported(model)) >= part or sorted(judge.unsupported(model)))
     assert printed(work + script) == ["True"]
 
 
-def test_cameras_far_away_with_few_points_are_taken_out_and_placed_again(work, tmp_path):
-    """As a mapper that gives every photo a pose leaves them: one far away with few points, one in a wrong place."""
+def test_wrong_cameras_are_removed_and_registered_again(work, tmp_path):
+    """One camera is far away with few points, one is misplaced, as after a mapper that gives every photo a pose."""
     script = f"""
 truth = {{i: model.image(i).projection_center() for i in (5, 9)}}
 keep(9, seen(9)[0][:8])
@@ -109,18 +109,18 @@ print(max(abs(mended.image(i).projection_center() - truth[i]).max() for i in tru
     broken, after, off = printed(work + script)
     assert set(json.loads(broken)) >= {5, 9}
     assert after == "{} set() 14"
-    assert float(off) < 0.2, "a fifth of what the nearer one was moved by"
+    assert float(off) < 0.2, "a fifth of the smaller displacement"
 
 
-def test_focal_lengths_that_are_all_over_the_place(work):
-    """Of ten photos with a camera each: nine tenths and one tenth within a factor of two, or not."""
+def test_scattered_focal_lengths_are_detected(work):
+    """Focal lengths scatter if their 10th and 90th percentiles differ by more than a factor of two."""
     script = """
 from engine.judge import scattered
 
 def spread(factors):
     made = pycolmap.Reconstruction()
     for number, factor in enumerate(factors, 1):
-        size = 320 * (1 + number % 2)  # shares of the longer side are compared
+        size = 320 * (1 + number % 2)  # focal lengths are compared relative to the longer side
         lens = pycolmap.Camera(
             model="SIMPLE_RADIAL", width=size, height=240, params=[factor * size, size / 2, 120, 0], camera_id=number
         )
@@ -129,7 +129,7 @@ def spread(factors):
         made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     return scattered(made)
 
-print(spread([1.1] * 21), spread([1.0] * 19 + [0.2, 6.0]))  # two odd ones of 21 are no scatter
+print(spread([1.1] * 21), spread([1.0] * 19 + [0.2, 6.0]))  # two outliers of 21 are not scatter
 print(spread([1.0] * 10 + [1.95] * 11), spread([1.0] * 10 + [2.05] * 11))  # one zoom, or two
 """
     assert printed(work + script) == ["False False", "False True"]

@@ -1,4 +1,4 @@
-"""How free a lens comes out, on synthetic matches whose camera is known."""
+"""How many lens parameters are freed, on synthetic matches from a known camera."""
 
 import json
 
@@ -29,7 +29,7 @@ def scene(name, params, frames, points=400, noise=0.5, seed=0):
     return model
 
 def mapped(model):
-    # as the mapper leaves it: adjusted with one focal length and one coefficient
+    # The state after mapping: adjusted with one focal length and one distortion coefficient.
     for number in list(model.cameras):
         camera = model.camera(number)
         focal = 1.03 * camera.focal_length_x
@@ -51,18 +51,18 @@ def outcome(script):
     return [json.loads(line) for line in printed(SCENE + script)]
 
 
-def test_few_photos_keep_one_focal_length_and_the_middle():
+def test_few_photos_keep_one_focal_length_and_a_centred_principal_point():
     script = """
 found(scene("SIMPLE_RADIAL", [815, 500, 375, 0.02], 12))
 found(scene("SIMPLE_RADIAL", [815, 500, 375, 0.02], 24))
 """
     for lens, fx, fy, cx, cy in outcome(script):
         assert lens == "SIMPLE_RADIAL" and (cx, cy) == (500, 375)
-        # Half a pixel of noise on some thousand observations: focal lengths come out to well below a hundredth.
+        # Half a pixel of noise on a few thousand observations leaves an error of the focal length well below 1 %.
         assert fx == fy and fx == pytest.approx(815, rel=0.01)
 
 
-def test_a_lens_that_needs_more_gets_it_where_photos_show_it():
+def test_distortion_is_added_if_enough_photos_show_it():
     script = """
 crooked = [815, 815, 500, 375, -0.2, 0.12, 0.02, -0.03]
 found(scene("OPENCV", crooked, 24, points=800, noise=0.1))
@@ -71,18 +71,18 @@ found(scene("OPENCV", crooked, 12, points=800, noise=0.1))
     many, few = outcome(script)
     assert many[0].startswith("OPENCV")
     assert many[1:3] == pytest.approx([815, 815], rel=0.01)
-    assert few[0] == "SIMPLE_RADIAL", "six photos of either half are no judge"
+    assert few[0] == "SIMPLE_RADIAL", "six photos per half are too few to judge"
 
 
-def test_the_centre_is_freed_where_it_is_off():
+def test_an_off_centre_principal_point_is_freed():
     (found,) = outcome('found(scene("SIMPLE_RADIAL", [815, 560, 350, 0.02], 30))')
     lens, fx, fy, cx, cy = found
     assert lens == "OPENCV, free centre"
     assert (fx, fy, cx, cy) == pytest.approx((815, 815, 560, 350), abs=8)
 
 
-def test_a_lens_that_photos_were_placed_with_is_given_up_and_judged():
-    """As the mapper leaves a free lens: fx, fy and the distortion fit what noise there is."""
+def test_a_lens_freed_during_mapping_is_simplified_and_judged_again():
+    """Start from a free lens as mapping leaves it: fx, fy and the distortion have fitted the noise."""
     script = """
 def free(model, params):
     for number in list(model.cameras):
@@ -102,5 +102,5 @@ free(scene("OPENCV", crooked, 20, points=500, noise=0.1), [*crooked[:4], -0.19, 
     plain, crooked = outcome(script)
     assert plain[0] == "SIMPLE_RADIAL" and plain[1] == plain[2] == pytest.approx(815, rel=0.01)
     assert crooked[0].startswith("OPENCV") and crooked[1:3] == pytest.approx([815, 815], rel=0.01)
-    k1, _, p1, p2 = crooked[3]  # the second coefficient shows in the corners alone
+    k1, _, p1, p2 = crooked[3]  # only the corners constrain k2
     assert (k1, p1, p2) == pytest.approx((-0.2, 0.02, -0.03), abs=0.02)

@@ -10,7 +10,7 @@ from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.result import QUARTER, output_names
 
 
-def test_another_mapper_lens_thresholds_and_a_camera_per_photo_are_tried_in_turn():
+def test_attempts_vary_mapper_lens_thresholds_and_cameras_in_turn():
     assert attempts("auto", "auto", 50, 1, one_lens=False) == [
         Attempt("incremental", "auto"),
         Attempt("global", "auto"),
@@ -20,23 +20,23 @@ def test_another_mapper_lens_thresholds_and_a_camera_per_photo_are_tried_in_turn
     ]
 
 
-def test_frames_of_a_video_are_of_one_camera():
+def test_video_frames_always_share_a_camera():
     assert not any(way.per_photo for way in attempts("auto", "auto", 50, 1, one_lens=True))
 
 
-def test_few_photos_of_a_camera_are_never_placed_with_a_free_lens():
-    """Too few to be judged by held-out ones; and no way keeps a lens that was not judged."""
+def test_a_lens_is_freed_only_with_twenty_photos_per_camera():
+    """A free lens is judged on held-out photos, which needs enough of them, and no unjudged lens is kept."""
     for photos, cameras, free in ((19, 1, False), (20, 1, True), (59, 3, False)):
         ways = attempts("auto", "auto", photos, cameras, one_lens=True)
         assert {way.model for way in ways} == {"auto"}
         assert any(way.free for way in ways) == free
 
 
-def test_a_lens_that_the_user_names_is_not_given_up():
+def test_a_lens_named_by_the_user_is_kept():
     assert not any(way.free for way in attempts("auto", "RADIAL", 50, 1, one_lens=True))
 
 
-def test_what_the_user_asks_for_stays():
+def test_mapper_and_lens_named_by_the_user_are_kept():
     ways = attempts("global", "OPENCV_FISHEYE", 50, 1, one_lens=False)
     assert {(way.mapper, way.model) for way in ways} == {("global", "OPENCV_FISHEYE")}
 
@@ -46,15 +46,15 @@ def test_many_photos_are_mapped_globally_first():
     assert attempts("auto", "auto", MANY_PHOTOS, 1, one_lens=True)[0].mapper == "incremental"
 
 
-def test_a_way_says_what_it_is():
+def test_an_attempt_describes_itself():
     assert str(Attempt("global", "OPENCV")) == "global mapper, OPENCV"
     last = attempts("auto", "auto", 50, 1, one_lens=False)[-1]
     assert str(last) == "incremental mapper, a camera per photo, lower thresholds"
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_a_turned_photo_has_a_turned_camera(turns):
-    """What a pixel shows, it shows after the photo is turned, at the place that it has then."""
+def test_a_turned_lens_projects_to_the_turned_pixel(turns):
+    """After the turn, a point projects to the place that its pixel has in the turned photo."""
     lens = Lens(40, 30, 50.0, 55.0, 18.0, 16.5)
     point = np.array([0.11, -0.07, 0.9])
     u, v, _ = Camera(np.eye(3), np.zeros(3), 50.0, 55.0, 18.0, 16.5, 30, 40).project(point)
@@ -70,7 +70,7 @@ def test_a_turned_photo_has_a_turned_camera(turns):
     assert np.hypot(found[0] - expected[1], found[1] - expected[0]) <= 2**-0.5
 
 
-def test_a_file_is_not_named_like_a_folder():
+def test_an_output_file_never_has_the_name_of_a_folder():
     photos = [PhotoFacts(name, "", 1, 1) for name in ("a.tif", "A.png/1.png", "b.tif", "c/b.png/1.jpg")]
     assert output_names(photos) == ["a_2.png", "A.png/1.png", "b.png", "c/b.png/1.jpg"]
 
@@ -79,7 +79,7 @@ WAYS = attempts("auto", "auto", 9, 1, one_lens=True)
 
 
 def model(numbers, agreement=1.0, steady=100, error=0.5):
-    """What the job "mapping" returns of a model with some photos."""
+    """Return what the job "mapping" returns for a model of the given photos."""
     names = [f"{i}.jpg" for i in numbers]
     facts = {
         "folder": "0",
@@ -94,7 +94,7 @@ def model(numbers, agreement=1.0, steady=100, error=0.5):
 
 @pytest.fixture
 def mapped(monkeypatch, tmp_path):
-    """Map ten photos by ways of which each gives as many a pose as is told, or fails where None is."""
+    """Map ten photos by several attempts: each registers the given number of photos, or fails if it is None."""
 
     def run(*counts):
         tried, said = [], []
@@ -119,16 +119,16 @@ def mapped(monkeypatch, tmp_path):
     return run
 
 
-def test_the_first_way_that_places_most_photos_is_the_last(mapped):
+def test_attempts_stop_once_most_photos_are_registered(mapped):
     best, tried, said = mapped(4, 9, 10)
     assert tried == 2 and len(best["names"]) == 9
     assert best["folder"] == "models/2/0" and best["way"] == f"{WAYS[1]}, SIMPLE_RADIAL"
     assert said == [f"{WAYS[0]}: 4 of 10 photos have a pose that counts"]
-    assert mapped(8, 9, 10)[1] == 1, "80 % are enough"
+    assert mapped(8, 9, 10)[1] == 1, "80 % is enough"
 
 
-def test_the_largest_model_is_kept_where_none_has_most_photos(mapped):
-    best, tried, said = mapped(4, 7, 5)  # no two ways agree
+def test_the_largest_model_is_kept_if_no_attempt_registers_most_photos(mapped):
+    best, tried, said = mapped(4, 7, 5)  # no two models agree
     assert tried == 3 and len(best["names"]) == 7 and best["way"] == f"{WAYS[1]}, SIMPLE_RADIAL"
     assert said == [
         f"{way}: {count} of 10 photos have a pose that counts"
@@ -136,7 +136,7 @@ def test_the_largest_model_is_kept_where_none_has_most_photos(mapped):
     ]
 
 
-def test_a_way_that_fails_is_not_the_end(mapped):
+def test_the_next_attempt_follows_a_failed_one(mapped):
     best, tried, said = mapped(None, 9, 10)
     assert tried == 2 and len(best["names"]) == 9
     assert said == [f"{WAYS[0]}: COLMAP's mapping failed, number 1"]
@@ -146,7 +146,7 @@ def test_a_way_that_fails_is_not_the_end(mapped):
     assert tried == 3 and str(best) == "COLMAP's mapping failed, number 3" and len(said) == 2
 
 
-def test_names_keep_folders_and_say_what_the_files_are():
+def test_output_names_keep_folders_and_match_the_file_type():
     names = [
         "a/IMG 1.JPG",
         "a/b.webp",
@@ -170,20 +170,20 @@ def test_names_keep_folders_and_say_what_the_files_are():
     ]
 
 
-def test_the_model_with_the_most_poses_is_not_the_best_where_matches_contradict_it():
+def test_a_model_contradicted_by_its_matches_loses_despite_more_poses():
     sound, wrong = model(range(26), agreement=0.95), model(range(40), agreement=0.4, steady=300, error=0.1)
     assert best_model([wrong, sound]) is sound
     assert best_model([model(range(20)), sound]) is sound
 
 
-def test_of_models_of_equal_worth_the_one_with_points_in_three_photos_and_a_small_error_is_taken():
+def test_ties_between_models_are_broken_by_steady_points_then_error():
     thin, dense = model(range(30), steady=50, error=0.1), model(range(30), steady=100, error=0.5)
     assert best_model([thin, dense]) is dense
     assert best_model([dense, model(range(30), steady=99, error=0.4)])["error"] == 0.4
 
 
-def test_photos_with_a_camera_each_count_six_eighths():
-    """They have eight unknowns instead of six: 26.7 of them are worth 20 of one camera."""
+def test_photos_with_their_own_camera_count_six_eighths():
+    """Such a photo has eight unknowns instead of six: 26.7 of them are worth 20 that share a camera."""
     shared = model(range(20))
     for count, taken in ((25, False), (27, False), (28, True)):
         free = model(range(count), error=0.1) | {"per_photo": True}
@@ -195,7 +195,7 @@ def group(count, W, H, kind=""):
     return {"names": [str(i) for i in range(count)], "width": W, "height": H, "kind": kind}
 
 
-def test_photos_that_are_all_of_another_size_share_a_camera():
+def test_photos_of_many_sizes_share_a_camera():
     sizes = [
         group(1, 320, 240),
         group(1, 333, 250),
@@ -203,20 +203,22 @@ def test_photos_that_are_all_of_another_size_share_a_camera():
         group(1, 401, 301),
         group(1, 280, 210),
     ]
-    assert shared_cameras(sizes) == {1: 3, 2: 3, 4: 3, 5: 3}, "scaled to the largest"
+    assert shared_cameras(sizes) == {1: 3, 2: 3, 4: 3, 5: 3}, "the largest photos lead"
     others = [group(1, 240, 320), group(1, 320, 180), group(1, 160, 120, kind="Canon"), group(10, 320, 240)]
-    assert shared_cameras([*sizes, *others[:3]]) == {1: 3, 2: 3, 4: 3, 5: 3}, "other aspects, another camera"
-    assert shared_cameras([*sizes, others[3]]) == {}, "most photos are of one size: others follow it"
+    assert shared_cameras([*sizes, *others[:3]]) == {1: 3, 2: 3, 4: 3, 5: 3}, (
+        "other aspect ratios or another camera"
+    )
+    assert shared_cameras([*sizes, others[3]]) == {}, "most photos have one size, so no cameras are merged"
     mixed = [*sizes, group(9, 800, 450), group(10, 800, 600)]
-    assert shared_cameras(mixed) == {1: 3, 2: 3, 4: 3, 5: 3}, "ten photos have a camera of their own"
+    assert shared_cameras(mixed) == {1: 3, 2: 3, 4: 3, 5: 3}, "a group of ten photos keeps its own camera"
 
 
-def test_two_ways_that_agree_about_most_photos_are_the_last(mapped):
+def test_attempts_stop_once_two_models_agree(mapped):
     best, tried, _ = mapped(6, 6, 7)
-    assert tried == 2 and len(best["names"]) == 6, "the other four share too little with them"
+    assert tried == 2 and len(best["names"]) == 6, "two attempts register the same six photos"
 
 
-def test_without_poses_the_reason_is_named(mapped):
+def test_without_poses_the_error_gives_the_reason(mapped):
     best, _, _ = mapped(0, 0, 0)
     assert "10 of 10 photos match one another, but their matches yield no poses" in str(best)
     assert "too little in common" not in str(best)

@@ -1,4 +1,4 @@
-"""Masks beside photos: found, used when features are looked for, and carried into the capture."""
+"""Masks beside photos are found, used for feature detection, and carried into the capture."""
 
 import sqlite3
 from contextlib import closing
@@ -17,7 +17,7 @@ from gsplat_edu.sfm.photos import copy_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 
 HIDDEN = np.s_[:, :120]
-"""What masks take out of photos of 320 px: features lie in it where there is no mask."""
+"""The part that masks hide in photos 320 px wide. Unmasked photos have features there."""
 
 
 def image(path, pixels=None):
@@ -36,13 +36,13 @@ def image(path, pixels=None):
         "masks/a.png",
     ],
 )
-def test_where_masks_lie(tmp_path, name):
+def test_masks_are_found_in_every_usual_place(tmp_path, name):
     photos = [image(tmp_path / "photos" / photo) for photo in ("a.jpg", "b.jpg")]
     mask = image(tmp_path / name)
     assert find_masks(photos) == {photos[0]: mask}
 
 
-def test_a_mask_that_two_photos_could_mean_is_neithers(tmp_path):
+def test_an_ambiguous_mask_is_not_used(tmp_path):
     photos = [image(tmp_path / name) for name in ("a.jpg", "a.png")]
     image(tmp_path / "masks" / "a.png")
     assert find_masks(photos) == {}
@@ -62,10 +62,10 @@ def test_a_mask_of_another_size_is_refused(tmp_path):
 
 
 ORIENTATIONS = {1: 6, 2: 3, 3: 8}
-"""What EXIF says of photos that so many quarter turns clockwise bring upright."""
+"""EXIF orientation by the number of clockwise quarter turns that make the photo upright."""
 
 CORNER = np.zeros((30, 40), np.uint8)
-CORNER[:10, :25] = 200  # no turn brings it onto itself, or onto another corner of another shape
+CORNER[:10, :25] = 200  # differs from itself under every turn
 
 
 def turned_photo(path, turns, pixels):
@@ -77,7 +77,7 @@ def turned_photo(path, turns, pixels):
 
 
 def masks_of(tmp_path, photos):
-    """The masks of photos as they go into the capture, and as COLMAP reads them."""
+    """Return the masks as they go into the capture, and as COLMAP reads them."""
     facts, unreadable = copy_photos(photos, tmp_path, tmp_path / "work" / "photos", 1600)
     assert not unreadable
     read = [decode_mask(tmp_path / "work" / "masks" / f"{photo.copy}.png") for photo in facts]
@@ -86,7 +86,7 @@ def masks_of(tmp_path, photos):
 
 @pytest.mark.parametrize("turns", [1, 3])
 @pytest.mark.parametrize("upright", [False, True])
-def test_a_mask_lies_as_its_photo_is_stored_or_upright(tmp_path, turns, upright):
+def test_a_mask_may_be_oriented_as_stored_or_upright(tmp_path, turns, upright):
     photo = turned_photo(tmp_path / "a.jpg", turns, np.zeros((30, 40), np.uint8))
     image(tmp_path / "masks" / "a.png", np.rot90(CORNER, -turns) if upright else CORNER)
     (carried,), (read,) = masks_of(tmp_path, [photo])
@@ -94,7 +94,7 @@ def test_a_mask_lies_as_its_photo_is_stored_or_upright(tmp_path, turns, upright)
 
 
 @pytest.mark.parametrize("upright", [False, True])
-def test_where_the_size_does_not_tell_how_a_mask_lies_the_other_masks_do(tmp_path, upright):
+def test_other_masks_decide_the_orientation_of_a_square_mask(tmp_path, upright):
     square = np.ascontiguousarray(CORNER[:, :30])
     photos = [
         turned_photo(tmp_path / "a.jpg", 1, np.zeros((30, 40), np.uint8)),
@@ -109,7 +109,7 @@ def test_where_the_size_does_not_tell_how_a_mask_lies_the_other_masks_do(tmp_pat
         assert np.array_equal(found, mask > 0) and np.array_equal(seen, mask > 0)
 
 
-def test_masks_of_something_else_are_not_used(tmp_path):
+def test_unrelated_masks_are_not_used(tmp_path):
     photos = [image(tmp_path / "photos" / f"{i}.png") for i in range(3)]
     image(tmp_path / "masks" / "house.png", np.zeros((15, 20), np.uint8))
     assert find_masks(photos) == {} and unused_folders(photos, {}) == [tmp_path / "masks"]
@@ -117,11 +117,11 @@ def test_masks_of_something_else_are_not_used(tmp_path):
     assert unused_folders(photos, find_masks(photos)) == [tmp_path / "masks"]
     assert find_masks(photos) == {photos[1]: ours}
     inside = [image(tmp_path / "two" / "masks" / name) for name in ("a.png", "b.png")]
-    assert find_masks(inside) == {}, "photos in a folder of that name are not their own masks"
+    assert find_masks(inside) == {}, "photos in a folder named masks are not their own masks"
 
 
 def test_a_mask_that_cannot_be_decoded_is_named(tmp_path):
-    """It was said of the photo, which is sound."""
+    """The message names the mask, not the photo, which is sound."""
     photo = image(tmp_path / "a.png")
     mask = image(
         tmp_path / "masks" / "a.png", np.random.default_rng(0).integers(0, 255, (30, 40)).astype(np.uint8)
@@ -133,18 +133,18 @@ def test_a_mask_that_cannot_be_decoded_is_named(tmp_path):
 
 @pytest.mark.usefixtures("colmap")
 def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
-    """Photos with a mask, photos that are transparent where those are masked, and one with neither."""
+    """Some photos have a mask, some are transparent in the same place, and one has neither."""
     source, out = tmp_path / "photos", tmp_path / "capture"
     counts = np.full((240, 320), 255, np.uint8)
     counts[HIDDEN] = 0
-    image(tmp_path / "masks" / "house.png")  # of something else
+    image(tmp_path / "masks" / "house.png")  # unrelated
     for i, camera in enumerate(box_orbit(8, turn=2.5)):
         pixels = photograph_box(camera)
         if i == 7:
             image(source / "7.png", pixels)
         elif i % 2:
             image(source / f"{i}.png", np.dstack([pixels, counts]))
-        elif i == 2:  # stored on its side, its mask upright
+        elif i == 2:  # stored on its side, with an upright mask
             turned_photo(source / "2.png", 1, np.ascontiguousarray(np.rot90(pixels)))
             image(source / "masks" / "2.png", counts)
         else:
@@ -163,7 +163,7 @@ def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
     assert np.frombuffer(last[2], np.float32).reshape(last[:2])[:, 0].min() < 100, "it has no mask"
     for i, (count, columns, data) in enumerate(rows):
         places = np.frombuffer(data, np.float32).reshape(count, columns)[:, :2]
-        u = 320 - places[:, 1] if i == 2 else places[:, 0]  # once it is upright
+        u = 320 - places[:, 1] if i == 2 else places[:, 0]  # in the upright photo
         assert count > 50 and u.min() > 119
 
     views = load_dataset(out, DataSettings(test_every=0, background=None)).train
@@ -173,5 +173,5 @@ def test_masks_and_alpha_are_used_and_carried_into_the_capture(tmp_path):
             continue
         photo = view.read()
         seen = photo.mask if int(view.name[0]) % 2 == 0 else photo.alpha > 127
-        # The lens that was found shifts the edge by a few pixels; it is neither smoothed nor lost.
+        # The estimated lens shifts the edge by a few pixels but neither smooths nor loses it.
         assert not seen[40:-40, :110].any() and seen[40:-40, 130:-20].all(), view.name

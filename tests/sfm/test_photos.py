@@ -23,7 +23,7 @@ def facts(tmp_path, exif, **options):
     return found
 
 
-def test_photos_are_known_by_what_is_in_them(tmp_path):
+def test_photos_are_recognised_by_their_contents(tmp_path):
     wanted = [
         photo(tmp_path / "IMG_1.JPG", format="JPEG"),
         photo(tmp_path / "no_ending", format="PNG"),
@@ -32,8 +32,8 @@ def test_photos_are_known_by_what_is_in_them(tmp_path):
         photo(tmp_path / "named.png", format="JPEG"),
     ]
     (tmp_path / "torn.jpeg").write_bytes(b"")
-    wanted.append(tmp_path / "torn.jpeg")  # it is to be named later
-    photo(tmp_path / "textures" / "atlas.png")  # of a model that was made of these photos
+    wanted.append(tmp_path / "torn.jpeg")  # listed here, reported later as undecodable
+    photo(tmp_path / "textures" / "atlas.png")  # belongs to a mesh made from these photos
     photo(tmp_path / "masks" / "IMG_1.png")
     photo(tmp_path / "b.mask.png")
     photo(tmp_path / "._IMG_1.JPG", format="JPEG")
@@ -43,12 +43,12 @@ def test_photos_are_known_by_what_is_in_them(tmp_path):
     assert photo_files(tmp_path) == sorted(wanted)
 
 
-def test_photos_lie_in_one_folder(tmp_path):
+def test_photos_must_be_in_one_folder(tmp_path):
     wanted = [photo(tmp_path / "session" / "jpeg" / name) for name in ("a.jpg", "b.jpg")]
     for other in ("images_4/a.png", ".hidden/d.png", "__MACOSX/e.png", "out/images/f.png", "masks/a.png"):
         photo(tmp_path / other)
     photo(tmp_path / "session" / "atlas" / "texture.png")
-    assert photo_files(tmp_path, (tmp_path / "out").resolve()) == wanted, "one picture alone is no capture"
+    assert photo_files(tmp_path, (tmp_path / "out").resolve()) == wanted, "a single image is not a capture"
     others = [photo(tmp_path / "day 2" / name) for name in ("a.jpg", "b.jpg", "c.jpg")]
     said = r"its photos are in 2 folders: day 2 \(3\), session/jpeg \(2\); give one of them"
     with pytest.raises(DatasetError, match=said):
@@ -59,7 +59,7 @@ def test_photos_lie_in_one_folder(tmp_path):
     assert photo_files(tmp_path / "masks", None) == [tmp_path / "masks" / "a.png"]
 
 
-def test_copies_are_rgb_and_small_and_have_plain_names(tmp_path):
+def test_copies_are_small_rgb_jpegs_with_plain_names(tmp_path):
     source = tmp_path / "photos"
     files = [
         photo(source / "ä b.png", pixels=np.dstack([PIXELS, np.zeros((30, 40), np.uint8)])),
@@ -78,10 +78,10 @@ def test_copies_are_rgb_and_small_and_have_plain_names(tmp_path):
             ) == (20, 15)
             assert (fact.W, fact.H) == (40, 30)
     with Image.open(tmp_path / "copies" / "000000.jpg") as copy:
-        assert abs(np.asarray(copy).astype(int) - 128).max() <= 2, "gray behind what is transparent"
+        assert abs(np.asarray(copy).astype(int) - 128).max() <= 2, "transparent pixels become gray"
 
 
-def test_copies_that_are_there_are_kept(tmp_path):
+def test_existing_copies_are_kept(tmp_path):
     files = [photo(tmp_path / "photos" / name) for name in ("a.png", "b.png")]
     copy_photos(files, tmp_path / "photos", tmp_path / "copies", 40)
     kept = tmp_path / "copies" / "000001.jpg"
@@ -91,7 +91,7 @@ def test_copies_that_are_there_are_kept(tmp_path):
     assert kept.stat().st_mtime_ns == before and (tmp_path / "copies" / "000000.jpg").is_file()
 
 
-def test_what_cannot_be_decoded_is_named_with_its_reason(tmp_path):
+def test_undecodable_photos_are_named_with_a_reason(tmp_path):
     source = tmp_path / "photos"
     good = photo(source / "good.png")
     torn = photo(source / "torn.png", pixels=np.tile(PIXELS, (20, 20, 1)))
@@ -109,21 +109,21 @@ def test_what_cannot_be_decoded_is_named_with_its_reason(tmp_path):
     assert all("\n" not in reason for reason in unreadable)
 
 
-def test_the_focal_length_is_that_of_exif(tmp_path):
+def test_the_focal_length_comes_from_exif(tmp_path):
     exif = Image.Exif()
     assert facts(tmp_path, exif).focal is None
     details = exif.get_ifd(0x8769)
-    details[0xA405] = 26  # as on 36 x 24 mm film, whose diagonal is 43.27 mm
+    details[0xA405] = 26  # 35 mm equivalent: the diagonal of the film is 43.27 mm
     np.testing.assert_allclose(facts(tmp_path, exif).focal, 26 / 43.2666 * 50, rtol=1e-4)
 
-    details[0xA405] = 0  # not known; 5 mm, and 40 px over 8 mm: five to a millimetre
+    details[0xA405] = 0  # unknown; instead 5 mm, at 50 px per cm
     details[0x920A], details[0xA20E], details[0xA210] = 5.0, 50.0, 3
     np.testing.assert_allclose(facts(tmp_path, exif).focal, 25.0, rtol=1e-4)
-    details[0xA002] = 80  # the photo was made half as large since
+    details[0xA002] = 80  # the photo was halved after it was taken
     np.testing.assert_allclose(facts(tmp_path, exif).focal, 12.5, rtol=1e-4)
 
     details[0x920A] = 500.0
-    assert facts(tmp_path, exif).focal is None, "more than twenty times the width is not believed"
+    assert facts(tmp_path, exif).focal is None, "more than twenty times the width is implausible"
 
 
 def test_photos_of_one_lens_and_zoom_share_a_camera(tmp_path):
@@ -144,23 +144,23 @@ def test_photos_of_one_lens_and_zoom_share_a_camera(tmp_path):
 
 
 @pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 1), (8, 3), (2, 0), (99, 0)])
-def test_how_the_camera_was_held(tmp_path, orientation, turns):
+def test_quarter_turns_come_from_the_exif_orientation(tmp_path, orientation, turns):
     exif = Image.Exif()
     exif[0x0112] = orientation
     assert facts(tmp_path, exif).turns == turns
 
 
-def test_where_a_photo_was_taken(tmp_path):
+def test_the_place_comes_from_exif_gps(tmp_path):
     exif = Image.Exif()
     gps = exif.get_ifd(0x8825)
     gps[1], gps[2], gps[3], gps[4], gps[6] = "S", (33.0, 51.0, 36.0), "E", (151.0, 12.0, 0.0), 25.0
     np.testing.assert_allclose(facts(tmp_path, exif).place, (-33.86, 151.2, 25.0))
     gps[2] = (0.0, 0.0, 0.0)
     gps[4] = (0.0, 0.0, 0.0)
-    assert facts(tmp_path, exif).place is None, "nobody photographs there: the device did not know"
+    assert facts(tmp_path, exif).place is None, "zeros mean that the device did not know"
 
 
-def test_the_fingerprint_knows_names_sizes_and_contents(tmp_path):
+def test_the_fingerprint_depends_on_names_and_contents(tmp_path):
     a, b = photo(tmp_path / "a.png"), photo(tmp_path / "b.png")
     first = fingerprint([a, b], tmp_path)
     assert fingerprint([a, b], tmp_path) == first
@@ -168,14 +168,14 @@ def test_the_fingerprint_knows_names_sizes_and_contents(tmp_path):
     photo(b, pixels=PIXELS[::-1])
     assert fingerprint([a, b], tmp_path) != first
     photo(b)
-    assert fingerprint([a, b], tmp_path) == first, "when it was written does not matter"
+    assert fingerprint([a, b], tmp_path) == first, "the modification time does not matter"
     b.rename(tmp_path / "c.png")
     assert fingerprint([a, tmp_path / "c.png"], tmp_path) != first
     with pytest.raises(DatasetError, match=r"b\.png: cannot be read"):
         fingerprint([a, b], tmp_path)
 
 
-def test_captures_and_runs_that_were_made_here_are_no_photos(tmp_path):
+def test_own_captures_and_runs_are_not_searched_for_photos(tmp_path):
     wanted = photo(tmp_path / "a.png")
     for made in ("capture/images/b.png", "run/test/c.png", "run/test/d.png"):
         photo(tmp_path / made)
@@ -184,13 +184,13 @@ def test_captures_and_runs_that_were_made_here_are_no_photos(tmp_path):
         (tmp_path / note).write_text("{}")
     assert photo_files(tmp_path) == [wanted]
     assert photo_files(tmp_path / "capture") == [tmp_path / "capture" / "images" / "b.png"], (
-        "what is named counts"
+        "a folder given explicitly is searched"
     )
 
 
-def test_links_to_nowhere_and_pipes_are_no_photos(tmp_path, monkeypatch):
+def test_broken_links_and_pipes_are_not_photos(tmp_path, monkeypatch):
     wanted, asked = photo(tmp_path / "a.png"), []
     (tmp_path / "z.jpg").symlink_to(tmp_path / "gone.jpg")
     os.mkfifo(tmp_path / "pipe")
     monkeypatch.setattr("gsplat_edu.sfm.photos.is_photo", lambda path: asked.append(path) or True)
-    assert photo_files(tmp_path) == asked == [wanted], "who opens a pipe waits for ever"
+    assert photo_files(tmp_path) == asked == [wanted], "opening a pipe would block for ever"

@@ -1,6 +1,6 @@
-"""A global model with wrong poses beside a smaller, sound one: which is taken, what is left out, what doctor names.
+"""Choosing between a global model with wrong poses and a smaller, sound one, and what `doctor` reports of them.
 
-The models are made, not mapped: a mapper cannot be made to go wrong in a given way. All that judges them is real.
+The models are synthetic, because a mapper cannot be made to fail in a given way. The code that judges them is real.
 """
 
 import json
@@ -33,7 +33,7 @@ camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=320, height=240, params=[3
 
 
 def pose(number):
-    # A wrong one stands 20 times too far away, or looks 30 degrees past the object.
+    # A wrong camera is 20 times too far away, or looks 30 degrees past the object.
     turn = 2 * np.pi * number / ALL
     away = 20.0 if number > SOUND and number % 2 else 1.0
     eye = 4 * away * np.array([np.sin(turn), 0.2 * np.sin(3 * turn), -np.cos(turn)])
@@ -103,7 +103,7 @@ print(json.dumps(jobs.mapping(lambda done: None, **json.loads({order!r}))))
 
 @pytest.fixture(scope="module")
 def models(colmap, tmp_path_factory):
-    """Two models of the photos, each a capture, and the matches that both were made of."""
+    """Two models of the photos, each written as a capture, and the matches shared by both."""
     root = tmp_path_factory.mktemp("models")
     printed(MODELS.format(root=str(root), sound=SOUND, all=ALL))
     rng = np.random.default_rng(1)
@@ -116,8 +116,8 @@ def models(colmap, tmp_path_factory):
     return SimpleNamespace(root=root, weak=weak, photos=root / "global" / "images")
 
 
-def test_the_sound_model_is_taken_and_the_others_photos_are_left_out(models, tmp_path, monkeypatch):
-    """Before poses had to be supported, the global model was taken: 40 of 40 photos have a pose."""
+def test_the_sound_model_is_chosen_over_one_with_more_poses(models, tmp_path, monkeypatch):
+    """By the number of poses alone the global model would win: all of its 40 photos have one."""
 
     answers = {}
 
@@ -136,12 +136,12 @@ def test_the_sound_model_is_taken_and_the_others_photos_are_left_out(models, tmp
     assert best["names"] == sound
     assert said[0] == "incremental mapper, SIMPLE_RADIAL: 26 of 40 photos have a pose that counts"
     assert [line.partition(":")[0] for line in said] == ["incremental mapper, SIMPLE_RADIAL"], (
-        "both ways agree"
+        "one message: both attempts agree"
     )
     centres = [np.linalg.norm(pose.shift) for pose in read_images(tmp_path / best["folder"] / "images.bin")]
     assert len(centres) == SOUND and max(centres) < 1.5 * min(centres), "no camera is far away"
     (left,) = answers["global"]["models"]
-    assert left["names"] == sound and left["doubtful"] == models.weak, "had it been the only one"
+    assert left["names"] == sound and left["doubtful"] == models.weak, "if it were the only model"
 
 
 def test_doctor_names_the_wrong_poses_of_the_global_model(models):

@@ -32,23 +32,23 @@ def test_every_photo_gets_its_pose(done):
     assert set(found) == set(done.truth)
     R = check(found, done.truth)
     for name, camera in found.items():
-        assert (camera.W, camera.H) == (done.truth[name].W, done.truth[name].H), "upright, and of full size"
+        assert (camera.W, camera.H) == (done.truth[name].W, done.truth[name].H), "upright and full size"
         assert abs(camera.fx / 352 - 1) < 0.03
 
-    # up is up: the truth's, whose cameras are level
+    # The result's up is the true up, because the true cameras are level.
     assert np.degrees(np.arccos(R[1, 1])) < TURNED
     eyes = np.stack([camera.eye for camera in found.values()])
     first = found[min(found)]
-    assert abs(np.median(np.linalg.norm(eyes, axis=1)) - 5) < 1e-6, "zero is what the cameras look at, 5 away"
+    assert abs(np.median(np.linalg.norm(eyes, axis=1)) - 5) < 1e-6, "the cameras look at the origin, 5 away"
     assert abs(first.R[2, 0]) < 1e-6 and first.R[2, 2] > 0, "the first photo looks along +z"
 
 
 def test_photos_are_upright_and_undistorted(done):
-    """A photo shows what it showed, where it showed it: in no quarter moved by a pixel.
+    """Undistortion moves no quarter of a photo by a pixel.
 
-    The cameras have no distortion, so all that undistortion may move is the bend of the lens that was found, and
-    photos explain that lens to less than a pixel. What moves by d px keeps a correlation of exp(-d²/4s²) with itself
-    even in a texture without any structure, once it is blurred by s px: 0.94 at d = 1 and s = 2.
+    The true cameras have no distortion, so undistortion moves pixels only by the error of the estimated lens, which is
+    below a pixel. A texture of white noise, blurred by s px and moved by d px, keeps a correlation of exp(-d²/4s²)
+    with itself: 0.94 at d = 1 and s = 2.
     """
     for view in load_dataset(done.out, DataSettings(test_every=0)).train:
         taken, written = (
@@ -81,27 +81,27 @@ def test_points_lie_on_the_box_and_the_floor(done):
     floor = np.abs(points[:, 1])
     beyond = np.abs(points - [0.0, -0.5, 0.0]) - [0.7, 0.5, 0.5]
     box = np.abs(beyond.max(axis=1))
-    # Two pixels at a distance of 4, along a ray that meets the floor at half a right angle or less.
+    # Two pixels at a distance of 4, along a ray that meets the floor at 45 degrees or less.
     assert np.mean(np.minimum(floor, box) < 4 * 2 * 4 / 352) > 0.9
     assert len(points) > 300
     assert dataset.colors.std() > 0.05, "points have the photos' colours"
 
 
-def test_stages_are_told_with_real_counts(done):
+def test_progress_counts_photos_and_pairs(done):
     stages = list(dict.fromkeys(stage for stage, _, _ in done.told))
     assert stages == ["photos", "features", "matches", "mapping", "undistorting"]
     last = {stage: (count, total) for stage, count, total in done.told}
     pairs = 14 * 13 // 2
     assert last == {stage: (pairs, pairs) if stage == "matches" else (14, 14) for stage in stages}
     assert [sentence.split(":")[0] for sentence in done.said] == list(STAGES)
-    assert "14 from one camera" in done.said[0], "held upright or not, the sensor is the same"
+    assert "14 from one camera" in done.said[0], "the sensor is the same in either orientation"
     assert "14 of 14 photos have a pose (incremental mapper, SIMPLE_RADIAL)" in done.said[3], (
-        "few photos fix a simple lens only"
+        "few photos constrain only a simple lens"
     )
     assert "COLMAP" not in done.said[0] and (done.out / "sfm" / "log.txt").stat().st_size > 1000
 
 
-def test_only_the_capture_and_the_work_are_left(done):
+def test_only_the_capture_and_its_work_folder_remain(done):
     assert sorted(path.name for path in done.out.iterdir()) == ["images", "sfm", "sparse"]
     assert {"result", "old"} & {path.name for path in (done.out / "sfm").iterdir()} == set()
 
@@ -118,7 +118,7 @@ class StoppedError(Exception):
     pass
 
 
-def test_an_interrupted_run_goes_on(done, phone, tmp_path):
+def test_an_interrupted_run_resumes_after_the_last_completed_stage(done, phone, tmp_path):
     options = SfmOptions(phone.folder, tmp_path / "capture", max_features=LIMIT)
     for finished, stage in enumerate(("photos", "features", "matches", "mapping", "undistorting")):
         said = []
@@ -132,17 +132,17 @@ def test_an_interrupted_run_goes_on(done, phone, tmp_path):
         assert [sentence.split(":")[0] for sentence in said] == list(STAGES[:finished])
         again = [sentence.endswith("(done before)") for sentence in said]
         assert again == [True] * (finished - 1) + [False] * (finished > 0), stage
-        assert not (options.out / "sparse").exists(), "there is no capture before it is complete"
+        assert not (options.out / "sparse").exists(), "no capture appears before it is complete"
     said = []
     reconstruct(options, said.append)
     assert [sentence.endswith("(done before)") for sentence in said] == [True] * 4 + [False]
 
     whole, parts = cameras_of(done.out), cameras_of(options.out)
-    for name in whole:  # the mapper's threads round differently: by less than a hundredth of a pixel
+    for name in whole:  # the mapper's threads change the rounding, by less than a hundredth of a pixel
         np.testing.assert_allclose(parts[name].R, whole[name].R, atol=0.01 / 352)
         np.testing.assert_allclose(parts[name].eye, whole[name].eye, atol=0.01 * 5 / 352)
 
-    # Other options begin again from the stage that they concern, and the old result goes when the new one is there.
+    # Changed options repeat the first stage that uses them and all later ones. The new result replaces the old one.
     said = []
     reconstruct(replace(options, camera_model="SIMPLE_RADIAL"), said.append)
     assert said[3] == "mapping: camera_model changed; repeating this stage and the later ones"
@@ -151,30 +151,30 @@ def test_an_interrupted_run_goes_on(done, phone, tmp_path):
 
 
 @pytest.fixture
-def taken_up(done, tmp_path):
+def copied(done, tmp_path):
     """A copy of the finished capture."""
     shutil.copytree(done.out, tmp_path / "copy")
     return replace(done.options, out=tmp_path / "copy")
 
 
-def test_photos_that_are_gone_are_undistorted_again(taken_up):
-    shutil.rmtree(taken_up.out / "images")
+def test_missing_undistorted_photos_are_written_again(copied):
+    shutil.rmtree(copied.out / "images")
     said = []
-    reconstruct(taken_up, said.append)
+    reconstruct(copied, said.append)
     assert [sentence.endswith("(done before)") for sentence in said] == [True] * 4 + [False]
-    assert len(cameras_of(taken_up.out)) == 14
+    assert len(cameras_of(copied.out)) == 14
 
 
-def test_masks_that_no_run_put_there_stay(taken_up):
-    mask = taken_up.out / "masks" / "mine.png"
+def test_masks_that_no_run_wrote_are_kept(copied):
+    mask = copied.out / "masks" / "mine.png"
     mask.parent.mkdir()
     mask.write_text("mine")
-    (taken_up.out / "sfm" / "published.json").unlink()  # captures of earlier versions have none
-    reconstruct(replace(taken_up, camera_model="SIMPLE_RADIAL"))
-    assert mask.read_text() == "mine" and published(taken_up.out / "sfm") == ("images", "sparse")
+    (copied.out / "sfm" / "published.json").unlink()  # earlier versions did not write it
+    reconstruct(replace(copied, camera_model="SIMPLE_RADIAL"))
+    assert mask.read_text() == "mine" and published(copied.out / "sfm") == ("images", "sparse")
 
 
-def test_a_part_in_the_way_is_refused_and_untouched(tmp_path):
+def test_publishing_over_foreign_files_is_refused(tmp_path):
     work, out = tmp_path / "out" / "sfm", tmp_path / "out"
     for part in ("images", "masks", "sparse"):
         (work / "result" / part).mkdir(parents=True)
@@ -189,11 +189,11 @@ def test_a_part_in_the_way_is_refused_and_untouched(tmp_path):
     (work / "result" / "images").mkdir(parents=True)
     publish(work, out)
     assert sorted(path.name for path in out.iterdir()) == ["images", "kept", "sfm"], (
-        "what a run put there goes"
+        "what a run published is replaced"
     )
 
 
-def test_photos_put_there_before_a_run_was_finished_stay(phone, tmp_path):
+def test_photos_added_before_a_run_finished_are_not_overwritten(phone, tmp_path):
     options = SfmOptions(phone.folder, tmp_path / "out")
 
     def stop(*progress):
@@ -202,15 +202,15 @@ def test_photos_put_there_before_a_run_was_finished_stay(phone, tmp_path):
     with pytest.raises(StoppedError):
         reconstruct(options, progress=stop)
     with pytest.raises(StoppedError):
-        reconstruct(options, progress=stop)  # goes on: its own work is no reason not to
+        reconstruct(options, progress=stop)  # resumes: its own work folder is no obstacle
     (options.out / "images").mkdir()
     with pytest.raises(ArgumentError, match="already holds photos or poses"):
         reconstruct(options)
 
 
-def test_matches_of_an_earlier_choice_are_forgotten(taken_up, monkeypatch):
+def test_matches_of_an_earlier_matcher_are_removed(copied, monkeypatch):
     def count(table):
-        with closing(sqlite3.connect(taken_up.out / "sfm" / "database.db")) as reader:
+        with closing(sqlite3.connect(copied.out / "sfm" / "database.db")) as reader:
             return reader.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
 
     features = count("descriptors")
@@ -218,7 +218,7 @@ def test_matches_of_an_earlier_choice_are_forgotten(taken_up, monkeypatch):
     monkeypatch.setattr("gsplat_edu.sfm.pairs.sequential_pairs", lambda total, overlap: chosen)
     assert count("matches") == 91
     with pytest.raises(StoppedError):
-        reconstruct(replace(taken_up, matcher="sequential"), progress=_stop_at_mapping)
+        reconstruct(replace(copied, matcher="sequential"), progress=_stop_at_mapping)
     assert count("two_view_geometries") == count("matches") == 2
     assert count("descriptors") == features
 
@@ -228,8 +228,8 @@ def _stop_at_mapping(stage, count, total):
         raise StoppedError
 
 
-def test_the_global_mapper_and_the_chosen_pairs_do_as_well(done, tmp_path):
-    """The nearest by looks and by sequence instead of all pairs; the work of the other run is taken over."""
+def test_the_global_mapper_with_selected_pairs_finds_the_poses(done, tmp_path):
+    """Select pairs by appearance and sequence instead of matching all."""
     out = tmp_path / "capture"
     options = replace(done.options, out=out, matcher="nearest", mapper="global")
     said = []
@@ -238,7 +238,7 @@ def test_the_global_mapper_and_the_chosen_pairs_do_as_well(done, tmp_path):
     assert "global mapper" in said[3]
 
 
-def test_what_cannot_be_used_is_named_and_left_out(phone, tmp_path):
+def test_unusable_photos_are_named_and_left_out(phone, tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
     for i, camera in enumerate(box_orbit(8, turn=2.5)):
@@ -278,25 +278,25 @@ def test_a_job_that_fails_names_its_log(tmp_path):
     assert "Traceback" in (tmp_path / "log.txt").read_text()
 
 
-def test_a_damaged_list_of_stages_is_one_line(done, tmp_path):
+def test_a_damaged_list_of_stages_is_reported_in_one_line(done, tmp_path):
     (tmp_path / "sfm").mkdir()
     (tmp_path / "sfm" / "stages.json").write_text(json.dumps({"stages": {"photos": 3}}))
     with pytest.raises(DatasetError, match="is damaged; remove .*sfm"):
         reconstruct(replace(done.options, out=tmp_path))
 
 
-def test_who_needs_poses(done, phone, tmp_path):
+def test_which_sources_need_poses(done, phone, tmp_path):
     assert needs_poses(phone.folder)
     assert not needs_poses(done.out)
-    assert needs_poses("walk.MP4") is False, "it is not there"
+    assert needs_poses("walk.MP4") is False, "the file does not exist"
     (tmp_path / "walk.MP4").write_bytes(b"")
     assert needs_poses(tmp_path / "walk.MP4")
     assert not needs_poses(tmp_path), "a folder without photos"
     assert not needs_poses(tmp_path / "gone")
 
 
-def test_the_limit_of_features_is_one(done):
-    """COLMAP's own limit keeps whole levels of scale, and counts places, of which some give two features."""
+def test_the_feature_limit_is_exact(done):
+    """COLMAP's own limit keeps whole scale levels and counts keypoints, some of which yield two features."""
     with closing(sqlite3.connect(done.out / "sfm" / "database.db")) as reader:
         (most,) = reader.execute("SELECT MAX(rows) FROM keypoints").fetchone()
     assert most == LIMIT
@@ -306,8 +306,8 @@ def test_the_limit_of_features_is_one(done):
             assert all(length == size * count * columns for count, columns, length in rows)
 
 
-def test_two_cameras_with_their_focal_lengths_in_exif(tmp_path):
-    """One of them zooms twice as far; sizes differ too."""
+def test_focal_lengths_from_exif_separate_two_cameras(tmp_path):
+    """One camera zooms further than the other, and their photos differ in size."""
     folder, truth = tmp_path / "photos", {}
     folder.mkdir()
     for i, near in enumerate(box_orbit(12, turn=3.5)):
@@ -317,7 +317,7 @@ def test_two_cameras_with_their_focal_lengths_in_exif(tmp_path):
         name = f"{'zoom' if i % 2 else 'wide'}_{i:02d}.jpg"
         exif = Image.Exif()
         exif[0x0110] = "Phone"
-        # the diagonal of the film is 43.27 mm, those of the photos 400 and 500 px; EXIF has whole numbers
+        # The diagonal of the film is 43.27 mm, those of the photos are 400 and 500 px. EXIF stores integers.
         exif.get_ifd(0x8769)[0xA405] = round(43.27 * camera.fx / np.hypot(camera.W, camera.H))
         truth[name] = camera
         Image.fromarray(photograph_box(camera)).save(folder / name, quality=95, exif=exif)
@@ -332,8 +332,8 @@ def test_two_cameras_with_their_focal_lengths_in_exif(tmp_path):
         assert (camera.W, camera.H) == (truth[name].W, truth[name].H)
 
 
-def test_a_camera_per_photo_and_lower_thresholds(done, tmp_path):
-    """The last way that is tried."""
+def test_the_last_attempt_registers_most_photos(done, tmp_path):
+    """The last attempt uses a camera per photo and lower thresholds."""
     way = attempts("auto", "auto", 14, 1, one_lens=False)[-1]
     work, told = done.out / "sfm", []
     models = call(

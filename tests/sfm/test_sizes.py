@@ -1,4 +1,4 @@
-"""Photos of one camera, each scaled to a size of its own: they are mapped with one focal length."""
+"""Photos from one camera, each scaled to its own size, are mapped with one focal length."""
 
 import json
 
@@ -20,7 +20,7 @@ sizes = [(4 * side, 3 * side) for side in rng.permutation(np.arange(60, 60 + 4 *
 
 
 def photo(number):
-    # A path that tells little of the focal length, as most do: a third of a turn at one height.
+    # Like most paths, this one constrains the focal length weakly: a third of a turn at one height.
     turn = 2 * np.pi / 3 * number / COUNT
     eye = 4 * np.array([np.sin(turn), -0.4, -np.cos(turn)])
     forward = -eye / np.linalg.norm(eye)
@@ -66,7 +66,7 @@ for mapper in ("incremental", "global"):
 
 
 def apart(path):
-    # Median distance of matches from the epipolar lines of the pair's matrix, px.
+    # Median distance of matches from the epipolar lines of the pair's fundamental matrix, px.
     with database.opened(str(path)) as db:
         geometry = db.read_two_view_geometry(2, 5)
         rows = geometry.inlier_matches
@@ -86,8 +86,6 @@ def test_photos_of_twelve_sizes_share_a_focal_length(tmp_path):
     for count, width, lenses in models:
         ((focal, *middle, _),) = lenses
         assert count == 12
-        # 0.4 px of noise, some 1,000 observations: well below a hundredth
+        # 0.4 px of noise on about 1,000 observations leaves an error well below 1 %.
         assert focal / width == pytest.approx(1.1, rel=0.01) and middle == [width / 2, 0.375 * width]
-    assert before < 1 and after < 2 * before, (
-        "photos are scaled up to 1.7 times, and the pairs' geometry with them"
-    )
+    assert before < 1 and after < 2 * before, "photos grow up to 1.7 times, and the pairs' geometry with them"

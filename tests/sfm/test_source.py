@@ -1,4 +1,4 @@
-"""What is refused before any work, in one line, and what a failure leaves behind."""
+"""Unusable sources are refused in one line before any work, and a failure leaves nothing behind."""
 
 import json
 
@@ -22,7 +22,7 @@ def photos(folder, count):
 
 @pytest.fixture
 def run(tmp_path):
-    """The folder of a run, as far as it is told by."""
+    """A folder with the files by which a run is recognised."""
     folder = photos(tmp_path / "run" / "renders", 4).parent
     (folder / "config.json").write_text(json.dumps({"data": {"path": "captures/desk"}}))
     (folder / "cameras.json").write_text("[]")
@@ -30,7 +30,7 @@ def run(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["sfm", "train"])
-def test_a_run_is_no_folder_of_photos(run, tmp_path, capsys, command):
+def test_a_run_folder_is_refused_as_photos(run, tmp_path, capsys, command):
     out = ["--out"] if command == "train" else []
     assert main([command, str(run), *out, str(tmp_path / "out")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -40,14 +40,14 @@ def test_a_run_is_no_folder_of_photos(run, tmp_path, capsys, command):
 
 
 @pytest.mark.parametrize("contents", ["{", "[" * 100_000, '{"data": {"path": 7}}'])
-def test_a_run_whose_configuration_is_damaged_is_still_one(run, contents):
+def test_a_run_with_a_damaged_configuration_is_still_recognised(run, contents):
     (run / "config.json").write_text(contents)
     with pytest.raises(DatasetError, match="give the capture it was trained on$"):
         needs_poses(run)
 
 
 @pytest.mark.parametrize("command", ["sfm", "train"])
-def test_a_file_of_another_kind_and_an_empty_folder_are_told_of_photos_and_videos(tmp_path, capsys, command):
+def test_refusing_other_files_and_empty_folders_names_photos_and_videos(tmp_path, capsys, command):
     out = ["--out"] if command == "train" else []
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "empty").mkdir()
@@ -58,7 +58,7 @@ def test_a_file_of_another_kind_and_an_empty_folder_are_told_of_photos_and_video
         assert not (tmp_path / "out").exists()
 
 
-def test_two_photos_are_too_few_and_not_too_different(tmp_path):
+def test_two_photos_are_too_few(tmp_path):
     source = photos(tmp_path / "photos", 2)
     with pytest.raises(DatasetError, match="holds 2 photos; poses need at least 3, from different places"):
         check_source(source, tmp_path / "out")
@@ -74,4 +74,4 @@ def test_a_failure_before_any_result_leaves_no_folder(tmp_path):
     for out in (tmp_path / "deep" / "out", mine):
         assert main(["sfm", str(tmp_path / "broken.mp4"), str(out)]) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "mine"]
-    assert not any(mine.iterdir()), "a folder that was there stays, and nothing in it"
+    assert not any(mine.iterdir()), "a folder that existed before stays, and stays empty"

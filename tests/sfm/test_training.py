@@ -1,4 +1,4 @@
-"""One command: photos or a video without poses become a scene that is as good as with the true poses."""
+"""One command turns photos or a video without poses into a scene as good as one trained with the true poses."""
 
 import json
 import re
@@ -19,7 +19,7 @@ TRAINING = ["--no-rescale", "--strategy", "none", "--eval-every", "0", "--save-e
 
 
 def trained(source, run, iterations=300):
-    """Train by the command line; return the mean PSNR of the test views and of the others."""
+    """Train from the command line; return the mean PSNR of the test views and of the training views."""
     assert main(["train", str(source), "--out", str(run), "--iterations", str(iterations), *TRAINING]) == 0
     metrics = json.loads((run / "metrics.json").read_text())
     return metrics["test"]["psnr"], metrics["train"]["psnr"]
@@ -39,14 +39,14 @@ def test_a_dozen_photos_train_as_well_as_with_their_true_poses(tmp_path, capsys)
     assert cameras.keys() == truth.keys()
     check(cameras, truth)
 
-    # The same points in the true world: only poses and lens differ between the two trainings.
+    # The same points, moved to the true world: the two runs differ only in poses and lens.
     move = align_cameras(cameras, truth)
     points = move.s * dataset.points @ move.R.T + move.t
     views = [View(camera, photograph_box(camera), name=name) for name, camera in truth.items()]
     write_colmap(tmp_path / "given", views, points, dataset.colors)
     given, _ = trained(tmp_path / "given", tmp_path / "true")
     assert reached > given - 0.5
-    # Photos 26 degrees apart say little of one another, with any poses; what was trained on is learned.
+    # Photos 26 degrees apart predict each other badly with any poses, so check that the training views are learned.
     _, untrained = trained(tmp_path / "given", tmp_path / "untrained", 1)
     assert fitted > untrained + 4.0
 

@@ -18,7 +18,7 @@ from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
 from sfm.textured_box import cameras_of, check
 
 BLURRED = range(7, 90, 9)
-"""Frames that are planted: as sharp as a shaken camera's."""
+"""Frames blurred on purpose, as by camera shake."""
 
 
 def silent(stage, done, total):
@@ -35,7 +35,7 @@ def write_video(path, frames):
 
 
 def turn_metadata(path, matrix):
-    """Write how the phone was held into the track header of an mp4 (ISO 14496-12, box tkhd, version 0)."""
+    """Write the phone's orientation into the track header of an mp4 (ISO 14496-12, box tkhd, version 0)."""
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 4 + 4 + 5 * 4 + 8 + 8
     assert struct.unpack_from(">9i", data, at) == (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
@@ -56,19 +56,19 @@ def walk(tmp_path_factory):
     return SimpleNamespace(path=path, cameras=cameras, angles=angles)
 
 
-def test_sharp_frames_at_equal_steps_of_motion(walk):
+def test_sharp_frames_are_chosen_at_equal_steps_of_motion(walk):
     told = []
     chosen = choose_frames(walk.path, 24, lambda *progress: told.append(progress))
     assert set(chosen) & set(BLURRED) == set()
     assert told[-1] == ("choosing frames", 120, 120)
     assert len(chosen) == 24
-    assert sum(number < 20 for number in chosen) == 1, "one of the frames that stand still"
+    assert sum(number < 20 for number in chosen) == 1, "one of the frames in which the camera stands still"
     fast, slow = (sum(low <= n < high for n in chosen) for low, high in ((20, 70), (70, 120)))
-    # The camera turns twice as far in the first half. The flow is not the angle: the box's short sides move less.
+    # The camera turns twice as far in the first half. Flow is not proportional to the angle: short sides move less.
     assert 1.4 < fast / slow < 2.8
 
     steps = np.diff(walk.angles[chosen])
-    # Wherever in its interval a frame is, two neighbours are less than two intervals apart; and again the flow.
+    # Neighbours are less than two intervals apart wherever in them they are. The factor 1.5 allows for uneven flow.
     assert steps.max() < 2 * 1.5 * walk.angles[-1] / 24
 
 
@@ -86,8 +86,8 @@ def test_frames_become_a_capture(walk, colmap, tmp_path):
     assert len(said) == 6 and all(sentence.endswith("(done before)") for sentence in said)
 
 
-def test_a_video_may_have_any_name(walk, tmp_path):
-    """OpenCV ends the process where a name is not UTF-8."""
+def test_a_video_name_need_not_be_utf8(walk, tmp_path):
+    """OpenCV ends the process when given a name that is not UTF-8."""
     odd = tmp_path / os.fsdecode(b"raw\xff.mp4")
     odd.symlink_to(walk.path)
     chosen = choose_frames(odd, 3, silent)
@@ -99,8 +99,8 @@ def test_a_video_may_have_any_name(walk, tmp_path):
     assert [file.read_bytes() for file in written[0]] == [file.read_bytes() for file in written[1]]
 
 
-def test_frames_that_show_the_same_are_left_out(tmp_path):
-    """Noise moves, too: a camera on a table gives one photo, not one of each interval."""
+def test_frames_without_motion_are_left_out(tmp_path):
+    """Noise is no motion: a camera on a table gives one photo, not one per interval."""
     rng = np.random.default_rng(0)
     still = photograph_box(box_camera(0.3)).astype(int)
     frames = [np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8) for _ in range(40)]
@@ -112,7 +112,7 @@ def test_frames_that_show_the_same_are_left_out(tmp_path):
         reconstruct(SfmOptions(tmp_path / "table.mp4", tmp_path / "out"))
 
 
-def test_a_short_video_gives_what_it_has(tmp_path):
+def test_a_short_video_gives_all_its_frames(tmp_path):
     write_video(tmp_path / "short.mp4", [photograph_box(box_camera(0.2 * i)) for i in range(5)])
     assert choose_frames(tmp_path / "short.mp4", 150, silent) == [0, 1, 2, 3, 4]
 
@@ -123,7 +123,7 @@ def test_a_short_video_gives_what_it_has(tmp_path):
         (
             (0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30),
             (0, -1),
-        ),  # a quarter turn clockwise: top left to top right
+        ),  # a quarter turn clockwise moves the top left corner to the top right
         ((-65536, 0, 0, 0, -65536, 0, 0, 0, 1 << 30), (-1, -1)),
         ((0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30), (-1, 0)),
     ],
@@ -144,7 +144,7 @@ def test_frames_are_upright(tmp_path, matrix, corner):
     assert white == {corner}
 
 
-def test_a_long_video_is_looked_at_in_steps(tmp_path, monkeypatch):
+def test_a_long_video_is_sampled_in_steps(tmp_path, monkeypatch):
     monkeypatch.setattr("gsplat_edu.sfm.video.CANDIDATES", 2)
     write_video(
         tmp_path / "long.mp4", [photograph_box(box_camera(0.03 * i, size=(96, 64))) for i in range(64)]
@@ -153,12 +153,12 @@ def test_a_long_video_is_looked_at_in_steps(tmp_path, monkeypatch):
     assert {number % 4 for number in chosen} == {0}, "of 64 frames, 16 for 8 intervals"
 
 
-def test_names_of_videos(tmp_path):
+def test_videos_are_recognised_by_their_suffix(tmp_path):
     assert is_video(tmp_path / "a.MOV") and not is_video(tmp_path / "a.jpg")
 
 
 @pytest.mark.parametrize("contents", [b"", b"not a video at all" * 100])
-def test_what_is_no_video_is_one_line(tmp_path, contents):
+def test_an_unreadable_video_is_refused_in_one_line(tmp_path, contents):
     path = tmp_path / "broken.mp4"
     path.write_bytes(contents)
     with pytest.raises(DatasetError, match=r"broken.mp4: is not a video that OpenCV can decode") as failure:
@@ -167,8 +167,8 @@ def test_what_is_no_video_is_one_line(tmp_path, contents):
 
 
 @pytest.mark.own_process
-def test_ffmpeg_says_nothing_beside(tmp_path):
-    """In a process that has opened no video before, as that of the command line: it is asked to be silent once."""
+def test_ffmpeg_prints_nothing_of_its_own(tmp_path):
+    """Test in a new process, like the command line's: OpenCV is silenced once, before it opens its first video."""
     (tmp_path / "broken.mp4").write_bytes(b"")
     code = f"""
 import sys

@@ -1,4 +1,4 @@
-"""Captures that invite wrong poses: every pose that is kept is right, and the other photos are named."""
+"""Captures that provoke wrong poses: every kept pose is right, and the photos left out are named."""
 
 import math
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("colmap")
 
 
 def captured(folder, photos, **options):
-    """Reconstruct photos; return their cameras, the truth, and what was said."""
+    """Reconstruct photos; return the cameras found, the true ones, and the messages."""
     (folder / "photos").mkdir()
     for name, (pixels, _) in photos.items():
         Image.fromarray(np.ascontiguousarray(pixels)).save(folder / "photos" / name, quality=92)
@@ -45,7 +45,7 @@ def _lens(camera, focal, W, H):
 
 @pytest.fixture(scope="module")
 def sizes(colmap, tmp_path_factory):
-    """9 photos of one size and 5 others, with few features and a path that tells little of the focal length."""
+    """Nine photos of one size and five others; few features and a short path constrain the focal length weakly."""
     photos = {}
     for i in range(14):
         size = (240, 320) if i == 8 else (320, 240)
@@ -56,23 +56,23 @@ def sizes(colmap, tmp_path_factory):
         elif i == 5:
             photo = cropped(*photo, 200, 150)
         elif i == 7:
-            photo = cropped(*photo, 160, 120)  # the size of the third, of another lens
+            photo = cropped(*photo, 160, 120)  # the size of photo 3, but another lens
         elif i == 11:
             photo = cropped(*photo, 240, 240)
         photos[f"{i:02d}.jpg"] = photo
     return captured(tmp_path_factory.mktemp("sizes"), photos, max_features=300)
 
 
-def test_photos_of_other_sizes_have_the_lens_of_the_main_ones_scaled_or_cropped(sizes):
+def test_scaled_and_cropped_photos_get_the_focal_length_of_the_main_ones(sizes):
     assert len(sizes.found) >= 12
     alignment = align_cameras(sizes.found, sizes.truth)
-    # A twentieth of the distance, and five degrees: with the wrong focal length it is ten times as much.
+    # A twentieth of the distance, and five degrees. A wrong focal length causes ten times as much.
     assert alignment.moved.max() < 0.05 and alignment.turned.max() < 5
     for name, camera in sizes.found.items():
         assert camera.fx == pytest.approx(sizes.truth[name].fx, rel=0.05), name
 
 
-def test_two_lenses_of_one_size_are_not_taken_for_one(sizes):
+def test_photos_of_equal_size_but_other_lenses_are_left_out_if_unexplained(sizes):
     missing = set(sizes.truth) - set(sizes.found)
     assert missing <= {"03.jpg", "07.jpg"}
     assert all(name in sizes.said for name in missing)
@@ -81,7 +81,7 @@ def test_two_lenses_of_one_size_are_not_taken_for_one(sizes):
 
 @pytest.fixture(scope="module")
 def two_sides(colmap, tmp_path_factory):
-    """Photos all around, those of the left and right too blurred and too plain to hold the sides together."""
+    """Photos all around; those at the left and right are too blurred and flat to connect front and back."""
     photos, rng = {}, np.random.default_rng(1)
     for i in range(18):
         angle = 2 * math.pi * i / 18
@@ -94,7 +94,7 @@ def two_sides(colmap, tmp_path_factory):
     return captured(tmp_path_factory.mktemp("sides"), photos, max_features=400)
 
 
-def test_kept_poses_are_right_and_photos_with_too_little_are_named(two_sides):
+def test_kept_poses_are_right_and_photos_left_out_are_reported(two_sides):
     assert 5 <= len(two_sides.found) < 18
     alignment = align_cameras(two_sides.found, two_sides.truth)
     assert alignment.moved.max() < 0.05 and alignment.turned.max() < 5

@@ -1,4 +1,4 @@
-"""A run that is taken up again goes on to the bit; what cannot be read or written says so."""
+"""A resumed run gives the same bits as an uninterrupted one; unusable checkpoints are reported."""
 
 import dataclasses
 import json
@@ -45,7 +45,7 @@ def steps(run: Trainer, count: int) -> None:
 @pytest.mark.parametrize("name", CONFIGS)
 @pytest.mark.parametrize("at", [1, 20, 33])
 def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, name, at):
-    """33: in the middle of an epoch, between densifications; 20: right after one (and after a reset)."""
+    """Iteration 33 is within an epoch, between densifications. Iteration 20 follows a densification and a reset."""
     whole, first = trainer(capture, CONFIGS[name]), trainer(capture, CONFIGS[name])
     whole.run()
     steps(first, at)
@@ -61,12 +61,12 @@ def test_a_resumed_run_ends_with_the_same_bits(capture, tmp_path, name, at):
     assert tensors.keys() == resumed.keys()
     for key, tensor in tensors.items():
         assert torch.equal(tensor, resumed[key]), key
-    assert len(whole.gaussians) != len(capture[1]), "density control took part"
+    assert len(whole.gaussians) != len(capture[1]), "densification changed the count"
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
-def test_a_checkpoint_of_the_version_before_parameter_groups_is_resumed(strategy):
-    """The files were written after 5 steps by the code before Adam had named groups, from the same trainers."""
+def test_a_checkpoint_from_before_parameter_groups_is_resumed(strategy):
+    """Code from before Adam had named groups wrote these files, after 5 steps of the same trainers."""
     path = Path(__file__).parent / "old_checkpoints" / f"{strategy}.safetensors"
     stored, metadata = read(path)
     run = Maker(strategy)()
@@ -80,7 +80,7 @@ def test_a_checkpoint_of_the_version_before_parameter_groups_is_resumed(strategy
     assert not torch.equal(run.state()[0]["first.means"], stored["first.means"])
 
 
-def test_the_last_two_are_kept_and_the_time_comes_back(capture, tmp_path):
+def test_the_last_two_checkpoints_and_the_training_time_are_kept(capture, tmp_path):
     run = trainer(capture, CONFIGS["adc"])
     for _ in range(4):
         steps(run, 3)
@@ -94,7 +94,7 @@ def test_the_last_two_are_kept_and_the_time_comes_back(capture, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "text", "header", "foreign"])
-def test_a_damaged_checkpoint_is_named_and_the_one_before_too(capture, tmp_path, damage):
+def test_the_error_of_a_damaged_checkpoint_names_the_previous_one(capture, tmp_path, damage):
     run = trainer(capture, CONFIGS["adc"])
     for _ in range(2):
         steps(run, 3)
@@ -125,15 +125,13 @@ def test_a_checkpoint_of_another_kind_of_run_is_refused(capture, tmp_path):
         load_checkpoint(path, other)
 
 
-def test_what_cannot_be_written_leaves_the_last_one_alone(capture, tmp_path):
+def test_a_failed_write_leaves_the_previous_checkpoint(capture, tmp_path):
     run = trainer(capture, CONFIGS["adc"])
     steps(run, 3)
     good = save_checkpoint(tmp_path, run, 0.0)
     before = good.read_bytes()
     steps(run, 3)
-    (
-        tmp_path / "iteration_6.safetensors"
-    ).mkdir()  # nothing can be renamed onto a folder with something in it
+    (tmp_path / "iteration_6.safetensors").mkdir()  # no file can be renamed onto a folder
     (tmp_path / "iteration_6.safetensors" / "x").touch()
     with pytest.raises(CheckpointError, match="earlier checkpoints are unharmed"):
         save_checkpoint(tmp_path, run, 0.0)
@@ -153,7 +151,7 @@ def double_gaussians(tensors, state):
 
 
 def generator_past_its_end(tensors, state):
-    """500 numbers left, from the 600th of 624 on: torch would read behind its block."""
+    """Claim 500 numbers left from position 600 of 624, so that torch would read past its block."""
     words = tensors["density.generator"].numpy().view("<i4")
     words[2], words[4] = 500, 600
 
@@ -209,7 +207,7 @@ def tiny(tmp_path_factory):
 
 @pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("message", HOSTILE)
-def test_a_hostile_checkpoint_is_refused_before_any_of_it_is_used(tiny, tmp_path, message):
+def test_a_hostile_checkpoint_changes_nothing(tiny, tmp_path, message):
     make, (tensors, metadata) = tiny
     assert len(tensors["gaussians.means"]) == 40
     tensors = {name: tensor.clone() for name, tensor in tensors.items()}
@@ -228,8 +226,8 @@ def test_a_hostile_checkpoint_is_refused_before_any_of_it_is_used(tiny, tmp_path
     steps(fresh, 1)
 
 
-def test_what_a_training_may_leave_behind_is_taken(tiny, tmp_path):
-    """Gaussians that are not finite wait for the next densification; their moments may not be finite either."""
+def test_a_checkpoint_with_nan_parameters_is_resumed(tiny, tmp_path):
+    """Gaussians that are not finite are pruned only by the next densification, so checkpoints may contain them."""
     make, (tensors, metadata) = tiny
     tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     for name in ("gaussians.means", "first.means", "second.means"):
@@ -243,8 +241,8 @@ def test_what_a_training_may_leave_behind_is_taken(tiny, tmp_path):
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
-def test_a_checkpoint_is_not_called_damaged_where_memory_ran_out(tiny, tmp_path, monkeypatch, error):
-    """Damaged files are to be deleted, and this one is whole."""
+def test_running_out_of_memory_is_not_reported_as_damage(tiny, tmp_path, monkeypatch, error):
+    """Users delete damaged files, and this one is intact."""
     make, (tensors, metadata) = tiny
     path = tmp_path / "iteration_3.safetensors"
     write(path, tensors, metadata)

@@ -1,4 +1,4 @@
-"""Clone, split, prune and the cap, on four Gaussians whose fate is set by hand."""
+"""Cloning, splitting, pruning and the cap, on four Gaussians with hand-made gradients."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ EXTENT = 3.0
 
 
 def four(dtype=torch.float64) -> Gaussians:
-    """Return Gaussians that are small, large, large, and small but too faint to live."""
+    """Return four Gaussians: small, large, large, and small but so faint that it is pruned."""
     n = 4
     return Gaussians(
         means=torch.arange(n * 3, dtype=dtype).reshape(n, 3),
@@ -35,7 +35,7 @@ def four(dtype=torch.float64) -> Gaussians:
 
 
 def controlled(hot, config=CONFIG):
-    """Set up density control that has seen the gradients `hot` asks for in two renders."""
+    """Set up density control as after two renders; `hot` gives the gradients in units of the threshold."""
     gaussians = four()
     optimizer = Adam(gaussians.tensors(), {"means": 1e-3})
     optimizer.first["means"] = torch.arange(12.0, dtype=torch.float64).reshape(4, 3) + 1
@@ -45,7 +45,7 @@ def controlled(hot, config=CONFIG):
     return control, gaussians, optimizer
 
 
-def test_small_offenders_are_cloned_large_ones_split_and_the_faint_pruned():
+def test_small_ones_are_cloned_large_ones_split_and_faint_ones_pruned():
     control, gaussians, optimizer = controlled(hot=[1, 1, 0, 1])
     changed, (event,) = control.update(100, gaussians, optimizer)
     assert dataclasses.astuple(event) == (100, 1, 2, 1, 5)
@@ -59,10 +59,10 @@ def test_small_offenders_are_cloned_large_ones_split_and_the_faint_pruned():
     torch.testing.assert_close(optimizer.first["means"][:2], torch.tensor([[1.0, 2, 3], [7, 8, 9]]).double())
     assert (optimizer.first["means"][2:] == 0).all()
     assert all(t.requires_grad and t.is_leaf for t in changed.tensors().values())
-    assert len(control.norm_sums) == 5 and (control.norm_sums == 0).all(), "starts counting again"
+    assert len(control.norm_sums) == 5 and (control.norm_sums == 0).all(), "the sums start again at zero"
 
 
-def test_the_threshold_is_on_the_mean_over_the_views_that_see_it():
+def test_the_threshold_applies_to_the_mean_over_views_that_see_it():
     control, gaussians, optimizer = controlled(hot=[1, 0, 0, 0])
     control.times_visible[0] = 3
     _, (event,) = control.update(100, gaussians, optimizer)
@@ -70,19 +70,19 @@ def test_the_threshold_is_on_the_mean_over_the_views_that_see_it():
     control, gaussians, optimizer = controlled(hot=[0.5, 0, 0, 0])
     control.times_visible[0] = 1
     _, (event,) = control.update(100, gaussians, optimizer)
-    assert event.num_cloned == 1, "seen once, the sum is the mean"
+    assert event.num_cloned == 1, "after one view the sum is the mean"
 
 
 @pytest.mark.parametrize(
     ("iteration", "due"), [(0, False), (99, False), (100, True), (150, False), (500, True), (600, False)]
 )
-def test_the_window(iteration, due):
+def test_densification_happens_only_within_its_window(iteration, due):
     control, gaussians, optimizer = controlled(hot=[0, 0, 0, 0])
     assert bool(control.update(iteration, gaussians, optimizer)[1]) == due
 
 
 @pytest.mark.parametrize("cap", [1, 2, 3, 4])
-def test_the_cap_cuts_from_the_end(cap):
+def test_the_cap_drops_the_last_gaussians(cap):
     control, gaussians, optimizer = controlled([1, 1, 0, 1], dataclasses.replace(CONFIG, max_gaussians=cap))
     changed, (event,) = control.update(100, gaussians, optimizer)
     assert event.num_gaussians == len(changed) == cap
@@ -90,7 +90,7 @@ def test_the_cap_cuts_from_the_end(cap):
     assert len(optimizer.first["means"]) == cap
 
 
-def test_all_may_be_pruned():
+def test_all_gaussians_may_be_pruned():
     gaussians = four().map(lambda t: t.detach()[3:]).trainable()
     optimizer = Adam(gaussians.tensors(), {"means": 1e-3})
     control = AdaptiveDensityControl(CONFIG, EXTENT, torch.Generator(), gaussians)
@@ -100,9 +100,9 @@ def test_all_may_be_pruned():
 
 
 def test_children_are_drawn_from_the_parents_distribution():
-    """20,000 children of one parent: their covariance is the parent's.
+    """20,000 children of one parent have the parent's covariance.
 
-    The sample covariance's relative error is about sqrt(2 / 20,000) = 1 %; five of those.
+    The relative error of the sample covariance is about sqrt(2 / 20,000) = 1 %. Allow five of those.
     """
     from gsplat_edu import build_cov3d, quat_to_R
 
@@ -134,8 +134,8 @@ def test_replace_without_change_is_the_identity():
 
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
-def test_observed_norms_are_ndc_gradients_of_what_is_visible(backend):
-    """The signal is |(gx W/2, gy H/2)|; on an image that is not square the two factors differ."""
+def test_observed_norms_are_ndc_gradients_of_visible_gaussians(backend):
+    """The observed norm is |(gx W/2, gy H/2)|. The image is not square, so the two factors differ."""
     camera = Camera.looking_at((0, 0, -3), (0, 0, 0), 20, 20, 12, 30)
     gaussians = four().map(lambda t: t.detach().clone())
     means = torch.tensor([[0.1, 0.1, 0], [-0.2, 0.1, 0.5], [0, 0, -9.0], [0.3, -0.1, 0]], dtype=torch.float64)
@@ -155,5 +155,5 @@ def test_observed_norms_are_ndc_gradients_of_what_is_visible(backend):
     expected = torch.zeros(4, dtype=torch.float64)
     expected[seen] = 2 * torch.sqrt((gradient[:, 0] * 15) ** 2 + (gradient[:, 1] * 6) ** 2)
     torch.testing.assert_close(control.norm_sums, expected)
-    # The third is behind the camera; the fourth is too faint to be drawn, which the kernels leave out too.
+    # The third is behind the camera. The fourth is too faint to be drawn, so the kernels do not count it.
     assert control.times_visible.tolist() == ([2, 2, 0, 0] if backend == "cpu" else [2, 2, 0, 2])

@@ -1,6 +1,6 @@
-"""What a render is compared with: made once where it stays as it is, read again only where it has to be.
+"""Targets of the loss: they are made once if they never change, and read again only if they must be.
 
-The room on a GPU is a number of bytes, and torch's device "meta" takes a GPU's place: the code is the same.
+The room on a GPU is a number of bytes. torch's device "meta" stands in for a GPU, because the code is the same.
 """
 
 import collections
@@ -56,31 +56,31 @@ def draw(feed, background):
 
 def drawn(feed, count, background=WHITE):
     targets = [draw(feed, background) for _ in range(count)]
-    feed._reader.shutdown()  # what is being read ahead is counted too
+    feed._reader.shutdown()  # prefetched photos are counted too
     return targets
 
 
 @pytest.mark.parametrize(
     ("room", "kept"), [(0, 0), (BYTES - 1, 0), (BYTES, 1), (5 * BYTES, 5), (99 * BYTES, 6)]
 )
-def test_a_gpu_keeps_what_there_is_room_for_and_the_rest_is_read_again(room, kept):
+def test_a_gpu_keeps_photos_that_fit_and_the_rest_is_read_again(room, kept):
     reads = collections.Counter()
     feed = ViewFeed(stored(6, reads), "shuffled", 0, WHITE, META, room)
     targets = drawn(feed, 60)
     assert sum(len({id(t) for v, t in targets if v is view}) == 1 for view in feed.views) == kept
     assert sum(t.nbytes for t in feed._kept.values()) <= room
-    assert sorted(reads.values())[:kept] == [1] * kept, "kept: read once, not once per step"
+    assert sorted(reads.values())[:kept] == [1] * kept, "a kept photo is read only once"
     assert all(count >= 10 for count in sorted(reads.values())[kept:])
 
 
-def test_masks_count_in_the_room():
+def test_masks_use_up_room_too():
     feed = ViewFeed(stored(4, collections.Counter(), mask=True), "shuffled", 0, WHITE, META, 2 * BYTES)
     drawn(feed, 12)
     assert len(feed._kept) == 1
 
 
-def test_targets_on_a_gpu_are_the_photos():
-    """The same code with room on the CPU's own device: bytes as they are in the photo."""
+def test_kept_targets_equal_the_photos():
+    """The same code on the CPU gives the photo's own bytes."""
     views = stored(3, collections.Counter(), mask=True)
     for view, target in drawn(ViewFeed(views, "shuffled", 0, WHITE), 6):
         assert np.array_equal(target.image.numpy(), view.read().image)
@@ -88,14 +88,14 @@ def test_targets_on_a_gpu_are_the_photos():
 
 
 @pytest.mark.parametrize("device", [META, torch.device("cpu")])
-def test_photos_over_random_colours_are_not_kept(device):
+def test_photos_over_random_backgrounds_are_not_kept(device):
     reads = collections.Counter()
     feed = ViewFeed(stored(2, reads, alpha=True), "shuffled", 0, None, device, 99 * BYTES)
     drawn(feed, 8)
     assert not feed._kept and sum(reads.values()) >= 8
 
 
-def test_photos_in_memory_are_put_over_the_background_once():
+def test_photos_in_memory_are_composited_over_the_background_once():
     views = in_memory(3, alpha=True)
     targets = drawn(ViewFeed(views, "shuffled", 0, WHITE), 12)
     assert len({target.image.data_ptr() for _, target in targets}) == 3
@@ -120,8 +120,8 @@ def test_every_draw_has_its_own_background():
 
 @pytest.mark.parametrize(("H", "W"), [(1, 3), (37, 500), (5, AT_ONCE + 1), (0, 4)])
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
-def test_a_photo_over_a_background_is_the_formula_to_the_bit(H, W, kind):
-    """`Photo.over` works on a few rows at a time; what comes out is that of the whole image at once."""
+def test_compositing_in_rows_equals_the_formula_to_the_bit(H, W, kind):
+    """`Photo.over` works on a few rows at a time and gives the same result as on the whole image."""
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (H, W, 3), dtype=np.uint8)
     if kind is np.float32:

@@ -1,4 +1,4 @@
-"""MCMC: relocation keeps the image, the cap holds, noise moves what is faint."""
+"""MCMC: relocation keeps the image, the cap holds, and noise moves faint Gaussians."""
 
 import math
 
@@ -20,14 +20,14 @@ def scene(count=60, dtype=torch.float64):
     return random_ball(count, torch.Generator().manual_seed(0), dtype).trainable()
 
 
-def made(gaussians, config=CONFIG, seed=0):
+def make(gaussians, config=CONFIG, seed=0):
     return MCMC(config, torch.Generator().manual_seed(seed)), Adam(gaussians.tensors(), config.learning_rates)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7, MOST_SHARERS])
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
-def test_sharers_have_the_papers_opacity_and_scale(n, opacity):
-    """The double sum of eq. 9, term by term with exact binomials, against ours."""
+def test_copies_have_the_opacity_and_scale_of_the_paper(n, opacity):
+    """Compare with the double sum of eq. 9, computed term by term with exact binomials."""
     each, factor = shared_shape(torch.tensor([opacity], dtype=torch.float64), torch.tensor([n]))
     assert 1 - (1 - float(each)) ** n == pytest.approx(opacity, rel=1e-12)
     o = float(each)
@@ -36,12 +36,12 @@ def test_sharers_have_the_papers_opacity_and_scale(n, opacity):
         for i in range(1, n + 1)
         for k in range(i)
     )
-    # The sums cancel: terms up to (1 + o')^n, here at most 500, in double.
+    # The terms cancel. They reach (1 + o')^n, here at most 500, in float64.
     assert float(factor) == pytest.approx(opacity / total, rel=1e-9)
 
 
-def test_sharers_look_like_the_one_before():
-    """Along a line through its middle, n equal splats composited have nearly the integral of the one."""
+def test_copies_have_nearly_the_integral_of_the_original():
+    """Along a line through the centre, n composited copies have nearly the integral of the original splat."""
     x = np.linspace(-6, 6, 4001)
     for n, opacity in ((2, 0.5), (5, 0.9), (20, 0.99)):
         each, factor = (float(t) for t in shared_shape(torch.tensor([opacity]).double(), torch.tensor([n])))
@@ -50,9 +50,9 @@ def test_sharers_look_like_the_one_before():
         assert np.trapezoid(after, x) == pytest.approx(np.trapezoid(before, x), rel=1e-6)
 
 
-def test_the_dead_move_to_the_living():
+def test_dead_gaussians_are_relocated_to_living_ones():
     gaussians = scene()
-    control, optimizer = made(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
+    control, optimizer = make(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
     with torch.no_grad():
         gaussians.logit_opacities[:10] = -8.0
         gaussians.logit_opacities[10:] = 1.0
@@ -73,9 +73,9 @@ def test_the_dead_move_to_the_living():
     assert (optimizer.first["means"][untouched] == 1).all()
 
 
-def test_growth_reaches_the_cap_and_stays():
+def test_growth_stops_at_the_cap():
     gaussians = scene(30)
-    control, optimizer = made(gaussians)
+    control, optimizer = make(gaussians)
     counts = []
     for iteration in range(600, 5_000, 100):
         gaussians, _ = control.update(iteration, gaussians, optimizer)
@@ -88,48 +88,48 @@ def test_growth_reaches_the_cap_and_stays():
 @pytest.mark.parametrize(
     ("iteration", "due"), [(500, False), (600, True), (650, False), (24_900, True), (25_000, False)]
 )
-def test_the_window(iteration, due):
+def test_relocation_happens_only_within_its_window(iteration, due):
     gaussians = scene()
-    control, optimizer = made(gaussians)
+    control, optimizer = make(gaussians)
     assert bool(control.update(iteration, gaussians, optimizer)[1]) == due
 
 
-def test_noise_moves_the_faint_along_their_own_axes():
-    """20,000 copies of one faint Gaussian: the covariance of their moves is (rate noise gate)² Sigma Sigma."""
+def test_noise_follows_the_covariance_of_faint_gaussians():
+    """The moves of 20,000 copies of a faint Gaussian have the covariance (rate noise gate)² Sigma Sigma."""
     gaussians = scene(1).map(lambda t: t.detach().repeat(20_000, *([1] * (t.ndim - 1))).clone())
     gaussians.log_scales[:] = torch.tensor([-1.0, -2.0, -3.0]).double()
     gaussians.logit_opacities[:] = math.log(0.005 / 0.995)
     gaussians = gaussians.trainable()
-    control, optimizer = made(gaussians)
+    control, optimizer = make(gaussians)
     optimizer.learning_rates["means"] = 1e-6
     before = gaussians.means.detach().clone()
     changed, _ = control.update(0, gaussians, optimizer)
     moves = (changed.means - before).detach().numpy()
     sigma = cov3d_t(gaussians.log_scales[:1], gaussians.quats[:1])[0].detach().numpy()
     expected = (1e-6 * 5e5 * 0.5) ** 2 * sigma @ sigma
-    # Relative error of a sample covariance: sqrt(2 / 20,000) = 1 %; five of those.
+    # The relative error of a sample covariance is sqrt(2 / 20,000) = 1 %. Allow five of those.
     assert np.abs(np.cov(moves.T) - expected).max() < 0.05 * np.abs(expected).max()
 
 
-def test_opaque_gaussians_stay_where_they_are():
+def test_noise_does_not_move_opaque_gaussians():
     gaussians = scene()
     with torch.no_grad():
         gaussians.logit_opacities.fill_(3.0)
-    control, optimizer = made(gaussians)
+    control, optimizer = make(gaussians)
     before = gaussians.means.detach().clone()
     changed, _ = control.update(0, gaussians, optimizer)
     assert (changed.means - before).abs().max() < 1e-12
 
 
-def test_all_dead_is_survived():
+def test_a_scene_of_dead_gaussians_is_kept():
     gaussians = scene()
     with torch.no_grad():
         gaussians.logit_opacities.fill_(-9.0)
-    control, optimizer = made(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
+    control, optimizer = make(gaussians, TrainConfig(strategy="mcmc", max_gaussians=60))
     changed, (event,) = control.update(600, gaussians, optimizer)
     assert event.num_relocated == 0 and len(changed) == 60
 
 
-def test_a_cap_is_needed():
+def test_mcmc_needs_a_cap():
     with pytest.raises(ArgumentError, match="^max_gaussians: "):
         MCMC(TrainConfig(strategy="mcmc"), torch.Generator())

@@ -1,4 +1,4 @@
-"""Training takes as much memory in its last iteration as in its first ones."""
+"""The memory of a training does not grow after its first iterations."""
 
 import json
 import subprocess
@@ -10,10 +10,10 @@ import pytest
 import soak
 
 WARM_UP = 120
-"""Iterations until every size of photo, every strategy's work and the log's buffers have been there several times."""
+"""Iterations after which every photo size, every step of the strategy and every log buffer has occurred repeatedly."""
 
 IMAGE = 320 * 240 * 3 * 4
-"""Bytes of a float image of the smaller kind; the photos of mixed sizes have as many pixels or more, on average."""
+"""Bytes of a float image of 320 x 240 px. Photos of mixed sizes have at least as many pixels on average."""
 
 
 @pytest.mark.sliced(1)
@@ -23,9 +23,9 @@ IMAGE = 320 * 240 * 3 * 4
 def test_memory_is_flat_after_the_warm_up(tmp_path, case):
     """RSS grows by less than four images in 120 iterations.
 
-    What is kept per step, or makes a hole per step that nothing fits into, has the size of an image: 120 of them.
-    The heap may still settle by what a single step takes from it besides the buffers: a photo as it is decoded and put
-    over its background, which is below 4 images (bytes: RGBA a third of a float image, twice while it is copied).
+    A leak or an unusable hole in the heap of one image per step would add 120 images. The heap may still settle by what
+    one step allocates besides the buffers, to decode a photo and composite it over its background. That is below 4
+    images: RGBA bytes are a third of a float image, and are held twice while they are copied.
     """
     run = [sys.executable, soak.__file__, case, str(tmp_path / "capture")]
     done = subprocess.run(run, check=False, capture_output=True, text=True, timeout=1800)

@@ -1,4 +1,4 @@
-"""The seams of a step: terms that are summed and named, a model of each view, views that are reduced before a step."""
+"""The parts of a step that can be replaced: named terms, view models, and the reduction of gradients over views."""
 
 import json
 
@@ -24,7 +24,7 @@ MCMC = recipe(20, strategy="mcmc", max_gaussians=60, sh_degree=0)
 
 
 class Gains:
-    """A brightness for each view, and one for all: a real view model, though a small one."""
+    """A small but real view model: one brightness per view."""
 
     def __init__(self, count):
         self.gains = torch.ones(count).requires_grad_()
@@ -62,8 +62,8 @@ def grads(run):
     return {name: tensor.grad.clone() for name, tensor in run.parameters().items() if tensor.numel()}
 
 
-def test_regularisers_are_the_papers(capture):
-    """Their values and gradients against autograd's of weight mean(opacity) + weight mean(scale)."""
+def test_regularisers_match_the_paper(capture):
+    """Values and gradients against autograd of weight mean(opacity) + weight mean(scale)."""
     run, seen = trainer(capture, MCMC), []
     run._objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
     run.gradients([run._feed.next()])
@@ -77,7 +77,7 @@ def test_regularisers_are_the_papers(capture):
     for tensor in run.parameters().values():
         tensor.grad = None
     Objective({"photo": PhotoTerm(MCMC.ssim_weight)}).backward(
-        Rendered(run.gaussians, rendered.draw, *_again(run, rendered), rendered.target, 0)
+        Rendered(run.gaussians, rendered.draw, *_rendered_again(run, rendered), rendered.target, 0)
     )
     sum(expected.values()).backward()
     for name in ("logit_opacities", "log_scales"):
@@ -86,7 +86,7 @@ def test_regularisers_are_the_papers(capture):
     assert torch.equal(with_all["means"], run.gaussians.means.grad)
 
 
-def _again(run, rendered):
+def _rendered_again(run, rendered):
     from gsplat_edu.render.settings import RenderSettings
 
     settings = RenderSettings(sh_degree=0, jacobian_limit=1.3, depth=False)
@@ -94,7 +94,7 @@ def _again(run, rendered):
     return output, output.image
 
 
-def test_a_batch_is_reduced_to_the_mean_of_its_views(capture):
+def test_a_batch_has_the_mean_gradient_of_its_views(capture):
     run = trainer(capture, CONFIG)
     draws = [run._feed.next() for _ in range(3)]
     assert len({draw.index for draw in draws}) == 3
@@ -108,14 +108,14 @@ def test_a_batch_is_reduced_to_the_mean_of_its_views(capture):
     run._parts.reduce(run.parameters(), 3)
     torch.testing.assert_close(terms["photo"], sum(losses) / 3)
     for name, found in grads(run).items():
-        # Two sums of three float32 numbers in two orders: four roundings of the largest of them.
+        # Two sums of three float32 numbers in different orders differ by at most four roundings of the largest.
         largest = float(torch.stack([each[name].abs() for each in single]).max())
         expected = sum(each[name] for each in single) / 3
         assert float((found - expected).abs().max()) <= 4 * 2**-24 * largest, name
 
 
-def test_what_is_applied_is_what_reduce_left(capture):
-    """A reduction that adds nothing up, as a process without work might: the parameters stay."""
+def test_only_gradients_left_by_reduce_are_applied(capture):
+    """If a reduction leaves no gradients, as a process without work might, the parameters do not change."""
     seen = []
 
     def nothing(parameters, num_views):
@@ -147,7 +147,7 @@ def test_terms_are_summed_and_logged_by_name(capture, tmp_path):
     run = trainer(capture, config, StepParts(objective=objective), [note])
     plain = trainer(capture, config)
     result = run.run()
-    assert result.losses[0] == plain.run().losses[0], "the loss is the photo's term"
+    assert result.losses[0] == plain.run().losses[0], "the reported loss is the photo term"
     assert not torch.equal(run.gaussians.logit_opacities, plain.gaussians.logit_opacities)
     log.close()
     (line,) = RunFolder(tmp_path).log()
@@ -158,8 +158,8 @@ def test_terms_are_summed_and_logged_by_name(capture, tmp_path):
     assert [text.get_text() for text in drawn.get_legend().get_texts()] == ["photo", "empty"]
 
 
-def test_a_term_on_depth_gets_it_and_moves_the_gaussians(capture):
-    """Weighted enough to count, the mean depth falls: Gaussians come nearer to the cameras or fade."""
+def test_a_depth_term_gets_the_depth_and_moves_the_gaussians(capture):
+    """With a large enough weight, the mean depth falls: Gaussians move towards the cameras or fade."""
     found = []
 
     class Depth:
@@ -175,13 +175,13 @@ def test_a_term_on_depth_gets_it_and_moves_the_gaussians(capture):
     assert found[-1] < 0.9 * found[0]
 
 
-def test_an_objective_needs_the_photo():
+def test_an_objective_needs_the_photo_term():
     with pytest.raises(ArgumentError, match="^terms: .*photo"):
         Objective({"depth": PhotoTerm(0.2)})
 
 
-def test_a_view_model_learns_how_the_photos_differ(capture):
-    """Two of the four photos are half as bright: their gains end near half of the others'."""
+def test_a_view_model_learns_brightness_differences(capture):
+    """Two of the four photos are half as bright, so their gains end near half of the others'."""
     views, brightness = capture[0], [1.0, 0.5, 1.0, 0.5]
     dimmed = [
         View(view.camera, (view.read().image * factor).astype("uint8"), name=view.name)
@@ -194,12 +194,12 @@ def test_a_view_model_learns_how_the_photos_differ(capture):
     run.run()
     gains = model.gains.detach()
     ratio = float((gains[1] + gains[3]) / (gains[0] + gains[2]))
-    # 150 steps, 37 a gain, of at most 0.02 each: enough for 0.5. Untrained it is 1.
+    # 150 steps are 37 per gain, of at most 0.02 each: enough to reach 0.5. The untrained ratio is 1.
     assert 0.4 < ratio < 0.65, gains
 
 
 @pytest.mark.parametrize("at", [3, 13])
-def test_a_view_model_is_resumed_with_the_same_bits_through_density_surgery(capture, tmp_path, at):
+def test_a_view_model_resumes_to_the_bit_across_density_surgery(capture, tmp_path, at):
     def make():
         return trainer(capture, CONFIG, StepParts(view_model=Gains(4)))
 
@@ -229,7 +229,7 @@ def test_a_checkpoint_with_another_view_model_is_refused(capture, tmp_path):
         load_checkpoint(path, trainer(capture, CONFIG, StepParts(view_model=Gains(3))))
 
 
-def test_a_view_model_cannot_take_the_name_of_a_parameter(capture):
+def test_a_view_model_cannot_reuse_a_parameter_name(capture):
     class Greedy(Gains):
         def parameters(self):
             return {"means": self.gains}

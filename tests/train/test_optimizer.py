@@ -19,7 +19,7 @@ def set_gradients(gaussians, generator):
         tensor.grad = torch.randn(tensor.shape, generator=generator, dtype=tensor.dtype)
 
 
-def test_steps_are_those_of_torch():
+def test_steps_match_torch():
     ours, theirs = start(), start()
     adam = Adam(ours.tensors(), RATES)
     oracle = torch.optim.Adam(
@@ -35,7 +35,7 @@ def test_steps_are_those_of_torch():
         torch.testing.assert_close(tensor, theirs.tensors()[name], rtol=0, atol=1e-14)
 
 
-def test_gradients_are_dropped_and_parameters_without_one_stay():
+def test_gradients_are_dropped_and_parameters_without_one_do_not_move():
     gaussians = start()
     before = gaussians.quats.clone()
     gaussians.means.grad = torch.ones_like(gaussians.means)
@@ -44,12 +44,12 @@ def test_gradients_are_dropped_and_parameters_without_one_stay():
     torch.testing.assert_close(gaussians.quats, before, rtol=0, atol=0)
 
 
-def test_a_rate_for_something_else_is_refused():
+def test_a_rate_for_an_unknown_parameter_is_refused():
     with pytest.raises(ArgumentError, match="colour"):
         Adam(start().tensors(), {"colour": 1.0})
 
 
-def test_moments_follow_survivors_and_start_at_zero_for_the_newborn():
+def test_moments_follow_survivors_and_start_at_zero_for_new_gaussians():
     gaussians = start()
     adam = Adam(gaussians.tensors(), RATES)
     set_gradients(gaussians, torch.Generator().manual_seed(3))
@@ -61,7 +61,7 @@ def test_moments_follow_survivors_and_start_at_zero_for_the_newborn():
     torch.testing.assert_close(adam.second["means"], torch.cat([v[[0, 3]], torch.zeros(2, 3).double()]))
 
 
-def test_parameters_need_not_be_contiguous_and_autograd_hears_of_the_step():
+def test_parameters_may_be_strided_and_autograd_notices_the_step():
     gaussians = start()
     strided = dataclasses.replace(gaussians, means=gaussians.means.detach().T.contiguous().T.requires_grad_())
     plain = start()
@@ -75,7 +75,7 @@ def test_parameters_need_not_be_contiguous_and_autograd_hears_of_the_step():
 
 
 def test_each_group_has_its_own_rate_eps_and_schedule():
-    """A constant gradient g moves by rate g / (|g| + eps) at every step: the corrected moments are g and g²."""
+    """A constant gradient g has corrected moments g and g², so every step is rate g / (|g| + eps)."""
     tensors = {name: torch.zeros(4, dtype=torch.float64).requires_grad_() for name in ("a", "b", "c")}
     groups = {
         "a": ParameterGroup(0.5, eps=3.0),
@@ -92,7 +92,7 @@ def test_each_group_has_its_own_rate_eps_and_schedule():
     assert moved == pytest.approx({"a": 3 * 0.5 * 2 / (2 + 3), "b": 1 + 1 / 2 + 1 / 3, "c": 3 * 0.25})
 
 
-def test_groups_without_a_row_per_gaussian_do_not_follow_surgery():
+def test_groups_that_are_not_per_gaussian_ignore_surgery():
     tensors = {"means": torch.zeros(5, 3).requires_grad_(), "exposures": torch.zeros(2).requires_grad_()}
     adam = Adam(tensors, {"means": 0.1, "exposures": ParameterGroup(0.1, per_gaussian=False)})
     for tensor in tensors.values():
@@ -105,7 +105,7 @@ def test_groups_without_a_row_per_gaussian_do_not_follow_surgery():
     assert adam.second["exposures"].shape == (2,) and (adam.second["exposures"] > 0).all()
 
 
-def test_the_kernel_is_handed_in():
+def test_the_kernel_is_injected():
     called = []
 
     def kernel(parameter, first, second, gradient, numbers):
@@ -114,10 +114,10 @@ def test_the_kernel_is_handed_in():
     tensors = {"a": torch.zeros(3).requires_grad_(), "b": torch.zeros(2).requires_grad_()}
     tensors["a"].grad = torch.ones(3)
     Adam(tensors, {"a": ParameterGroup(0.5, eps=1e-3), "b": 0.1}, kernel).step(tensors)
-    assert called == [((3,), 0.5, 1e-3)], "a tensor without a gradient stays"
+    assert called == [((3,), 0.5, 1e-3)], "the kernel skips a tensor without a gradient"
 
 
-def test_moments_that_did_not_follow_are_refused():
+def test_parameters_that_do_not_match_the_moments_are_refused():
     gaussians = start()
     adam = Adam(gaussians.tensors(), RATES)
     fewer = gaussians.map(lambda tensor: tensor[:3]).trainable()

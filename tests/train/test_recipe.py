@@ -1,4 +1,4 @@
-"""The recipe: its numbers against the papers', what is stretched, and what is due when."""
+"""The recipe: its defaults against the papers, rescaling, and the schedule."""
 
 import math
 
@@ -17,8 +17,8 @@ from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import means_rate, sh_degree
 
 
-def test_the_defaults_are_the_papers():
-    """Kerbl et al. 2023 and its code; Kheradmand et al. 2024 and its code."""
+def test_the_defaults_match_the_papers():
+    """The papers are Kerbl et al. 2023 and Kheradmand et al. 2024, with their code."""
     config = TrainConfig()
     expected = {
         "iterations": 30_000,
@@ -55,7 +55,7 @@ def test_the_defaults_are_the_papers():
     assert {name: flat[name] for name in expected} == expected
 
 
-def test_milestones_are_stretched_and_intervals_are_not():
+def test_milestones_are_rescaled_and_intervals_are_not():
     short = recipe(7_000)
     factor = 7_000 / 30_000
     for name in MILESTONES:
@@ -65,7 +65,7 @@ def test_milestones_are_stretched_and_intervals_are_not():
     assert recipe() == TrainConfig()
 
 
-def test_plain_numbers_on_request_and_explicit_ones_as_they_are():
+def test_rescaling_can_be_disabled_and_spares_explicit_values():
     plain = recipe(7_000, rescale=False)
     assert plain == TrainConfig(iterations=7_000)
     assert recipe(7_000, densify_stop=6_000).adc.densify_stop == 6_000
@@ -80,12 +80,14 @@ def test_short_runs_do_not_reset():
 def test_the_rate_of_the_means_falls_log_linearly():
     config = TrainConfig()
     assert means_rate(config, 2.0, 0) == pytest.approx(3.2e-4)
-    assert means_rate(config, 2.0, 15_000) == pytest.approx(3.2e-5), "a tenth half way down a hundredfold"
+    assert means_rate(config, 2.0, 15_000) == pytest.approx(3.2e-5), (
+        "half way down a factor of 100 is a factor of 10"
+    )
     assert means_rate(config, 2.0, 30_000) == pytest.approx(3.2e-6)
     assert means_rate(config, 2.0, 40_000) == pytest.approx(3.2e-6)
 
 
-def test_harmonics_come_one_degree_at_a_time():
+def test_sh_degrees_are_enabled_one_at_a_time():
     config = TrainConfig()
     assert [sh_degree(config, i) for i in (0, 999, 1_000, 2_999, 3_000, 29_999)] == [0, 0, 1, 2, 3, 3]
     assert sh_degree(TrainConfig(sh_every=0), 0) == 3
@@ -101,7 +103,7 @@ def scene(count=50, scale=0.05):
 
 
 def due(config, iterations):
-    """Which events come after which iterations, for a scene that nothing pulls at."""
+    """Return the events after each iteration, for a scene without gradients."""
     gaussians = scene()
     control, optimizer = (
         make_strategy(config, 1.0, gaussians),
@@ -114,7 +116,7 @@ def due(config, iterations):
     return found
 
 
-def test_what_is_due_when():
+def test_the_schedule_of_densifications_and_resets():
     config = recipe(prune_scale=0.0)
     found = due(config, [0, 100, 500, 501, 600, 650, 700, 3_000, 6_000, 14_900, 15_000, 18_000])
     densified = [i for kind, i in found if kind is DensifyEvent]
@@ -122,7 +124,7 @@ def test_what_is_due_when():
     assert [i for kind, i in found if kind is ResetEvent] == [3_000, 6_000]
 
 
-def test_white_resets_early_too():
+def test_a_white_background_adds_an_early_reset():
     white = recipe(background=(1.0, 1.0, 1.0), prune_scale=0.0)
     found = due(white, [500, 501, 502, 3_000])
     assert [i for kind, i in found if kind is ResetEvent] == [500, 3_000]
@@ -131,14 +133,14 @@ def test_white_resets_early_too():
     ]
 
 
-def test_a_reset_lowers_opacities_and_forgets_their_moments_only():
+def test_a_reset_lowers_opacities_and_clears_only_their_moments():
     config, gaussians = recipe(prune_scale=0.0), scene()
     optimizer = Adam(gaussians.tensors(), config.learning_rates)
     for moments in (optimizer.first, optimizer.second):
         for tensor in moments.values():
             tensor.fill_(1.0)
     with torch.no_grad():
-        gaussians.logit_opacities[0] = -5.0  # 0.0067: fainter than the ceiling already, yet not pruned
+        gaussians.logit_opacities[0] = -5.0  # 0.0067: below the ceiling of a reset, but not pruned
     control = AdaptiveDensityControl(config, 1.0, torch.Generator(), gaussians)
     changed, _ = control.update(3_000, gaussians, optimizer)
     opacities = changed.opacities.detach()
@@ -162,7 +164,7 @@ def test_large_gaussians_are_pruned_once_opacities_have_been_reset():
         assert len(changed) == left and events[0].num_pruned == 50 - left
 
 
-def test_screen_size_prunes_only_on_request():
+def test_pruning_by_screen_size_is_off_by_default():
     for limit, left in ((0.0, 50), (20.0, 49)):
         config, gaussians = recipe(prune_scale=0.0, prune_screen_size=limit), scene()
         control = AdaptiveDensityControl(config, 1.0, torch.Generator(), gaussians)
@@ -172,8 +174,8 @@ def test_screen_size_prunes_only_on_request():
 
 
 @pytest.mark.parametrize("cap", [50, 53, 60])
-def test_the_strongest_come_first_where_room_is_scarce(cap):
-    """Of 50 Gaussians 20 are due, half of them to be cloned and half to be split; each adds one."""
+def test_near_the_cap_the_largest_gradients_densify_first(cap):
+    """Of 50 Gaussians, 20 are due: half are to be cloned and half to be split. Each adds one."""
     config, gaussians = recipe(max_gaussians=cap, percent_dense=0.01), scene()
     with torch.no_grad():
         gaussians.log_scales[:10] = math.log(0.001)
@@ -182,13 +184,13 @@ def test_the_strongest_come_first_where_room_is_scarce(cap):
     control.norm_sums[:20] = 1.0 + torch.arange(20.0)
     changed, (event,) = control.update(600, gaussians, Adam(gaussians.tensors(), config.learning_rates))
     assert len(changed) == cap
-    # Numbers 19, 18 ... are pulled hardest, and those are the large ones.
+    # Numbers 19, 18 ... have the largest gradients, and they are large, so they are split.
     assert event.num_split_children == 2 * min(cap - 50, 10) and event.num_cloned == 0
     assert event.num_pruned == 0
 
 
 def test_start_from_points():
-    """Four points in a row: the distances to three neighbours can be worked out by hand."""
+    """With four points in a row, the distances to three neighbours can be computed by hand."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [7, 0, 0]])
     colors = np.array([[0.5, 0.5, 0.5], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     gaussians = from_points(points, colors, TrainConfig())
@@ -202,7 +204,7 @@ def test_start_from_points():
     np.testing.assert_allclose(shrunk.opacities.numpy(), 0.5, rtol=1e-6)
 
 
-def test_a_cloud_larger_than_the_cap_is_thinned():
+def test_a_point_cloud_larger_than_the_cap_is_subsampled():
     points = np.random.default_rng(0).normal(size=(200, 3))
     config = TrainConfig(max_gaussians=80, seed=4)
     some = from_points(points, np.zeros((200, 3)), config)
@@ -210,10 +212,10 @@ def test_a_cloud_larger_than_the_cap_is_thinned():
     assert not torch.equal(some.means, torch.tensor(points[:80], dtype=torch.float32)), "not the first 80"
 
 
-def test_odd_clouds():
+def test_degenerate_point_clouds():
     one = from_points([[1.0, 2, 3]], [[0, 0, 0]], TrainConfig())
     assert len(one) == 1 and torch.isfinite(one.log_scales).all()
     same = from_points(np.ones((5, 3)), np.ones((5, 3)), TrainConfig())
-    assert torch.isfinite(same.log_scales).all(), "coinciding points have a floor"
+    assert torch.isfinite(same.log_scales).all(), "the scale of coinciding points has a floor"
     with pytest.raises(ArgumentError, match="^points: is empty"):
         from_points(np.zeros((0, 3)), np.zeros((0, 3)), TrainConfig())

@@ -41,22 +41,22 @@ def set_threads():
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_two_runs_give_the_same_bits(set_threads, threads):
-    """64 px and chunks of 16 splats: 65,536 numbers per operation, twice what torch needs to go parallel."""
+    """64 px and chunks of 16 splats are 65,536 numbers per operation, twice the size at which torch uses threads."""
     set_threads(threads)
     views = sphere_capture(64).train
     runs = [trainer(views) for _ in range(2)]
     losses = [run.run().losses for run in runs]
     assert losses[0] == losses[1]
-    assert len(runs[0].gaussians) > 60, "density control took part"
+    assert len(runs[0].gaussians) > 60, "densification changed the count"
     for name, tensor in runs[0].gaussians.tensors().items():
         assert torch.equal(tensor, runs[1].gaussians.tensors()[name]), name
 
 
-def test_callbacks_hear_of_every_step_and_densification_in_order(views):
-    heard = []
-    result = trainer(views, [lambda t, event: heard.append((event, len(t.gaussians)))]).run()
-    steps = [event for event, _ in heard if isinstance(event, StepEvent)]
-    changes = [(event, count) for event, count in heard if isinstance(event, DensifyEvent)]
+def test_callbacks_get_every_step_and_densification_in_order(views):
+    received = []
+    result = trainer(views, [lambda t, event: received.append((event, len(t.gaussians)))]).run()
+    steps = [event for event, _ in received if isinstance(event, StepEvent)]
+    changes = [(event, count) for event, count in received if isinstance(event, DensifyEvent)]
     assert [s.iteration for s in steps] == list(range(12))
     assert [s.loss for s in steps] == result.losses and [s.num_gaussians for s in steps] == result.counts
     assert [event.iteration for event, _ in changes] == [4, 8]
@@ -65,7 +65,7 @@ def test_callbacks_hear_of_every_step_and_densification_in_order(views):
     assert result.seconds > 0
 
 
-def test_the_start_is_left_alone(views):
+def test_the_start_is_not_modified(views):
     start = random_ball(20, torch.Generator().manual_seed(0))
     before = start.map(torch.clone)
     Trainer(start, views, course_config(iterations=2), render=RENDER).run()
@@ -86,11 +86,11 @@ def test_views_are_drawn_with_the_seed(views):
     assert seen == [int(rng.integers(24)) for _ in range(6)]
 
 
-def test_one_gaussian_finds_one_spot(views):
-    """Views of any origin will do: here a single blob, and the loop fits it.
+def test_one_gaussian_fits_one_blob(views):
+    """The loop fits a view of a single blob.
 
-    Every raw parameter starts 0.05 off. Adam's slowest rate, 1e-3, covers that in 50 steps; a loop that
-    follows another gradient, or none, would not come down tenfold in 150.
+    Every raw parameter starts 0.05 off. Adam's slowest rate, 1e-3, covers that in 50 steps. With a wrong gradient, or
+    none, the loss would not fall tenfold in 150 steps.
     """
     camera = views[0].camera
     blob = Gaussians(
@@ -116,7 +116,7 @@ def test_a_scene_that_vanishes_does_not_stop_the_run(views):
     assert run.run().counts == [3, 3, 0, 0]
 
 
-def test_nothing_to_learn_from_is_refused(views):
+def test_no_views_or_no_gaussians_are_refused(views):
     some = random_ball(3, torch.Generator())
     with pytest.raises(ArgumentError, match="^views: "):
         Trainer(some, [], SHORT, render=RENDER)
@@ -154,7 +154,7 @@ def test_a_photo_of_another_size_is_refused(views):
         View(views[0].camera, np.zeros((24, 25, 3)))
 
 
-def test_photos_are_uint8_or_0_to_1(views):
+def test_photos_are_uint8_or_floats_from_0_to_1(views):
     camera = views[0].camera
     photo = np.random.default_rng(0).integers(0, 256, (24, 24, 3), dtype=np.uint8)
     np.testing.assert_array_equal(View(camera, photo).image, photo)
@@ -168,7 +168,7 @@ def test_random_ball_is_the_documented_start():
     gaussians = random_ball(5000, torch.Generator().manual_seed(0), torch.float64)
     radii = gaussians.means.norm(dim=-1)
     assert radii.max() <= 1
-    # Uniform by volume: the median radius is 0.5^(1/3) = 0.794; its standard error is below 0.006.
+    # Uniform by volume: the median radius is 0.5^(1/3) = 0.794, with a standard error below 0.006.
     assert abs(float(radii.median()) - 0.5 ** (1 / 3)) < 0.02
     torch.testing.assert_close(gaussians.scales, torch.full((5000, 3), 0.09, dtype=torch.float64))
     assert gaussians.sh_degree == 0
