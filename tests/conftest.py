@@ -44,6 +44,24 @@ def as_shipped() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def sphere_photographed_once() -> None:
+    """Keep the course's photos of the sphere: the reference renderer takes seconds, many tests need the same 25."""
+    from gsplat_edu.data import synthetic
+
+    original = synthetic.render_gaussians
+    images: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
+
+    def photographed(camera: Camera, *shell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        key = (camera.intrinsics, camera.R.tobytes(), camera.eye.tobytes(), *(a.tobytes() for a in shell))
+        if key not in images:
+            images[key] = original(camera, *shell)
+        image, transmittance = images[key]
+        return image.copy(), transmittance.copy()
+
+    synthetic.render_gaussians = photographed
+
+
 @pytest.fixture
 def random_splats():
     """Make n random splats in front of `random_camera`, with distinct depths."""
