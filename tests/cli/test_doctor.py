@@ -193,7 +193,7 @@ def test_an_exposure_jump_is_named_before_and_after_training(doctor, capture, ru
         assert any("view_003.png" in line for line in lines), said
 
 
-def test_a_run_is_judged(doctor, run):
+def test_a_run_is_examined(doctor, run):
     code, said = doctor(run.path)
     lines = said.splitlines()
     assert code == 0 and len(lines) <= 24 and lines[-4] == "what to do:"

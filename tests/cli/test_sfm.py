@@ -189,7 +189,7 @@ def _refused(tmp_path, capsys, source, out, says):
 def test_options_out_of_range_cost_one_line(tmp_path, capsys, words, named):
     try:
         code = main(["sfm", str(tmp_path), str(tmp_path / "out"), *words])
-    except SystemExit as stop:  # what argparse refuses
+    except SystemExit as stop:  # raised by argparse
         code = stop.code
     said = capsys.readouterr().err
     assert code == 2 and named in said and said.count("\n") == 1

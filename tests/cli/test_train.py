@@ -129,11 +129,11 @@ def test_sizes(text, size):
 def test_options_out_of_range_cost_one_line(tmp_path, capsys, words, named):
     try:
         code = main(["train", str(tmp_path), "--out", str(tmp_path / "run"), *words])
-    except SystemExit as stop:  # what argparse refuses
+    except SystemExit as stop:  # raised by argparse
         code = stop.code
     said = capsys.readouterr().err
     assert code == 2 and named in said and said.count("\n") == 1
-    assert not (tmp_path / "run").exists(), "nothing was begun"
+    assert not (tmp_path / "run").exists(), "nothing was started"
 
 
 def _nothing(folder):
@@ -196,7 +196,7 @@ def test_a_capture_that_cannot_be_used_costs_one_line(tmp_path, capsys, make):
     code = main(["train", str(tmp_path / "capture"), "--out", str(tmp_path / "run"), "--iterations", "2"])
     said = capsys.readouterr().err
     assert code == 2 and FAULTS[make] in said and said.count("\n") == 1, said
-    assert not (tmp_path / "run").exists(), "nothing was begun"
+    assert not (tmp_path / "run").exists(), "nothing was started"
 
 
 def test_one_photo_is_enough(tmp_path):

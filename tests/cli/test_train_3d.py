@@ -73,7 +73,7 @@ def test_an_interrupt_is_one_line_and_exit_code_130(tmp_path):
         tmp_path / "x.png",
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        for line in process.stdout:  # ends by itself if the process dies
+        for line in process.stdout:  # the loop also ends if the process dies
             if line.startswith("iter "):
                 break
         else:

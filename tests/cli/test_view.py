@@ -183,7 +183,7 @@ def test_what_cannot_be_shown_costs_one_line(tmp_path, monkeypatch, capsys, word
     default = [] if "--port" in words else ["--port", "0"]
     try:
         code = command_line.main(["view", *words, *default])
-    except SystemExit as stop:  # what argparse refuses
+    except SystemExit as stop:  # raised by argparse
         code = stop.code
     said = capsys.readouterr()
     assert code == 2 and said.out == ""

@@ -112,7 +112,7 @@ def test_the_captures_own_split(tmp_path, small):
     dataset = load_dataset(tmp_path)
     assert [v.name for v in dataset.train] == names[:4] and [v.name for v in dataset.test] == names[6:]
     assert any("2 of 9 photos are in none" in note for note in dataset.notes)
-    assert len(load_dataset(tmp_path, DataSettings(test_every=0)).train) == 9  # asked for another split
+    assert len(load_dataset(tmp_path, DataSettings(test_every=0)).train) == 9  # another split is requested
     write_transforms(tmp_path, views, extra={"val_filenames": names[:2]})
     assert [v.name for v in load_dataset(tmp_path).train] == names[2:]
     write_transforms(tmp_path, views, extra={"test_filenames": names})
@@ -339,7 +339,7 @@ def test_preload_names_the_corrupt_photo(written, as_shipped):
     folder = written("colmap")
     file = folder / "images" / "view_005.png"
     file.write_bytes(file.read_bytes()[:-60])
-    dataset = load_dataset(folder)  # headers are fine
+    dataset = load_dataset(folder)  # the headers are intact
     with pytest.raises(DatasetError, match=r"view_005\.png: cannot be decoded"):
         dataset.preload()
 

@@ -68,7 +68,7 @@ def test_a_truncated_jpeg_is_named_too(tmp_path, orbit):
     (refused,) = survey.refused
     assert refused.name == "images/view_004.jpg" and refused.reason.startswith("image file is truncated")
     assert {max(shot.stats.thumbnail.shape) for shot in survey.shots} == {128}
-    assert {shot.size for shot in survey.shots} == {(2400, 1800)}, "the size in the file"
+    assert {shot.size for shot in survey.shots} == {(2400, 1800)}, "the full size, not the decoded one"
 
 
 def test_all_photos_damaged_is_hopeless(diagnosed, orbit):

@@ -37,7 +37,7 @@ def test_a_bare_scene_fills_the_picture_despite_floaters():
         # The medians of 2000 points are off by about 0.5 / sqrt(2000), under 3 px here, and so are the edges.
         assert abs(u.mean() - 50) < 3 and abs(v.mean() - 50) < 3
         assert u.min() > -3 and u.max() < 103 and u.max() - u.min() > 80
-        assert camera.eye[1] < 5, "from above"
+        assert camera.eye[1] < 5, "the camera is above the scene"
 
 
 def test_one_gaussian_is_a_scene_and_none_is_not():

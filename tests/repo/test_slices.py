@@ -43,7 +43,7 @@ def test_a_seed_draws_the_same_cases_and_all_seeds_draw_all_of_them():
     assert drawn[7] == names(slices.split(items, 7)[0])
     for kept in drawn:
         assert len(kept) == 3 + 4 and kept == [name for name in names(items) if name in kept], (
-            "in their order"
+            "the order is kept"
         )
         assert set(names(cases("short", None, range(4)))) <= set(kept)
     # 100 seeds miss a case with a probability of 0.75**100, below 1e-12.

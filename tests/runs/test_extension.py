@@ -380,7 +380,7 @@ def test_a_folder_in_use_is_refused_by_train_and_eval(capture, run, tmp_path, ca
                 f"is in use by `gsplat-edu train`, process {os.getpid()} on " in error
                 and error.count("\n") == 1
             )
-        assert main(["eval", str(run), "--out", str(tmp_path / "apart")]) == 0, "it writes elsewhere"
+        assert main(["eval", str(run), "--out", str(tmp_path / "apart")]) == 0, "writes elsewhere"
     assert main(["eval", str(run)]) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 20
 

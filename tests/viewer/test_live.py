@@ -108,7 +108,8 @@ def test_while_the_camera_moves_pictures_are_smaller(capture, tmp_path):
         client.pictures.clear()
         client.move(position=(0.0, 0.0, -4.0))
         widths = until(
-            lambda: len(client.listened().pictures) >= 2 and [p.shape for p in client.pictures], "two"
+            lambda: len(client.listened().pictures) >= 2 and [p.shape for p in client.pictures],
+            "two pictures",
         )
         assert widths == [(32, 48, 3), (80, 120, 3)], "0.4 of the width first"
         time.sleep(2 * live.STILL_EVERY)
@@ -327,7 +328,7 @@ def test_the_finished_scene_is_shown_until_the_last_browser_closes(capture, tmp_
     with training(capture, tmp_path / "run", "--iterations", "300") as made:
         with Client(made.view) as client:
             client.move()
-            until(lambda: made.view.watched, "somebody who looks")
+            until(lambda: made.view.watched, "a browser that is connected")
             made.ended()
             assert made.view.watched
             staying = threading.Thread(target=made.view.stay)

@@ -292,7 +292,7 @@ def test_a_port_that_is_taken_is_named():
             PageServer(PAGE, port=port)
         with pytest.raises(ArgumentError, match=says):
             free_port("127.0.0.1", port, NAMES)
-    assert free_port("127.0.0.1", port, NAMES) == port, "closed is closed"
+    assert free_port("127.0.0.1", port, NAMES) == port, "a closed server frees its port"
 
 
 @pytest.mark.parametrize(
