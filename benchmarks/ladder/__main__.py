@@ -2,8 +2,8 @@
 
     python benchmarks/ladder [--smoke] [--out FILE.json]
 
-Round splats of 2 px on 256 x 256 pixels, opacities 0.1 to 0.99, float32, one thread. Seconds are those of the process
-on the processor, the best of several rounds; each evaluation of a splat at a pixel is counted by the kernel itself.
+Round splats of 2 px on 256 x 256 pixels, opacities 0.1 to 0.99, float32, one thread. Times are CPU times of the
+process, the best of several rounds. The kernels themselves count how often they evaluate a splat at a pixel.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def measure(count: int, size: int, rounds: int) -> list[dict[str, float | str]]:
 
 
 def triton_row(smoke: bool) -> dict[str, float | str] | None:
-    """Time the naive kernel in Triton, where it is installed, and say where it ran."""
+    """Time the naive kernel in Triton and say where it ran; None if Triton is not installed."""
     if importlib.util.find_spec("triton") is None:
         return None
     from ladder.naive_triton import DEVICE, naive_triton, where

@@ -1,9 +1,9 @@
-"""The backward rungs: what a loss on the image says about every splat, with shared sums and with slots.
+"""The backward rungs: gradients of a loss on the image for every splat, with shared sums and with slots.
 
     cg = g . c;   w = T alpha;   R -= w cg;   dL/dalpha = T cg - R / (1 - alpha);   T -= w        near to far
 
-`atomics` adds each pair's sums to those of its splat as they come; `slots` writes them down and adds them up in a fixed
-order. Both replay the rung `tight`, tile by tile.
+`atomics` adds each pair's sums to those of its splat in order of arrival; `slots` stores them and adds them up in a
+fixed order. Both replay the rung `tight`, tile by tile.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Gradients(NamedTuple):
     opacities: np.ndarray  # (N,)
 
     def bits(self) -> bytes:
-        """Return all of it as bytes, to compare to the bit."""
+        """Return all gradients as bytes, for bit-exact comparison."""
         return b"".join(array.tobytes() for array in self)
 
 
@@ -55,7 +55,7 @@ class _Gradient(ctypes.Structure):
 
 
 def num_tiles(splats: Splats) -> int:
-    """Return how many tiles the screen has."""
+    """Return the number of tiles of the screen."""
     return -(-splats.H // TILE) * -(-splats.W // TILE)
 
 
@@ -66,16 +66,16 @@ def atomics(
     threads: int = 1,
     order: np.ndarray | None = None,
 ) -> Gradients:
-    """Go back with sums that all tiles of a splat add to: the result depends on the order of arrival.
+    """Run the backward pass with sums shared by all tiles of a splat: the result depends on the order of arrival.
 
     Args:
-        splats: What was drawn.
-        image: (H, W, 3) what `ladder.forward.tight` drew of them, on black.
+        splats: The splats that were drawn.
+        image: (H, W, 3) their image by `ladder.forward.tight`, on black.
         grad_image: (H, W, 3) dL/dimage.
-        threads: How many take tiles.
-        order: The tiles in the order in which they are handed out; row by row where None.
+        threads: Number of threads.
+        order: The tiles in the order in which they are handed out; row by row if None.
     """
-    return _go_back("backward_atomics", splats, image, grad_image, threads, order)
+    return _run_backward("backward_atomics", splats, image, grad_image, threads, order)
 
 
 def slots(
@@ -85,35 +85,35 @@ def slots(
     threads: int = 1,
     order: np.ndarray | None = None,
 ) -> Gradients:
-    """Go back with a slot for each pair of tile and splat: the same to the bit on any number of threads, in any order.
+    """Run the backward pass with a slot for each pair of tile and splat: bit-identical for any threads and order.
 
     Arguments are those of `atomics`.
     """
-    return _go_back("backward_slots", splats, image, grad_image, threads, order)
+    return _run_backward("backward_slots", splats, image, grad_image, threads, order)
 
 
 def seconds(rung: str, splats: Splats, image: np.ndarray, grad_image: np.ndarray, threads: int = 1) -> float:
-    """Time a rung, lists included: the best of five.
+    """Time a rung, including the building of its lists; return the best of five.
 
     Args:
         rung: "atomics" or "slots".
-        splats: As for the rung, like what follows.
-        image: As there.
-        grad_image: As there.
-        threads: As there.
+        splats: As for the rung.
+        image: As for the rung.
+        grad_image: As for the rung.
+        threads: As for the rung.
     """
     times = []
     for _ in range(5):
-        begin = time.perf_counter()
+        start = time.perf_counter()
         RUNGS[rung](splats, image, grad_image, threads)
-        times.append(time.perf_counter() - begin)
+        times.append(time.perf_counter() - start)
     return min(times)
 
 
 RUNGS = {"atomics": atomics, "slots": slots}
 
 
-def _go_back(
+def _run_backward(
     function: str,
     splats: Splats,
     image: np.ndarray,

@@ -1,4 +1,4 @@
-"""Compile a rung of the ladder where it runs, once."""
+"""Compile a rung of the ladder once, on the machine that runs it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from gsplat_edu.errors import BackendUnavailableError
 HERE = Path(__file__).resolve().parent
 NATIVE = HERE.parents[1] / "native"
 CACHE = HERE.parents[1] / "build" / "ladder"
-"""Libraries, by a hash of everything that decides them; safe to delete."""
+"""Compiled libraries, named by a hash of everything that affects them; safe to delete."""
 
-# As in CMakeLists.txt. -ffast-math is out: it would fold the rounding inside exp2 away.
+# As in CMakeLists.txt. Without -ffast-math, which would remove the rounding inside exp2.
 FLAGS = (
     "-O3",
     "-std=c++20",
@@ -46,13 +46,13 @@ HERE_ONLY = (
 
 @functools.cache
 def library(source: str) -> ctypes.CDLL:
-    """Load the library of benchmarks/ladder/<source>.cpp; compile it first where that has not been done.
+    """Load the library of benchmarks/ladder/<source>.cpp; compile it first if necessary.
 
     Args:
         source: Name of the file without its suffix.
 
     Raises:
-        BackendUnavailableError: there is no C++ compiler here, or it refuses the file.
+        BackendUnavailableError: there is no C++ compiler, or it rejects the file.
     """
     compiler = _compiler()
     command = [*compiler, *FLAGS, *HERE_ONLY, str(HERE / f"{source}.cpp")]
@@ -87,7 +87,7 @@ def _compiler() -> list[str]:
 
 
 def _processor() -> str:
-    """What -march=native depends on: a library built on another machine is not taken for this one's."""
+    """Return what -march=native depends on, so that a library built on another machine is not used."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     features = [line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))]

@@ -1,4 +1,4 @@
-"""The rungs of the forward pass, all by one interface: splats in, image and transmittance and counts out.
+"""The rungs of the forward pass behind one interface: splats in; image, transmittance and counts out.
 
 alpha = min(0.99, o exp(-d' conic d / 2)), 0 below 1/255;   image += T alpha c;   T *= 1 - alpha
 """
@@ -19,22 +19,22 @@ from ladder.splats import Splats
 
 FLOATS = ctypes.POINTER(ctypes.c_float)
 SPLAT_BYTES, COLOR_BYTES, PIXEL_BYTES = 24, 12, 16
-"""What a kernel asks memory for: mean, conic and opacity; a colour; a pixel's colour and transmittance. All float32."""
+"""Bytes that a kernel accesses: mean, conic and opacity; a colour; a pixel's colour and transmittance. All float32."""
 
 
 class Counts(NamedTuple):
-    """What a rung did for one image."""
+    """The work of a rung for one image."""
 
-    pairs: int  # entries in the lists of the tiles; 0 where there are no tiles
-    evaluated: int  # a pixel worked out the alpha of a splat
-    mattered: int  # and it was not below the floor
-    bytes: int  # loaded and stored while compositing, from whichever cache
+    pairs: int  # entries in the tiles' lists; 0 if there are no tiles
+    evaluated: int  # evaluations of a splat's alpha at a pixel
+    mattered: int  # those with an alpha not below the floor
+    bytes: int  # loaded and stored while compositing, from any cache
 
 
 class Rendered(NamedTuple):
-    """What a rung returns."""
+    """The result of a rung."""
 
-    image: np.ndarray  # (H, W, 3), before a black background
+    image: np.ndarray  # (H, W, 3), on a black background
     transmittance: np.ndarray  # (H, W)
     counts: Counts
 
@@ -57,7 +57,7 @@ class _Drawn(ctypes.Structure):
 
 
 def _draw(rung: str, splats: Splats) -> Rendered:
-    """Call the function of a rung's library, which has the rung's name."""
+    """Call the function of a rung's library; it has the rung's name."""
     image = np.empty((splats.H, splats.W, 3), np.float32)
     transmittance = np.empty((splats.H, splats.W), np.float32)
     given = _Splats(*(a.ctypes.data_as(FLOATS) for a in splats[:4]), splats.count, splats.H, splats.W)
@@ -88,12 +88,12 @@ def tight(splats: Splats) -> Rendered:
 
 
 def simd(splats: Splats) -> Rendered:
-    """The same, a row of sixteen pixels at a time."""
+    """As `tight`, a row of sixteen pixels at a time."""
     return _draw("simd", splats)
 
 
 def package(splats: Splats) -> Rendered:
-    """The package's own kernels on one thread, projection and sort included."""
+    """The package's own kernels on one thread, including projection and sort."""
     return _prepared_package(splats)()
 
 
@@ -118,22 +118,22 @@ def _prepared_package(splats: Splats) -> Callable[[], Rendered]:
                 output = render_covariances(*tensors, camera)
         finally:
             torch.set_num_threads(threads)
-        counts = Counts(output.num_pairs, 0, 0, 0)  # it counts its pairs and nothing else
+        counts = Counts(output.num_pairs, 0, 0, 0)  # the package counts only its pairs
         return Rendered(output.image.numpy(), output.transmittance.numpy(), counts)
 
     return render
 
 
 def seconds(rung: str, splats: Splats, enough: float = 0.2, rounds: int = 5) -> tuple[float, Rendered]:
-    """Time a rung on one thread: the best of several rounds, after one that warms up.
+    """Time a rung on one thread: the best of several rounds, after a warm-up round.
 
-    The clock is the process's time on the processor, which others who want the same cores do not lengthen.
+    The clock is the process's CPU time, which other programs on the same cores do not lengthen.
 
     Args:
         rung: Its name in RUNGS.
-        splats: What to draw; bringing it into the package's shape and compiling are not timed.
-        enough: Seconds after which no further round begins.
-        rounds: At most so many.
+        splats: The splats to draw. Converting them for the package and compiling are not timed.
+        enough: Seconds after which no further round starts.
+        rounds: Maximum number of rounds.
     """
     if rung != "package":
         library(rung)

@@ -1,7 +1,7 @@
 """The naive kernel in Triton: a program takes a block of pixels and reads every splat, near to far.
 
-Compiled on a GPU where there is one, else in Triton's interpreter, which runs the same source step by step in NumPy: it
-proves the kernel and says nothing about its speed.
+Compiled for a GPU if there is one. Otherwise Triton's interpreter runs the same source step by step in NumPy, which
+checks the kernel but says nothing about its speed.
 """
 
 # ruff: noqa: ANN001, ANN201
@@ -16,7 +16,7 @@ import torch
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 if DEVICE == "cpu":
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined
-os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")  # else triton 3.9 warns at the first compilation
+os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")  # otherwise triton 3.9 warns at the first compilation
 
 import triton  # noqa: E402
 import triton.language as tl  # noqa: E402
@@ -26,7 +26,7 @@ from ladder.splats import Splats  # noqa: E402
 
 ALPHA_MIN, ALPHA_MAX = tl.constexpr(constants.ALPHA_MIN), tl.constexpr(constants.ALPHA_MAX)
 BLOCK = 256 if DEVICE == "cuda" else 1024
-"""Pixels a program takes. A step of the interpreter costs the same for any number of them."""
+"""Pixels per program. A step of the interpreter costs the same for any number of pixels."""
 
 
 @triton.jit
@@ -56,7 +56,7 @@ def naive_kernel(
 
 
 def where() -> str:
-    """Say plainly what the kernel runs on here."""
+    """Return what the kernel runs on here."""
     if DEVICE == "cpu":
         return "Triton's interpreter, on the CPU: no GPU here"
     return f"compiled by Triton {triton.__version__} for {torch.cuda.get_device_name()}"
@@ -65,7 +65,7 @@ def where() -> str:
 def naive_triton(splats: Splats) -> tuple[np.ndarray, np.ndarray, float]:
     """Draw splats; return image (H, W, 3), transmittance (H, W), seconds.
 
-    Where the kernel is compiled, the first launch does that and is not timed.
+    If the kernel is compiled, the first launch does so and is not timed.
     """
     arrays = [torch.from_numpy(array).to(DEVICE) for array in splats[:4]]
     image = torch.empty(splats.H, splats.W, 3, device=DEVICE)

@@ -1,4 +1,4 @@
-"""What every rung has to equal, and how closely."""
+"""The reference image for every rung, and the tolerance."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def oracle(splats: Splats, extent: Extent = "exact", stop: Stop = "none") -> tup
 def tolerance(splats: Splats, conics_again: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Bound how far a float32 kernel may be from `oracle`, per pixel, for image (H, W, 3) and transmittance (H, W).
 
-    With e = 2^-24 and S = (A dx² + C dy²) / 2 + |B dx dy|, the size of the terms of the exponent, which may cancel:
-    an exponent made of at most ten roundings per term is off by 10 e S; opacity (or its logarithm, at most 8), exp and
-    their product add 24 e. So d = e (10 S + 24) bounds the relative error of alpha, and is 1 where alpha is so near
-    the floor that rounding decides whether it counts. T = product of (1 - alpha) is off, relatively, by the sum of
-    alpha / (1 - alpha) (d + e) + e over the splats in front; the image by w (that + d + 3 e), plus e for each addition.
-    A tenth more covers what is of second order.
+    Let e = 2^-24, and let S = (A dx² + C dy²) / 2 + |B dx dy| be the size of the exponent's terms, which may cancel.
+    An exponent with at most ten roundings per term is off by 10 e S; opacity (or its logarithm, at most 8), exp and
+    their product add 24 e. So d = e (10 S + 24) bounds the relative error of alpha. It is set to 1 if alpha is so near
+    the floor that rounding decides whether it counts. The relative error t of T = product of (1 - alpha) is the sum of
+    alpha / (1 - alpha) (d + e) + e over the splats in front. Each splat adds an error of w (t + d + 3 e) to the image,
+    and each addition one of e times the image. Another tenth covers second-order terms.
 
     Args:
-        splats: What is drawn.
+        splats: The splats that are drawn.
         conics_again: The kernel was given covariances and inverts them in float32, where the determinant cancels.
     """
     y, x = np.mgrid[: splats.H, : splats.W]

@@ -1,4 +1,4 @@
-"""What every rung of the ladder is given: splats on the screen, near to far."""
+"""The input of every rung of the ladder: splats on the screen, near to far."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class Splats(NamedTuple):
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """The number of splats."""
         return len(self.opacities)
 
     @property
     def pixels(self) -> int:
-        """How many pixels the screen has."""
+        """The number of pixels of the screen."""
         return self.H * self.W
 
     def cov2d(self) -> np.ndarray:
@@ -41,10 +41,10 @@ class Splats(NamedTuple):
         return np.stack([C, -B, -B, A], axis=-1).reshape(-1, 2, 2) / (A * C - B * B)[:, None, None]
 
     def flat(self) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return a camera and 3D Gaussians (means, cov3ds, colors, opacities) whose image these splats are.
+        """Return a camera and 3D Gaussians (means, cov3ds, colors, opacities) that project to these splats.
 
-        Discs on the plane z = 1 before a camera of focal length 1 at the origin are their own projection, to the last
-        bit of a mean; ties in depth keep their order. So `render_gaussians` draws exactly these splats.
+        Discs on the plane z = 1, seen by a camera of focal length 1 at the origin, are their own projection, exact to
+        the last bit of the means. Ties in depth keep their order. So `render_gaussians` draws exactly these splats.
         """
         camera = Camera(np.eye(3), (0, 0, 0), fx=1, fy=1, cx=0, cy=0, H=self.H, W=self.W)
         means, cov3ds = np.ones((self.count, 3)), np.zeros((self.count, 3, 3))
@@ -56,7 +56,7 @@ class Splats(NamedTuple):
 def from_cov2d(
     means2d: ArrayLike, cov2d: np.ndarray, colors: ArrayLike, opacities: ArrayLike, size: tuple[int, int]
 ) -> Splats:
-    """Make splats of dilated covariances (N, 2, 2) for a screen of (H, W) pixels."""
+    """Make splats from dilated covariances (N, 2, 2) for a screen of (H, W) pixels."""
     inverse = np.linalg.inv(cov2d)
     conics = np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=-1)
     arrays = (np.ascontiguousarray(a, dtype=np.float32) for a in (means2d, conics, colors, opacities))
@@ -78,10 +78,10 @@ def scene(count: int, size: int, seed: int = 0, stretch: float = 1.0) -> Splats:
     """Scatter splats of 2 px over a square screen, as benchmarks/raster.py does.
 
     Args:
-        count: How many.
+        count: Number of splats.
         size: Edge of the screen, px.
-        seed: Of the generator.
-        stretch: Ratio of the axes, 1 for round ones; the area stays. Directions are random.
+        seed: Seed of the generator.
+        stretch: Ratio of the axes, 1 for round splats; the area does not change. Directions are random.
     """
     rng = np.random.default_rng(seed)
     means2d, colors = rng.uniform(0, size, (count, 2)), rng.uniform(0, 1, (count, 3))

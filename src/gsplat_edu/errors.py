@@ -43,7 +43,7 @@ class DatasetError(SplatError):
 
     Args:
         message: One line: what is wrong, where, and what to do next.
-        reason: What is wrong in a few words, for a list in which the file stands already; None for the message.
+        reason: What is wrong in a few words, for a list that already names the file; None for the message.
     """
 
     def __init__(self, message: str, reason: str | None = None) -> None:

@@ -146,7 +146,7 @@ def _this_machine() -> str:
 def remove_leftovers(folder: Path, *, below: bool = True) -> None:
     """Remove temporary files of `written_aside` whose process was killed; keep those of running processes.
 
-    Whether a process of another machine still runs cannot be asked; its files go once they are a day old.
+    Processes on other machines cannot be checked; their files are removed once they are a day old.
 
     Args:
         folder: The folder; it need not exist.

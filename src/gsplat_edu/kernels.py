@@ -24,8 +24,8 @@ try:
     _native = importlib.import_module("gsplat_edu._native")
 except ImportError as error:
     _native = None
-    mend = "unset it" if "GSPLAT_EDU_ISA" in str(error) else "install gsplat_edu again"
-    REASON = f"the native module does not load ({error}); {mend}, or use the backend torch"
+    remedy = "unset it" if "GSPLAT_EDU_ISA" in str(error) else "install gsplat_edu again"
+    REASON = f"the native module does not load ({error}); {remedy}, or use the backend torch"
 else:
     REASON = None
     _native.ask_before_large_blocks(available_memory)

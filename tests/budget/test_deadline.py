@@ -1,10 +1,10 @@
-"""Limits of time: what counts is the clock that was handed in."""
+"""Time limits depend only on the clock that is passed in."""
 
 from gsplat_edu.budget import deadline, pace, plan, probe
 from gsplat_edu.budget.deadline import Deadline, stopwatch
 
 
-def test_what_is_left_follows_the_clock():
+def test_the_time_left_follows_the_clock():
     moments = iter((2.0, 2.5, 11.0))
     limit = Deadline(10.0, lambda: next(moments))
     assert (limit.spent, limit.left, limit.left) == (2.0, 7.5, -1.0)
@@ -18,6 +18,6 @@ def test_a_stopwatch_counts_from_when_it_was_made(monkeypatch):
     assert Deadline(60.0).left == 20.0
 
 
-def test_no_part_of_the_budget_asks_for_the_age_of_the_process():
-    """That is for the command line to say: a program that has run for hours may plan a training of minutes."""
+def test_the_budget_does_not_use_the_age_of_the_process():
+    """Only the command line counts it: a program that has run for hours may plan a training of minutes."""
     assert not any(hasattr(module, "process_age") for module in (deadline, pace, plan, probe))

@@ -1,4 +1,4 @@
-"""Forecasts by arithmetic: measurements are given, so that no clock decides a test."""
+"""Forecast arithmetic: measurements are given, so no clock affects a test."""
 
 import dataclasses
 import math
@@ -56,25 +56,25 @@ def test_the_fit_finds_the_law_behind_steps():
     places = [(25_784, 7e5), (206_272, 7e5), (25_784, 1.8e5)]
     fitted = Speed.fitted([(n, p, law.seconds(n, p)) for n, p in places])
     for part, known in zip(dataclasses.astuple(fitted), dataclasses.astuple(law), strict=True):
-        # float64 with columns scaled to 1: a few units of the last place of a system whose condition is below 1e3
+        # float64 with columns scaled to 1: a few ulp times the system's condition number, which is below 1e3
         assert part == pytest.approx(known, rel=1e-10)
 
 
 def test_no_part_of_the_fit_is_negative():
-    """More Gaussians came out faster, as they may on a busy machine: then they cost nothing, not less than that."""
+    """More Gaussians measured faster, as can happen on a busy machine, so they are taken to cost nothing."""
     fitted = Speed.fitted([(1_000, 1e5, 0.030), (2_000, 1e5, 0.020), (1_000, 2.5e4, 0.010)])
     assert fitted.per_gaussian == 0.0 and fitted.fixed >= 0.0 and fitted.per_pixel > 0.0
-    assert fitted.seconds(1_500, 1e5) == pytest.approx(0.025), "the mean of the two is the best that is left"
+    assert fitted.seconds(1_500, 1e5) == pytest.approx(0.025), "the mean of the two is then the best fit"
 
 
-def test_adc_is_expected_to_grow_where_it_densifies():
+def test_adc_is_expected_to_grow_when_it_densifies():
     config = recipe(7_000)  # densifies after iterations 200, 300, ... 3,400
     counts = expected_counts(config, 25_784, 734_580)
     grown = np.flatnonzero(np.diff(counts)) + 1
     assert len(counts) == 7_000 and counts[0] == 25_784
     assert (grown - 1).tolist() == list(range(200, 3_500, 100))
     assert wanted_gaussians(config, 25_784, 734_580) == counts[-1]
-    # benchmarks/RESULTS.md: 163,950 at the end; nobody claims to know it better than within a factor of two
+    # benchmarks/RESULTS.md: 163,950 at the end. The forecast only claims to be within a factor of two.
     assert 0.5 < counts[-1] / 163_950 < 2.0
     capped = expected_counts(recipe(7_000, max_gaussians=40_000), 25_784, 734_580)
     assert capped.max() == 40_000
@@ -86,7 +86,7 @@ def test_without_a_strategy_nothing_grows():
 
 
 def test_mcmc_is_expected_to_grow_as_it_does():
-    """Against the strategy itself: same moments, same numbers."""
+    """Compared with the strategy itself: the same counts at the same iterations."""
     config = recipe(400, strategy="mcmc", max_gaussians=135, densify_every=20)
     shapes = {"means": (100, 3), "quats": (100, 4), "log_scales": (100, 3), "sh0": (100, 1, 3)}
     shapes |= {"sh_rest": (100, 0, 3), "logit_opacities": (100,)}
@@ -104,7 +104,7 @@ def test_mcmc_is_expected_to_grow_as_it_does():
 def test_the_time_of_a_run_is_the_sum_of_its_parts():
     found = predict(FACTS, MEASURED, PLAIN, eval_every=1_000, save_every=500)
     each = 0.001 + 1e-7 * 1e4 + 1e-6 * 1_000
-    assert found.seconds["reading"] == pytest.approx(0.02 * 100 / 2), "two at a time"
+    assert found.seconds["reading"] == pytest.approx(0.02 * 100 / 2), "two photos at a time"
     assert found.seconds["training"] == pytest.approx(3_000 * each)
     assert found.seconds["judging"] == pytest.approx(2 * 20 * 2e-6 * 1e4), (
         "after 1,000 and 2,000; not at the end"
@@ -120,7 +120,7 @@ def test_growth_is_integrated():
     counts = expected_counts(config, FACTS.points, FACTS.pixels)
     found = predict(FACTS, MEASURED, config)
     steps = [MEASURED.speed.seconds(count, FACTS.pixels) for count in counts.tolist()]
-    # the sum of 3,000 float64 and 3,000 times their mean differ by rounding
+    # The sum of 3,000 float64 values and 3,000 times their mean differ by rounding.
     assert found.seconds["training"] == pytest.approx(math.fsum(steps), rel=1e-12)
     assert found.gaussians == (1_000, counts[-1]) and found.steps[1] > found.steps[0]
 
@@ -138,13 +138,13 @@ def test_photos_that_are_not_kept_cost_time_and_memory():
 def test_memory_follows_gaussians_pixels_and_degree():
     footprint = Footprint(FACTS, 400 * 2**20, 4_000, sh_degree=3)
     one, two = (footprint.peak(count, 0) for count in (100_000, 200_000))
-    # 59 floats, 8 times: 1,888 bytes; and buffers
+    # 8 copies of 59 floats: 1,888 bytes, plus buffers
     assert 1_888 < (two - one) / 100_000 < 1.5 * 1_888
     flat = dataclasses.replace(footprint, sh_degree=0)
     assert flat.peak(100_000, 0) < one
     larger = dataclasses.replace(footprint, facts=dataclasses.replace(FACTS, largest=1e7))
     assert larger.peak(0, 0) - footprint.peak(0, 0) == pytest.approx(180 * (1e7 - 1e4))
-    assert footprint.parts(0, 10**9)["photos"] == 3_000_000, "no more than there are"
+    assert footprint.parts(0, 10**9)["photos"] == 3_000_000, "no more than all photos take"
 
 
 @pytest.mark.parametrize("kept", [0, 1_000_000, 3_000_000])
@@ -156,8 +156,8 @@ def test_the_most_gaussians_fit_and_one_more_does_not(limit, kept):
 
 
 @pytest.mark.parametrize("limit", [1_450, 2_000])
-def test_gaussians_have_the_room_that_reading_leaves(limit):
-    """Photos of 12 MP, eight decoded at once: the peak without a Gaussian is that of the reading."""
+def test_gaussians_may_use_the_memory_that_reading_needed(limit):
+    """Photos of 12 MP, eight decoded at once: without Gaussians, the peak is that of reading the photos."""
     large = dataclasses.replace(FACTS, full=12e6, workers=8)
     footprint = Footprint(large, 400 * 2**20, 4_000, sh_degree=3)
     most = footprint.most_gaussians(limit * 2**20, 0)
@@ -165,19 +165,19 @@ def test_gaussians_have_the_room_that_reading_leaves(limit):
     assert most > 100_000
 
 
-def test_where_nothing_fits_there_is_no_room_for_any():
+def test_a_limit_below_the_fixed_costs_allows_no_gaussians():
     assert Footprint(FACTS, 400 * 2**20, 4_000, sh_degree=3).most_gaussians(100 * 2**20, 0) == -1
 
 
-def test_the_lines_name_numbers():
+def test_the_lines_state_numbers():
     found = predict(FACTS, MEASURED, recipe(3_000))
-    time, iteration, memory, sure = found.lines()
+    time, iteration, memory, certainty = found.lines()
     assert "3,000 iterations on cpu" in time and spelled_seconds(found.total) in time
     assert "1,000 to" in iteration and "ms at first" in iteration
     assert spelled_bytes(found.peak) in memory and "Gaussians" in memory
-    assert f"factor of {found.factor:.1f}" in sure
+    assert f"factor of {found.factor:.1f}" in certainty
     noisy = predict(FACTS, dataclasses.replace(MEASURED, noise=1.5), recipe(3_000))
-    assert noisy.factor == pytest.approx(1.5 * found.factor), "a busy machine is less sure"
+    assert noisy.factor == pytest.approx(1.5 * found.factor), "a forecast on a busy machine is less certain"
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_sizes_are_spelled():
     assert (spelled_bytes(204 * 2**20), spelled_bytes(1.25 * 2**30)) == ("204 MiB", "1.25 GiB")
 
 
-def test_smaller_photos_have_less_of_everything_but_the_file():
+def test_smaller_photos_reduce_everything_but_the_file_size():
     half = FACTS.smaller(2.0)
     assert (half.pixels, half.largest, half.photo_bytes, half.full) == (2_500.0, 2_500.0, 750_000, 4e4)
 

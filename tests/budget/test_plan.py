@@ -1,4 +1,4 @@
-"""Plans: what is chosen obeys the limits by the model; and one small run obeys them by what the system counts."""
+"""Plans obey their limits according to the model. One small run obeys them according to the system's counters."""
 
 import dataclasses
 import itertools
@@ -73,7 +73,7 @@ def chosen(*arguments, **options):
 
 
 def peak(found):
-    """What the model says of a plan with all the Gaussians it allows."""
+    """The model's peak memory for a plan with all the Gaussians it allows."""
     facts = FACTS.smaller(found.resolution or 1.0)
     footprint = Footprint(facts, MEASURED.process, MEASURED.pairs, found.options.config.sh_degree)
     return footprint.peak(found.max_gaussians, found.image_memory)
@@ -91,7 +91,7 @@ def test_memory_holds_for_any_limit_and_more_memory_is_never_worse(strategy):
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > 1.0 and sizes[-1] == 1.0
     for less, more in itertools.pairwise(found for found in plans if found.resolution is None):
         assert more.max_gaussians >= less.max_gaussians and more.image_memory >= less.image_memory
-    assert plans[-1].image_memory == FACTS.photo_bytes, "all photos are kept where there is room"
+    assert plans[-1].image_memory == FACTS.photo_bytes, "all photos are kept if there is room"
     assert all(found.iterations == 30_000 and not found.by_time for found in plans)
 
 
@@ -102,10 +102,10 @@ def test_time_holds_for_any_limit_and_more_time_is_never_worse():
         assert found.forecast.total + SPENT <= seconds
         assert found.by_time and found.options.time_limit is None
     assert [found.iterations for found in plans] == sorted(found.iterations for found in plans)
-    assert plans[-1].iterations == 30_000, "the recipe has no more"
+    assert plans[-1].iterations == 30_000, "the recipe's maximum"
     sizes = [found.resolution or 1.0 for found in plans]
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > 1.0 and sizes[-1] == 1.0
-    # the schedule uses its share of the time: two digits are rounded down by up to 9 %, a cap by as much
+    # The schedule uses most of the time: rounding down to two digits loses up to 9 %, and so does rounding the cap.
     assert plans[4].forecast.total + SPENT > 0.7 * 600
 
 
@@ -114,7 +114,7 @@ def test_both_limits_hold_together():
     assert peak(found) <= 700 * MIB and found.forecast.total + SPENT <= 300
 
 
-def test_the_milestones_stretch_with_the_iterations_that_were_chosen():
+def test_the_milestones_scale_with_the_chosen_iterations():
     config = chosen(None, 240.0).options.config
     stretched = recipe(config.iterations)
     assert config == dataclasses.replace(stretched, max_gaussians=config.max_gaussians)
@@ -128,16 +128,16 @@ def test_the_milestones_stretch_with_the_iterations_that_were_chosen():
     ("name", "value"),
     [("resolution", 3.0), ("image_memory", 50 * MIB), ("max_gaussians", 60_000), ("iterations", 700)],
 )
-def test_what_the_user_gave_stays(name, value):
+def test_given_options_are_kept(name, value):
     factors = (1.0,) if name == "resolution" else FACTORS
     found = chosen(900, 240.0, given=[name], factors=factors, **{name: value})
     assert getattr(found, name) == value
     flag = f"--{name.replace('_', '-')}"
-    assert flag not in found.sentences[0], "it was not chosen"
+    assert flag not in found.sentences[0], "the user gave it, so the plan did not choose it"
     assert found.by_time == (name != "iterations")
 
 
-def test_a_cap_that_was_given_has_room_or_is_refused():
+def test_a_given_cap_fits_or_is_refused():
     found = chosen(900, given=["max_gaussians"], max_gaussians=100_000)
     footprint_holds = peak(found) <= 900 * MIB
     assert footprint_holds and found.max_gaussians == 100_000
@@ -146,7 +146,7 @@ def test_a_cap_that_was_given_has_room_or_is_refused():
 
 
 @pytest.mark.parametrize("given", [{}, {"max_gaussians": 500_000}, {"image_memory": 200 * MIB}])
-def test_too_little_memory_is_one_line_and_what_it_names_does(given):
+def test_too_little_memory_is_one_line_and_the_amount_it_names_is_enough(given):
     with pytest.raises(ArgumentError) as refused:
         chosen(64, given=list(given), **given)
     said = str(refused.value)
@@ -157,7 +157,7 @@ def test_too_little_memory_is_one_line_and_what_it_names_does(given):
         chosen(enough - 2, given=list(given), **given)
 
 
-def test_too_little_time_is_one_line_and_what_it_names_does():
+def test_too_little_time_is_one_line_and_the_time_it_names_is_enough():
     with pytest.raises(ArgumentError) as refused:
         chosen(None, 9.0)
     said = str(refused.value)
@@ -176,8 +176,8 @@ def test_the_sentences_name_what_was_chosen():
     assert any("memory: up to" in line for line in forecast) and all("\n" not in line for line in forecast)
 
 
-def test_the_sentence_given_as_options_is_the_same_run():
-    """What was planned and what its sentence says have one recipe and one size of photos."""
+def test_the_options_in_the_sentence_give_the_same_run():
+    """The plan and the options in its sentence have the same recipe and photo size."""
     found = chosen(700, 240.0)
     words = found.sentences[0].split("chosen ")[1].split()
     parsed = build_parser(["train"]).parse_args(["train", "capture", "--out", "run", *words])
@@ -187,8 +187,8 @@ def test_the_sentence_given_as_options_is_the_same_run():
     assert bytes_text(words[words.index("--image-memory") + 1]) >= found.image_memory
 
 
-def test_large_photos_leave_a_cap_that_is_worth_having_and_are_kept_where_that_is_cheaper():
-    """60 photos of 12 MP; made smaller, all of them take less than decoding one of them again."""
+def test_large_photos_leave_a_useful_cap_and_are_kept_if_that_is_cheaper():
+    """60 photos of 12 MP: once downscaled, all of them take less memory than decoding one of them again."""
     facts = dataclasses.replace(
         FACTS, train=52, test=8, pixels=12e6, largest=12e6, full=12e6, photo_bytes=60 * 36_000_000
     )
@@ -202,8 +202,8 @@ def test_large_photos_leave_a_cap_that_is_worth_having_and_are_kept_where_that_i
         assert found.max_gaussians >= 1_000
 
 
-def test_nothing_is_planned_without_need(tmp_path):
-    """The capture is not there, so looking at it would fail: it is not looked at."""
+def test_nothing_is_planned_without_a_need(tmp_path):
+    """The capture does not exist, so reading it would fail. It is not read."""
     options = dataclasses.replace(OPTIONS, data=tmp_path / "nothing", time_limit=3.0)
     assert plan(options, Limits()).options is options
     assert plan(options, Limits(time=Deadline(3.0)), ["iterations"]).options is options
@@ -229,7 +229,7 @@ def trained(run, callbacks=(), stop=lambda: False):
 
 
 def test_a_capture_is_planned_from_its_files(capture, tmp_path):
-    """The whole way: read, measure, choose. How fast this machine is decides the numbers, not that they hold."""
+    """Read, measure and choose. The numbers depend on this machine's speed; the bounds hold on any machine."""
     found = plan(
         dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), Limits(2**32, Deadline(3_600.0))
     )
@@ -241,7 +241,7 @@ def test_a_capture_is_planned_from_its_files(capture, tmp_path):
     ("strategy", "limits"), [("adc", Limits(2**32)), ("mcmc", Limits(None, Deadline(3_600.0)))]
 )
 def test_a_start_scene_is_planned_with_its_own_gaussians(strategy, limits, capture, tmp_path):
-    """Of points a cap selects some; a start scene has to fit whole."""
+    """A cap selects some of a capture's points, but a start scene must fit entirely."""
     scene = tmp_path / "scene.ply"
     save_ply(scene, random_ball(5_000, torch.Generator().manual_seed(0)))
     run = dataclasses.replace(options(capture, tmp_path / "run", strategy=strategy), scene=scene)
@@ -251,7 +251,7 @@ def test_a_start_scene_is_planned_with_its_own_gaussians(strategy, limits, captu
 
 
 def test_a_start_scene_that_does_not_fit_is_refused(capture, tmp_path):
-    """The capture's points would fit into this limit, or a part of them; ten times as many Gaussians do not."""
+    """The capture's points would fit this limit, at least in part. The far larger start scene does not."""
     scene = tmp_path / "scene.ply"
     save_ply(scene, random_ball(200_000, torch.Generator().manual_seed(0)))
     run = options(capture, tmp_path / "run", strategy="none")
@@ -262,24 +262,26 @@ def test_a_start_scene_that_does_not_fit_is_refused(capture, tmp_path):
 
 
 def test_what_was_spent_before_the_plan_counts(capture, tmp_path):
-    """An hour would do for any length; of its last second nothing is left to train in."""
+    """An hour is enough for any plan, but only its last second is left."""
     late = Limits(time=Deadline(3_600.0, lambda: 3_599.0))
     with pytest.raises(ArgumentError, match="--time-limit 1 h 0 min: is too short"):
         plan(dataclasses.replace(OPTIONS, data=capture, out=tmp_path / "run"), late)
 
 
-def test_a_resumed_run_takes_the_numbers_of_its_config(capture, tmp_path):
-    begun = dataclasses.replace(
+def test_a_resumed_run_keeps_the_numbers_of_its_config(capture, tmp_path):
+    started = dataclasses.replace(
         options(capture, tmp_path / "run", 20, max_gaussians=333), data_settings=DataSettings(resolution=2)
     )
-    trained(CaptureRun(begun))
-    plain = dataclasses.replace(begun, config=recipe(), data_settings=DataSettings(), resume=True)
+    trained(CaptureRun(started))
+    plain = dataclasses.replace(started, config=recipe(), data_settings=DataSettings(), resume=True)
     again = plan(plain, Limits(2**30, Deadline(100.0)))
-    assert again.options.config == begun.config and again.resolution == 2 and not again.by_time
+    assert again.options.config == started.config and again.resolution == 2 and not again.by_time
     assert is_finished(again.options)
     assert len(again.sentences) == 1 and "memory is not planned again" in again.sentences[0]
     assert plan(plain, Limits(time=Deadline(100.0))).sentences == ()
-    assert not is_finished(taken_up(plain, ["iterations"])), "more iterations than its own extend a run"
+    assert not is_finished(taken_up(plain, ["iterations"])), (
+        "more iterations than its config has extend a run"
+    )
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -301,7 +303,7 @@ def test_a_damaged_config_is_one_line(capture, tmp_path, stored, named):
 
 
 class Clock:
-    """Ten seconds for every iteration of a run, whatever the machine."""
+    """A clock on which every iteration takes ten seconds, on any machine."""
 
     def __init__(self, before=0.0):
         self.iteration, self.before = 0, before
@@ -317,20 +319,20 @@ def paced(run, limit, clock, **settings):
     return trained(run, [clock, pace], pace.over), pace.outcome
 
 
-def test_training_ends_in_time_to_judge(capture, tmp_path):
-    """600 s less those before training and those to judge, which is the 2.5 s of the report and little more."""
+def test_training_ends_in_time_to_evaluate(capture, tmp_path):
+    """600 s minus the time before training and the reserve for evaluation: 2.5 s for the report and little more."""
     run = CaptureRun(options(capture, tmp_path / "run", 100))
     folder, outcome = paced(run, 600.0, Clock(before=100.0))
-    # the first iteration after which less than 10 s and the reserve are left; judging 16 tiny views is not 30 s
+    # It stops when less than 10 s plus the reserve are left. Evaluating 16 tiny views takes less than 30 s.
     assert 46 <= folder.read_metrics()["iterations"] <= 50
     assert folder.read_config()["train"]["iterations"] == 100 and outcome is None, "it can be resumed"
 
 
-def test_time_that_is_left_is_used_and_the_numbers_give_the_same_bits(capture, tmp_path):
+def test_remaining_time_is_used_and_the_printed_options_repeat_the_run_exactly(capture, tmp_path):
     run = CaptureRun(options(capture, tmp_path / "run", max_gaussians=400))
     folder, outcome = paced(run, 600.0, Clock(), extend=True)
     total = folder.read_metrics()["iterations"]
-    # 60 would fit without judging; what is left at the end is less than 2.5 % or less than one iteration is worth
+    # 60 would fit without evaluation. Less than 2.5 % of the time, or less than one iteration, is left unused.
     assert 50 <= total <= 59
     stored = folder.read_config()["train"]
     assert stored["iterations"] == total and stored["means_rate_iterations"] == 20, "milestones stay"
@@ -343,28 +345,28 @@ def test_time_that_is_left_is_used_and_the_numbers_give_the_same_bits(capture, t
 
 
 class SlowingClock(Clock):
-    """Ten seconds for each of the first 25 iterations, 40 for every later one."""
+    """Each of the first 25 iterations takes ten seconds, every later one 40."""
 
     def __call__(self, trainer=None, event=None):
         return super().__call__(trainer, event) + 30.0 * max(self.iteration - 25, 0)
 
 
-def test_a_lengthened_run_that_is_cut_is_complete_all_the_same(capture, tmp_path):
-    """20 iterations are done at 200 s of 600; what then seems to fit does not, since the machine slows down."""
+def test_an_extended_run_that_is_cut_short_is_still_complete(capture, tmp_path):
+    """20 iterations take 200 s of 600. The extension that then seems to fit does not: the machine slows down."""
     run = CaptureRun(options(capture, tmp_path / "run"))
     folder, outcome = paced(run, 600.0, SlowingClock(), extend=True)
-    # 250 s for 25, and (600 - 250 - reserve) / 40 more, for a reserve of less than 40 s; the last may run over
+    # 250 s for 25, then (600 - 250 - reserve) / 40 more, with a reserve of less than 40 s; the last may run over.
     assert folder.read_metrics()["iterations"] == folder.read_config()["train"]["iterations"] in (33, 34)
     assert "20 iterations were planned" in outcome
     assert is_finished(dataclasses.replace(run.options, resume=True))
 
 
-def test_a_run_that_was_not_planned_is_not_lengthened(capture, tmp_path):
+def test_a_run_that_was_not_planned_is_not_extended(capture, tmp_path):
     folder, outcome = paced(CaptureRun(options(capture, tmp_path / "run")), 600.0, Clock())
     assert outcome is None and folder.read_metrics()["iterations"] == 20
 
 
-def test_flags_name_milestones_that_iterations_do_not_give():
+def test_flags_include_milestones_that_differ_from_the_recipe():
     config = dataclasses.replace(recipe(3_400), iterations=4_000)
     words = flags(dataclasses.replace(OPTIONS, config=config))
     assert words.startswith("--iterations 4000 --means-rate-iterations 3400 ")
@@ -393,18 +395,18 @@ _, status, usage = os.wait4(child, 0)
 print(usage.ru_maxrss * 1024)
 sys.exit(os.waitstatus_to_exitcode(status))
 """
-"""A parent of its own, since Linux counts what the parent held when it started the child."""
+"""The child gets a small parent of its own, because Linux includes the parent's memory in the child's peak."""
 
 
 @pytest.mark.own_process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ru_maxrss is in KiB on Linux")
-def test_a_training_stays_below_its_limit_as_the_system_counts(capture, tmp_path):
-    """Everything is cloned or split, so the cap that was chosen is reached and the memory is really used."""
+def test_a_training_stays_below_its_memory_limit_as_the_system_counts_it(capture, tmp_path):
+    """Every Gaussian is cloned or split, so the run reaches the chosen cap and really uses the memory."""
     limit = 560 * MIB
     words = [sys.executable, "-c", MEASURE, RUN, str(capture), str(tmp_path / "run"), str(limit)]
     done = subprocess.run(words, check=False, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     folder = RunFolder(tmp_path / "run")
     cap = json.loads(folder.config.read_text())["train"]["max_gaussians"]
-    assert folder.read_metrics()["num_gaussians"] > 0.9 * cap, "the limit was worth a test"
+    assert folder.read_metrics()["num_gaussians"] > 0.9 * cap, "the run came near its limit"
     assert int(done.stdout) <= limit

@@ -20,8 +20,8 @@ def convert(capsys):
     def call(*words, code=0):
         try:
             assert main(["convert", *map(str, words)]) == code
-        except SystemExit as leaving:  # argparse leaves by itself
-            assert leaving.code == code
+        except SystemExit as stop:  # argparse exits by itself
+            assert stop.code == code
         printed = capsys.readouterr()
         if code:
             assert printed.err.count("\n") == 1 and "Traceback" not in printed.err
@@ -45,7 +45,7 @@ def test_every_format_is_written_and_verified_from_the_runs_cameras(convert, tmp
     figures = re.search(r"PSNR ([\d.]+) dB over 5 views, worst ([\d.]+) \((.*)\.jpg\); ([\d,]+) bytes", said)
     assert int(figures[4].replace(",", "")) == out.stat().st_size
 
-    # the line is right: rendered here again
+    # Render both scenes again here to check the printed figures.
     source, written = open_source(folder.path), read_back(out)
     with torch.no_grad():
         scores = [
@@ -64,7 +64,7 @@ def test_every_format_is_written_and_verified_from_the_runs_cameras(convert, tmp
         assert float(figures[1]) == 100.0
 
 
-def test_what_a_format_cannot_hold_is_said(convert, tmp_path):
+def test_what_a_format_cannot_store_is_reported(convert, tmp_path):
     folder, *_ = make_run(tmp_path / "run")
     said = convert(folder.path, tmp_path / "a.splat")
     assert "30 splats, SH degree 0" in said
@@ -73,7 +73,7 @@ def test_what_a_format_cannot_hold_is_said(convert, tmp_path):
     assert "left out" not in convert(folder.path, tmp_path / "a.ply")
 
 
-def test_filters_and_moves_are_done_in_their_order(convert, plain, tmp_path):
+def test_filters_and_transforms_are_applied_in_order(convert, plain, tmp_path):
     before = read_scene(plain).gaussians
     matrix = tmp_path / "m.txt"
     matrix.write_text("1 0 0 0\n0 0 -1 0\n0 1 0 0.5\n")
@@ -83,12 +83,12 @@ def test_filters_and_moves_are_done_in_their_order(convert, plain, tmp_path):
     )
     after = read_scene(tmp_path / "out.ply").gaussians
     means = before.means.double().numpy()
-    stays = (
+    kept = (
         (means >= (-0.5, -1, -1)).all(axis=1) & (means <= 1).all(axis=1) & (before.opacities >= 0.3).numpy()
     )
-    x, y, z = 2 * means[stays].T
+    x, y, z = 2 * means[kept].T
     np.testing.assert_allclose(after.means, np.stack([x + 1, -z, y + 0.5], axis=1), atol=1e-6)
-    assert after.sh_degree == 1 and 0 < stays.sum() < 300
+    assert after.sh_degree == 1 and 0 < kept.sum() < 300
     convert(plain, tmp_path / "turned.ply", "--transform", "rotate=x:180")
     np.testing.assert_allclose(
         read_scene(tmp_path / "turned.ply").gaussians.means, means * (1, -1, -1), atol=1e-6

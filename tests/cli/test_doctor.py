@@ -20,7 +20,7 @@ from splats import splats_on
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """A clean capture, and what it was written from."""
+    """A clean capture, and the views, points and colours it was written from."""
     folder = tmp_path_factory.mktemp("made") / "capture"
     views, points, colors = procedural_capture(64, 24)
     write_colmap(folder, views, points, colors)
@@ -29,7 +29,7 @@ def capture(tmp_path_factory):
 
 @pytest.fixture
 def doctor(capsys):
-    """Run the command; return its exit code and what it printed, the error line where there is one."""
+    """Run the command; return its exit code and its output, including any error line."""
 
     def call(*words):
         try:
@@ -53,7 +53,7 @@ def test_a_clean_capture_fits_on_a_screen_and_ends_with_advice(doctor, capture):
     )
 
 
-def test_the_recommended_training_is_the_one_that_was_asked_about(doctor, capture):
+def test_the_recommended_training_uses_the_given_options(doctor, capture):
     """A forecast for 800 iterations at half size used to end with the command for 30,000 at full size."""
     folder, *_ = capture
     code, said = doctor(folder, "--no-forecast", "--iterations", "800", "--resolution", "2")
@@ -72,7 +72,7 @@ def test_faults_are_named_and_the_exit_code_stays_0(doctor, capture, tmp_path):
     assert code == 0
     assert "unusable: 1 of 23 photos" in said and "view_003.png" in said
     assert "1 missing image of 24 listed, first view_005.png" in said
-    # a forecast reads the capture as training would, and that refuses it
+    # A forecast reads the capture as training would, so it fails in the same way.
     assert (
         "forecast   none, because training would fail" in said and "view_003.png: cannot be decoded" in said
     )
@@ -136,13 +136,13 @@ def run(capture, tmp_path_factory):
 
 
 def pasted(said):
-    """The commands of an output, as a shell would split them."""
+    """Return the commands in an output, split as a shell would split them."""
     lines = [line.partition("gsplat-edu ") for line in said.splitlines()]
     return [shlex.split(words) for _, found, words in lines if found]
 
 
 def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
-    """CAPTURE and RUN stood for names, and those with a blank or a quote were not quoted."""
+    """Commands used to contain the placeholders CAPTURE and RUN, and did not quote names with blanks or quotes."""
     monkeypatch.chdir(tmp_path)
     place = Path("it's a $(place) & more")
     shutil.copytree(capture[0], place / "capture one")
@@ -157,7 +157,7 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     for words in commands:
         parsed = command_line.build_parser(words).parse_args(words)
         assert parsed.command == words[0]
-        # what is there, or the folder that the command before would make
+        # The path exists, or the previous command would create it.
         assert (str(place) in words[1] and Path(words[1]).exists()) or words == ["doctor", "out/capture one"]
         assert "RUN" not in words and "CAPTURE" not in words
     renders = next(words for words in commands if words[0] == "render")
@@ -170,14 +170,14 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_30000").is_dir()
 
 
-def test_a_proposed_folder_is_a_new_one(doctor, capture, tmp_path, monkeypatch):
+def test_the_proposed_output_folder_does_not_exist_yet(doctor, capture, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out" / "capture").mkdir(parents=True)
     assert f"train {capture[0]} --out out/capture_2" in doctor(capture[0], "--no-forecast")[1]
 
 
 def test_an_exposure_jump_is_named_before_and_after_training(doctor, capture, run, tmp_path):
-    """A photo 0.7 stops brighter: the warning was gone once a scene fitted it."""
+    """One photo is 0.7 stops brighter. The warning used to disappear once a trained scene fitted it."""
     _, views, points, colors = capture
     jumped = [
         View(v.camera, np.clip(v.image * (1.25 if i == 3 else 1.0), 0, 255).astype(np.uint8), name=v.name)
@@ -193,7 +193,7 @@ def test_an_exposure_jump_is_named_before_and_after_training(doctor, capture, ru
         assert any("view_003.png" in line for line in lines), said
 
 
-def test_a_run_is_judged(doctor, run):
+def test_a_run_is_examined(doctor, run):
     code, said = doctor(run.path)
     lines = said.splitlines()
     assert code == 0 and len(lines) <= 24 and lines[-4] == "what to do:"
@@ -228,7 +228,7 @@ def real(name):
 
 
 def test_snowmiku97(doctor):
-    """Two photos are blurred by motion, and in two the photographer's shadow falls on the toy: seen by eye."""
+    """Checked by eye: two photos have motion blur, and in two the photographer's shadow falls on the toy."""
     code, said = doctor(real("snowmiku97"), "--no-forecast")
     blurred, exposure = (
         "\n".join(x for x in said.splitlines() if f"warning    {n}" in x) for n in ("blur", "expo")
@@ -245,7 +245,7 @@ def test_fox(doctor):
 
 
 def test_truck11(doctor):
-    """Its focal lengths are wrong; with the right ones, about 385 px, the points would all be seen."""
+    """Its focal lengths are wrong; with the right ones, about 385 px, every point would be visible."""
     code, said = doctor(real("truck11"), "--no-forecast")
     assert code == 0 and said.count("warning") == 3
     for words in (
@@ -261,8 +261,8 @@ def test_help_shows_an_example(doctor, capsys):
     assert code == 0 and "example: gsplat-edu doctor " in said
 
 
-def test_points_and_photos_far_from_zero_are_no_obstacle(doctor, capture, tmp_path):
-    """Map coordinates: float64 keeps them, and the checks are the same."""
+def test_captures_far_from_the_origin_are_checked_alike(doctor, capture, tmp_path):
+    """Map coordinates are kept in float64, so the checks give the same results."""
     _, views, points, colors = capture
     away = np.array([431000.0, 5400000.0, 300.0])
     moved = [

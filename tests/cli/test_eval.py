@@ -23,7 +23,7 @@ def cli():
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A capture on disk, and a run of it that was stopped after 30 iterations."""
+    """A capture on disk, and a run of it that stopped after 30 iterations."""
     root = tmp_path_factory.mktemp("made")
     views, points, colors = procedural_capture(size=32, count=6)
     write_colmap(root / "capture", views, points, colors)
@@ -93,7 +93,7 @@ def contents(folder):
 
 @pytest.fixture(scope="module")
 def other(tmp_path_factory):
-    """As many views of the same names, from elsewhere: what only the cameras tell apart."""
+    """A capture with as many views of the same names, seen from elsewhere: only the cameras differ."""
     views, points, colors = procedural_capture(size=32, count=6)
     folder = tmp_path_factory.mktemp("other") / "capture"
     write_colmap(folder, [rotated(view) for view in views], points, colors)
@@ -112,7 +112,7 @@ def run(made, tmp_path):
     return RunFolder(tmp_path / "run")
 
 
-def test_another_dataset_is_scored_apart_or_not_at_all(run, other, cli, capsys, tmp_path):
+def test_another_dataset_is_scored_only_into_a_separate_folder(run, other, cli, capsys, tmp_path):
     assert cli(["eval", str(run.path)]) == 0
     before = contents(run.path)
     capsys.readouterr()
@@ -125,7 +125,7 @@ def test_another_dataset_is_scored_apart_or_not_at_all(run, other, cli, capsys, 
     words = ["eval", str(run.path), "--dataset", str(other), "--out", str(tmp_path / "apart")]
     (tmp_path / "apart").mkdir()
     (tmp_path / "apart" / LOCK).touch()  # an evaluation was killed here
-    for _ in range(2):  # an evaluation may be done again
+    for _ in range(2):  # an evaluation may be repeated
         assert cli(words) == 0
         assert "the scores are written to" in capsys.readouterr().out.replace("\n", " ")
     assert contents(run.path) == before
@@ -135,7 +135,7 @@ def test_another_dataset_is_scored_apart_or_not_at_all(run, other, cli, capsys, 
     assert apart.report.is_file() and len(list((apart.renders / "test").iterdir())) == 2
 
 
-def test_an_evaluation_apart_overwrites_nothing_else(run, cli, capsys, tmp_path):
+def test_an_evaluation_overwrites_neither_runs_nor_other_files(run, cli, capsys, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     for place, says in ((run.path, "holds a run"), (tmp_path / "mine", "holds other files")):
@@ -157,8 +157,8 @@ def test_a_copy_of_the_capture_is_the_same_and_a_changed_photo_is_named(made, ru
     assert "1 of 6 changed since the run started, first view_002.png" in capsys.readouterr().err
 
 
-def test_renders_of_views_that_are_not_its_own_are_removed_and_no_other_file(run, cli):
-    """As an evaluation by an older version left them: of another dataset, in the run's folder."""
+def test_only_stale_renders_of_other_views_are_removed(run, cli):
+    """Older versions left renders of another dataset in the run's folder."""
     folder = run.renders / "test"
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("stray_1.png", "stray_2.png", "mine.png", "notes.txt"):
@@ -169,7 +169,7 @@ def test_renders_of_views_that_are_not_its_own_are_removed_and_no_other_file(run
     assert names == ["mine.png", "notes.txt", "view_000.png", "view_003.png"]
 
 
-def test_what_is_no_run_is_one_line(cli, capsys, tmp_path):
+def test_a_folder_that_is_not_a_run_is_a_one_line_error(cli, capsys, tmp_path):
     for arguments in ([str(tmp_path)], [str(tmp_path), "--backend", "abacus"]):
         assert cli(["eval", *arguments]) == 2
         assert capsys.readouterr().err.count("\n") == 1

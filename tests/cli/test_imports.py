@@ -1,4 +1,4 @@
-"""What costs seconds to import is not imported for a mistake, `--help` or a value that is out of range."""
+"""Modules that take seconds to import are not imported for a mistake, `--help` or an out-of-range value."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ from gsplat_edu.cli.main import COMMANDS
 
 HEAVY = ("torch", "scipy", "cv2", "matplotlib", "PIL")
 
-ASKS = """
+PROBE = """
 import contextlib, io, sys
 from gsplat_edu.cli.main import main
 for line in sys.stdin.read().splitlines():
@@ -58,21 +58,21 @@ def test_mistakes_and_help_import_nothing_heavy(tmp_path):
         lines += [f"{name} --help", f"{name} {words} --backendd cpu", f"{name} {words} --iteration 10"]
     lines += OUT_OF_RANGE
     (tmp_path / "photos").mkdir()
-    asked = (
+    commands = (
         "\n".join(lines).replace("CAPTURE", str(tmp_path / "photos")).replace("RUN", str(tmp_path / "run"))
     )
-    done = subprocess.run(
-        [sys.executable, "-c", ASKS % (HEAVY,)], input=asked, capture_output=True, text=True, check=True
+    finished = subprocess.run(
+        [sys.executable, "-c", PROBE % (HEAVY,)], input=commands, capture_output=True, text=True, check=True
     )
-    answers = done.stdout.splitlines()
+    answers = finished.stdout.splitlines()
     assert len(answers) == len(lines)
     for line, answer in zip(lines, answers, strict=True):
         wanted = "0" if line.endswith(("--help", "--help-all", "--version")) else "2"
         assert answer.startswith(f"{wanted} |"), (line, answer)
     assert not (tmp_path / "run").exists()
-    said = dict(zip(lines, answers, strict=True))
+    answer_to = dict(zip(lines, answers, strict=True))
     assert (
         "gsplat-edu train: unrecognized argument --iteration: did you mean --iterations? see gsplat-edu train"
-        in (said["train CAPTURE --out RUN --iteration 10"])
+        in (answer_to["train CAPTURE --out RUN --iteration 10"])
     )
-    assert "--backendd: did you mean --backend?" in said["eval a --backendd cpu"]
+    assert "--backendd: did you mean --backend?" in answer_to["eval a --backendd cpu"]

@@ -36,7 +36,7 @@ def scene(count=50):
     return gaussians
 
 
-def test_a_scene_is_described_and_its_oddities_named(info, tmp_path):
+def test_a_scene_is_described_with_warnings_for_odd_values(info, tmp_path):
     gaussians = scene()
     save_ply(tmp_path / "a.ply", gaussians)
     said = info(tmp_path / "a.ply")
@@ -58,7 +58,7 @@ def test_an_empty_scene_is_described(info, tmp_path):
     assert "0, SH degree 2" in info(tmp_path / "a.ply")
 
 
-def test_a_run_says_how_far_it_got(info, tmp_path):
+def test_a_run_reports_its_progress(info, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.write_config(
         {"version": "9.9", "train": {"iterations": 7000}, "backend": "cpu", "data": {"path": "x"}}
@@ -95,7 +95,7 @@ def test_a_dataset_is_described_and_no_photo_is_decoded(info, tmp_path, monkeypa
         assert words in said, words
 
 
-def test_what_is_none_of_them_is_one_line(info, tmp_path):
+def test_an_unknown_kind_of_path_is_a_one_line_error(info, tmp_path):
     assert "does not exist; give a dataset folder" in info(tmp_path / "gone", code=2)
     assert "is not a capture" in info(tmp_path, code=2)
     (tmp_path / "a.txt").write_text("hello")

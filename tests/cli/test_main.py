@@ -13,13 +13,13 @@ TINY = ["demo", "--iters", "2", "--k0", "5", "--cap", "8", "--size", "8"]
 def test_demo_writes_figure_curves_and_scene(tmp_path, capsys):
     assert main([*TINY, "--out", str(tmp_path / "a" / "s.png")]) == 0
     printed = capsys.readouterr().out
-    assert "2/2" in printed, "the bar reached its end"
+    assert "2/2" in printed, "the progress bar reached its end"
     assert re.search(r"held-out L1: init 0\.\d{4} -> final 0\.\d{4}", printed)
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["s.ply", "s.png", "s_curves.png"]
 
 
-def test_a_handler_that_python_did_not_install_is_no_obstacle(monkeypatch):
-    """`signal.signal` then returns None, which it does not take back."""
+def test_signal_handlers_not_installed_by_python_are_tolerated(monkeypatch):
+    """`signal.signal` then returns None for the old handler, but does not accept None to restore it."""
     table = dict.fromkeys((signal.SIGINT, signal.SIGTERM))
 
     def install(number, handler):
@@ -35,7 +35,7 @@ def test_a_handler_that_python_did_not_install_is_no_obstacle(monkeypatch):
     assert table == dict.fromkeys(table, signal.SIG_DFL)
 
 
-def test_a_name_in_brackets_is_printed_as_it_is(tmp_path, capsys):
+def test_a_name_in_brackets_is_printed_unchanged(tmp_path, capsys):
     out = tmp_path / "[red]x" / "s.png"
     assert main([*TINY, "--out", str(out)]) == 0
     assert str(out) in capsys.readouterr().out.replace("\n", "")
@@ -49,12 +49,12 @@ def test_the_seed_decides_the_run(tmp_path, capsys):
     assert scenes[0] == scenes[1] != scenes[2]
 
 
-def test_a_part_of_the_budget_leaves_the_rest_to_the_backend(tmp_path, capsys):
+def test_options_left_out_of_the_budget_are_chosen_by_the_backend(tmp_path, capsys):
     arguments = ["demo", "--iters", "1", "--size", "8", "--k0", "5", "--out", str(tmp_path / "s.png")]
     assert main([*arguments, "--backend", "torch"]) == 0
     assert "reduced to --cap 800 (the chapter uses --cap 1600)" in capsys.readouterr().out
     assert main(arguments) == 0
-    assert "reduced" not in capsys.readouterr().out, "the kernels take the chapter's budget"
+    assert "reduced" not in capsys.readouterr().out, "the kernels use the chapter's budget"
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, says, tmp_path, monkey
     assert code == 2
     assert printed.err.count("\n") == 1 and says in printed.err
     assert printed.err.startswith("gsplat-edu")
-    assert "0/" not in printed.out, "no bar was begun"
+    assert "0/" not in printed.out, "no progress bar was started"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["folder.png", "taken"]
 
 

@@ -1,4 +1,4 @@
-"""Too little memory is one line that says what to do, wherever it runs out."""
+"""Running out of memory, wherever it happens, prints one line that says what to do."""
 
 import os
 import re
@@ -70,13 +70,13 @@ def screens(path: Path, count: int) -> Path:
     return path
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not tell what it has")
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc/self/statm")
 @pytest.mark.own_process
-def test_a_process_that_may_take_little_more(tmp_path):
-    """A 24,000 x 18,000 PNG, an image 200,000 px wide and screen-filling splats, where 640 MiB are left.
+def test_a_process_with_little_memory_left(tmp_path):
+    """A 24,000 x 18,000 PNG, an image 200,000 px wide and screen-filling splats, with 640 MiB left.
 
-    20,000 splats in 64 x 64 tiles are 82 million pairs of 8 bytes and more: above 640 MiB with the quarter that buffers
-    grow by. The photo takes 4 GiB, and the image 600 GiB.
+    20,000 splats in 64 x 64 tiles are 82 million pairs of at least 8 bytes. Buffers grow by a quarter, which makes
+    that more than 640 MiB. The photo takes 4 GiB, and the image 600 GiB.
     """
     photo, scene = png(tmp_path / "large.png", 24_000, 18_000), screens(tmp_path / "screens.ply", 20_000)
     out = tmp_path / "out"
@@ -85,7 +85,7 @@ def test_a_process_that_may_take_little_more(tmp_path):
     assert ended.returncode == 0, ended.stderr
     codes = [
         line for line in ended.stdout.splitlines() if line.isdigit()
-    ]  # render also says which path it takes
+    ]  # render also prints which camera path it takes
     assert codes == ["2", "2", "2"], ended.stderr
     first, second, third = ended.stderr.splitlines()
     assert re.fullmatch(
@@ -104,7 +104,7 @@ def test_a_process_that_may_take_little_more(tmp_path):
         r"close other programs, or reduce --size",
         third,
     )
-    assert not out.exists() or not list(out.iterdir()), "nothing half done is left"
+    assert not out.exists() or not list(out.iterdir()), "no partial output is left"
 
 
 def failing(allocate):
@@ -129,23 +129,23 @@ HUGE = 2**62
     ],
     ids=["numpy", "torch", "python", "opencv", "system", "threads"],
 )
-def test_every_library_that_runs_out_is_one_line(capsys, allocate):
+def test_running_out_of_memory_in_any_library_is_one_line(capsys, allocate):
     assert run_command("gsplat-edu train", failing(allocate), False) == 2
     said = capsys.readouterr().err
     assert said.startswith("gsplat-edu train: ran out of memory (") and said.count("\n") == 1
     assert "--resolution" in said
 
 
-def test_other_faults_are_not_called_a_lack_of_memory():
+def test_other_errors_are_not_reported_as_out_of_memory():
     with pytest.raises(RuntimeError, match="shapes differ"):
         run_command("x", failing(lambda: (_ for _ in ()).throw(RuntimeError("shapes differ"))), False)
 
 
-def test_what_is_free_is_the_least_of_what_the_machine_and_its_groups_leave(tmp_path, monkeypatch):
-    """A container's limit, in the files of both versions of cgroups; its file cache can be taken."""
+def test_free_memory_is_the_minimum_over_the_machine_and_its_cgroups(tmp_path, monkeypatch):
+    """Reads a container's limit from the files of cgroups v1 and v2, and counts its file cache as free."""
     monkeypatch.setattr(headroom, "PROC", tmp_path / "proc")
     monkeypatch.setattr(headroom, "CGROUPS", tmp_path / "groups")
-    assert available_memory() is None, "a system that does not tell"
+    assert available_memory() is None, "this system does not report it"
     (tmp_path / "proc" / "self").mkdir(parents=True)
     (tmp_path / "proc" / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    4000 kB\n")
     assert available_memory() == 4000 * 1024

@@ -1,4 +1,4 @@
-"""Names that are not UTF-8, hold commands for terminals, or meet a locale that has ASCII only."""
+"""Names that are not UTF-8, that contain terminal escape codes, or that meet an ASCII-only locale."""
 
 import json
 import os
@@ -61,8 +61,8 @@ def odd_capture(tmp_path_factory):
 
 
 @pytest.mark.own_process
-def test_a_training_among_odd_names_in_a_locale_of_ascii(odd_capture, tmp_path):
-    """All commands, as a program of its own: the locale belongs to the process."""
+def test_every_command_accepts_odd_names_in_an_ascii_locale(odd_capture, tmp_path):
+    """The commands run in a separate process, because the locale belongs to the process."""
     run = os.fsdecode(bytes(tmp_path) + b"/run\xfe \x1b[1m")
     words = [sys.executable, "-c", CHILD, odd_capture, run]
     ended = subprocess.run(
@@ -76,7 +76,7 @@ def test_a_training_among_odd_names_in_a_locale_of_ascii(odd_capture, tmp_path):
     assert r"run\xfe" in report
     names = {entry["img_name"] for entry in json.loads((Path(run) / "cameras.json").read_text())}
     assert {r"images/raw\xff.png", "images/π.png"} <= names
-    assert (Path(run) / "renders" / "views" / "images_π.png").is_file(), "written as UTF-8 all the same"
+    assert (Path(run) / "renders" / "views" / "images_π.png").is_file(), "still written as UTF-8"
     assert (Path(run) / "renders" / "orbit.mp4").is_file()
 
 
@@ -93,8 +93,8 @@ def test_names_as_text():
     assert as_file_name("\ud800") == "\ud800" and as_file_name("π") == "π"
 
 
-def test_the_terminal_prints_text_as_it_is(capsys):
-    """No markup, no emoji codes, no commands."""
+def test_the_terminal_prints_text_unchanged(capsys):
+    """It interprets no markup, no emoji codes and no escape codes."""
     Terminal().print("[red]x[/] :car: \x1b[31m", "b\nc", sep="\n", soft_wrap=True)
     assert capsys.readouterr().out == "[red]x[/] :car: \\x1b[31m\nb\\nc\n"
 
@@ -102,7 +102,7 @@ def test_the_terminal_prints_text_as_it_is(capsys):
 @pytest.mark.parametrize(
     "words", [["info", "\x1b[2J"], ["train", "\x1b[2J", "--out", "x"], ["\x1b[2J"], ["info", "a", "\x1b[2J"]]
 )
-def test_a_mistake_does_not_command_the_terminal(capsys, tmp_path, monkeypatch, words):
+def test_an_error_message_sends_no_escape_codes_to_the_terminal(capsys, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     try:
         code = main(words)
@@ -122,13 +122,13 @@ def test_a_report_takes_any_title(tmp_path):
 
 
 def test_many_images_of_one_name_get_file_names_in_linear_work():
-    """Each looks for its number from where the last one found its own; a billion comparisons would not end here."""
+    """Each name counts on from the last number given out. A quadratic search would need a billion comparisons."""
     names = image_file_names(["a.png"] * 50_000 + ["A.jpg", "b", "a_7.png"])
     assert names[:3] == ["a.png", "a_2.png", "a_3.png"] and len({name.lower() for name in names}) == 50_003
 
 
-def test_a_bar_prints_names_as_they_are():
-    """rich takes "[/x]" in a description for markup that ends what never began, and passes ESC on."""
+def test_a_progress_bar_prints_names_unchanged():
+    """rich would read "[/x]" in a description as a closing tag without an opening one, and would pass ESC through."""
     task = Task(TaskID(0), "checking [/x]\x1b[2J.ply", 1, 0, _get_time=lambda: 0.0)
     assert Field("{task.description}").render(task).plain == r"checking [/x]\x1b[2J.ply"
 
@@ -136,7 +136,7 @@ def test_a_bar_prints_names_as_they_are():
 @pytest.mark.parametrize(
     ("value", "digits", "text"),
     [
-        (99.7, 2, "100"),  # a share in percent was "1e+02 %"
+        (99.7, 2, "100"),  # a percentage used to print as "1e+02 %"
         (1432.0, 3, "1,432"),
         (-451234.6, 4, "-451,235"),
         (0.0123, 2, "0.012"),

@@ -31,7 +31,7 @@ def cli(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A capture, and a run of it whose coordinates were moved and whose background is blue."""
+    """A capture, and a run of it with moved coordinates and a blue background."""
     root = tmp_path_factory.mktemp("made")
     views, points, colors = procedural_capture(size=32, count=6)
     write_colmap(root / "capture", views, points, colors)
@@ -60,10 +60,10 @@ def test_a_run_is_rendered_as_an_orbit_into_its_folder(made, cli, capsys):
     video = cv2.VideoCapture(str(path))
     frames = [video.read() for _ in range(4)]
     assert [read for read, _ in frames] == [True] * 3 + [False]
-    assert frames[0][1][0, 0].argmax() == 0, "blue, which is BGR's first, behind the scene"
+    assert frames[0][1][0, 0].argmax() == 0, "the background is blue, the first BGR channel"
 
 
-def test_the_runs_cameras_see_what_they_saw_in_training(made, cli, capsys, tmp_path):
+def test_the_runs_cameras_render_the_same_images_as_in_training(made, cli, capsys, tmp_path):
     folder, _, bare, views = made
     assert cli(["render", str(folder.path), "--dataset", "--out", str(tmp_path / "seen")]) == 0
     assert f"wrote {tmp_path / 'seen'}/: 6 images" in capsys.readouterr().out
@@ -71,13 +71,13 @@ def test_the_runs_cameras_see_what_they_saw_in_training(made, cli, capsys, tmp_p
     settings = RenderSettings(background=BLUE)
     for i in (0, 5):
         direct = render(load_ply(bare), views[i].camera, settings=settings).image.clamp(0, 1).numpy()
-        # the scene went through a file at 512, where float32 steps are 6e-5 world units: under 0.01 px, and a
-        # colour changes by less than a byte over that
+        # The scene was stored at coordinates near 512, where float32 steps are 6e-5 world units. That is less than
+        # 0.01 px, over which a colour changes by less than one 8-bit step.
         difference = pixels(tmp_path / "seen" / f"view_{i:03d}.png") - 255.0 * direct
         assert np.abs(difference).max() < 2
 
 
-def test_a_datasets_cameras_a_size_and_a_background_can_be_asked_for(made, cli, tmp_path):
+def test_a_datasets_cameras_a_size_and_a_background_can_be_chosen(made, cli, tmp_path):
     _, capture, bare, _ = made
     words = [
         "render",
@@ -130,8 +130,8 @@ def test_mistakes_are_one_line(made, cli, capsys, tmp_path, arguments, says):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_cameras_of_one_side_get_no_full_circle(made, cli, capsys, tmp_path):
-    """Three cameras of six, 60 degrees apart: half of the frames of a full circle would show what no photo saw."""
+def test_cameras_on_one_side_get_no_full_circle(made, cli, capsys, tmp_path):
+    """Three cameras of six, 60 degrees apart: half of a full circle's frames would show what no photo saw."""
     folder, _, bare, views = made
     run = RunFolder(tmp_path / "run")
     run.write_config(folder.read_config() | {"origin": [0.0, 0.0, 0.0]})
@@ -150,8 +150,8 @@ def test_help_shows_an_example(cli, capsys):
 
 @pytest.mark.own_process
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
-def test_a_render_that_is_ended_leaves_no_temporary_file(made, cli, tmp_path, number):
-    """SIGTERM left one; what SIGKILL leaves goes with the next render."""
+def test_an_interrupted_render_leaves_no_temporary_file(made, cli, tmp_path, number):
+    """SIGTERM used to leave one. The next render removes what SIGKILL leaves."""
     (tmp_path / ".mine.original.mp4").write_text("a user's own hidden file")
     program = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
     words = ["render", str(made[2]), "--size", "64", "--out", str(tmp_path / "x.mp4")]

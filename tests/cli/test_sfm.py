@@ -1,4 +1,4 @@
-"""`gsplat-edu sfm`: what it says, and that bad input costs one line."""
+"""`gsplat-edu sfm`: its messages, and one-line errors for bad input."""
 
 import importlib.util
 import io
@@ -48,7 +48,7 @@ def test_photos_become_a_capture(tmp_path, capsys):
     assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "my out")]) == 0
     said = capsys.readouterr().out.replace("\n", "")
     assert "6 of 6 photos have a pose" in said and "mean reprojection error 0." in said
-    assert f"next: gsplat-edu train '{tmp_path / 'my out'}' --out RUN" in said, "it can be pasted"
+    assert f"next: gsplat-edu train '{tmp_path / 'my out'}' --out RUN" in said, "the command can be pasted"
     assert len(load_dataset(tmp_path / "my out").train) == 5
 
 
@@ -104,7 +104,7 @@ def _unreadable(folder):
     ],
 )
 @pytest.mark.usefixtures("colmap", "as_shipped")
-def test_what_gives_no_poses_is_one_line(tmp_path, capsys, make, says):
+def test_input_that_yields_no_poses_is_a_one_line_error(tmp_path, capsys, make, says):
     make(tmp_path / "photos")
     assert main(["sfm", str(tmp_path / "photos"), str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
@@ -130,18 +130,18 @@ def test_an_empty_video_is_one_line(tmp_path, capsys):
     ],
 )
 @pytest.mark.usefixtures("colmap", "as_shipped")
-def test_the_users_photos_are_not_written_over(tmp_path, capsys, out, says):
+def test_the_users_photos_are_not_overwritten(tmp_path, capsys, out, says):
     _refused(tmp_path, capsys, tmp_path / ("images" if out == "." else "photos"), out, says)
 
 
 @pytest.mark.parametrize("place", ["sfm/photos", "sfm/frames", "masks", "sparse/0", "images/day 1"])
 @pytest.mark.usefixtures("colmap", "as_shipped")
-def test_photos_where_a_run_puts_things_are_not_removed(tmp_path, capsys, place):
+def test_photos_inside_the_output_folder_are_not_removed(tmp_path, capsys, place):
     _refused(tmp_path, capsys, tmp_path / "out" / place, "out", "is the folder of the photos")
 
 
 @pytest.mark.usefixtures("colmap", "as_shipped")
-def test_a_video_where_a_run_puts_things_is_not_removed(tmp_path, capsys):
+def test_a_video_inside_the_output_folder_is_not_removed(tmp_path, capsys):
     (tmp_path / "out" / "sfm" / "frames").mkdir(parents=True)
     video = tmp_path / "out" / "sfm" / "frames" / "walk.mp4"
     video.write_bytes(b"")
@@ -154,7 +154,7 @@ def test_a_video_where_a_run_puts_things_is_not_removed(tmp_path, capsys):
     "mine", ["masks/mine.png", "sparse/mine.txt", "images/mine.txt", "sfm/models/mine.txt", "sfm/database.db"]
 )
 @pytest.mark.usefixtures("colmap", "as_shipped")
-def test_what_no_run_put_there_stays(tmp_path, capsys, mine):
+def test_files_that_no_run_created_are_kept(tmp_path, capsys, mine):
     (tmp_path / "out" / mine).parent.mkdir(parents=True)
     (tmp_path / "out" / mine).write_text("mine")
     _refused(
@@ -189,7 +189,7 @@ def _refused(tmp_path, capsys, source, out, says):
 def test_options_out_of_range_cost_one_line(tmp_path, capsys, words, named):
     try:
         code = main(["sfm", str(tmp_path), str(tmp_path / "out"), *words])
-    except SystemExit as stop:  # what argparse refuses
+    except SystemExit as stop:  # raised by argparse
         code = stop.code
     said = capsys.readouterr().err
     assert code == 2 and named in said and said.count("\n") == 1
@@ -204,7 +204,7 @@ def test_without_pycolmap_one_line_says_how_to_install_it(tmp_path, capsys, monk
 
 
 @pytest.mark.usefixtures("colmap")
-def test_ctrl_c_says_that_it_goes_on(tmp_path, capsys, monkeypatch):
+def test_an_interrupt_says_how_to_resume(tmp_path, capsys, monkeypatch):
     save(tmp_path / "photos", [box_camera(0.2 * i) for i in range(4)])
 
     def press(*arguments):
@@ -217,7 +217,7 @@ def test_ctrl_c_says_that_it_goes_on(tmp_path, capsys, monkeypatch):
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_bars_show_a_stage_after_the_other():
+def test_bars_show_one_stage_after_another():
     drawn = io.StringIO()
     with stage_bars(Console(file=drawn, force_terminal=True, width=100)) as progress:
         for stage, total in (("features", 3), ("matches", 7)):
@@ -228,16 +228,16 @@ def test_bars_show_a_stage_after_the_other():
 
 @pytest.fixture
 def never(monkeypatch):
-    """Fail if poses are looked for."""
+    """Fail if structure from motion starts."""
 
     def fail(*arguments):
-        raise AssertionError("poses were looked for")
+        raise AssertionError("structure from motion started")
 
     monkeypatch.setattr("gsplat_edu.cli.train.reconstruct", fail)
 
 
 @pytest.mark.usefixtures("as_shipped", "never")
-def test_a_finished_run_is_asked_for_before_its_capture_is_replaced(tmp_path, capsys):
+def test_an_existing_run_needs_resume_before_its_capture_is_replaced(tmp_path, capsys):
     save(tmp_path / "photos", box_orbit(3))
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.json").write_text("{}")
@@ -247,7 +247,7 @@ def test_a_finished_run_is_asked_for_before_its_capture_is_replaced(tmp_path, ca
 
 
 @pytest.mark.usefixtures("never")
-def test_a_run_that_goes_on_keeps_its_poses(tmp_path):
+def test_a_resumed_run_keeps_its_poses(tmp_path):
     save(tmp_path / "photos", box_orbit(3))
     found = tmp_path / "run" / "capture"
     (found / "sparse" / "0").mkdir(parents=True)
@@ -261,7 +261,7 @@ def test_a_run_that_goes_on_keeps_its_poses(tmp_path):
 
 
 @pytest.mark.usefixtures("as_shipped", "never")
-def test_points_that_are_not_there_are_named_before_poses_are_looked_for(tmp_path, capsys):
+def test_missing_points_are_reported_before_poses_are_computed(tmp_path, capsys):
     save(tmp_path / "photos", box_orbit(3))
     words = ["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--points", "nowhere.ply"]
     assert main(words) == 2

@@ -1,4 +1,4 @@
-"""`gsplat-edu train`: options become a recipe, and bad input costs one line."""
+"""`gsplat-edu train`: options become a recipe, and bad input is a one-line error."""
 
 import json
 
@@ -22,7 +22,7 @@ def options(*words):
     return options_from(parsed(["train", "somewhere", "--out", "run", *words]))
 
 
-def test_no_options_are_the_recipe():
+def test_without_options_the_recipe_has_its_defaults():
     chosen = options()
     assert chosen.config == TrainConfig() == recipe()
     assert chosen.data_settings.background == (0.0, 0.0, 0.0)
@@ -52,7 +52,7 @@ def test_the_other_strategies_and_colours():
     assert options("--strategy", "none").config.strategy == "none"
     assert options("--background", "0.1", "0.2", "0.3").config.background == (0.1, 0.2, 0.3)
     late = options("--no-rescale", "--densify-start", "26000", "--densify-stop", "28000").config
-    assert late.adc.densify_stop == 28_000, "the window of the other strategy is not looked at"
+    assert late.adc.densify_stop == 28_000, "the other strategy's window is not checked"
 
 
 def test_every_field_of_the_recipe_has_an_option(capsys):
@@ -65,7 +65,7 @@ def test_every_field_of_the_recipe_has_an_option(capsys):
 
 
 def test_config_json_has_the_flat_names_of_older_runs():
-    """A run of `mcmc` as the version before nested settings wrote it; that it is resumed is checked key by key."""
+    """An `mcmc` config as written before settings were nested. Resuming compares configurations key by key."""
     older = {
         "iterations": 700, "seed": 0, "means_rate": 0.00016, "means_rate_final": 1.6e-06, "means_rate_iterations": 700,
         "quats_rate": 0.001, "scales_rate": 0.005, "sh0_rate": 0.0025, "sh_rest_rate": 0.000125, "opacities_rate": 0.05,
@@ -91,7 +91,7 @@ def test_durations(text, seconds):
 
 
 @pytest.mark.parametrize("limit", [["--max-memory", "4GiB"], ["--time-limit", "20m"]])
-def test_the_cap_of_mcmc_is_left_to_the_plan_where_there_is_one(limit):
+def test_mcmc_leaves_its_cap_to_the_plan_if_there_is_one(limit):
     words = ["train", "capture", "--out", "run", "--strategy", "mcmc", *limit]
     assert options_from(build_parser(["train"]).parse_args(words)).config.max_gaussians is None
 
@@ -129,11 +129,11 @@ def test_sizes(text, size):
 def test_options_out_of_range_cost_one_line(tmp_path, capsys, words, named):
     try:
         code = main(["train", str(tmp_path), "--out", str(tmp_path / "run"), *words])
-    except SystemExit as stop:  # what argparse refuses
+    except SystemExit as stop:  # raised by argparse
         code = stop.code
     said = capsys.readouterr().err
     assert code == 2 and named in said and said.count("\n") == 1
-    assert not (tmp_path / "run").exists(), "nothing was begun"
+    assert not (tmp_path / "run").exists(), "nothing was started"
 
 
 def _nothing(folder):
@@ -196,7 +196,7 @@ def test_a_capture_that_cannot_be_used_costs_one_line(tmp_path, capsys, make):
     code = main(["train", str(tmp_path / "capture"), "--out", str(tmp_path / "run"), "--iterations", "2"])
     said = capsys.readouterr().err
     assert code == 2 and FAULTS[make] in said and said.count("\n") == 1, said
-    assert not (tmp_path / "run").exists(), "nothing was begun"
+    assert not (tmp_path / "run").exists(), "nothing was started"
 
 
 def test_one_photo_is_enough(tmp_path):
@@ -209,7 +209,7 @@ def test_one_photo_is_enough(tmp_path):
     assert metrics["train"]["num_images"] == 1 and metrics["test"]["num_images"] == 0
 
 
-def test_a_scene_is_exported_and_what_the_files_show_is_reported(tmp_path, capsys):
+def test_a_scene_is_exported_and_the_psnr_of_each_file_is_reported(tmp_path, capsys):
     write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=40))
     files = [tmp_path / "out" / "scene.spz", tmp_path / "scene.html"]
     words = [
@@ -232,7 +232,7 @@ def test_a_scene_is_exported_and_what_the_files_show_is_reported(tmp_path, capsy
         assert str(path) in (tmp_path / "run" / "report.html").read_text()
 
 
-def test_an_export_that_cannot_be_written_is_found_out_before_the_training(tmp_path, capsys):
+def test_an_impossible_export_is_reported_before_training(tmp_path, capsys):
     write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=40))
     words = ["train", tmp_path / "capture", "--out", tmp_path / "run", "--export", tmp_path / "scene.obj"]
     assert main([str(word) for word in words]) == 2

@@ -21,12 +21,12 @@ def run(*arguments, **options):
 @pytest.mark.sliced(0)
 @pytest.mark.slow
 def test_the_default_budget_trains_end_to_end(tmp_path):
-    """The dense backend's reduced budget: at least threefold on the camera that was held out.
+    """The dense backend's reduced budget cuts the held-out error at least threefold.
 
-    Minutes: it waits for `make soak`. Every run follows the first hundred iterations of that backend (tests/golden).
+    This takes minutes, so only `make soak` runs it. tests/golden checks the first hundred iterations on every run.
     """
     out = tmp_path / "new" / "folder" / "sphere.png"
-    # One thread: torch's wait for one another, for minutes where other programs run.
+    # Use one thread: torch's threads wait for each other, which takes minutes on a busy machine.
     done = run("--backend", "torch", "--out", out, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
@@ -37,8 +37,8 @@ def test_the_default_budget_trains_end_to_end(tmp_path):
     assert re.fullmatch(r"iter    0  L1 0\.\d{4}  K 400", lines[1])
     assert re.fullmatch(r"  densify: \+\d+ cloned, \+\d+ split children, -\d+ pruned -> K=\d+", lines[3])
     assert re.fullmatch(r"300 iters in \d+\.\d s -> \d+\.\d{3} ms/iter at 64 px, K~800", lines[-3])
-    judged = re.fullmatch(r"held-out L1: init (0\.\d{4}) -> final (0\.\d{4})", lines[-2])
-    before, after = (float(number) for number in judged.groups())
+    scores = re.fullmatch(r"held-out L1: init (0\.\d{4}) -> final (0\.\d{4})", lines[-2])
+    before, after = (float(number) for number in scores.groups())
     assert before > 3 * after
 
     written = {path.name for path in out.parent.iterdir()}
@@ -73,7 +73,7 @@ def test_an_interrupt_is_one_line_and_exit_code_130(tmp_path):
         tmp_path / "x.png",
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        for line in process.stdout:  # ends by itself if the process dies
+        for line in process.stdout:  # the loop also ends if the process dies
             if line.startswith("iter "):
                 break
         else:

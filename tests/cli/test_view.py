@@ -1,4 +1,4 @@
-"""`gsplat-edu view`: a real server in a process of its own, asked by real requests."""
+"""`gsplat-edu view`: a real server in its own process, and real requests."""
 
 import dataclasses
 import os
@@ -38,7 +38,7 @@ own_process = pytest.mark.own_process
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A run whose coordinates were moved and whose background is orange; and its scene alone, as a .splat."""
+    """A run with moved coordinates and an orange background, and its scene alone as a .splat."""
     root = tmp_path_factory.mktemp("made")
     views, points, colors = procedural_capture(size=48, count=6)
     gaussians = splats_on(points, colors)
@@ -53,7 +53,7 @@ def made(tmp_path_factory):
 
 @contextmanager
 def viewing(*words, ends_with=signal.SIGINT):
-    """Run the command; yield what it printed up to the URL, and the URL. It has to end well when it is told to."""
+    """Run the command; yield its output up to the URL, and the URL. It must exit cleanly on the signal `ends_with`."""
     command = [*COMMAND, *map(str, words)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
@@ -116,7 +116,7 @@ def test_a_scene_of_another_format_has_no_cameras(made):
 
 @pytest.mark.skipif(shutil.which("sh") is None or sys.platform == "win32", reason="needs sh and a terminal")
 @own_process
-def test_a_person_at_a_screen_has_the_browser_opened(made, tmp_path):
+def test_the_browser_opens_for_a_user_at_a_screen(made, tmp_path):
     import pty
 
     _, bare = made
@@ -126,7 +126,7 @@ def test_a_person_at_a_screen_has_the_browser_opened(made, tmp_path):
     script.chmod(0o755)
 
     def opened(*words, **environment):
-        """Say which URL was opened before the command was interrupted, which is when it had time to."""
+        """Return whether the browser opened the URL before the command was interrupted."""
         noted.unlink(missing_ok=True)
         ours, theirs = pty.openpty()
         command = [*COMMAND, str(bare), "--port", "0", *words]
@@ -183,7 +183,7 @@ def test_what_cannot_be_shown_costs_one_line(tmp_path, monkeypatch, capsys, word
     default = [] if "--port" in words else ["--port", "0"]
     try:
         code = command_line.main(["view", *words, *default])
-    except SystemExit as stop:  # what argparse refuses
+    except SystemExit as stop:  # raised by argparse
         code = stop.code
     said = capsys.readouterr()
     assert code == 2 and said.out == ""

@@ -1,4 +1,4 @@
-"""What the tests of captures share: a capture on disk, and the real ones where this machine has them."""
+"""Fixtures for capture tests: a capture on disk, and the real captures if this machine has them."""
 
 import json
 import os
@@ -45,7 +45,7 @@ def written(tmp_path, small):
 
 @pytest.fixture
 def real():
-    """Return a real capture's folder, or skip by its name."""
+    """Return a real capture's folder, or skip the test and name the capture."""
 
     def find(name: str) -> Path:
         shared = Path(__file__).parents[3] / "shared" / "data"

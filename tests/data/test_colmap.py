@@ -1,4 +1,4 @@
-"""COLMAP's files: odd models, refusals by name, photos in folders, and files that are cut short or garbled."""
+"""COLMAP's files: odd models, refusals by name, photos in folders, and truncated or garbled files."""
 
 import os
 import shutil
@@ -29,7 +29,7 @@ def text(written):
     return written("text")
 
 
-def test_bin_and_txt_say_the_same(capture, text):
+def test_bin_and_txt_give_the_same_dataset(capture, text):
     a, b = load_dataset(capture, EVERYTHING), load_dataset(text, EVERYTHING)
     np.testing.assert_array_equal(a.points, b.points)
     np.testing.assert_array_equal(a.colors, b.colors)
@@ -46,7 +46,7 @@ def test_bin_wins_over_txt(capture):
 
 
 @pytest.mark.parametrize("name", ["rigs.bin", "frames.bin"])
-def test_newer_files_are_no_trouble(capture, name):
+def test_newer_files_are_ignored(capture, name):
     (capture / "sparse" / "0" / name).write_bytes(b"\1\2\3")
     assert len(load_dataset(capture).train) == 7
 
@@ -76,7 +76,7 @@ READ = [
     ("line", "intrinsics", "coefficients", "fisheye"), READ, ids=lambda v: str(v).split()[0]
 )
 def test_camera_models(tmp_path, line, intrinsics, coefficients, fisheye):
-    """The text and the binary form of a camera; its number in the binary form is its place in MODELS."""
+    """Both the text and the binary form of a camera. In the binary form, the model id is its index in MODELS."""
     model, W, H, *values = line.split()
     (tmp_path / "cameras.txt").write_text(f"# a comment\n\n7 {line}\n")
     number = [name for name, _ in MODELS].index(model)
@@ -90,8 +90,8 @@ def test_camera_models(tmp_path, line, intrinsics, coefficients, fisheye):
         assert lens.coefficients == (*coefficients, *[0.0] * ((4 if fisheye else 8) - len(coefficients)))
 
 
-def test_the_numbers_of_the_models():
-    """The numbers of COLMAP's documentation, which a table in another order would get wrong."""
+def test_the_ids_of_the_models():
+    """The ids are those in COLMAP's documentation; a table in another order would get them wrong."""
     names = [name for name, _ in MODELS]
     assert names[:6] == ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
     assert names[6:9] == ["FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE"]
@@ -99,7 +99,7 @@ def test_the_numbers_of_the_models():
 
 
 @pytest.mark.parametrize("number", [7, 10, 11, 12, 13, 16, 17, 18, 99, -1])
-def test_models_that_are_not_read_are_refused_by_name(tmp_path, number):
+def test_unsupported_models_are_refused_by_name(tmp_path, number):
     path = tmp_path / "cameras.bin"
     path.write_bytes(struct.pack("<QIiQQ16d", 1, 7, number, 24, 18, *range(1, 17)))
     with pytest.raises(DatasetError) as caught:
@@ -135,8 +135,8 @@ def test_a_malformed_line_is_named(text, file, line, content):
     assert "\n" not in str(caught.value)
 
 
-def test_numbers_with_gaps_and_a_name_with_a_space(text):
-    """COLMAP numbers images and cameras as it likes, and drops some."""
+def test_ids_with_gaps_and_a_name_with_a_space(text):
+    """COLMAP may give images and cameras any ids, with gaps."""
     model = text / "sparse" / "0"
     for file, old, new in (("cameras", "1 PINHOLE", "907 PINHOLE"), ("images", " 1 view_", " 907 view_")):
         path = model / f"{file}.txt"
@@ -148,7 +148,7 @@ def test_numbers_with_gaps_and_a_name_with_a_space(text):
     assert len(dataset.train) == 9 and dataset.train[0].name == "view 002.png" and dataset.notes == ()
 
 
-def test_a_camera_that_is_not_there(text):
+def test_a_missing_camera_is_named(text):
     path = text / "sparse" / "0" / "images.txt"
     path.write_text(path.read_text().replace(" 1 view_003", " 5 view_003"))
     with pytest.raises(DatasetError, match=r"image view_003\.png: its camera 5 is not in cameras\.txt"):
@@ -157,7 +157,7 @@ def test_a_camera_that_is_not_there(text):
 
 @pytest.mark.parametrize("quat", ["0 0 0 0", "nan 0 0 0", "inf 0 0 0"])
 @pytest.mark.parametrize("shift", ["0 0 0", "nan 0 0", "1e300 0 0", "1e13 0 0"])
-def test_a_pose_that_is_none(text, quat, shift):
+def test_an_invalid_pose_names_its_image(text, quat, shift):
     path = text / "sparse" / "0" / "images.txt"
     lines = path.read_text().split("\n")
     lines[3] = f"2 {quat} {shift} 1 view_001.png"
@@ -168,7 +168,7 @@ def test_a_pose_that_is_none(text, quat, shift):
 
 @pytest.mark.parametrize("place", ["images/a/b.png", "a/b.png", "images/b.png"])
 def test_names_with_folders(tmp_path, small, place):
-    """As images/NAME, as NAME from the capture, and by the bare name in images/."""
+    """A photo is found as images/NAME, as NAME in the capture's folder, and by its bare name in images/."""
     view = small[0][0]
     write_colmap(tmp_path, [view], *small[1:])
     path = tmp_path / "sparse" / "0" / "images.bin"
@@ -180,7 +180,7 @@ def test_names_with_folders(tmp_path, small, place):
     np.testing.assert_array_equal(found.image, view.image)
 
 
-def test_missing_photos_are_told_and_skipped(capture):
+def test_missing_photos_are_reported_and_skipped(capture):
     for i in (2, 5):
         (capture / "images" / f"view_00{i}.png").unlink()
     dataset = load_dataset(capture, EVERYTHING)
@@ -191,7 +191,7 @@ def test_missing_photos_are_told_and_skipped(capture):
         load_dataset(capture)
 
 
-def test_a_model_of_no_images(capture):
+def test_a_model_without_images(capture):
     (capture / "sparse" / "0" / "images.bin").write_bytes(struct.pack("<Q", 0))
     with pytest.raises(DatasetError, match=r"images\.bin: lists no images"):
         load_dataset(capture)
@@ -216,8 +216,8 @@ def test_without_points_the_start_is_random(capture, how):
     assert len(dataset.points) == 100_000 and any("no points" in note for note in dataset.notes)
 
 
-def test_tracks_and_observations_are_stepped_over(tmp_path):
-    """Both have a length of their own per entry; written here by hand, with the numbers that have to come out."""
+def test_tracks_and_observations_are_skipped(tmp_path):
+    """Both vary in length from entry to entry. The files are written here by hand, so the expected values are known."""
     data = struct.pack("<Q", 2)
     for i, track in ((3, 2), (9, 0)):
         data += struct.pack("<Q3d3BdQ", i, i, i + 0.5, -i, 255, 0, 51, 0.7, track) + b"\xff" * 8 * track
@@ -250,13 +250,12 @@ def test_masks_beside_the_images(capture, stem):
 
 
 @pytest.mark.parametrize("file", MODEL_FILES)
-def test_every_truncation_is_told(capture, file):
-    """Whatever byte a file ends at, the error names the file; a file that lacks bytes is never read as whole."""
+def test_every_truncation_names_the_file(capture, file):
+    """Wherever a file is cut, the error names it. A truncated file is never read as a complete one."""
     path = capture / "sparse" / "0" / f"{file}.bin"
     data = path.read_bytes()
-    for end in range(
-        0, len(data), 7 if len(data) > 500 else 1
-    ):  # 7 and the 51 bytes of a point share no factor
+    # 7 and the 51 bytes of a point share no factor
+    for end in range(0, len(data), 7 if len(data) > 500 else 1):
         path.write_bytes(data[:end])
         with pytest.raises(DatasetError, match=rf"{file}\.bin"):
             read_colmap(capture, capture / "sparse" / "0")
@@ -279,7 +278,7 @@ def test_a_count_beyond_the_file_allocates_nothing(capture):
     head=st.booleans(),
 )
 def test_garbled_files_end_in_a_dataset_error_or_a_dataset(capture, file, flips, head):
-    """Nothing but DatasetError comes out, whatever bytes are flipped; half of the time early in the file."""
+    """Whatever bytes are flipped, nothing but DatasetError is raised. Half of the flips are early in the file."""
     path = capture / "sparse" / "0" / f"{file}.bin"
     whole = path.read_bytes()
     data = bytearray(whole)
@@ -295,7 +294,7 @@ def test_garbled_files_end_in_a_dataset_error_or_a_dataset(capture, file, flips,
 
 
 def test_the_statue_as_bin_and_as_txt(real, tmp_path):
-    """One model in both forms. The text has six digits for the camera, and points without rounding."""
+    """One model in both forms. The text gives six digits of the camera, and points without rounding."""
     folder = real("odd/statue_sparse_bin_and_txt")
     (a,), (b,) = (read_cameras(folder / f"cameras.{s}").values() for s in ("bin", "txt"))
     np.testing.assert_allclose((a.fx, a.fy, a.cx, a.cy), (b.fx, b.fy, b.cx, b.cy), rtol=5e-6)
@@ -327,8 +326,8 @@ def renamed(capture, names):
     path.write_text(text)
 
 
-def test_a_bare_name_that_two_images_share_is_nobodys(text):
-    """Else both views would be trained on one photo, with two poses."""
+def test_a_bare_name_that_two_images_share_is_not_used(text):
+    """Otherwise one photo would be trained on as two views with two poses."""
     renamed(text, {"view_001.png": "a/view_000.png"})
     with pytest.raises(DatasetError, match=r"none of the 9 photos"):
         (text / "images").rename(text / "elsewhere")
@@ -348,7 +347,7 @@ def test_two_images_of_one_file_are_refused(text):
         load_dataset(text)
 
 
-def test_a_bare_mask_that_two_images_share_is_not_used_and_told(text):
+def test_a_bare_mask_that_two_images_share_is_reported_and_not_used(text):
     renamed(text, {"view_001.png": "a/view_000.png", "view_000.png 1": "view_000.png 1"})
     (text / "images" / "a").mkdir()
     (text / "images" / "view_001.png").rename(text / "images" / "a" / "view_000.png")
@@ -364,8 +363,8 @@ def test_a_bare_mask_that_two_images_share_is_not_used_and_told(text):
 
 
 @pytest.mark.parametrize("number", [7, 10, 11, 12, 13, 16, 17])
-def test_a_refused_camera_that_nothing_uses_is_no_trouble(capture, number):
-    """The parameters of every model are known, so that the cameras behind it are read from the right byte."""
+def test_an_unsupported_camera_that_no_image_uses_is_skipped(capture, number):
+    """The parameter count of every model is known, so the cameras after it are read from the right byte."""
     path = capture / "sparse" / "0" / "cameras.bin"
     values = range(1, 1 + len(dict(MODELS)[MODELS[number][0]].split()))
     odd = struct.pack(f"<IiQQ{len(values)}d", 99, number, 24, 18, *values)
@@ -374,7 +373,7 @@ def test_a_refused_camera_that_nothing_uses_is_no_trouble(capture, number):
     assert len(values) == {7: 5, 10: 12, 11: 16, 12: 4, 13: 5, 16: 6, 17: 2}[number]
 
 
-def test_a_pose_without_a_photo_may_be_anything(text):
+def test_a_pose_without_a_photo_is_not_checked(text):
     renamed(text, {"view_001.png": "gone.png"})
     path = text / "sparse" / "0" / "images.txt"
     lines = path.read_text().split("\n")
@@ -396,7 +395,7 @@ def test_the_folder_of_models_and_a_model_that_is_not_0(capture, named):
     ]
 
 
-def test_points_of_the_other_kind(capture, text):
+def test_points_in_the_other_format(capture, text):
     """cameras.bin and images.bin with a points3D.txt."""
     (capture / "sparse" / "0" / "points3D.bin").unlink()
     shutil.copy(text / "sparse" / "0" / "points3D.txt", capture / "sparse" / "0")
@@ -405,8 +404,8 @@ def test_points_of_the_other_kind(capture, text):
 
 
 @pytest.mark.parametrize("layout", ["colmap", "text"])
-def test_names_of_other_systems(written, layout):
-    """A backslash is a folder's end, and a name that is not UTF-8 is the file's of those bytes."""
+def test_names_from_other_systems(written, layout):
+    """A backslash separates folders. A name that is not UTF-8 matches the file with the same bytes."""
     folder = written(layout)
     path = folder / "sparse" / "0" / ("images.bin" if layout == "colmap" else "images.txt")
     data = path.read_bytes().replace(b"view_000.png", b"a\\view0.png").replace(b"view_001", b"view\xff01")
@@ -419,7 +418,7 @@ def test_names_of_other_systems(written, layout):
     assert len(names) == 9 and "a/view0.png" in names and "view\\xff01.png" in names
 
 
-def test_a_colour_that_is_no_number_is_gray(text):
+def test_a_nonfinite_colour_channel_is_gray(text):
     path = text / "sparse" / "0" / "points3D.txt"
     lines = path.read_text().split("\n")
     lines[1] = "1 0 0 0 nan 51 255 0"
@@ -427,8 +426,8 @@ def test_a_colour_that_is_no_number_is_gray(text):
     np.testing.assert_allclose(load_dataset(text).colors[0], [0.5, 0.2, 1.0])
 
 
-def test_a_full_photo_beside_wins_over_a_smaller_copy(capture):
-    """Photos beside the model, not in images/, and an images_2 from somewhere."""
+def test_a_full_photo_beside_the_model_wins_over_a_smaller_copy(capture):
+    """The photos lie beside the model instead of in images/, and an unrelated images_2 exists."""
     (capture / "images").rename(capture / "images_2")
     for file in (capture / "images_2").iterdir():
         shutil.copy(file, capture)

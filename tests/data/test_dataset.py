@@ -1,4 +1,4 @@
-"""What is done to every capture after reading: detection, split, origin, start points, settings, preloading."""
+"""Steps shared by all captures: detection, split, origin, start points, settings, preloading."""
 
 import json
 import shutil
@@ -32,13 +32,13 @@ from gsplat_edu.views import View
         ({"image_memory": -1}, "image_memory"),
     ],
 )
-def test_settings_that_cannot_be(as_shipped, values, word):
+def test_invalid_settings_are_refused(as_shipped, values, word):
     with pytest.raises(ArgumentError, match=word):
         DataSettings(**values)
 
 
 @pytest.mark.parametrize("name", ["nothing", "empty", "photos", "photos/images"])
-def test_what_is_no_capture_says_what_was_looked_for(tmp_path, name):
+def test_a_folder_without_a_capture_names_what_is_missing(tmp_path, name):
     (tmp_path / "empty").mkdir()
     (tmp_path / "photos" / "images").mkdir(parents=True)
     Image.new("RGB", (4, 4)).save(tmp_path / "photos" / "images" / "a.JPG")
@@ -64,7 +64,7 @@ def test_a_model_is_found_in_each_place(written, tmp_path, place):
     assert len(load_dataset(folder).train) == 7
 
 
-def test_the_model_folder_itself_may_be_named(written):
+def test_the_model_folder_itself_may_be_given(written):
     folder = written("colmap")
     assert len(load_dataset(folder / "sparse" / "0").train) == 7
 
@@ -77,13 +77,13 @@ def test_both_kinds_of_poses(written, small):
     assert any("transforms.json and a COLMAP model" in note for note in dataset.notes)
 
 
-def test_several_models_are_told(written):
+def test_several_models_are_reported(written):
     folder = written("colmap")
     (folder / "sparse" / "1").mkdir()
     assert any("2 models: 0 is read, 1 not" in note for note in load_dataset(folder).notes)
 
 
-def test_every_eighth_view_by_name_is_for_testing(written, small):
+def test_every_eighth_view_by_name_is_held_out(written, small):
     folder, names = written("colmap"), sorted(view.name for view in small[0])
     dataset = load_dataset(folder)
     assert [v.name for v in dataset.test] == [names[0], names[8]]
@@ -112,7 +112,7 @@ def test_the_captures_own_split(tmp_path, small):
     dataset = load_dataset(tmp_path)
     assert [v.name for v in dataset.train] == names[:4] and [v.name for v in dataset.test] == names[6:]
     assert any("2 of 9 photos are in none" in note for note in dataset.notes)
-    assert len(load_dataset(tmp_path, DataSettings(test_every=0)).train) == 9  # asked for another split
+    assert len(load_dataset(tmp_path, DataSettings(test_every=0)).train) == 9  # another split is requested
     write_transforms(tmp_path, views, extra={"val_filenames": names[:2]})
     assert [v.name for v in load_dataset(tmp_path).train] == names[2:]
     write_transforms(tmp_path, views, extra={"test_filenames": names})
@@ -121,7 +121,7 @@ def test_the_captures_own_split(tmp_path, small):
 
 
 def test_far_coordinates_are_moved_to_the_origin(tmp_path, small):
-    """Integers are subtracted, so at 1e5 all but the last bits (1e-11 of 1e5) of the distances survive."""
+    """The offset is an integer, so distances at 1e5 keep all but their last bits (1e-11)."""
     views, points, colors = small
     shift = np.array([1e5, -2.5e5, 3e4])
     moved = []
@@ -137,14 +137,14 @@ def test_far_coordinates_are_moved_to_the_origin(tmp_path, small):
             dataset.origin, np.round(np.mean([v.camera.eye for v in moved], axis=0))
         )
         for view, before in zip(dataset.train, moved, strict=True):
-            # COLMAP stores -R e: its rounding is that of numbers of 2.5e5, 3e-11 each, three of them summed twice.
+            # COLMAP stores -R e. Numbers of 2.5e5 are rounded by 3e-11, and three of them are summed twice.
             np.testing.assert_allclose(view.camera.eye + dataset.origin, before.camera.eye, rtol=0, atol=1e-9)
             assert np.abs(view.camera.eye).max() < 10
         np.testing.assert_allclose(dataset.points + dataset.origin, points + shift, rtol=0, atol=1e-9)
         assert any("coordinates are large" in note for note in dataset.notes)
 
 
-def test_points_of_another_file(written, tmp_path, small):
+def test_points_from_another_file(written, tmp_path, small):
     cloud = Cloud(np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]]), np.array([[0.2, 0.4, 0.6]] * 2))
     write_points_ply(tmp_path / "p.ply", cloud)
     dataset = load_dataset(written("colmap"), points=tmp_path / "p.ply")
@@ -189,7 +189,7 @@ def test_extent():
         scene_extent([])
 
 
-def test_poses_that_are_none_name_the_frame(tmp_path, small):
+def test_invalid_poses_name_the_frame(tmp_path, small):
     write_transforms(tmp_path, small[0])
     path = tmp_path / "transforms.json"
     contents = json.loads(path.read_text())
@@ -212,7 +212,7 @@ def test_poses_that_are_none_name_the_frame(tmp_path, small):
         assert "view_004" in str(caught.value)
 
 
-def test_a_rotation_of_few_digits_is_made_one_again(tmp_path, small):
+def test_a_rotation_with_few_digits_is_made_orthonormal(tmp_path, small):
     write_transforms(tmp_path, small[0])
     path = tmp_path / "transforms.json"
     contents = json.loads(path.read_text())
@@ -222,7 +222,8 @@ def test_a_rotation_of_few_digits_is_made_one_again(tmp_path, small):
     for view, truth in zip(load_dataset(tmp_path, DataSettings(test_every=0)).train, small[0], strict=True):
         R = view.camera.R
         np.testing.assert_allclose(R @ R.T, np.eye(3), rtol=0, atol=1e-14)
-        # Nine roundings of at most 5e-4 have a norm of at most 1.5e-3; the nearest rotation is as near as the truth.
+        # Nine roundings of at most 5e-4 have a norm of at most 1.5e-3. The true rotation is that near to the rounded
+        # matrix, so the nearest rotation is too.
         np.testing.assert_allclose(R, truth.camera.R, rtol=0, atol=2 * 1.5e-3)
 
 
@@ -236,7 +237,7 @@ def test_preload_keeps_what_fits_and_counts(written):
     assert dataset.train[0].read() is dataset.train[0].read()
 
 
-def test_what_is_over_the_budget_is_read_again_alike(written):
+def test_photos_over_the_memory_budget_are_read_again_unchanged(written):
     folder = written("colmap")
     roomy, tight = load_dataset(folder), load_dataset(folder, DataSettings(image_memory=3 * 24 * 18 * 3 + 5))
     tight.preload()
@@ -247,7 +248,7 @@ def test_what_is_over_the_budget_is_read_again_alike(written):
     assert len(tight.images) == 3
 
 
-def test_what_memory_is_too_small_for_is_told(written):
+def test_photos_that_do_not_fit_in_memory_are_reported(written):
     folder = written("colmap")
     assert not any("memory" in note for note in load_dataset(folder).notes)
     (note,) = load_dataset(folder, DataSettings(image_memory=9 * 24 * 18 * 3 - 1)).notes
@@ -278,14 +279,14 @@ def test_photos_decoded_at_once_are_limited_by_their_size(monkeypatch):
     ],
 )
 def test_memory_for_photos_includes_alpha_that_is_kept(name, mask, background, planes):
-    """A random background is chosen at every step, so alpha is kept; a JPEG has none."""
+    """A random background changes at every step, so alpha is kept; a JPEG has none."""
     source = PhotoFile(Path(name), mask, Lens(40, 20, 30.0, 30.0, 0.0, 0.0), 20, 10, background)
     assert ImageStore(0, [source] * 3).needed == 3 * 20 * 10 * planes
 
 
 @pytest.mark.parametrize("resolution", [None, 2.0])
-def test_ready_made_sizes_are_the_photos_where_there_are_no_others(written, resolution):
-    """Only images_2 and images_4: the real sizes decide, and no photo is halved twice."""
+def test_ready_made_sizes_are_used_if_there_are_no_full_photos(written, resolution):
+    """Only images_2 and images_4 exist. The files' real sizes decide, and no photo is halved twice."""
     for layout in ("colmap", "transforms"):
         folder = written(layout)
         for factor in (2, 4):
@@ -304,7 +305,7 @@ def test_ready_made_sizes_are_the_photos_where_there_are_no_others(written, reso
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + ".json", "a\0b"])
-def test_names_that_nothing_can_have(tmp_path, name):
+def test_impossible_file_names_are_refused(tmp_path, name):
     with pytest.raises(DatasetError, match="is neither a folder nor"):
         load_dataset(tmp_path / name)
     with pytest.raises(DatasetError, match="give a point cloud"):
@@ -338,12 +339,12 @@ def test_preload_names_the_corrupt_photo(written, as_shipped):
     folder = written("colmap")
     file = folder / "images" / "view_005.png"
     file.write_bytes(file.read_bytes()[:-60])
-    dataset = load_dataset(folder)  # headers are fine
+    dataset = load_dataset(folder)  # the headers are intact
     with pytest.raises(DatasetError, match=r"view_005\.png: cannot be decoded"):
         dataset.preload()
 
 
-def test_a_camera_with_uneven_pixels_is_told(tmp_path):
+def test_a_camera_with_uneven_pixels_is_reported(tmp_path):
     camera = Camera(look_at((0, 0, -3), (0, 0, 0)), (0, 0, -3), 40, 20, 3.5, 3.5, 8, 8)
     write_transforms(tmp_path, [View(camera, np.zeros((8, 8, 3), np.uint8), name="a.png")])
     assert any("calibration may be wrong" in note for note in load_dataset(tmp_path).notes)

@@ -1,4 +1,4 @@
-"""Captures and scenes that somebody made to break readers, or that are merely huge: one line each, in bounded work."""
+"""Captures and scenes made to break readers, or merely huge: each gives a one-line error, in bounded work."""
 
 import json
 import os
@@ -27,10 +27,10 @@ EVERYTHING = DataSettings(test_every=0)
 
 @pytest.fixture
 def no_hang():
-    """End a test that waits for a pipe: a minute is far beyond what it takes."""
+    """Fail a test that hangs on a pipe. A minute is far more than it needs."""
 
     def late(number, frame):
-        raise AssertionError("waits for ever")
+        raise AssertionError("the test hangs")
 
     before = signal.signal(signal.SIGALRM, late)
     signal.alarm(60)
@@ -39,7 +39,7 @@ def no_hang():
     signal.signal(signal.SIGALRM, before)
 
 
-def test_there_is_one_door_to_image_files():
+def test_only_one_module_opens_image_files():
     """`image_files.py` holds the list of formats; nothing else opens an image."""
     opens = re.compile(r"Image\.open\(|\bimread\(|imdecode\(|plt\.imread|image_dimensions")
     files = [*(ROOT / "src").rglob("*.py"), *(ROOT / "train").rglob("*.py")]
@@ -52,7 +52,7 @@ EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 12\n%%EndComments\nshowpa
 
 @pytest.mark.parametrize("read", [decode, decode_mask, image_size])
 def test_a_drawing_named_like_a_photo_starts_no_other_program(tmp_path, monkeypatch, read):
-    """Pillow runs Ghostscript for an EPS. A stand-in for `gs` leaves a mark where it is run."""
+    """Pillow runs Ghostscript for an EPS. A stand-in for `gs` leaves a mark if it runs."""
     mark, program = tmp_path / "was_run", tmp_path / "bin" / "gs"
     program.parent.mkdir()
     program.write_text(f"#!/bin/sh\ntouch {mark}\n")
@@ -69,7 +69,7 @@ def test_a_drawing_named_like_a_photo_starts_no_other_program(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp", "a.tif", "a.bmp", "a.ppm"])
-def test_the_formats_that_are_promised_are_read(tmp_path, name):
+def test_the_documented_formats_are_read(tmp_path, name):
     Image.new("RGB", (16, 12), (90, 80, 70)).save(tmp_path / name)
     assert decode(tmp_path / name)[0].shape == (12, 16, 3) and image_size(tmp_path / name) == (16, 12)
 
@@ -80,7 +80,7 @@ def special(folder: Path, kind: str, name: str) -> Path:
         os.mkfifo(path)
     elif kind == "a socket":
         here = Path.cwd()
-        os.chdir(folder)  # names of sockets are short
+        os.chdir(folder)  # socket paths must be short
         try:
             with socket.socket(socket.AF_UNIX) as made:
                 made.bind(name)
@@ -97,7 +97,7 @@ SCENES = ["a.ply", "a.compressed.ply", "a.splat", "a.spz", "a.sog", "a.glb"]
 
 
 @pytest.mark.parametrize("kind", ["a pipe", "a socket", "a device", "a folder"])
-def test_what_is_no_file_is_refused_by_every_reader(tmp_path, no_hang, kind):
+def test_special_files_are_refused_by_every_reader(tmp_path, no_hang, kind):
     for name in SCENES:
         with pytest.raises(OSError, match=f"is {kind}, not a file"):
             read_scene(special(tmp_path, kind, name))
@@ -145,11 +145,11 @@ def test_elements_larger_than_any_file(tmp_path):
         *("element foo 999999999999", *(f"property double a{i}" for i in range(9000))),
         *VERTEX,
     )
-    assert len(read_points_ply(path).points) == 0, "no row is wanted, so nothing is passed over"
+    assert len(read_points_ply(path).points) == 0, "no row is needed, so none is skipped"
 
 
 def test_thousands_of_elements_and_properties_are_looked_up_in_tables(tmp_path, monkeypatch):
-    """Names that count how often they are compared: at most once or so each, not once with every other."""
+    """The names count their comparisons: a few per name, not one with every other name."""
     from gsplat_edu import ply_table
 
     compared = 0
@@ -191,16 +191,16 @@ def transforms(folder: Path, names, **more) -> Path:
     return folder
 
 
-def test_many_frames_without_a_photo_cost_no_call_of_the_system_each(tmp_path, monkeypatch):
-    """300,000 of them took minutes: each could have 22 endings in 4 folders."""
-    asked = []
+def test_many_frames_without_a_photo_need_few_system_calls(tmp_path, monkeypatch):
+    """300,000 of them used to take minutes: each could have 22 endings in 4 folders."""
+    checked = []
     monkeypatch.setattr(
-        capture, "is_file", lambda path, really=capture.is_file: asked.append(path) or really(path)
+        capture, "is_file", lambda path, really=capture.is_file: checked.append(path) or really(path)
     )
     folder = transforms(tmp_path, [*(f"images/{i:04d}" for i in range(500)), "images/a"])
     dataset = load_dataset(folder, EVERYTHING)
     assert any("500 of 501 photos have no file" in note for note in dataset.notes)
-    assert len(asked) < 50
+    assert len(checked) < 50
 
 
 def test_many_frames_of_one_photo_read_its_header_once(tmp_path, monkeypatch):
@@ -225,7 +225,7 @@ def test_photos_are_found_under_every_ending_in_any_case(tmp_path):
 
 
 def test_photos_in_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
-    """A folder may allow opening files and not listing them; nothing is ruled out then."""
+    """A folder may allow opening files but not listing them. Then no name can be ruled out."""
 
     def refuse(place, really=os.listdir):
         if Path(place).name.startswith("images"):

@@ -44,7 +44,7 @@ def test_every_kind_of_pixel_becomes_rgb(tmp_path):
         decode(saved(tmp_path, Image.fromarray(gray.astype(np.float32)), "a.tiff"))
 
 
-def test_alpha_is_kept_apart(tmp_path):
+def test_alpha_is_returned_separately(tmp_path):
     alpha = RNG.integers(0, 256, (12, 16), dtype=np.uint8)
     rgb, found = decode(saved(tmp_path, Image.fromarray(np.dstack([NOISE, alpha]))))
     np.testing.assert_array_equal(rgb, NOISE)
@@ -61,7 +61,7 @@ def test_alpha_is_kept_apart(tmp_path):
 
 
 def test_exif_orientation_is_ignored(tmp_path):
-    """COLMAP measured the pixels as they are stored, so that is what the poses belong to."""
+    """COLMAP uses the pixels as they are stored, so the poses refer to those."""
     exif = Image.Exif()
     exif[0x0112] = 6  # turn by 90 degrees for display
     path = saved(tmp_path, Image.fromarray(NOISE), "a.png", exif=exif)
@@ -107,9 +107,8 @@ def test_a_broken_photo_among_good_ones(written):
 def test_downscaling_keeps_the_pixel_convention(one_photo):
     """A linear ramp, I = column + row: every pixel still shows the value of the place its camera looks at.
 
-    With I = a + b at column a, row b of the full image, and a' the column that the scaled camera maps the same ray
-    to, averaging whole cells of a ramp gives its value at the cell's middle; the file and the result are rounded to 8
-    bits, half a step each.
+    Averaging a whole cell of a ramp gives its value at the cell's centre, where the scaled camera's ray meets the full
+    image. The result is rounded to 8 bits, by at most half a step.
     """
     y, x = np.mgrid[:48, :72]
     ramp = np.repeat((x + y).astype(np.uint8)[..., None], 3, axis=2)
@@ -137,7 +136,7 @@ def test_an_impulse_lands_where_its_ray_does(one_photo):
 
 @pytest.mark.parametrize("resolution", [2, 4, 8])
 def test_ready_made_sizes_are_used(one_photo, resolution):
-    """images_4/a.png of its own size and pixels, 17x13, decides; 64/4 x 48/4 would be another."""
+    """The file's own size and pixels count: images_4/a.png is 17x13, while 64/4 x 48/4 would be 16x12."""
     folder = one_photo(np.zeros((48, 64, 3), np.uint8), cx=30.0, cy=20.0)
     W, H = {2: (32, 24), 4: (17, 13), 8: (8, 6)}[resolution]
     pixels = RNG.integers(0, 256, (H, W, 3), dtype=np.uint8)
@@ -171,7 +170,7 @@ def test_a_photo_of_another_size_rescales_its_camera(one_photo):
 
 @pytest.mark.parametrize("photo", [(1920, 1088), (1920, 1072), (1900, 1080), (960, 544)])
 def test_a_cropped_photo_is_refused(one_photo, photo):
-    """A 1920x1080 video that an encoder padded to 1088 rows has other rows than its camera."""
+    """An encoder may pad a 1920x1080 video to 1088 rows, which its camera does not have."""
     folder = one_photo(np.zeros((photo[1], photo[0], 3), np.uint8), w=1920, h=1080)
     with pytest.raises(DatasetError, match="another aspect ratio"):
         load_dataset(folder)
@@ -186,7 +185,7 @@ def test_a_cropped_photo_is_refused(one_photo, photo):
         ((1957, 1091), (978, 545)),
     ],
 )
-def test_sizes_that_were_rounded_are_one_camera(one_photo, camera, photo):
+def test_sizes_that_differ_by_rounding_are_accepted(one_photo, camera, photo):
     folder = one_photo(np.zeros((photo[1], photo[0], 3), np.uint8), w=camera[0], h=camera[1])
     found = load_dataset(folder).train[0].camera
     assert photo == (found.W, found.H)
@@ -194,8 +193,8 @@ def test_sizes_that_were_rounded_are_one_camera(one_photo, camera, photo):
 
 @pytest.mark.parametrize("limit", [150, 50])
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp"])
-def test_large_photos_are_photos(tmp_path, name, limit, monkeypatch):
-    """Pillow warns of an attack beyond its limit, and refuses beyond twice of it; it has to stand there afterwards."""
+def test_large_photos_are_read_and_pillows_limit_stays(tmp_path, name, limit, monkeypatch):
+    """Pillow warns of an attack above its limit and refuses above twice of it. Reading must not change the limit."""
     path = saved(tmp_path, Image.fromarray(NOISE), name, **({"lossless": True} if "webp" in name else {}))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
     found = []
@@ -243,17 +242,17 @@ def test_alpha_goes_over_the_background_when_read(one_photo, background):
     folder = one_photo(np.dstack([NOISE, alpha]))
     photo = load_dataset(folder, DataSettings(background=background)).train[0].read()
     expected = NOISE * (alpha / 255.0) + 255.0 * np.array(background) * (1 - alpha / 255.0)
-    # Rounded once; the float32 inside may tip a half to the other side.
+    # The result is rounded once; float32 inside may round a half the other way.
     np.testing.assert_allclose(photo.image, expected, rtol=0, atol=0.5 + 1e-4)
     assert photo.alpha is None
 
 
 @pytest.mark.parametrize("values", [{}, {"k1": -0.1}])
 def test_kept_alpha_downscales_like_the_composite(one_photo, values):
-    """Colour is averaged by its alpha, so that a background chosen later gives what choosing it first does.
+    """Colour is averaged with alpha as weight, so a background may be chosen before or after downscaling.
 
-    Averages of C alpha and of alpha go over any background as the average of the composites. Alpha and colour are
-    each rounded by half a step, the composite of them once more and that of every source too: at most 2 steps.
+    Over any background, the averages of C alpha and of alpha give the average of the composites. Alpha, colour, their
+    composite and each source composite are all rounded by half a step: at most 2 steps.
     """
     alpha = np.kron(RNG.integers(0, 2, (6, 8)), np.ones((4, 4))).astype(np.uint8) * 255
     alpha[3::7] = 90
@@ -275,9 +274,9 @@ def with_mask(folder, mask):
     return folder
 
 
-def test_a_mask_downscales_to_what_counts_as_a_whole(one_photo):
+def test_a_downscaled_mask_keeps_only_cells_that_count_entirely(one_photo):
     mask = np.full((24, 32), 255, np.uint8)
-    mask[5, 9] = 0  # one pixel of 16 that does not count
+    mask[5, 9] = 0  # one masked pixel in a cell of 16
     folder = with_mask(one_photo(np.zeros((24, 32, 3), np.uint8)), mask)
     found = load_dataset(folder, DataSettings(resolution=4.0)).train[0].read().mask
     expected = np.ones((6, 8), bool)
@@ -287,8 +286,8 @@ def test_a_mask_downscales_to_what_counts_as_a_whole(one_photo):
     np.testing.assert_array_equal(found, mask > 0)
 
 
-def test_a_masked_photo_is_downscaled_here(one_photo):
-    """The mask has the size of the full photo: a copy in images_2 would not fit it, nor is one looked for."""
+def test_a_masked_photo_does_not_use_a_ready_made_size(one_photo):
+    """The mask has the size of the full photo. A copy in images_2 would not fit it and is not looked for."""
     folder = with_mask(one_photo(np.zeros((24, 32, 3), np.uint8)), np.full((24, 32), 255, np.uint8))
     (folder / "images_2").mkdir()
     Image.new("RGB", (16, 12), (9, 9, 9)).save(folder / "images_2" / "a.png")
@@ -298,7 +297,7 @@ def test_a_masked_photo_is_downscaled_here(one_photo):
 
 
 def test_a_mask_is_undistorted_with_its_photo(one_photo):
-    """Photo and mask are the same picture; where the photo is clearly on one side of its edge, so is the mask."""
+    """Photo and mask are the same picture, so wherever the photo is clearly black or white, the mask agrees."""
     disk = np.where(np.hypot(*(np.mgrid[:48, :64] - np.array([20, 40])[:, None, None])) < 11, 255, 0).astype(
         np.uint8
     )
@@ -315,7 +314,7 @@ def test_a_mask_of_another_size_names_both(one_photo):
         load_dataset(folder)
 
 
-def test_a_file_that_changes_later_is_told(one_photo):
+def test_a_photo_whose_size_changes_later_is_refused(one_photo):
     folder = one_photo(np.zeros((24, 32, 3), np.uint8))
     view = load_dataset(folder).train[0]
     Image.new("RGB", (30, 24)).save(folder / "images" / "a.png")
@@ -327,9 +326,9 @@ def test_a_file_that_changes_later_is_told(one_photo):
     "distortion", [{}, {"k1": -0.2, "p1": 0.01}, {"camera_model": "OPENCV_FISHEYE", "k1": 1.0}]
 )
 def test_many_threads_read_the_same_pixels(tmp_path, distortion):
-    """A prefetcher reads from its own thread while the trainer reads from another; and memory makes no difference.
+    """A prefetcher reads in one thread while the trainer reads in another. The memory budget makes no difference.
 
-    Every frame has a focal length of its own, so that nothing can be kept from one to the next.
+    Every frame has its own focal length, so nothing can be reused from one frame for the next.
     """
     camera = Camera(np.eye(3), (0, 0, 0), 60, 60, 31.5, 75, 150, 64)
     pixels = RNG.integers(0, 256, (6, 150, 64, 3), dtype=np.uint8)
@@ -361,9 +360,9 @@ def test_many_threads_read_the_same_pixels(tmp_path, distortion):
 
 @pytest.mark.parametrize("distortion", [{"k1": -0.2}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}])
 def test_undistorting_takes_little_memory_and_keeps_none(one_photo, distortion):
-    """The maps of a whole photo are 8 bytes a pixel, and were 96 MB for one of 12 megapixels, outside of the budget.
+    """The maps of a whole photo would take 8 bytes a pixel, 96 MB for 12 megapixels, outside the memory budget.
 
-    What is needed is the photo, the undistorted one and a byte for what counts, 7 bytes, and some for 128 of 1500 rows.
+    The photo, the undistorted photo and the mask need 7 bytes a pixel, and 128 of 1500 rows need a little more.
     """
     folder = one_photo(np.zeros((1500, 2000, 3), np.uint8), **distortion)
     view = load_dataset(folder, DataSettings(image_memory=0)).train[0]

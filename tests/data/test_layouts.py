@@ -1,4 +1,4 @@
-"""Each layout written and read back: the cameras and pixels that went in come out, in all layouts alike."""
+"""Every layout is written and read back; each returns the same cameras and pixels that were written."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ EVERYTHING = DataSettings(test_every=0)
 
 
 def assert_same_camera(actual, expected, atol=1e-9):
-    """repr() of a double is exact, so text loses nothing; 1e-9 is room for R -> quaternion -> R and R'(R e)."""
+    """repr() of a double is exact, so text loses nothing; 1e-9 allows for R -> quaternion -> R and R'(R e)."""
     for name in ("R", "eye", "fx", "fy", "cx", "cy"):
         np.testing.assert_allclose(
             getattr(actual, name), getattr(expected, name), rtol=0, atol=atol, err_msg=name
@@ -46,7 +46,7 @@ def test_what_is_written_is_read(written, small, layout):
 
 
 def test_the_layouts_agree(written):
-    """The formats' axes and pixel centres differ; what is read from them may not."""
+    """The formats' axes and pixel centres differ; the cameras read from them must not."""
     colmap, others = load_dataset(written("colmap"), EVERYTHING), ("text", "transforms", "blender")
     for layout in others:
         other = by_stem(load_dataset(written(layout), EVERYTHING).train)
@@ -60,7 +60,7 @@ def test_the_layouts_agree(written):
 
 
 def test_intrinsics_that_differ_and_are_off_centre(tmp_path):
-    """Two cameras of two sizes with fx != fy, off the centre: COLMAP and transforms.json can say all of it."""
+    """Cameras of two sizes, with fx != fy and off-centre: COLMAP and transforms.json can store all of it."""
     rng = np.random.default_rng(3)
     views = []
     for i, (W, H) in enumerate([(20, 12), (15, 30), (20, 12)]):

@@ -1,4 +1,4 @@
-"""Undistortion against the lens formulas, written down here once more from OpenCV's documentation."""
+"""Undistortion against the lens formulas, restated here from OpenCV's documentation."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.lens import BAND, PERSPECTIVE, Lens, bands, lens_of, undistortion
 from gsplat_edu.errors import DatasetError
 
-W, H, FX, FY, CX, CY = 160, 120, 140.0, 133.0, 83.0, 57.0  # corner convention: what a file says
+W, H, FX, FY, CX, CY = 160, 120, 140.0, 133.0, 83.0, 57.0  # corner convention, as in files
 
 
 def perspective(x, y, **given):
@@ -28,13 +28,13 @@ def fisheye(x, y, k1=0.0, k2=0.0, k3=0.0, k4=0.0):
 
 
 def whole(lens):
-    """Return the maps of all rows, band by band as photos are undistorted."""
+    """Return the maps of all rows, computed in bands as for photos."""
     parts = [undistortion(lens, band) for band in bands(lens.H)]
     return [np.concatenate(planes) for planes in zip(*parts, strict=True)]
 
 
 def dots(distort, coefficients):
-    """Draw one soft dot per channel and corner where the lens shows three rays; return photo and rays."""
+    """Draw a soft dot where the lens shows each of three rays, one ray per channel; return photo and rays."""
     rays = np.array([[-0.31, -0.22], [0.27, 0.19], [0.05, -0.24]])
     y, x = np.mgrid[:H, :W]
     photo = np.zeros((H, W, 3))
@@ -67,8 +67,8 @@ def centres(image):
 def test_rays_lie_where_the_pinhole_puts_them(one_photo, model, coefficients, resolution):
     """Dots drawn through the distorting lens are found at u = fx x + cx of the view's camera.
 
-    Rounding to 8 bits, bilinear maps and the dots' own bending move a centre by some hundredths of a pixel; the bound
-    of 0.15 px catches half a pixel lost in a convention, at half size too, where it would be a quarter.
+    Rounding to 8 bits, bilinear maps and the dots' own bending move a centre by a few hundredths of a pixel. The bound
+    of 0.15 px catches a half-pixel error of convention, even at half size, where it is a quarter of a pixel.
     """
     photo, rays = dots(fisheye if "FISHEYE" in model else perspective, coefficients)
     folder = one_photo(photo, camera_model=model, fl_x=FX, fl_y=FY, cx=CX, cy=CY, **coefficients)
@@ -86,11 +86,11 @@ def test_rays_lie_where_the_pinhole_puts_them(one_photo, model, coefficients, re
     [
         ({"k1": -0.25, "p1": 0.02}, False, False),
         ({"k1": 0.3, "p1": 0.02}, False, False),
-        ({"k1": 1.0}, True, True),  # bulges so that the corners of the undistorted photo lie outside
+        ({"k1": 1.0}, True, True),  # the corners of the undistorted image lie outside the photo
     ],
 )
-def test_the_mask_is_what_lies_outside_of_the_photo(values, is_fisheye, some_outside):
-    """A pixel counts exactly where the formula leads inside the edges; maps are float32, good to 1e-4 px here."""
+def test_only_pixels_that_lie_inside_the_photo_are_valid(values, is_fisheye, some_outside):
+    """A pixel is valid exactly where the formula lands inside the edges. The float32 maps are accurate to 1e-4 px."""
     lens = lens_of({"fx": FX, "fy": FY, "cx": CX, "cy": CY, **values}, W, H, fisheye=is_fisheye)
     (columns, rows, valid), pinhole = whole(lens), lens.undistorted()
     y, x = np.mgrid[:H, :W]
@@ -105,10 +105,10 @@ def test_the_mask_is_what_lies_outside_of_the_photo(values, is_fisheye, some_out
     assert some_outside == bool((~inside).any())
 
 
-def test_where_the_image_is_folded_no_pixel_counts():
-    """With k1 = -0.6 the formula r (1 + k1 r²) turns round at r² = 1 / 1.8 and shows the same again, mirrored.
+def test_pixels_beyond_a_fold_of_the_image_are_invalid():
+    """With k1 = -0.6 the formula r (1 + k1 r²) peaks at r² = 1 / 1.8. Beyond it the image repeats, mirrored.
 
-    Slopes are differences between neighbours, so within 5 % of that radius either answer will do.
+    Slopes are differences between neighbours, so either answer is accepted within 5 % of that radius.
     """
     lens = Lens(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.6,))
     pinhole, (_, _, valid) = lens.undistorted(), whole(lens)
@@ -133,18 +133,18 @@ def test_pinholes_have_no_maps(one_photo):
         (
             Lens(64, 48, 8.0, 8.0, 31.5, 23.5, (), fisheye=True),
             "focal length would change",
-        ),  # over half a turn
+        ),  # over 180 degrees
         (Lens(640, 480, 205.0, 205.0, 319.5, 239.5, (), fisheye=True), "degrees to the side"),
         (Lens(640, 480, 210.0, 210.0, 319.5, 239.5, (), fisheye=True), "7[0-9] degrees to the side"),
         (Lens(640, 480, 100.0, 100.0, 319.5, 239.5, (1e-9,)), "73 degrees to the side"),
         (Lens(640, 480, 560.0, 560.0, 319.5, 239.5, (9.0,)), "focal length would change"),
-        (Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,)), "no rectangle"),  # no slope to tell a fold by
+        (Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,)), "no rectangle"),  # no slope, so no fold detection
         (Lens(1, 9, 40.0, 40.0, 0.0, 4.0, (0.1,), fisheye=True), "no rectangle"),
         (Lens(64, 48, 20.0, 20.0, 31.5, 23.5, (-0.5, 0.0, 0.0, 0.0), fisheye=True), "no rectangle"),
         (Lens(32767, 48, 20000.0, 20000.0, 16383.0, 23.5, (0.1,)), "32767x48 px cannot be undistorted"),
     ],
 )
-def test_what_no_pinhole_shows_is_refused(lens, check):
+def test_a_lens_that_no_pinhole_can_represent_is_refused(lens, check):
     with pytest.raises(DatasetError, match=check) as caught:
         lens.undistorted()
         undistortion(lens, slice(0, lens.H))
@@ -155,18 +155,19 @@ def test_what_no_pinhole_shows_is_refused(lens, check):
     "coefficients", [(-0.25,), (0.3,), (-0.1, 0.02, 0.01, -0.008), (-0.02, 0.0, 0.0, 0.01)]
 )
 def test_pixels_keep_their_shape_and_stay_inside(coefficients):
-    """OpenCV's own matrix fills the image with each axis by itself: it would squeeze these pixels by up to 20 %."""
+    """OpenCV's own matrix scales each axis separately to fill the image, which would squeeze pixels by up to 20 %."""
     lens = Lens(640, 480, 560.0, 550.0, 325.0, 230.0, coefficients)
     pinhole = lens.undistorted()
     assert pinhole.fx / pinhole.fy == pytest.approx(lens.fx / lens.fy, rel=1e-12)
     columns, rows, valid = whole(lens)
     assert valid.all()
-    # As much as can be: somewhere an edge of the photo is touched. OpenCV samples the rim, which misses a pixel or two.
+    # The view is as wide as possible: it touches an edge of the photo. OpenCV samples the rim, so it may miss by a
+    # pixel or two.
     room = (columns.min(), 639 - columns.max(), rows.min(), 479 - rows.max())
     assert -0.5 <= min(room) < 2.0
 
 
-def test_bands_are_the_rows_of_the_whole():
+def test_bands_give_the_same_maps_as_the_whole():
     lens = Lens(90, 2 * BAND + 7, 200.0, 210.0, 45.0, 130.0, (-0.1, 0.0, 0.002, 0.001))
     assert [(band.start, band.stop) for band in bands(lens.H)] == [
         (0, BAND),
@@ -178,7 +179,7 @@ def test_bands_are_the_rows_of_the_whole():
 
 
 def test_the_statues_strong_distortion_gives_a_sane_camera():
-    """k = -0.684 of real internet photos, at the calibrated size and at a quarter of it."""
+    """k = -0.684 comes from real internet photos; checked at the calibrated size and at a quarter of it."""
     lens = lens_of({"fx": 2395.65, "fy": 2395.65, "cx": 400, "cy": 600, "k1": -0.684122}, 800, 1200)
     for one in (lens, lens.scaled(200, 300)):
         pinhole = one.undistorted()
@@ -187,7 +188,7 @@ def test_the_statues_strong_distortion_gives_a_sane_camera():
 
 
 def test_sizes_scale_about_the_corner():
-    """The middle of the image stays the middle, and the principal point's share of the width stays the same."""
+    """The centre of the image stays the centre, and the principal point keeps its relative position."""
     lens = lens_of({"fx": 100, "fy": 90, "cx": 20, "cy": 15}, 40, 30)
     half = lens.scaled(20, 15)
     assert (half.fx, half.fy, half.cx, half.cy) == (50, 45, 9.5, 7.0)

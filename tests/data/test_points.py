@@ -1,4 +1,4 @@
-"""Start clouds from PLY files: ours, others', ASCII and binary, and what is none."""
+"""Start clouds from PLY files: our own, from other programs, ASCII, binary, and invalid ones."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_round_trip(tmp_path):
 
 @pytest.mark.parametrize(("kind", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
 def test_binary(tmp_path, kind, order):
-    """Columns in an odd order with one that is not asked for, and faces behind."""
+    """The columns are in an odd order, one is not needed, and faces follow."""
     dtype = np.dtype(
         [("z", order + "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("s", order + "i2")]
     )
@@ -95,7 +95,7 @@ def test_colours(tmp_path):
         (b"ply\nformat ascii 1.0\nelement vertex -2\n" + XYZ.encode() + b"end_header\n", "line 3"),
     ],
 )
-def test_what_is_no_cloud(tmp_path, content, message):
+def test_invalid_clouds_are_refused(tmp_path, content, message):
     path = tmp_path / "p.ply"
     path.write_bytes(content)
     with pytest.raises(DatasetError, match=message) as caught:
@@ -103,7 +103,7 @@ def test_what_is_no_cloud(tmp_path, content, message):
     assert "p.ply" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_colour_that_is_no_number_is_gray(tmp_path):
+def test_a_nonfinite_colour_is_gray(tmp_path):
     floats = RGB.replace("uchar", "float")
     cloud = read_points_ply(write(tmp_path, "ascii", XYZ + floats, b"1 2 3 nan 0.5 1\n1 2 3 inf -inf 0\n"))
     np.testing.assert_array_equal(cloud.colors, [[0.5, 0.5, 1.0], [1.0, 0.0, 0.0]])
@@ -139,7 +139,7 @@ def test_garbled_files_end_in_a_dataset_error_or_points(tmp_path, kind, flips, k
 
 
 def test_real_files(real):
-    """The fox's cloud, a scene of Gaussians with SH, a mesh, and a splat file without colours but with infinities."""
+    """The fox's cloud, a Gaussian scene with SH, a mesh, and a splat file without colours but with infinities."""
     fox = read_points_ply(real("fox/points3D_aligned_derived.ply"))
     assert len(fox.points) == 1457 and 0 < fox.colors.std() < 0.5
     odd = read_points_ply(real("odd/no_colour_value_weight.ply"))

@@ -1,4 +1,4 @@
-"""Real captures, where this machine has them: numbers of views, notes, and poses that fit the points and photos."""
+"""Real captures, if this machine has them: numbers of views, notes, and poses that fit the points and photos."""
 
 import json
 
@@ -10,8 +10,8 @@ from gsplat_edu.data.colmap import read_points
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 
 
-def share_in_sight(dataset):
-    """Of all points in all views, how many lie in front of the camera and inside its image."""
+def points_in_sight(dataset):
+    """Return, for each view and point, whether the point is in front of the camera and inside its image."""
     seen = []
     for view in dataset.train:
         camera = view.camera
@@ -29,13 +29,13 @@ def test_snowmiku97(real):
     }
     names = sorted(v.name for v in (*dataset.train, *dataset.test))
     assert [v.name for v in dataset.test] == names[::8]
-    seen = share_in_sight(dataset)
+    seen = points_in_sight(dataset)
     assert seen.any(axis=0).mean() > 0.99  # COLMAP triangulated each point from photos of this capture
     assert 4 < scene_extent([v.camera for v in dataset.train]) < 8
 
 
 def share_of_colour(dataset, views, shift):
-    """How many of the points in sight have, within 0.05, the colour of the photo where they project to plus a shift."""
+    """Return the share of visible points whose photo colour, at their projection plus a shift, is within 0.05."""
     near = []
     for view in views:
         camera, edge = view.camera, 4
@@ -52,11 +52,11 @@ def share_of_colour(dataset, views, shift):
 
 
 def test_snowmikus_points_have_the_colour_of_the_photos(real):
-    """Poses, axes and the pixel convention against the photos themselves.
+    """Check poses, axes and the pixel convention against the photos themselves.
 
-    COLMAP coloured each point from the photos it saw it in. Many points are hidden from a view, so most colours differ;
-    but the share that agrees is largest where nothing is shifted, and smaller half a pixel off in either direction,
-    which is what a convention got wrong would be.
+    COLMAP coloured each point from the photos that show it. Many points are hidden from a view, so most colours differ.
+    But the share that agrees is largest without a shift. It is smaller half a pixel off in either direction, which is
+    the shift that a wrong convention would cause.
     """
     dataset = load_dataset(real("snowmiku97"))
     views = dataset.train[::6]
@@ -78,21 +78,21 @@ def test_fox(real):
     assert photo.mask is None or photo.mask.mean() > 0.99
     with_points = load_dataset(real("fox"), points=real("fox") / "points3D_aligned_derived.ply")
     assert len(with_points.points) == 1457
-    assert share_in_sight(with_points).any(axis=0).mean() > 0.99
+    assert points_in_sight(with_points).any(axis=0).mean() > 0.99
 
 
 def test_the_foxs_colmap_model(real):
-    """Named by its own folder, the photos beside it: nine views of an OPENCV camera."""
+    """The model's own folder is given, and the photos lie beside it: nine views of an OPENCV camera."""
     dataset = load_dataset(real("fox/colmap9_opencv"), DataSettings(test_every=0))
     assert len(dataset.train) == 9 and len(dataset.points) == 1457
-    assert share_in_sight(dataset).any(axis=0).mean() > 0.99
+    assert points_in_sight(dataset).any(axis=0).mean() > 0.99
     assert any("distortion" in note for note in dataset.notes)
     assert dataset.train[0].image.shape == (1920, 1080, 3)
 
 
 def test_truck11(real):
-    """Names with a folder in front, and a calibration that is told to be odd; the poses are those of cameras.json,
-    which holds camera-to-world rotations and camera centres."""
+    """Names include a folder, and a note reports the odd calibration. The poses equal those in cameras.json, which
+    holds camera-to-world rotations and camera centres."""
     folder = real("truck11")
     dataset = load_dataset(folder, DataSettings(test_every=0))
     assert len(dataset.train) == 11 and len(dataset.points) == 8143
@@ -106,8 +106,8 @@ def test_truck11(real):
         assert view.image.shape == (389, 649, 3)
 
 
-def test_every_track_of_a_large_points_file_is_stepped_over(real):
-    """25,784 points with tracks of many lengths: one stepped over wrongly would make nonsense of all that follow."""
+def test_every_track_of_a_large_points_file_is_skipped(real):
+    """25,784 points have tracks of many lengths. Skipping one wrongly would garble all that follow."""
     cloud = read_points(real("snowmiku97") / "sparse" / "0")
     assert cloud.points.shape == (25784, 3) and np.isfinite(cloud.points).all()
     assert cloud.colors.min() >= 0 and cloud.colors.max() <= 1

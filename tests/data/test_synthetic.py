@@ -16,7 +16,7 @@ def test_cameras_are_the_chapters():
     assert {(c.fx, c.fy, c.cx, c.cy, c.H, c.W) for c in cameras} == {(75, 75, 32, 32, 64, 64)}
 
 
-def test_the_held_out_camera_is_none_of_them():
+def test_the_held_out_camera_is_not_a_training_camera():
     capture = sphere_capture(16)
     a, el = np.radians(202.5), 0.18
     eye = 3 * np.array([np.cos(el) * np.sin(a), np.sin(el), -np.cos(el) * np.cos(a)])

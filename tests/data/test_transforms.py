@@ -1,4 +1,4 @@
-"""transforms.json and Blender's files: dialects, what is missing, and where the points come from."""
+"""transforms.json and Blender's files: dialects, missing values, and where the points come from."""
 
 import json
 import shutil
@@ -18,7 +18,7 @@ NOISE = np.random.default_rng(2).integers(0, 256, (20, 30, 3), dtype=np.uint8)
 
 @pytest.fixture
 def edited(tmp_path, small):
-    """Write the small capture and let `change` edit what transforms.json holds."""
+    """Write the small capture and let `change` edit the contents of transforms.json."""
 
     def write(change):
         write_transforms(tmp_path, *small)
@@ -36,7 +36,7 @@ def camera_of(folder):
 
 
 def test_intrinsics_of_the_whole_file_and_their_defaults(one_photo):
-    """cx, cy default to the middle of the image, whose corner convention is half a pixel from ours."""
+    """cx, cy default to the middle of the image; the file's corner convention is half a pixel from ours."""
     camera = camera_of(one_photo(PIXELS, fl_x=25.0))
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (25.0, 25.0, 14.5, 9.5)
     camera = camera_of(one_photo(PIXELS, fl_x=25.0, fl_y=26.0, cx=13.0, cy=11.5))
@@ -47,7 +47,7 @@ def test_fields_of_view(one_photo):
     """At 90 degrees the focal length is half the size."""
     right, path = np.pi / 2, one_photo(PIXELS, camera_angle_x=np.pi / 2) / "transforms.json"
     contents = json.loads(path.read_text())
-    del contents["fl_x"], contents["w"], contents["h"]  # the size is the image's then
+    del contents["fl_x"], contents["w"], contents["h"]  # the size then comes from the image
     path.write_text(json.dumps(contents))
     camera = camera_of(path)
     assert camera.fx == pytest.approx(15.0) and camera.fy == pytest.approx(15.0)
@@ -78,7 +78,7 @@ def test_axes(one_photo):
     camera = camera_of(one_photo(PIXELS))
     np.testing.assert_array_equal(camera.R, np.diag([1.0, -1.0, -1.0]))
     u, v, z = camera.project(camera.world_to_cam([(0.2, 0.1, -2.0)]))
-    assert z[0] == 2.0 and u[0] > camera.cx and v[0] < camera.cy  # to the right is right, above is above
+    assert z[0] == 2.0 and u[0] > camera.cx and v[0] < camera.cy  # right stays right, up stays up
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".Jpeg", ".webp", ".TIF"])
@@ -98,7 +98,7 @@ def test_a_syntax_error_has_a_place(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"[]", b"{}", b'{"frames": 3}', b"\xff\xfe\x00", b"[" * 100_000, b""])
-def test_what_is_no_transforms_json(tmp_path, content):
+def test_an_invalid_transforms_json_is_refused(tmp_path, content):
     (tmp_path / "transforms.json").write_bytes(content)
     with pytest.raises(DatasetError, match=r"transforms\.json") as caught:
         load_dataset(tmp_path)
@@ -126,7 +126,7 @@ def test_what_is_no_transforms_json(tmp_path, content):
         ("mask_path", "no.png", r"view_004\.png: its mask .*no\.png does not exist"),
     ],
 )
-def test_what_cannot_be_used_names_the_frame_and_the_key(edited, key, value, message):
+def test_invalid_values_name_the_frame_and_the_key(edited, key, value, message):
     def change(contents):
         contents["frames"][4][key] = value
         if value is None:
@@ -136,7 +136,7 @@ def test_what_cannot_be_used_names_the_frame_and_the_key(edited, key, value, mes
         load_dataset(edited(change))
 
 
-def test_lists_that_are_no_lists(edited):
+def test_a_split_that_is_not_a_list_is_refused(edited):
     with pytest.raises(DatasetError, match="test_filenames is not a list"):
         load_dataset(edited(lambda contents: contents.update(test_filenames=3)))
 
@@ -156,14 +156,14 @@ def test_missing_photos(edited):
         load_dataset(folder)
 
 
-def test_the_file_may_be_named_instead_of_its_folder(edited):
+def test_the_file_may_be_given_instead_of_its_folder(edited):
     folder = edited(lambda contents: None)
     (folder / "transforms.json").rename(folder / "other.json")
     assert len(load_dataset(folder / "other.json", EVERYTHING).train) == 9
 
 
 def test_a_ply_is_in_the_frame_of_the_poses(edited, small):
-    """applied_transform is how the poses came to be; the PLY went the same way and is not moved again."""
+    """The poses and the PLY both already include applied_transform, so the PLY is not moved again."""
     transform = [[0, 1, 0, 3.0], [1, 0, 0, -2.0], [0, 0, -1, 0.5]]
     dataset = load_dataset(edited(lambda contents: contents.update(applied_transform=transform)))
     np.testing.assert_array_equal(dataset.points, small[1])
@@ -176,7 +176,7 @@ def test_colmaps_points_are_moved_by_applied_transform(tmp_path, small):
     views, points, colors = small
     write_colmap(tmp_path, views, points, colors)
     write_transforms(tmp_path, views)
-    assert len(load_dataset(tmp_path).points) == 100_000  # nobody says how the two frames are related
+    assert len(load_dataset(tmp_path).points) == 100_000  # how the two frames relate is not stated
     transform = np.array([[0, 1, 0, 3.0], [0, 0, 1, -2.0], [1, 0, 0, 0.5]])  # not its own transpose
     write_transforms(tmp_path, views, extra={"applied_transform": transform.tolist()})
     dataset = load_dataset(tmp_path)
@@ -187,16 +187,16 @@ def test_colmaps_points_are_moved_by_applied_transform(tmp_path, small):
         load_dataset(tmp_path)
 
 
-def test_distortion_words(one_photo):
-    """is_fisheye and camera_model say the same; PINHOLE without coefficients distorts nothing."""
+def test_distortion_keys(one_photo):
+    """is_fisheye and camera_model mean the same; PINHOLE without coefficients distorts nothing."""
     assert camera_of(one_photo(PIXELS, camera_model="PINHOLE")).fx == 30
     fisheye = camera_of(one_photo(PIXELS, camera_model="OPENCV_FISHEYE", k1=0.05))
     assert fisheye.fx == camera_of(one_photo(PIXELS, is_fisheye=True, k1=0.05)).fx != 30
     assert any("distortion" in note for note in load_dataset(one_photo(PIXELS, k1=0.05)).notes)
 
 
-def test_blenders_parts(tmp_path, small):
-    """Train and test are the files'; val stands in for a missing test; an explicit split dissolves both."""
+def test_blenders_splits(tmp_path, small):
+    """The files define train and test. Without a test file, val is used instead; an explicit split overrides both."""
     views = small[0]
     write_blender(tmp_path, views[3:], views[:3])
     dataset = load_dataset(tmp_path)
@@ -236,7 +236,7 @@ def merged_camera(one_photo, whole, frame):
         ({"fl_x": 99.0, "camera_angle_y": np.pi / 2}, {}, (99.0, 10.0)),
     ],
 )
-def test_a_frames_own_focal_length_wins_however_it_is_said(one_photo, whole, frame, focal):
+def test_a_frames_own_focal_length_wins_in_any_form(one_photo, whole, frame, focal):
     assert merged_camera(one_photo, whole, frame) == pytest.approx(focal)
 
 
@@ -255,7 +255,7 @@ NULLS = ("camera_model", "cx", "cy", "k1", "fl_y", "is_fisheye", "train_filename
 NULLS += ("val_filenames", "ply_file_path", "applied_transform", "applied_scale", "mask_path")
 
 
-def test_null_says_as_much_as_nothing(one_photo):
+def test_null_counts_as_missing(one_photo):
     camera = camera_of(one_photo(PIXELS))
     path = one_photo(PIXELS, **dict.fromkeys(NULLS)) / "transforms.json"
     contents = json.loads(path.read_text())
@@ -276,7 +276,7 @@ def test_val_is_not_trained_on(tmp_path, small):
     )
 
 
-def test_blenders_val_is_left_out_and_told(tmp_path, small):
+def test_blenders_val_is_left_out_and_reported(tmp_path, small):
     write_blender(tmp_path, small[0][3:], small[0][:3])
     assert not any("val" in note for note in load_dataset(tmp_path).notes)
     shutil.copy(tmp_path / "transforms_test.json", tmp_path / "transforms_val.json")

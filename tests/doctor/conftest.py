@@ -1,4 +1,4 @@
-"""What the tests of the doctor share: a capture written to disk and examined."""
+"""Fixtures for the doctor's tests: a capture written to disk and examined."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ from gsplat_edu.doctor.survey import prepare
 
 @pytest.fixture
 def diagnosed(tmp_path) -> Callable[..., Diagnosis]:
-    """Write views as a capture, COLMAP's where there are points, let `spoil` at its folder, and examine it."""
+    """Write views as a capture (COLMAP if there are points), call `spoil` on its folder, and examine it."""
 
     def examined(views, points=None, spoil=None) -> Diagnosis:
         folder = tmp_path / "capture"
@@ -30,7 +30,7 @@ def diagnosed(tmp_path) -> Callable[..., Diagnosis]:
 
 @pytest.fixture
 def named(diagnosed) -> Callable[..., dict]:
-    """The same, as the labelled images of each finding that is no note, by the finding's name."""
+    """As `diagnosed`, but return the labelled images of every finding above a note, by the finding's name."""
 
     def warnings(views, points=None, spoil=None) -> dict:
         findings = diagnosed(views, points, spoil).findings

@@ -1,4 +1,4 @@
-"""A textured room, ray traced from cameras of several layouts: clean captures, for faults to be planted into."""
+"""A textured room, ray traced from cameras in several layouts: clean captures that tests plant faults in."""
 
 import functools
 import math
@@ -13,23 +13,23 @@ WALL = 5.0
 """Half the edge of the room."""
 
 BALL = 0.9
-"""Radius of the ball in its middle."""
+"""Radius of the ball in the middle of the room."""
 
 OCTAVES = 8
-"""Of its texture, from cells of 1 down to 1/128: finer than a pixel."""
+"""Octaves of the texture. Cells range from 1 down to 1/128, finer than a pixel."""
 
 COUNT = 24
-"""Views, where a test does not say."""
+"""Default number of views."""
 
 
 @functools.cache
 def noise():
-    """Random numbers on a lattice that repeats: one grey and three for the colours."""
+    """Random numbers on a periodic lattice: one channel for grey and three for colours."""
     return np.random.default_rng(0).normal(size=(4, 32, 32, 32)).astype(np.float32)
 
 
 def texture(points, footprint):
-    """Colour of points in space: octaves of noise, a little lower the finer they are, as in pictures of real surfaces.
+    """Colour of points in space: octaves of noise whose amplitude falls slowly with scale, as on real surfaces.
 
     Detail finer than what a pixel covers (`footprint`, world units) is smoothed away, as a lens does.
     """
@@ -46,7 +46,7 @@ def texture(points, footprint):
 
 
 def cast(eye, directions, ball):
-    """Return where rays from a point inside the room end: on the ball or on a wall."""
+    """Return where rays from a point inside the room hit the ball or a wall."""
     with np.errstate(divide="ignore"):
         reach = np.min((WALL * np.sign(directions) - eye) / directions, axis=1)
     if ball:
@@ -90,7 +90,7 @@ def placed(layout, i, count):
 
 @functools.cache
 def room(layout="orbit", size=160, count=COUNT, height=None):
-    """Photograph the room: the ball in it from all round, a wall of it, or all of it from its middle."""
+    """Photograph the room: the ball from all round, one wall, or everything from the middle."""
     ball = layout in ("orbit", "forward")
     views, points = [], []
     rng = np.random.default_rng(1)
@@ -105,14 +105,14 @@ def room(layout="orbit", size=160, count=COUNT, height=None):
 
 
 def turned(view, degrees):
-    """Return the view with its camera turned about its own vertical, the photo as it was."""
+    """Return the view with its camera turned about the camera's vertical axis, and the same photo."""
     a = math.radians(degrees)
     R = np.array([[math.cos(a), 0, -math.sin(a)], [0, 1, 0], [math.sin(a), 0, math.cos(a)]]) @ view.camera.R
     return with_camera(view, R=R)
 
 
 def with_camera(view, **changes):
-    """Return the view with other numbers in its camera, the photo as it was."""
+    """Return the view with other camera parameters and the same photo."""
     camera = view.camera
     names = ("R", "eye", "fx", "fy", "cx", "cy", "H", "W")
     return View(Camera(**{**{n: getattr(camera, n) for n in names}, **changes}), view.image, name=view.name)

@@ -1,4 +1,4 @@
-"""Faults of a trained scene, each at three severities: the slight one may pass, the two others are named."""
+"""Faults of a trained scene, each at three severities: a slight one may pass, the two others are reported."""
 
 import functools
 from dataclasses import replace
@@ -25,12 +25,12 @@ BACKGROUND = (0.2, 0.3, 0.4)
 RENDER = functools.partial(render, settings=RenderSettings(background=BACKGROUND), backend="cpu")
 
 NOISE = 0.02
-"""Standard deviation of the noise of every photo: 34 dB."""
+"""Standard deviation of the noise in every photo, which gives 34 dB."""
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """A scene, and noisy photos of it: eight to train on, four to test with."""
+    """A scene and noisy photos of it: eight for training, four for testing."""
     views, points, colors = procedural_capture(size=48, count=12)
     gaussians = splats_on(points, colors)
     photos = [RENDER(gaussians, view.camera).image.double().numpy() for view in views]
@@ -78,11 +78,11 @@ def test_a_good_run_gets_no_warning(scene):
     assert len(diagnosis.advice) == 3
 
 
-def test_residuals_are_those_of_rendering_and_comparing(scene):
+def test_residuals_equal_rendering_and_comparing(scene):
     gaussians, views = scene
-    told = []
-    found = residuals(gaussians, views[:3], RENDER, BACKGROUND, lambda: told.append(1))
-    assert len(told) == 3
+    calls = []
+    found = residuals(gaussians, views[:3], RENDER, BACKGROUND, lambda: calls.append(1))
+    assert len(calls) == 3
     for residual, view in zip(found, views, strict=False):
         assert residual.name == view.name
         assert residual.psnr == psnr(RENDER(gaussians, view.camera).image, view.image)
@@ -93,13 +93,13 @@ def test_residuals_are_those_of_rendering_and_comparing(scene):
     assert sum(" test " in line for line in lines) == 4
 
 
-def test_a_view_without_a_pixel_that_counts_is_left_out(scene):
+def test_a_fully_masked_view_is_left_out(scene):
     gaussians, views = scene
     none = View(views[0].camera, views[0].image, mask=np.zeros((36, 48), dtype=bool), name="masked")
     assert residuals(gaussians, [none], RENDER, BACKGROUND) == []
 
 
-# noise of s adds up with that which is there: 10 log10(1 + s² / 0.02²) = 1, 7 and 14 dB
+# Noise of s adds to the existing noise: 10 log10(1 + s² / 0.02²) = 1, 7 and 14 dB.
 @pytest.mark.parametrize(("sigma", "is_named"), [(0.01, False), (0.04, True), (0.1, True)])
 def test_a_photo_the_scene_cannot_explain(scene, sigma, is_named):
     gaussians, views = scene
@@ -149,12 +149,12 @@ def test_a_photo_of_another_exposure(scene, stops, sign, is_named):
     gaussians, views = scene
     spoiled = with_photo(views, 7, lambda image: np.clip(image * 2.0 ** (sign * stops / 2.2), 0.0, 1.0))
     run = trained(gaussians, spoiled)
-    assert run.train[3].stops == pytest.approx(sign * stops, abs=0.2)  # bright pixels are cut off
+    assert run.train[3].stops == pytest.approx(sign * stops, abs=0.2)  # bright pixels are clipped
     found = warnings(run)
     assert found["exposure"].images[0].startswith(views[7].name) if is_named else "exposure" not in found
 
 
-def test_a_scene_that_is_too_dark_as_a_whole_is_no_jump_of_every_photo(scene):
+def test_a_scene_that_is_too_dark_as_a_whole_is_not_many_exposure_jumps(scene):
     gaussians, views = scene
     for i in range(len(views)):
         views = with_photo(views, i, lambda image: np.clip(image * 2.0 ** (0.9 / 2.2), 0.0, 1.0))
@@ -164,9 +164,9 @@ def test_a_scene_that_is_too_dark_as_a_whole_is_no_jump_of_every_photo(scene):
 
 
 def in_front(gaussians, camera, share):
-    """Add a splat a twentieth of the way to the scene that covers about so much of a camera's picture."""
+    """Add a splat a twentieth of the way to the scene that covers about this share of a camera's image."""
     z = 0.05 * 3.2
-    # covered from an opacity of 0.2 on: 0.9 exp(-r²/2) = 0.2 at r = 1.73 standard deviations
+    # A pixel counts as covered from alpha 0.2 on: 0.9 exp(-r²/2) = 0.2 at r = 1.73 standard deviations.
     pixels = np.sqrt(share * camera.W * camera.H / np.pi) / 1.73
     added = Gaussians(
         means=torch.tensor(camera.eye + z * camera.R[2], dtype=torch.float32)[None],
@@ -183,14 +183,14 @@ def in_front(gaussians, camera, share):
 def test_a_floater_in_front_of_a_camera(scene, share, is_named):
     gaussians, views = scene
     run = trained(in_front(gaussians, views[5].camera, share), views)
-    # whole pixels of 1728, and a sphere's projection is a little wider than the disc
+    # The image has only 1728 pixels, and a sphere's projection is a little wider than the disc.
     assert run.train[1].veiled == pytest.approx(share, rel=0.25, abs=0.002)
     found = warnings(run)
     assert found["floaters"].images[0].startswith(views[5].name) if is_named else "floaters" not in found
 
 
 @pytest.mark.parametrize(("share", "severity"), [(0.2, None), (0.5, Severity.NOTE), (0.9, Severity.NOTE)])
-def test_splats_that_hardly_show(scene, share, severity):
+def test_faint_splats(scene, share, severity):
     gaussians, views = scene
     faint = torch.arange(len(gaussians)) < share * len(gaussians)
     logits = torch.where(faint, torch.tensor(-6.0), gaussians.logit_opacities)
@@ -200,7 +200,7 @@ def test_splats_that_hardly_show(scene, share, severity):
 
 
 @pytest.mark.parametrize(("share", "is_named"), [(0.005, False), (0.03, True), (0.2, True)])
-def test_splats_larger_than_all(scene, share, is_named):
+def test_splats_larger_than_the_scene(scene, share, is_named):
     gaussians, views = scene
     scales = gaussians.log_scales.clone()
     scales[: round(share * len(gaussians)), 1] = 2.0
@@ -211,20 +211,20 @@ def test_splats_larger_than_all(scene, share, is_named):
 @pytest.mark.parametrize(
     ("reached", "planned", "is_named"), [(30_000, 30_000, False), (30_000, None, False), (70, 7000, True)]
 )
-def test_a_training_that_did_not_end(scene, reached, planned, is_named):
+def test_an_unfinished_training(scene, reached, planned, is_named):
     gaussians, views = scene
     run = trained(gaussians, views, reached=reached, planned=planned)
     assert ("unfinished" in warnings(run)) == is_named
 
 
-def test_an_empty_scene_is_no_obstacle(scene):
+def test_an_empty_scene_is_reported(scene):
     gaussians, views = scene
     empty = gaussians.map(lambda tensor: tensor[:0])
     assert "splats" in warnings(trained(empty, views))
 
 
 def evaluations(reached, gain, count=8):
-    """A log whose test PSNR rises to that of the scene, 34 dB; its last quarter gains so many decibels."""
+    """A log whose test PSNR rises to the scene's 34 dB and gains `gain` decibels in its last quarter."""
     iterations = [reached * i // count for i in range(1, count)]
     return [{"iteration": i, "loss": 0.1, "psnr": None} for i in iterations] + [
         {"iteration": i, "psnr": 34.0 - gain - 3.0 * (0.75 - i / reached) * (i < 0.75 * reached)}
@@ -247,12 +247,12 @@ def evaluations(reached, gain, count=8):
     ],
 )
 def test_a_short_training_is_not_fine(scene, reached, gain, severity, says):
-    """1,500 of 30,000 iterations were "length: fine", and "a better scene needs better photos"."""
+    """1,500 of 30,000 iterations used to give "length: fine" and "a better scene needs better photos"."""
     gaussians, views = scene
     log = [] if gain is None else evaluations(reached, gain)
     run = trained(gaussians, views, reached=reached, planned=reached, log=log, capture=Path("a b/$c"))
     measured = np.mean([view.psnr for view in run.test])
-    assert abs(measured - 34.0) < 0.5, "or the gains above are others"
+    assert abs(measured - 34.0) < 0.5, "the gains above assume 34 dB"
     diagnosis = examine_run(run)
     found = [finding for finding in diagnosis.findings if finding.name == "short training"]
     assert [finding.severity for finding in found] == ([] if severity is None else [severity])
@@ -265,8 +265,8 @@ def test_a_short_training_is_not_fine(scene, reached, gain, severity, says):
     assert ("better photos" in advice) is (severity is not Severity.WARNING)
 
 
-def test_a_longer_training_says_how_long_it_takes_at_the_pace_of_this_one(scene):
-    """The command for 30,000 iterations stood there alone after 400 that took 0.8 s each: a day's work by surprise."""
+def test_advice_to_train_for_longer_gives_the_time_at_this_runs_pace(scene):
+    """After 400 iterations of 0.8 s, the command for 30,000 used to come without any hint that it takes hours."""
     gaussians, views = scene
     log = [{"iteration": i, "ms": 50.0 if i <= 300 else 800.0} for i in range(10, 401, 10)]
     run = trained(gaussians, views, reached=400, planned=400, log=log, capture=Path("a"))
@@ -277,7 +277,7 @@ def test_a_longer_training_says_how_long_it_takes_at_the_pace_of_this_one(scene)
 
 
 @pytest.mark.parametrize(("factor", "rising"), [(0.8, True), (1.0, False)])
-def test_without_test_views_the_loss_says_whether_it_still_falls(scene, factor, rising):
+def test_without_test_views_the_loss_shows_whether_training_still_improves(scene, factor, rising):
     gaussians, views = scene
     log = [{"iteration": i, "loss": 0.1 * (factor if i > 900 else 1.0)} for i in range(10, 1001, 10)]
     run = trained(gaussians, views, test=[], reached=1000, planned=1000, log=log)
@@ -285,8 +285,8 @@ def test_without_test_views_the_loss_says_whether_it_still_falls(scene, factor, 
     assert replace(run, log=[]).rising is None
 
 
-def test_what_the_photos_show_before_training_is_not_gone_after_it(scene):
-    """A scene fits photos of differing exposure; its renders are then as bright as they are."""
+def test_a_warning_about_the_photos_remains_after_training(scene):
+    """A scene fits photos of differing exposure, so its renders are as bright as the photos."""
     gaussians, views = scene
     before = Finding("exposure", Severity.WARNING, "1 of 12 photos", "fix it", ("a.jpg",), ("+0.6",))
     diagnosis = examine_run(trained(gaussians, views, beforehand=[before]))
@@ -297,8 +297,8 @@ def test_what_the_photos_show_before_training_is_not_gone_after_it(scene):
     )
 
 
-def test_a_photo_that_the_scene_cannot_explain_is_not_said_to_be_fitted_all_the_same(scene):
-    """One screen said of the same two photos that they were far from the scene and that it fitted them."""
+def test_an_unexplained_photo_is_not_also_reported_as_fitted(scene):
+    """One report used to say of the same two photos that the scene could not explain them and that it fitted them."""
     gaussians, views = scene
     run = trained(gaussians, views)
     poor = replace(run.train[0], psnr=run.train[0].psnr - 20.0)
@@ -309,7 +309,7 @@ def test_a_photo_that_the_scene_cannot_explain_is_not_said_to_be_fitted_all_the_
     assert found["exposure"].sentence == "1 of 12 photos"
 
 
-def test_that_exposure_was_not_compared_is_said(scene, tmp_path):
+def test_the_report_says_if_exposure_was_not_compared(scene, tmp_path):
     gaussians, views = scene
     findings, why = _exposure_beforehand(tmp_path / "gone", Terminal())
     assert findings == [] and "gone" in why

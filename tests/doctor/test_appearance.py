@@ -1,4 +1,4 @@
-"""Faults of the pixels, each at three severities: the slight one passes, the others are named, and nothing else is."""
+"""Faults of the pixels, each at three severities: a slight one passes, the others are reported, and nothing else is."""
 
 import io
 
@@ -10,11 +10,11 @@ from PIL import Image
 from doctor.rooms import replaced, room, with_camera, with_photo
 
 SPOILED = (4, 13)
-"""Views that faults are planted into."""
+"""Views that faults are planted in."""
 
 
-def drawn_along(image, length, degrees):
-    """Blur as a camera does that moves while the shutter is open: the mean along a line of so many px."""
+def motion_blurred(image, length, degrees):
+    """Blur as a camera that moves while the shutter is open: the mean along a line of `length` px."""
     a, offsets = np.radians(degrees), np.linspace(-length / 2, length / 2, 4 * length + 1)
     v, u = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
     moved = [
@@ -41,7 +41,7 @@ def changed(views, change):
 @pytest.mark.parametrize(("length", "is_named"), [(2, False), (10, True), (20, True)])
 def test_motion_blur(named, length, degrees, is_named):
     views, points = room("forward", 256)
-    spoiled, names = changed(views, lambda image: drawn_along(image, length, degrees))
+    spoiled, names = changed(views, lambda image: motion_blurred(image, length, degrees))
     found = named(spoiled, points)
     assert set(found.get("blurred", ())) == (names if is_named else set())
     assert set(found) <= {"blurred"}
@@ -58,7 +58,7 @@ def test_a_photo_out_of_focus(named, sigma, is_named):
 @pytest.mark.sliced(1)
 @pytest.mark.parametrize("contrast", [0.5, 0.2])
 def test_a_dull_photo_is_not_blurred(named, contrast):
-    """A tenth of the contrast is a hundredth of the detail; it is not what the neighbours would call blur."""
+    """Detail falls with the square of the contrast, but low contrast must not be taken for blur."""
     views, points = room("forward", 256)
     spoiled, _ = changed(views, lambda image: 128 + contrast * (image - 128))
     assert "blurred" not in named(spoiled, points)
@@ -76,7 +76,7 @@ def test_exposure(named, stops, sign, is_named, with_points):
     assert set(jumps) == (names if is_named else set())
     assert set(found) <= {"exposure"}
     for text in jumps.values():
-        # a fifth of the jump is lost at most: bytes cut off are left out, and the depth is not known everywhere
+        # At most a fifth of a small jump is lost: clipped pixels are left out, and depth is not known everywhere.
         measured = float(text.partition("(")[2].rstrip(")"))
         assert measured == pytest.approx(sign * stops, rel=0.2 if stops < 1 else 0.4)
 
@@ -87,7 +87,7 @@ def test_exposure(named, stops, sign, is_named, with_points):
 )
 @pytest.mark.parametrize(("stops", "is_named"), [(0.1, False), (0.9, True), (1.5, True)])
 def test_photos_that_are_dark_in_a_row(named, which, stops, is_named):
-    """They agree with one another; that so many neighbours differ gives them away."""
+    """The dark photos agree with one another. That so many neighbours differ gives them away."""
     views, points = room("orbit")
     dark = {i: with_photo(views[i], views[i].image * 2.0 ** (-stops / 2.2)) for i in which}
     assert ("exposure" in named(replaced(views, dark), points)) == is_named
@@ -120,16 +120,16 @@ DUPLICATES = {
 
 @pytest.mark.sliced(2)
 @pytest.mark.parametrize("how", DUPLICATES)
-def test_photos_there_twice(named, how):
-    """Photo 9 is photo 8 again, once under its own pose and once under that of photo 8."""
+def test_duplicated_photos(named, how):
+    """Photo 9 is replaced by photo 8, first with its own pose and then with photo 8's."""
     views, points = room("orbit", 160)
     change, is_named = DUPLICATES[how]
     copy = with_photo(views[9], change(views[8].image))
-    told = (f"{views[8].name} and {views[9].name}",) if is_named else ()
-    assert named(replaced(views, {9: copy}), points).get("same photo", ()) == told
+    expected = (f"{views[8].name} and {views[9].name}",) if is_named else ()
+    assert named(replaced(views, {9: copy}), points).get("same photo", ()) == expected
     at_one_place = with_camera(copy, R=views[8].camera.R, eye=views[8].camera.eye)
     found = named(replaced(views, {9: at_one_place}), points)
-    assert found.get("duplicates", ()) == told and "same photo" not in found
+    assert found.get("duplicates", ()) == expected and "same photo" not in found
 
 
 @pytest.mark.sliced(1, by="is_named")
@@ -137,5 +137,5 @@ def test_photos_there_twice(named, how):
 def test_two_photos_with_one_pose(named, distance, is_named):
     views, points = room("orbit", 160)
     copy = with_camera(views[9], R=views[8].camera.R, eye=views[8].camera.eye + distance)
-    told = (f"{views[8].name} and {views[9].name}",) if is_named else ()
-    assert named(replaced(views, {9: copy}), points).get("same pose", ()) == told
+    expected = (f"{views[8].name} and {views[9].name}",) if is_named else ()
+    assert named(replaced(views, {9: copy}), points).get("same pose", ()) == expected

@@ -50,7 +50,7 @@ INTRINSICS = {
 @pytest.mark.parametrize(
     ("how", "amount", "is_named"), [(how, *case) for how, (_, cases) in INTRINSICS.items() for case in cases]
 )
-def test_intrinsics_no_camera_has(diagnosed, orbit, how, amount, is_named):
+def test_implausible_intrinsics(diagnosed, orbit, how, amount, is_named):
     views, points = orbit
     spoiled = [with_camera(view, **INTRINSICS[how][0](view.camera, amount)) for view in views]
     found = [f for f in diagnosed(spoiled, points).findings if f.name == "intrinsics"]
@@ -59,7 +59,7 @@ def test_intrinsics_no_camera_has(diagnosed, orbit, how, amount, is_named):
 
 
 @pytest.mark.parametrize(("factor", "is_named"), [(1.1, False), (1.5, True), (0.4, True)])
-def test_one_camera_of_another_focal_length(named, orbit, factor, is_named):
+def test_one_camera_with_another_focal_length(named, orbit, factor, is_named):
     views, points = orbit
     camera = views[7].camera
     spoiled = replaced(views, {7: with_camera(views[7], fx=factor * camera.fx, fy=factor * camera.fy)})
@@ -78,7 +78,7 @@ def test_turning_on_the_spot_is_hopeless(diagnosed, share, is_fatal):
 
 
 def test_without_points_only_one_place_is_hopeless(diagnosed):
-    """Nothing says how far the subject is."""
+    """Without points, the distance to the subject is unknown."""
     views, _ = room("outward", 96)
     assert not diagnosed([with_camera(view, eye=1e-3 * view.camera.eye) for view in views]).hopeless
     assert diagnosed([with_camera(view, eye=(7.0, 8.0, 9.0)) for view in views]).hopeless
@@ -101,19 +101,19 @@ def test_cameras_that_look_away(named, layout, degrees, is_named, with_points):
 @pytest.mark.parametrize(("missing", "name"), [(2, None), (4, "hole"), (6, "hole"), (14, "one side")])
 def test_a_hole_in_an_orbit(diagnosed, orbit, missing, name):
     views, points = orbit
-    left = views[:5] + views[5 + missing :]
-    found = [f for f in diagnosed(left, points).findings if f.name in ("hole", "one side")]
+    remaining = views[:5] + views[5 + missing :]
+    found = [f for f in diagnosed(remaining, points).findings if f.name in ("hole", "one side")]
     assert [f.name for f in found] == ([name] if name else [])
     if name == "hole":
         assert found[0].severity is Severity.WARNING
         assert f"a gap of {15 * (missing + 1)} degrees" in found[0].sentence
         assert views[4].name in found[0].advice and views[5 + missing].name in found[0].advice
     elif name:
-        assert found[0].severity is Severity.NOTE, "a thing on a wall has no back"
+        assert found[0].severity is Severity.NOTE, "a subject on a wall has no back"
 
 
 def test_one_height_is_a_note(diagnosed, orbit):
-    """The cameras of the orbit go up and down; put at one height, they see no top."""
+    """The orbit's cameras go up and down. Moved to one height, they do not see the top."""
     views, points = orbit
     ring = [with_camera(view, eye=view.camera.eye * (1, 0, 1)) for view in views]
     (found,) = [f for f in diagnosed(ring, points).findings if f.name == "one height"]
@@ -155,7 +155,7 @@ def test_photos_smaller_than_their_camera_are_a_note(diagnosed, orbit, factor, c
         assert len(finding.images) == count % 24
 
 
-def test_what_the_reader_notes_is_told(diagnosed, orbit):
+def test_notes_of_the_reader_are_shown(diagnosed, orbit):
     views, points = orbit
 
     def spoil(folder):
@@ -166,7 +166,7 @@ def test_what_the_reader_notes_is_told(diagnosed, orbit):
 
 
 def with_tracks(folder, counts):
-    """Write so many found points into each image of a model, in the order of the names."""
+    """Write `counts` observed points into the images of a model, in the order of their names."""
     path = folder / "sparse" / "0" / "images.bin"
     data = path.read_bytes()
     (number,), at, written = struct.unpack_from("<Q", data), 8, [data[:8]]
@@ -174,7 +174,7 @@ def with_tracks(folder, counts):
         end = data.index(b"\0", at + 64) + 1
         (points,) = struct.unpack_from("<Q", data, end)
         seen = np.zeros(count + 5, [("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
-        seen["point"][:5] = -1  # features that are no point
+        seen["point"][:5] = -1  # features without a point
         written += [data[at:end], struct.pack("<Q", len(seen)), seen.tobytes()]
         at = end + 8 + 24 * points
     assert number == len(counts) and at == len(data)
@@ -185,14 +185,14 @@ COUNTS = [200] * 24
 
 
 @pytest.mark.parametrize(("count", "is_named"), [(60, False), (11, True), (0, True)])
-def test_a_pose_that_few_points_fix_is_named(named, orbit, count, is_named):
+def test_a_pose_based_on_few_points_is_named(named, orbit, count, is_named):
     views, points = orbit
     counts = [*COUNTS[:7], count, *COUNTS[8:]]
     found = named(views, points, lambda folder: with_tracks(folder, counts)).get("doubtful poses", ())
     assert found == ((f"{views[7].name} ({count} points)",) if is_named else ())
 
 
-def test_few_points_in_all_photos_are_no_fault_of_one(named, orbit):
+def test_few_points_in_all_photos_make_no_single_pose_doubtful(named, orbit):
     views, points = orbit
     found = named(views, points, lambda folder: with_tracks(folder, [25, 40] * 12))
     assert "doubtful poses" not in found
@@ -200,21 +200,21 @@ def test_few_points_in_all_photos_are_no_fault_of_one(named, orbit):
 
 @pytest.mark.parametrize(("times", "is_named"), [(2, False), (20, True)])
 def test_a_camera_that_stands_far_away_is_named(named, orbit, times, is_named):
-    """With the counts of found points, where they are low; without them, by its distance alone."""
+    """With point counts, only if its count is low; without counts, by its distance alone."""
     views, points = orbit
     spoiled = replaced(views, {7: with_camera(views[7], eye=times * views[7].camera.eye)})
     low = [*COUNTS[:7], 60, *COUNTS[8:]]
     for counts in (low, None):
         spoil = None if counts is None else lambda folder: with_tracks(folder, low)
-        (told,) = named(spoiled, points, spoil).get("doubtful poses", ("",))
-        assert ("times as far as the others" in told) == is_named
-        assert told.startswith(views[7].name) == is_named
+        (label,) = named(spoiled, points, spoil).get("doubtful poses", ("",))
+        assert ("times as far as the others" in label) == is_named
+        assert label.startswith(views[7].name) == is_named
     assert "doubtful poses" not in named(spoiled, points, lambda folder: with_tracks(folder, COUNTS)), (
-        "many points fix it: it may stand there"
+        "many points support this pose, so the camera may stand there"
     )
 
 
-def test_a_camera_that_looks_past_with_few_points_is_named(named, orbit):
+def test_a_camera_with_few_points_that_looks_past_the_subject_is_named(named, orbit):
     views, points = orbit
     points = points[np.abs(points).max(axis=1) < 4.5]
     spoiled = replaced(views, {5: turned(views[5], 35)})
@@ -226,12 +226,12 @@ def test_a_camera_that_looks_past_with_few_points_is_named(named, orbit):
 
 @pytest.mark.parametrize(("times", "is_named"), [(2.5, False), (4, True), (20, True)])
 def test_without_counts_a_camera_that_stands_apart_is_named(named, orbit, times, is_named):
-    """The unit is what three quarters keep: four units from the middle are three from the nearest camera."""
+    """The unit is the distance that three quarters keep: 4 units from the centre are 3 from the nearest camera."""
     views, _ = orbit
     spoiled = replaced(views, {7: with_camera(views[7], eye=times * views[7].camera.eye)})
-    (told,) = named(spoiled).get("doubtful poses", ("",))
-    assert bool(told) == is_named
-    assert told.endswith(f"{views[7].name} ({times:.0f} times as far as the others)") or not is_named
+    (label,) = named(spoiled).get("doubtful poses", ("",))
+    assert bool(label) == is_named
+    assert label.endswith(f"{views[7].name} ({times:.0f} times as far as the others)") or not is_named
 
 
 @pytest.mark.parametrize(("degrees", "is_named"), [(20, False), (35, True)])
@@ -246,7 +246,7 @@ def test_without_counts_a_camera_whose_picture_misses_the_subject_is_named(named
 
 @pytest.mark.parametrize("capture", ["fox", "snowmiku97", "truck11"])
 def test_no_pose_of_a_clean_capture_is_doubted(capture):
-    """As if nothing said in which photos the points were found; no photo is decoded."""
+    """The check runs without observation counts, and no photo is decoded."""
     folder = DATA / capture
     if not folder.is_dir():
         pytest.skip(f"{capture} is not on this machine; see GSPLAT_EDU_DATA")
@@ -259,11 +259,11 @@ def test_no_pose_of_a_clean_capture_is_doubted(capture):
     assert check_away(Survey(folder, read.layout, tuple(shots), (), (), points, ())) == []
 
 
-def test_found_points_are_read_from_text_as_well(tmp_path):
+def test_observed_points_are_read_from_text_too(tmp_path):
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
     (model / "cameras.txt").write_text("1 PINHOLE 10 10 9 9 5 5\n")
     rows = b"1 1 0 0 0 0 0 0 1 a b.png\n1 2 7 3 4 -1 5 6 8\n\n2 1 0 0 0 0 0 0 1 d\\raw\xff.png\n\n"
     (model / "images.txt").write_bytes(b"# Image list\n" + rows)
-    assert observed_points(tmp_path) == {"a b.png": 2, r"d/raw\xff.png": 0}, "named as frames are"
+    assert observed_points(tmp_path) == {"a b.png": 2, r"d/raw\xff.png": 0}, "with the same names as frames"
     assert observed_points(tmp_path / "nowhere") == {}

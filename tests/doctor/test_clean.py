@@ -38,7 +38,7 @@ def test_the_procedural_scene_gets_no_warning(named, size, count, height, with_p
     assert named(views, points if with_points else None) == {}
 
 
-def test_nor_does_blenders_layout(tmp_path):
+def test_blenders_layout_gets_no_warning(tmp_path):
     views, _, _ = procedural_capture(64, 24)
     write_blender(tmp_path, views[3:], views[:3])
     (tmp_path / "test" / "view_000_depth.png").write_bytes((tmp_path / "test" / "view_000.png").read_bytes())
@@ -48,7 +48,7 @@ def test_nor_does_blenders_layout(tmp_path):
 
 @pytest.mark.sliced(2)
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_how_the_cameras_stand_is_recognised(diagnosed, layout):
+def test_the_camera_layout_is_recognised(diagnosed, layout):
     views, points = room(layout, 128)
     said = {"orbit": "common centre", "forward": "one way", "outward": "outwards", "walk": "one way"}[layout]
     assert said in dict(diagnosed(views, points).facts)["cameras"]

@@ -1,4 +1,4 @@
-"""Faults of the files: planted, and named."""
+"""Planted faults of files are reported."""
 
 import json
 
@@ -52,8 +52,8 @@ def test_damaged_photos_are_named_and_the_others_examined(diagnosed, orbit, how,
     assert names[0] in diagnosis.advice[0]
 
 
-def test_a_jpeg_cut_short_is_named_too(tmp_path, orbit):
-    """JPEGs are decoded at a fraction of their size, which must not hide what is missing of them."""
+def test_a_truncated_jpeg_is_named_too(tmp_path, orbit):
+    """JPEGs are decoded at a fraction of their size, which must not hide missing data."""
     views, _ = orbit
     write_transforms(tmp_path, views[:13])
     contents = json.loads((tmp_path / "transforms.json").read_text())
@@ -68,7 +68,7 @@ def test_a_jpeg_cut_short_is_named_too(tmp_path, orbit):
     (refused,) = survey.refused
     assert refused.name == "images/view_004.jpg" and refused.reason.startswith("image file is truncated")
     assert {max(shot.stats.thumbnail.shape) for shot in survey.shots} == {128}
-    assert {shot.size for shot in survey.shots} == {(2400, 1800)}, "the size is the file's"
+    assert {shot.size for shot in survey.shots} == {(2400, 1800)}, "the full size, not the decoded one"
 
 
 def test_all_photos_damaged_is_hopeless(diagnosed, orbit):
@@ -100,7 +100,7 @@ def test_missing_photos_are_counted(diagnosed, count):
 @pytest.mark.parametrize(
     ("count", "severity"), [(1, Severity.NOTE), (4, Severity.WARNING), (10, Severity.WARNING)]
 )
-def test_photos_without_a_pose_are_told(tmp_path, orbit, count, severity):
+def test_photos_without_a_pose_are_reported(tmp_path, orbit, count, severity):
     views, points = orbit
     write_colmap(tmp_path, views[count:], points, np.full_like(points, 0.5))
     for i in range(count):
@@ -113,7 +113,7 @@ def test_photos_without_a_pose_are_told(tmp_path, orbit, count, severity):
 
 
 @pytest.mark.parametrize(("count", "name"), [(24, None), (8, "few photos"), (1, "usable")])
-def test_few_photos_are_told(named, orbit, count, name):
+def test_few_photos_are_reported(named, orbit, count, name):
     views, points = orbit
     found = set(named(views[:: 24 // count][:count], points)) & {"few photos", "usable"}
     assert found == ({name} if name else set())
@@ -130,8 +130,8 @@ def test_a_photo_of_another_shape_than_its_camera_is_named(diagnosed, orbit):
     assert found.images == (views[5].name,) and "another aspect ratio" in found.sentence
 
 
-def test_names_that_read_like_messages_do_not_change_what_is_found(tmp_path, orbit):
-    """Reasons and numbers come from fields. In a sentence, a name with these signs would be taken for a part of it."""
+def test_names_that_read_like_messages_do_not_change_the_findings(tmp_path, orbit):
+    """Reasons and numbers come from fields. If sentences were parsed, such a name would be taken for part of one."""
     views, _ = orbit
     odd = "cannot be decoded (x); 1 of 2 photos have no file: skipped, first"
     write_transforms(tmp_path, views)
@@ -153,7 +153,7 @@ def test_names_that_read_like_messages_do_not_change_what_is_found(tmp_path, orb
     )
 
 
-def test_one_reason_is_told_once(diagnosed, orbit):
+def test_a_reason_shared_by_several_photos_is_given_once(diagnosed, orbit):
     views, points = orbit
 
     def spoil(folder):
@@ -165,7 +165,7 @@ def test_one_reason_is_told_once(diagnosed, orbit):
     assert len(found.images) == 6 and found.sentence.count("another aspect ratio") == 1
 
 
-def test_the_advice_is_three_sentences_the_gravest_first(diagnosed, orbit):
+def test_the_advice_is_three_sentences_with_the_most_severe_first(diagnosed, orbit):
     views, points = orbit
 
     def spoil(folder):

@@ -1,4 +1,4 @@
-"""Captures that are odd in ways nobody would make them: the doctor says something, and warns of nothing in Python."""
+"""Captures that are odd in unlikely ways: the doctor gives advice and prints no NaN or infinity."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ CLOUDS = {
 
 @pytest.mark.parametrize("cloud", CLOUDS)
 @pytest.mark.parametrize("odd", ODD)
-def test_odd_captures_are_told_of(diagnosed, odd, cloud):
+def test_odd_captures_get_advice(diagnosed, odd, cloud):
     views, points = room("orbit", 96)
     diagnosis = diagnosed(ODD[odd](views[::4]), CLOUDS[cloud](points))
     lines = [*diagnosis_lines(diagnosis), *advice_lines(diagnosis)]

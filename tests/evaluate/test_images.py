@@ -24,7 +24,7 @@ def test_a_png_holds_the_bytes(tmp_path):
     np.testing.assert_array_equal(np.array(Image.open(tmp_path / "b.png")), image)
 
 
-def test_side_by_side_puts_a_line_between():
+def test_side_by_side_puts_a_line_between_images():
     row = side_by_side([colour(6, 5, (255, 0, 0)), np.zeros((6, 3, 3))])
     assert row.shape == (6, 5 + 4 + 3, 3)
     assert (row[:, :5] == (255, 0, 0)).all() and (row[:, 5:9] == 128).all() and (row[:, 9:] == 0).all()
@@ -56,13 +56,13 @@ def test_frames_go_into_a_folder_numbered_or_named(tmp_path):
         ([(4, 4), (4, 6)], "frame 1 is 6x4, but the first is 4x4; write a folder"),
     ],
 )
-def test_a_video_that_cannot_be_leaves_nothing(tmp_path, frames, says):
+def test_an_impossible_video_leaves_no_file(tmp_path, frames, says):
     with pytest.raises(ArgumentError, match=says):
         write_frames(tmp_path / "v.mp4", [colour(*size, (0, 0, 0)) for size in frames])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_is_no_folder(tmp_path):
+def test_a_file_and_a_folder_are_not_confused(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(ArgumentError, match=r"taken: is a file; give a video \(\.mp4\) or a folder of PNGs"):
         write_frames(tmp_path / "taken", [colour(4, 4, (0, 0, 0))])
@@ -75,7 +75,7 @@ def test_a_file_is_no_folder(tmp_path):
 
 @pytest.mark.parametrize("suffix", [*sorted(NOT_WRITTEN), ".GIF"])
 def test_other_formats_are_refused_by_name(tmp_path, suffix):
-    """`--out x.gif` was taken for a folder."""
+    """`--out x.gif` used to be taken for a folder."""
     with pytest.raises(
         ArgumentError, match=rf"x\{suffix}: {suffix[1:].upper()} is not supported; give a video"
     ):
@@ -91,7 +91,7 @@ def test_a_folder_may_have_a_dot_in_its_name(tmp_path):
         ]
 
 
-def test_leftovers_of_killed_writers_go_and_other_files_stay(tmp_path):
+def test_leftovers_of_killed_writers_are_removed_and_other_files_kept(tmp_path):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     with written_aside(tmp_path / "x") as aside:
@@ -106,7 +106,7 @@ def test_leftovers_of_killed_writers_go_and_other_files_stay(tmp_path):
     ]
     kept = [
         f".v.{machine}-{os.getppid()}-abcd1234.mp4",
-        f".v.{other}-{gone.pid}-abcd1234.mp4",  # no such process here, but perhaps there
+        f".v.{other}-{gone.pid}-abcd1234.mp4",  # no such process here, but perhaps on the other machine
         f"v.{machine}-{gone.pid}-abcd1234.mp4",
         ".v.original.mp4",
         ".v.12-ab.mp4",
@@ -124,7 +124,7 @@ def test_leftovers_of_killed_writers_go_and_other_files_stay(tmp_path):
     assert [p.name for p in (tmp_path / "below").iterdir()] == ["frame_0000.png"]
 
 
-def test_an_encoder_that_does_not_open_is_said(tmp_path, monkeypatch):
+def test_an_encoder_that_does_not_open_is_reported(tmp_path, monkeypatch):
     class Closed:
         fourcc = staticmethod(lambda *_: 0)
 

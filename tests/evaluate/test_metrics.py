@@ -28,7 +28,7 @@ def noise(*shape, seed=0):
 
 
 def ssim_by_definition(x, y):
-    """SSIM written from its formula, with scipy's filter: 11 taps, sigma 1.5, zero outside."""
+    """SSIM from its formula, with scipy's filter: 11 taps, sigma 1.5, zero outside."""
     taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     taps /= taps.sum()
 
@@ -78,16 +78,16 @@ def test_tensors_are_images_too():
 
 @pytest.mark.parametrize("shape", [(40, 31, 3), (5, 64, 3), (1, 1, 3)])
 def test_ssim_against_its_definition(shape):
-    """Both work in float64. A window's sums carry at most some 30 roundings (121 products, summed by rows and
-    columns), of values up to 1: 3e-15. The ratio divides by at least C2 = 9e-4 (and C1 = 1e-4 where both are
-    dark), which makes an error of 1e-11 at the most; the mean does not add to it.
+    """Both use float64. A window's sums have about 30 roundings (121 products, summed by rows and columns) of values
+    up to 1: 3e-15. The ratio divides by at least C2 = 9e-4 (and C1 = 1e-4 if both are dark), so the error is at most
+    1e-11. The mean does not add to it.
     """
     x = noise(*shape)
     y = np.clip(x + 0.2 * (noise(*shape, seed=1) - 0.5), 0, 1)
     assert ssim(x, y) == pytest.approx(ssim_by_definition(x, y), abs=1e-10)
 
 
-def test_a_mask_decides_what_counts():
+def test_only_pixels_inside_the_mask_count():
     truth = (255 * noise(16, 18, 3)).astype(np.uint8)
     image = np.clip(truth / 255 + 0.05, 0, 1)
     mask = np.zeros((16, 18), dtype=bool)
@@ -105,7 +105,7 @@ def test_a_mask_decides_what_counts():
 
 
 @pytest.mark.usefixtures("as_shipped")
-def test_what_cannot_be_compared_is_refused():
+def test_images_that_cannot_be_compared_are_refused():
     image = noise(4, 5, 3)
     with pytest.raises(ShapeError, match=r"truth: expected shape \(H=4, W=5, 3\), got \(5, 4, 3\)"):
         psnr(image, noise(5, 4, 3))
@@ -166,7 +166,7 @@ def test_views_are_scored_over_the_background_in_their_order():
     )
     assert [score.name for score in scores] == seen == ["black", "clear", "grey"]
     assert scores[0].psnr == pytest.approx(10 * math.log10(4), abs=1e-9)
-    # the photo is bytes by then: 255, 128, 128
+    # The composited photos are bytes: 255, 128, 128.
     error = (0.5**2 + 2 * (0.5 - 128 / 255) ** 2) / 3
     assert scores[1].psnr == pytest.approx(-10 * math.log10(error), abs=1e-9)
     assert best(scores).name == "grey" and worst(scores).name == "black"
@@ -175,7 +175,7 @@ def test_views_are_scored_over_the_background_in_their_order():
     assert means["psnr"] == pytest.approx(sum(s.psnr for s in scores) / 3, abs=1e-12)
 
 
-def test_no_images_have_no_means():
+def test_no_images_means_no_averages():
     assert summarize([]) == {"psnr": None, "psnr_8bit": None, "ssim": None, "l1": None, "num_images": 0}
     with pytest.raises(ArgumentError, match="scores: is empty"):
         worst([])

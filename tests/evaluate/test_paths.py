@@ -25,7 +25,7 @@ def scene(means, logit):
     )
 
 
-def test_a_bare_scene_fills_the_picture_whatever_floats_around():
+def test_a_bare_scene_fills_the_picture_despite_floaters():
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(2000, 3))
     ball = 0.5 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + (4, 5, 6)
@@ -34,10 +34,10 @@ def test_a_bare_scene_fills_the_picture_whatever_floats_around():
     for camera in orbit_of_scene(gaussians, 7, 100):
         u, v, _ = camera.project(camera.world_to_cam(ball))
         assert (camera.W, camera.H) == (100, 100)
-        # the medians of 2000 points are some 0.5 / sqrt(2000) off, under 3 px here; so are the edges
+        # The medians of 2000 points are off by about 0.5 / sqrt(2000), under 3 px here, and so are the edges.
         assert abs(u.mean() - 50) < 3 and abs(v.mean() - 50) < 3
         assert u.min() > -3 and u.max() < 103 and u.max() - u.min() > 80
-        assert camera.eye[1] < 5, "from above"
+        assert camera.eye[1] < 5, "the camera is above the scene"
 
 
 def test_one_gaussian_is_a_scene_and_none_is_not():
@@ -47,7 +47,7 @@ def test_one_gaussian_is_a_scene_and_none_is_not():
         orbit_of_scene(scene(np.zeros((0, 3)), 0.0), 1, 10)
 
 
-def test_resizing_keeps_what_is_seen():
+def test_resizing_keeps_the_view():
     camera = Camera(np.eye(3), (0, 0, 0), 80, 85, 30.5, 22.0, 48, 64)
     small = resized(camera, 32)
     assert (small.W, small.H) == (32, 24)

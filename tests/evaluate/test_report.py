@@ -75,12 +75,12 @@ def full_report(count=20):
     )
 
 
-def test_a_page_is_whole_and_needs_nothing_else(tmp_path):
+def test_a_page_is_well_formed_and_self_contained(tmp_path):
     path = tmp_path / "new" / "report.html"
     write_report(path, full_report())
     page = Page(path)
     assert path.read_text("utf-8").startswith("<!DOCTYPE html>")
-    # one script, our own, which a policy can name by its hash; no handler in an attribute of ours
+    # There is one script, our own, which a policy can allow by its hash, and no inline event handler.
     assert page.tags.count("script") == 1 and f"<script>{SCRIPT}</script>" in path.read_text("utf-8")
     assert "link" not in page.tags and not page.handlers
     assert page.references and all(r.startswith(("data:", "#")) for r in page.references)
@@ -102,7 +102,7 @@ def test_best_and_worst_are_named_and_shown(tmp_path):
     report = full_report()
     write_report(tmp_path / "r.html", report)
     page = Page(tmp_path / "r.html")
-    # 20 + 7 i mod 20: the least is 20 at i = 0, the largest 39 at i = 17
+    # 20 + (7 i mod 20): the smallest is 20 at i = 0, the largest 39 at i = 17.
     assert "Best: 17.png (39.00 dB). Worst: 0.png (20.00 dB)." in page.text
     shown = [words for words in page.words if words.rstrip().endswith("SSIM 0.9000")]
     assert len(shown) == 8 and any(w.startswith("17.png: PSNR 39.00") for w in shown)
@@ -111,7 +111,7 @@ def test_best_and_worst_are_named_and_shown(tmp_path):
 def test_pictures_are_render_photo_and_difference(tmp_path):
     (_, render), (_, photo), (_, difference) = picture("a", 50).panels
     means = [np.array(Image.open(io.BytesIO(data))).mean() for data in (render, photo, difference)]
-    np.testing.assert_allclose(means, (50, 200, 150), atol=1)  # JPEG of one colour: within a step
+    np.testing.assert_allclose(means, (50, 200, 150), atol=1)  # a JPEG of one colour is exact to one step
     big = np.zeros((900, 1600, 3), np.uint8)
     assert Image.open(io.BytesIO(Picture.of("b", big, big).panels[0][1])).size == (640, 360)
     write_report(tmp_path / "r.html", Report("t", {}, scores=[score("a", 20.0)], pictures=[picture("a", 50)]))
@@ -123,8 +123,8 @@ def test_pictures_are_render_photo_and_difference(tmp_path):
 @pytest.mark.parametrize(
     ("step", "times"), [(0, 16), (3, 16), (15, 16), (16, 8), (60, 4), (127, 2), (128, 1), (200, 1)]
 )
-def test_differences_are_bright_enough_to_see_and_say_by_how_much(step, times):
-    """The difference of a good render, a few steps of 255, was black."""
+def test_differences_are_amplified_until_visible_and_say_by_how_much(step, times):
+    """The difference of a good render, a few steps of 255, used to look black."""
     title, data = Picture.of(
         "a", np.full((30, 40, 3), step, np.uint8), np.zeros((30, 40, 3), np.uint8)
     ).panels[2]
@@ -132,8 +132,8 @@ def test_differences_are_bright_enough_to_see_and_say_by_how_much(step, times):
     assert np.array(Image.open(io.BytesIO(data))).mean() == pytest.approx(step * times, abs=1)
 
 
-def test_the_last_judgement_is_on_the_curve(tmp_path, monkeypatch):
-    """The evaluation at the end is in the metrics, not in the log."""
+def test_the_final_evaluation_is_on_the_curve(tmp_path, monkeypatch):
+    """The final evaluation is in the metrics, not in the log."""
     drawn = []
     monkeypatch.setattr(report_module, "run_curve_figures", lambda log: drawn.append(log) or [])
     log = [{"iteration": i, "loss": 0.1} for i in (1, 2, 3)] + [{"iteration": 2, "psnr": 20.0}]
@@ -180,7 +180,7 @@ def test_the_verdict_is_a_sentence_from_the_numbers(tmp_path, test, train, says)
     assert sentence in Page(tmp_path / "r.html").text and "<i>" not in (tmp_path / "r.html").read_text()
 
 
-def test_the_page_is_linked_or_the_command_that_makes_it_is_named(tmp_path):
+def test_the_page_is_linked_or_the_command_to_write_it_is_shown(tmp_path):
     folder = tmp_path / "a run's <folder>"
     write_report(folder / "report.html", Report("t", {"exports": [{"path": str(tmp_path / "gone.html")}]}))
     page = Page(folder / "report.html")
@@ -230,7 +230,7 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
         tab.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
-        # a number has one line: its cell is as high as one
+        # A number takes one line, so its cell has the height of one line.
         heights = tab.evaluate(
             "[...document.querySelectorAll('td.n')].map((e) => e.getClientRects()[0].height)"
         )
@@ -248,7 +248,7 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
         box = slider.bounding_box()
         tab.touchscreen.tap(box["x"] + 0.2 * box["width"], box["y"] + 0.5 * box["height"])
         assert abs(float(tab.evaluate(at).rstrip("%")) - 20) < 4
-        # the photo, 200, is left of the line and the render, 150, right of it
+        # The photo (200) is left of the line, the render (150) right of it.
         shot = np.array(Image.open(io.BytesIO(tab.locator(".pair").first.screenshot())))
         row = shot[shot.shape[0] // 2, :, 0].astype(int)
         assert abs(row[int(0.1 * len(row))] - 200) < 4 and abs(row[int(0.6 * len(row))] - 150) < 4
@@ -256,7 +256,7 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
         browser.close()
 
 
-def test_nothing_to_show_is_a_page_too(tmp_path):
+def test_a_report_without_content_is_a_page_too(tmp_path):
     write_report(tmp_path / "r.html", Report("empty", {"test": summarize([])}))
     page = Page(tmp_path / "r.html")
     assert "No view was held out for testing" in page.text and "svg" not in page.tags
@@ -283,9 +283,9 @@ def test_every_kind_of_number_has_its_own_curve():
     assert [axes.lines[0].get_ydata()[0] for axes in panels] == [2.0, 21.0, 301.0, 5.0]
 
 
-def test_curves_are_of_what_the_log_has():
+def test_only_values_in_the_log_get_curves():
     assert run_curve_figures([]) == run_curve_figures([{"iteration": 1, "loss": None}, {"loss": 2.0}]) == []
-    log = [{"iteration": i, "loss": 0.0, "psnr": float("nan")} for i in range(5000)]  # no logarithm of zero
+    log = [{"iteration": i, "loss": 0.0, "psnr": float("nan")} for i in range(5000)]  # zero has no logarithm
     log[7]["num_gaussians"] = 40
     every = [axes for figure in run_curve_figures(log) for axes in figure.axes]
     drawn = {axes.get_title(): axes.lines[0].get_xydata() for axes in every}
@@ -295,16 +295,16 @@ def test_curves_are_of_what_the_log_has():
     assert len(thinned) == 400 and thinned[0, 0] == np.mean(range(13)) and (thinned[:, 1] == 0).all()
 
 
-def test_a_drawing_stands_in_a_page_and_is_repeatable():
+def test_a_drawing_has_unique_ids_and_is_repeatable():
     log = [{"iteration": i, "loss": 1.0 / (i + 1)} for i in range(5000)]
     first, second = (svg_element(*run_curve_figures(log)) for _ in range(2))
     other = svg_element(*run_curve_figures(log), name="other")
     ids, others = (set(re.findall(r'id="(p[0-9a-f]{10})"', text)) for text in (first, other))
-    assert ids and others and not ids & others, "a clip of one drawing would cut the other"
+    assert ids and others and not ids & others, "the clip path of one drawing would cut the other"
     assert first == second and first.startswith("<svg") and len(first) < 100_000
 
 
-def test_exports_are_told_with_their_figures(tmp_path):
+def test_exports_are_listed_with_their_figures(tmp_path):
     entry = {
         "path": "a/<b>.spz",
         "num_bytes": 123456,

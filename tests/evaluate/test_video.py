@@ -1,4 +1,4 @@
-"""Videos: the whole picture at any size, equal bytes, and a browser that plays them in the right colours."""
+"""Videos contain the whole picture at any size, are repeatable, and play in a browser in the right colours."""
 
 import base64
 import os
@@ -33,7 +33,7 @@ PLAY = """async ([kind, data, expected]) => {
     canvas.width = video.videoWidth; canvas.height = video.videoHeight;
     const context = canvas.getContext("2d", { willReadFrequently: true });
     let found = [];
-    // on a busy machine a frame that was sought may reach the canvas a little later
+    // On a busy machine the frame may reach the canvas a little after `seeked`.
     for (let attempt = 0; attempt < 200; attempt++) {
       context.drawImage(video, 0, 0);
       found = [0.25, 0.75].flatMap((y) => [0.25, 0.75].map((x) =>
@@ -52,7 +52,7 @@ PLAY = """async ([kind, data, expected]) => {
 
 
 def quarters(height, width, turn):
-    """Four colours, one in each quarter of the picture, turned on by a place per frame."""
+    """Four colours, one in each quarter of the picture; each frame moves them on by one place."""
     image = np.zeros((height, width, 3), dtype=np.uint8)
     for i, colour in enumerate(np.roll(COLOURS, turn, axis=0)):
         rows = slice(None, height // 2) if i < 2 else slice(height // 2, None)
@@ -70,8 +70,8 @@ def boxes(data):
 
 
 @pytest.mark.parametrize(("height", "width"), [(33, 47), (48, 33), (33, 48), (32, 48), (1, 9)])
-def test_the_whole_picture_is_in_it(tmp_path, height, width):
-    """Odd heights and widths were cut. The last row and column are white here, and still there."""
+def test_the_video_contains_the_whole_picture(tmp_path, height, width):
+    """Odd heights and widths used to be cut. The last row and column are white here and must survive."""
     frames = [np.zeros((height, width, 3), dtype=np.uint8) for _ in range(3)]
     for i, frame in enumerate(frames):
         frame[:] = 60 + 40 * i
@@ -91,7 +91,7 @@ def test_the_whole_picture_is_in_it(tmp_path, height, width):
             )
             < 20
         )
-        # in white, lossy, in chroma of half the resolution and 16..235: nearer to white than to the grey beside it
+        # The codec is lossy, with half-resolution chroma and range 16..235: nearer to white than to the grey beside it.
         assert shown[height - 1 :].min() > 200 and shown[:, width - 1 :].min() > 200
     assert not video.read()[0]
 
@@ -105,14 +105,14 @@ def test_equal_frames_give_equal_bytes_and_the_index_is_in_front(tmp_path):
     assert first == second
     kinds = boxes(first)
     assert kinds.index(b"moov") < kinds.index(b"mdat")
-    # profile 0 (8 bits, 4:2:0), limited range, matrix of BT.601
+    # profile 0 (8 bits, 4:2:0), limited range, BT.601 matrix
     entry = first[first.index(b"vpcC") + 4 :]
     assert entry[4] == 0 and entry[6] == 0x82 and tuple(entry[7:10]) == (1, 1, 6)
-    assert streamable(first) == first, "done already"
+    assert streamable(first) == first, "already streamable"
 
 
 def test_a_video_may_have_any_name(tmp_path):
-    """OpenCV ends the process where a name is not UTF-8."""
+    """OpenCV aborts the process if a name is not UTF-8."""
     frames = [quarters(16, 24, turn) for turn in range(3)]
     plain, odd = tmp_path / "plain.mp4", tmp_path / os.fsdecode(b"run\xfe") / os.fsdecode(b"raw\xff.mp4")
     for path in (plain, odd):
@@ -120,7 +120,7 @@ def test_a_video_may_have_any_name(tmp_path):
     assert odd.read_bytes() == plain.read_bytes() and list(odd.parent.iterdir()) == [odd]
 
 
-def test_what_is_no_video_is_refused():
+def test_data_that_is_not_a_video_is_refused():
     for data in (b"", b"GIF89a", struct.pack(">I4s", 8, b"ftyp")):
         with pytest.raises(ArgumentError, match="is not an MP4 file with an index"):
             streamable(data)
@@ -128,7 +128,7 @@ def test_what_is_no_video_is_refused():
 
 @pytest.mark.parametrize(("height", "width"), [(63, 95), (720, 1280)])
 def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width):
-    """Chromium refused MPEG-4 Part 2. It takes the colours of untagged videos of any size for BT.709's."""
+    """Chromium does not play MPEG-4 Part 2, and assumes BT.709 for untagged videos of any size."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     chromium = shutil.which("chromium")
     if chromium is None:
@@ -150,5 +150,5 @@ def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width):
     )
     assert len(played["shown"]) == len(frames)
     for i, shown in enumerate(played["shown"]):
-        # one step of YUV in limited range is up to 2.3 of RGB, and quantization a few; a wrong matrix is 30 off
+        # One step of limited-range YUV is up to 2.3 in RGB, and quantization adds a few; a wrong matrix is off by 30.
         assert np.abs(np.array(shown) - np.array(expected[i])).max() <= 8

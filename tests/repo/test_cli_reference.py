@@ -1,4 +1,4 @@
-"""docs/CLI.md is what the parsers say, and `train --help` shows what a user needs."""
+"""docs/CLI.md matches the parsers, and `train --help` shows what a user needs."""
 
 import importlib.util
 import re
@@ -23,7 +23,7 @@ def reference():
 
 @pytest.fixture
 def shown(capsys):
-    """Return the options at the beginning of a line of help."""
+    """Return the options that begin a line of help."""
 
     def run(*words):
         with pytest.raises(SystemExit) as stop:
@@ -48,8 +48,8 @@ def test_a_changed_option_makes_it_stale(reference, monkeypatch):
 def test_every_option_is_in_the_reference(command, shown):
     section = WRITTEN.split(f"\n## gsplat-edu {command}\n")[1].split("\n## ")[0]
     options = shown(command, "--help-all" if command == "train" else "--help")
-    told = re.findall(r"^\| `(--[a-z0-9-]+)", section, flags=re.MULTILINE)
-    assert sorted(told) == sorted(set(options) - {"--help", "--help-all", "--debug"})
+    documented = re.findall(r"^\| `(--[a-z0-9-]+)", section, flags=re.MULTILINE)
+    assert sorted(documented) == sorted(set(options) - {"--help", "--help-all", "--debug"})
 
 
 def test_the_help_of_train_shows_about_twenty_options_and_the_rest_on_request(shown):

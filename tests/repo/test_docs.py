@@ -1,4 +1,4 @@
-"""The documents are tested: their examples run, and they name everything there is."""
+"""The documents' examples run, and the documents name everything that exists."""
 
 import re
 import shlex
@@ -58,7 +58,7 @@ def test_every_make_target_is_explained_by_make_help():
 
 
 UNMEASURED = {"gpu.py"}
-"""Benchmarks whose machine has not been at hand: their section has to say so."""
+"""Benchmarks without an available machine. Their sections must say so."""
 
 FIGURE = re.compile(r"\d[\d,]*\.\d+|\d+,\d{3}|\d+ (?:ms|s|min|MiB|GiB|px|%)(?!\w)")
 
@@ -70,7 +70,7 @@ def sections(results):
 
 
 def without_figures(results, scripts):
-    """Name the benchmarks that no section's heading names, or whose sections hold fewer than three figures."""
+    """Return the benchmarks that no section's heading names, or whose sections hold fewer than three figures."""
     named = {
         name: "".join(
             text for heading, text in sections(results).items() if f"python benchmarks/{name}" in heading
@@ -92,7 +92,7 @@ def test_every_benchmark_has_its_results():
 
 
 @pytest.mark.parametrize("text", ["Not run: 1.5 s, 2.5 s and 3.5 s are expected.", "It is fast.", "1.5 s"])
-def test_a_benchmark_without_results_would_be_found(text):
+def test_a_benchmark_without_results_is_found(text):
     good = "# Results\n\n## A (`python benchmarks/a.py`)\n\n1.5 s, 20 MiB, 1,200 splats\n"
     assert without_figures(good, {"a.py"}) == set()
     assert without_figures(good.replace("1.5 s, 20 MiB, 1,200 splats", text), {"a.py"}) == {"a.py"}
@@ -109,21 +109,21 @@ def test_every_constant_is_in_the_decisions():
 
 
 def undescribed(architecture, modules):
-    """Find the modules that the tree of ARCHITECTURE.md does not name where they are.
+    """Find the modules that the tree of ARCHITECTURE.md does not name in their folder.
 
     Args:
-        architecture: The document, whose first indented tree has a line for each module or package of the top level
-            and, further to the right or on the same line, what is in each package.
+        architecture: The document. Its first indented tree has a line for each top-level module or package; the
+            contents of a package follow on that line or further to the right.
         modules: Paths within src/gsplat_edu, without the __init__ files.
     """
     (tree,) = re.findall(r"^src/gsplat_edu/\n(.*?)^\S", architecture, flags=re.MULTILINE | re.DOTALL)
-    rooms = {}
+    entries = {}
     for entry in re.split(r"^  (?=\S)", tree, flags=re.MULTILINE)[1:]:
-        rooms[entry.split()[0]] = entry
+        entries[entry.split()[0]] = entry
     missing = []
     for path in modules:
         *folders, name = path.parts
-        text = rooms.get(f"{folders[0]}/" if folders else name, "")
+        text = entries.get(f"{folders[0]}/" if folders else name, "")
         for folder in folders[1:]:
             text = re.split(rf"(?<![\w./]){folder}/", text, maxsplit=1)[-1] if f"{folder}/" in text else ""
         if not re.search(rf"(?<![\w.-]){re.escape(name)}", text):
@@ -134,13 +134,13 @@ def undescribed(architecture, modules):
 def test_every_module_is_in_the_architecture():
     package = ROOT / "src" / "gsplat_edu"
     modules = [path.relative_to(package) for path in package.rglob("*.py") if path.name != "__init__.py"]
-    # the options of a command stand in a module of its name: the tree says so once
+    # The tree states once that a command's options are in a module of the command's name.
     modules = [path for path in modules if path.parts[:2] != ("cli", "options")]
     assert len(modules) > 100
     assert undescribed((ROOT / "ARCHITECTURE.md").read_text(), modules) == []
 
 
-def test_a_module_named_elsewhere_is_missed():
+def test_a_module_named_in_another_folder_counts_as_missing():
     tree = "src/gsplat_edu/\n  camera.py  x\n  io/  ply.py, zip.py\n    sog/  files.py\n  runs/  log.py\ntests/\n"
     paths = ["camera.py", "io/ply.py", "io/sog/files.py", "runs/log.py"]
     assert undescribed(tree, map(Path, paths)) == []

@@ -1,4 +1,4 @@
-"""The limits of the house, and that the tool which checks them sees a breach."""
+"""The repository is within the house limits, and the tool that checks them finds violations."""
 
 import importlib.util
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Who may import whom: the contracts of pyproject.toml, and that they would notice."""
+"""The import contracts of pyproject.toml hold, and detect violations."""
 
 import shutil
 import subprocess
@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def lint(folder):
-    """Run the contracts on a copy of the package, so that a planted import is what is looked at."""
-    # An editable installation would answer for the package before the copy is looked at.
+    """Run the contracts on a copy of the package, where a test may plant an import."""
+    # Otherwise an editable installation would be found before the copy.
     code = (
         "import sys; sys.path.insert(0, 'src'); "
         "sys.meta_path[:] = [f for f in sys.meta_path if 'ScikitBuild' not in type(f).__name__]; "

@@ -1,4 +1,4 @@
-"""What the native source promises about itself."""
+"""Properties that the native source must have."""
 
 import importlib.util
 import re
@@ -14,17 +14,17 @@ ISA_FREE = {
         for end in ("cpp", "h")
     ),
 }
-"""Compiled once, for the oldest machine; all others are compiled once per instruction set."""
+"""Files compiled once, for the oldest machine. All others are compiled once per instruction set."""
 
 
-def test_the_constants_header_is_made_from_constants_py():
+def test_the_constants_header_is_generated_from_constants_py():
     spec = importlib.util.spec_from_file_location("generate", ROOT / "tools" / "generate_constants.py")
     generate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generate)
     assert (NATIVE / "constants.h").read_text() == generate.header()
 
 
-def test_only_the_bindings_know_python_and_nothing_knows_torch():
+def test_only_the_bindings_include_python_and_nothing_includes_torch():
     for path in NATIVE.iterdir():
         includes = re.findall(r"#include [<\"](.*)[>\"]", path.read_text())
         assert not [i for i in includes if "torch" in i or "ATen" in i], path.name
@@ -32,7 +32,7 @@ def test_only_the_bindings_know_python_and_nothing_knows_torch():
             assert not [i for i in includes if "nanobind" in i or "Python" in i], path.name
 
 
-def test_kernel_files_include_nothing_of_the_standard_library_but_c():
+def test_kernel_files_include_only_c_standard_headers():
     allowed = {"math.h", "stdint.h", "string.h", "immintrin.h"}
     files = [path for path in NATIVE.iterdir() if path.name not in ISA_FREE]
     assert len(files) > 8

@@ -1,4 +1,4 @@
-"""The chapters: nothing the package has is defined again, and what ships was executed from its source."""
+"""The chapters redefine nothing that the package has, and the shipped notebooks were executed from their sources."""
 
 import ast
 import importlib.util
@@ -23,7 +23,7 @@ CHAPTERS = pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem
 
 
 def top_level_names(text: str) -> set[str]:
-    """Collect the functions, classes and constants that a module of the package defines."""
+    """Collect the functions, classes and constants that a module defines."""
     names = set()
     for node in ast.parse(text).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -41,7 +41,7 @@ def public_names() -> set[str]:
 
 
 def redefinitions(text: str) -> set[str]:
-    """Find names of the package that a chapter binds itself, wherever and however it does."""
+    """Find names of the package that a chapter binds itself, in any scope and by any statement."""
     bound = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -98,12 +98,12 @@ def test_no_chapter_redefines_a_public_name(source):
         "gsplat_edu.camera.Camera = 1",
     ],
 )
-def test_a_redefinition_would_be_found(text):
+def test_a_redefinition_is_found(text):
     assert redefinitions(text)
 
 
 def draws_aside(node: ast.AST) -> bool:
-    """Say whether a figure could appear that plt.show() has not seen."""
+    """Return whether a statement could draw a figure past plt.show()."""
     if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "plt":
         return node.attr not in ("subplots", "subplot_mosaic", "figure", "show", "setp")
     if isinstance(node, ast.Call):
@@ -112,7 +112,7 @@ def draws_aside(node: ast.AST) -> bool:
 
 
 def violations(text: str) -> list[str]:
-    """Say what a chapter's source lacks, or has and should not."""
+    """List the rules that a chapter's source breaks."""
     nodes = list(ast.walk(ast.parse(text)))
     names = [node.attr for node in nodes if isinstance(node, ast.Attribute)]
     made = sum(name in ("subplots", "figure", "subplot_mosaic") for name in names)
@@ -147,7 +147,7 @@ assert 1 + 1 == 2
 
 
 @CHAPTERS
-def test_chapters_keep_the_rules(source):
+def test_chapters_follow_the_rules(source):
     assert violations(source.read_text()) == []
 
 
@@ -189,7 +189,7 @@ def tool(name):
 
 
 def figure(**settings):
-    """Draw a line with a title and labels, or with those that are given."""
+    """Draw a line with a title and labels, or with the given settings."""
     made, axes = plt.subplots()
     axes.plot([0, 1])
     axes.set(**({"title": "a line", "xlabel": "x, px", "ylabel": "y, px"} | settings))
@@ -208,7 +208,7 @@ def test_a_figure_without_title_or_labels_is_rejected(faults, lacking):
     assert len(faults(figure(**{lacking: ""}))) == 1
 
 
-def test_images_need_titles_colour_bars_labels_and_inner_axes_nothing(faults):
+def test_images_need_titles_and_colour_bars_labels_but_inner_axes_nothing(faults):
     assert faults(figure(xlabel="", ylabel="", xticks=[], yticks=[])) == []
     made, axes = plt.subplots(1, 2, sharey=True)
     for ax in axes:
@@ -266,8 +266,8 @@ def test_chapters_that_modules_name_link_them():
 
 
 def prose_numbers(markdown: str) -> set[str]:
-    """Find numbers in prose that a reader would want to see measured: those with a point, a % or three digits."""
-    for apart in (
+    """Find numbers in prose that must be measured: those with a decimal point, a % or three digits."""
+    for skipped in (
         r"\$\$.*?\$\$",
         r"\$.*?\$",
         r"`[^`]*`",
@@ -275,7 +275,7 @@ def prose_numbers(markdown: str) -> set[str]:
         r"^#+ .*$",
         r"\bet al\. \d{4}|\b(19|20)\d\d\b",
     ):
-        markdown = re.sub(apart, " ", markdown, flags=re.DOTALL | re.MULTILINE)
+        markdown = re.sub(skipped, " ", markdown, flags=re.DOTALL | re.MULTILINE)
     found = re.findall(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?:e-?\d+)?(?: ?%)?(?!\w)", markdown)
     return {n.rstrip(",") for n in found if "." in n or "%" in n or sum(c.isdigit() for c in n) > 2}
 
@@ -304,16 +304,16 @@ def test_thirteen_chapters():
 
 
 @CHAPTERS
-def test_what_ships_comes_from_the_source_and_was_executed(source):
+def test_shipped_notebooks_match_their_source_and_were_executed(source):
     shipped = nbformat.read(ROOT / "notebooks" / f"{source.stem}.ipynb", as_version=4)
     cells = jupytext.read(source).cells
     assert [(c.cell_type, c.source) for c in shipped.cells] == [(c.cell_type, c.source) for c in cells]
     code = [cell for cell in shipped.cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), "from top to bottom"
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), "run from top to bottom"
     outputs = [output for cell in code for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error"]
     assert any("image/png" in output.get("data", {}) for output in outputs)
-    assert not any("(reduced)" in output.get("text", "") for output in outputs), "ships on the full budget"
+    assert not any("(reduced)" in output.get("text", "") for output in outputs), "ships with the full budget"
 
 
 @pytest.mark.sliced(2)
@@ -322,7 +322,7 @@ def test_what_ships_comes_from_the_source_and_was_executed(source):
 def test_chapters_execute_on_a_reduced_budget(source, tmp_path):
     done = subprocess.run(
         [sys.executable, str(ROOT / "tools" / "build_notebooks.py"), source.stem, "--out", str(tmp_path)],
-        # One thread: torch's wait for one another, for minutes where other programs run.
+        # Use one thread: torch's threads wait for each other, which takes minutes on a busy machine.
         env=os.environ | {"GSPLAT_EDU_BUDGET": "reduced", "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,

@@ -1,4 +1,4 @@
-"""The table of docs/RECIPE.md is written from the settings' metadata, and says what each is."""
+"""The table of docs/RECIPE.md is generated from the settings' metadata and explains each setting."""
 
 import dataclasses
 import importlib.util
@@ -42,8 +42,8 @@ def test_every_field_is_a_setting_with_a_meaning():
     assert len({setting.name for setting in SETTINGS}) == len(SETTINGS)
 
 
-def test_milestones_and_what_only_one_strategy_uses():
-    """Those that 2023 and 2024 give in iterations of 30,000; intervals are not among them."""
+def test_milestones_and_settings_of_one_strategy():
+    """Milestones are the settings that 2023 and 2024 give in iterations out of 30,000. Intervals are not milestones."""
     assert set(MILESTONES) == {
         *("means_rate_iterations", "sh_every", "densify_start", "densify_stop", "reset_every", "mcmc_stop")
     }

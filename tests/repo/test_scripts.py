@@ -1,4 +1,4 @@
-"""Every script runs: at a tiny size, to the end, with results that can be read."""
+"""Every script runs to the end at a tiny size and gives readable results."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from processes import Program
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py")) + sorted((ROOT / "benchmarks").glob("*/__main__.py"))
 SHARED = {"captures.py", "hardware.py"}
-"""What the others import."""
+"""Modules that the benchmarks import."""
 
 TRAININGS = {
     "train_2d.py": ("--splats", "5", "--iters", "2", "--size", "12"),
@@ -33,7 +33,7 @@ ELSEWHERE = {
     "sanitize.sh": "Makefile",
     "set_up.sh": "Makefile",
 }
-"""Tools, and where each is run."""
+"""The file that runs each tool."""
 
 
 SCRIPT = """
@@ -51,7 +51,7 @@ def run(*words, cwd=ROOT):
 
 
 def script(path, *words, folder):
-    """Run a Python script in a process of its own, on no captures but those it makes itself."""
+    """Run a Python script in a separate process, without captures except those it makes itself."""
     return Program(SCRIPT, [path, *words], folder).ended(patience=600)
 
 
@@ -83,7 +83,7 @@ def test_a_training_runs(path, tmp_path):
 
 
 def test_the_constants_are_generated(tmp_path):
-    """A copy of the tool writes beside itself."""
+    """The tool is copied, because it writes next to itself."""
     for name in ("tools", "native"):
         (tmp_path / name).mkdir()
     shutil.copy(ROOT / "tools" / "generate_constants.py", tmp_path / "tools")
@@ -103,13 +103,13 @@ def targets():
     return re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.M)[1].split()
 
 
-def test_every_target_is_explained_and_run():
-    """By .ci/run, by this file, or with the same tool by another test; what takes hours, by hand."""
-    told = run("make", "help").stdout
+def test_every_make_target_is_explained_and_run():
+    """.ci/run, this file or a test of the same tool runs each target. Targets that take hours are run by hand."""
+    explained = run("make", "help").stdout
     ci = (ROOT / ".ci" / "run").read_text()
     elsewhere = {"help", "clean", "notebooks", "site", "bench", "soak"}
     for name in targets():
-        assert name == "help" or re.search(rf"^make {name} ", told, re.M), name
+        assert name == "help" or re.search(rf"^make {name} ", explained, re.M), name
         assert name in elsewhere or re.search(rf"^make {name}\b", ci, re.M), name
 
 
@@ -132,12 +132,12 @@ def test_make_soak_runs_every_case_and_the_whole_budget():
 
 
 def soak_results():
-    """Return the section of RESULTS.md that `make soak` is written into."""
+    """Return the section of RESULTS.md about `make soak`."""
     results = (ROOT / "benchmarks" / "RESULTS.md").read_text()
     return re.split(r"^## ", re.split(r"^## .*make soak.*$", results, flags=re.M)[1], flags=re.M)[0]
 
 
-def test_make_clean_leaves_the_source(tmp_path):
+def test_make_clean_keeps_the_source(tmp_path):
     shutil.copy(ROOT / "Makefile", tmp_path)
     for name in (".venv/bin", "out/run", "build", "src"):
         (tmp_path / name).mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The site: built without a warning, opened from disk, and every link on it leads somewhere."""
+"""The site builds without a warning, opens from disk, and has no broken link."""
 
 import re
 import subprocess
@@ -12,12 +12,12 @@ import pytest
 from browsers import chromium
 
 ROOT = Path(__file__).parents[2]
-APART = ("pre", "code", "dt", "math", "script", "style", "title")
-"""Tags whose text is no prose: programs, signatures, equations."""
+NOT_PROSE = ("pre", "code", "dt", "math", "script", "style", "title")
+"""Tags whose text is not prose: programs, signatures, equations."""
 
 
 class Page(HTMLParser):
-    """What a page links, what it loads, and what can be linked on it."""
+    """The links of a page, the files it loads, and its anchors."""
 
     def __init__(self, text):
         super().__init__()
@@ -28,7 +28,7 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attributes):
         found = dict(attributes)
         self.tags.add(tag)
-        self.within += [tag] if tag in APART else []
+        self.within += [tag] if tag in NOT_PROSE else []
         self.anchors |= {found[name] for name in ("id", "name") if found.get(name)}
         self.links += [found["href"]] if tag == "a" and found.get("href") else []
         self.loaded += [found["href"]] if tag == "link" and found.get("rel") == "stylesheet" else []
@@ -59,7 +59,7 @@ def browser():
 
 
 def broken(pages, out):
-    """Find links within the site that lead nowhere, or to a place that the page does not have."""
+    """Find links within the site to missing pages or missing anchors."""
     found = []
     for path, page in pages.items():
         for link in [*page.links, *page.loaded]:
@@ -134,7 +134,7 @@ def test_set_up_cells_are_folded_and_others_are_not(site):
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1440, 390])
 def test_no_line_of_code_is_cut_off(site, width, browser):
-    """Code and printed output wrap or fit."""
+    """Code and printed output fit or wrap."""
     _, out = site
     page = browser.new_page(viewport={"width": width, "height": 900})
     for name in ("notebooks/10_the_naive_kernel.html", "README.html", "docs/PYTHON.html", "docs/CLI.html"):
@@ -150,7 +150,7 @@ def test_no_line_of_code_is_cut_off(site, width, browser):
 
 
 @pytest.mark.slow
-def test_broken_links_would_be_found(site, tmp_path):
+def test_broken_links_are_found(site, tmp_path):
     texts = {"a": '<a href="b.html#here"><a href="gone.html#x">', "b": '<p id="there"><img src="c.png">'}
     for name, text in texts.items():
         (tmp_path / f"{name}.html").write_text(text)
@@ -159,7 +159,7 @@ def test_broken_links_would_be_found(site, tmp_path):
 
 
 @pytest.mark.slow
-def test_no_equation_and_no_docstring_is_torn_apart(site):
+def test_no_equation_and_no_docstring_is_garbled(site):
     pages, _ = site
     for path, page in pages.items():
         prose = "".join(page.prose)
@@ -167,7 +167,7 @@ def test_no_equation_and_no_docstring_is_torn_apart(site):
         assert "Return type" not in prose, "signatures carry the types"
 
 
-def test_a_folder_that_is_no_site_is_not_written_over(tmp_path):
+def test_a_folder_that_is_not_a_site_is_not_overwritten(tmp_path):
     (tmp_path / "thesis.txt").write_text("years")
     command = [sys.executable, str(ROOT / "tools" / "build_site.py"), "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Which cases of the long tests a run takes: some of them, others for each commit, all of them in time."""
+"""The cases of the long tests that one run draws: some per commit, others with the next, all of them over time."""
 
 import os
 import shutil
@@ -15,14 +15,14 @@ ROOT = Path(__file__).parents[2]
 
 
 class Case(SimpleNamespace):
-    """Collected tests are compared by identity."""
+    """A stand-in for a collected test; compared by identity."""
 
     __hash__ = object.__hash__
     __eq__ = object.__eq__
 
 
 def cases(name, mark, values):
-    """Make what `split` reads of collected tests: a name, a marker and the parameters."""
+    """Make stand-ins with what `split` reads of collected tests: a name, a marker and parameters."""
     return [
         Case(
             nodeid=f"{name}[{i}]",
@@ -43,10 +43,10 @@ def test_a_seed_draws_the_same_cases_and_all_seeds_draw_all_of_them():
     assert drawn[7] == names(slices.split(items, 7)[0])
     for kept in drawn:
         assert len(kept) == 3 + 4 and kept == [name for name in names(items) if name in kept], (
-            "in their order"
+            "the order is kept"
         )
         assert set(names(cases("short", None, range(4)))) <= set(kept)
-    # a case is missed by 100 seeds with a probability of 0.75**100, below 1e-12
+    # 100 seeds miss a case with a probability of 0.75**100, below 1e-12.
     assert set().union(*drawn) == set(names(items))
     kept, left_out = slices.split(items, 7)
     assert sorted(names(kept + left_out)) == sorted(names(items))
@@ -59,13 +59,13 @@ def test_every_value_of_a_parameter_keeps_its_share():
 
 
 @pytest.mark.parametrize(("mark", "count"), [(pytest.mark.sliced(0), 0), (pytest.mark.sliced, 4)])
-def test_a_test_may_wait_for_the_soak_or_never_be_cut(mark, count):
-    """sliced(0) runs in a soak only; sliced without a number cuts itself, by the files it reads."""
+def test_a_test_may_run_only_in_a_soak_or_always(mark, count):
+    """sliced(0) runs only in a soak. A test sliced without a number selects its own files."""
     assert len(slices.split(cases("long", mark, range(4)), 1)[0]) == count
 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
-def test_the_seed_is_the_commits(tmp_path):
+def test_the_seed_comes_from_the_commit(tmp_path):
     assert slices.commit_seed(tmp_path) == slices.WITHOUT_GIT
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@example.org"]
     seeds = []
@@ -92,8 +92,8 @@ def test_long(case):
 
 
 @pytest.mark.own_process
-def test_a_failure_says_how_its_slice_is_drawn_again(tmp_path):
-    """pytest itself, with the hooks of this suite's conftest."""
+def test_a_failure_says_how_to_draw_its_slice_again(tmp_path):
+    """Run pytest itself with the hooks of this suite's conftest."""
     (tmp_path / "test_failing.py").write_text(FAILING)
     (tmp_path / "conftest.py").write_text(HOOKS)
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:jaxtyping", str(tmp_path)]
@@ -101,7 +101,7 @@ def test_a_failure_says_how_its_slice_is_drawn_again(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=paths)
     assert "1 failed, 4 deselected" in done.stdout, done.stdout + done.stderr
     assert f"GSPLAT_EDU_SLICE={slices.SEED}" in done.stdout.partition("collected")[0], (
-        "a run says what it drew"
+        "a run reports what it drew"
     )
     assert slices.HOW_TO_REPEAT in done.stdout
 

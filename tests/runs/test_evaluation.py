@@ -29,11 +29,11 @@ def folder(tmp_path):
 RENDER = functools.partial(render, settings=RenderSettings(depth=False))
 
 
-def test_a_run_is_judged_and_everything_is_written(capture, folder):
+def test_a_run_is_evaluated_and_everything_is_written(capture, folder):
     views, points, colors = capture
     gaussians = splats_on(points, colors)
     folder.write_metrics({"seconds": 12.5, "num_gaussians": 1, "mine": "kept"})
-    told = []
+    progress = []
     judged = Judged(views[:2], views[2:], notes=["a note"])
     result = evaluate_run(
         folder,
@@ -41,15 +41,15 @@ def test_a_run_is_judged_and_everything_is_written(capture, folder):
         gaussians,
         RENDER,
         {"iterations": 70},
-        lambda split, score: told.append((split, score.name)),
+        lambda split, score: progress.append((split, score.name)),
     )
-    assert told == [("test", v.name) for v in views[:2]] + [("train", v.name) for v in views[2:]]
+    assert progress == [("test", v.name) for v in views[:2]] + [("train", v.name) for v in views[2:]]
     metrics = folder.read_metrics()
     assert metrics == json.loads(json.dumps(result.metrics))
     assert (metrics["seconds"], metrics["mine"], metrics["iterations"]) == (12.5, "kept", 70)
     assert (metrics["num_gaussians"], metrics["train"]["num_images"]) == (len(points), 3)
 
-    # the numbers are those of rendering and comparing by hand
+    # The numbers equal rendering and comparing by hand.
     images = [RENDER(gaussians, view.camera).image for view in views[:2]]
     by_hand = [psnr(image, view.image) for image, view in zip(images, views, strict=False)]
     assert [entry["psnr"] for entry in metrics["test_views"]] == by_hand
@@ -67,7 +67,7 @@ def test_a_run_is_judged_and_everything_is_written(capture, folder):
     assert "view_001.png" in page and "a note" in page
 
 
-def test_no_test_views_are_no_obstacle(capture, folder):
+def test_a_run_without_test_views_is_evaluated(capture, folder):
     views, points, colors = capture
     result = evaluate_run(folder, Judged([], views[:1]), splats_on(points, colors), RENDER)
     assert result.metrics["test"] == {

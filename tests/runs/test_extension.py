@@ -63,7 +63,7 @@ def ply(out, iterations):
 
 @pytest.fixture(scope="module")
 def finished(capture, tmp_path_factory):
-    """20 iterations by the schedule of 20, milestones made by the recipe."""
+    """A run of 20 iterations with the recipe's milestones for 20."""
     out = tmp_path_factory.mktemp("runs") / "egg"
     assert train(capture, out, "--iterations", "20") == 0
     return out
@@ -77,7 +77,7 @@ def run(finished, tmp_path):
 
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory):
-    """30 iterations in one go, by the milestones of 20."""
+    """A run of 30 iterations at once, with the milestones for 20."""
     short, words = recipe(20), []
     for name in ("means_rate_iterations", "sh_every", "densify_stop", "reset_every"):
         words += [f"--{name.replace('_', '-')}", str(short.flat()[name])]
@@ -86,7 +86,7 @@ def whole(capture, tmp_path_factory):
     return out
 
 
-def test_a_finished_run_is_extended_by_its_own_milestones(capture, finished, whole, run, capsys):
+def test_a_finished_run_is_extended_with_its_own_milestones(capture, finished, whole, run, capsys):
     assert train(capture, run, "--iterations", "30", "--resume") == 0
     said = capsys.readouterr().out.replace("\n", " ")
     assert "extended from 20 to 30 iterations" in said and "resuming after 20 iterations" in said
@@ -101,8 +101,8 @@ def test_a_finished_run_is_extended_by_its_own_milestones(capture, finished, who
     assert "is finished, 30 iterations; nothing to do" in capsys.readouterr().out.replace("\n", " ")
 
 
-def test_an_extended_run_of_mcmc_gives_the_bytes_of_one_run_with_its_milestones(capture, tmp_path):
-    """Both relocate (opacities start at 0.5) and grow up to the end of the shorter schedule, then only add noise."""
+def test_an_extended_mcmc_run_equals_one_run_with_the_same_milestones(capture, tmp_path):
+    """Both relocate (opacities start at 0.5) and grow until the shorter schedule ends, then only add noise."""
 
     def mcmc(out, *words):
         numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--min-opacity", "0.45", *BASE[:-2], *words]
@@ -121,19 +121,19 @@ def test_an_extended_run_of_mcmc_gives_the_bytes_of_one_run_with_its_milestones(
 
 
 def test_a_run_is_complete_once_it_is_constructed(capture, tmp_path):
-    """A program that holds one may look at it, save it, train it in pieces and finish it, in this order."""
-    chosen, heard = options(capture, tmp_path / "run", "--iterations", "6"), []
+    """A program may inspect a run, save it, train it in parts and finish it, in this order."""
+    chosen, events = options(capture, tmp_path / "run", "--iterations", "6"), []
     assert not is_finished(chosen)
-    held = CaptureRun(chosen)
-    assert (held.trainer.iteration, held.seconds, len(held.dataset.train)) == (0, 0.0, VIEWS - 1)
-    assert held.save().name == "iteration_0.safetensors"
-    assert held.train(lambda: held.trainer.iteration >= 2, [lambda trainer, event: heard.append(event)])
+    run = CaptureRun(chosen)
+    assert (run.trainer.iteration, run.seconds, len(run.dataset.train)) == (0, 0.0, VIEWS - 1)
+    assert run.save().name == "iteration_0.safetensors"
+    assert run.train(lambda: run.trainer.iteration >= 2, [lambda trainer, event: events.append(event)])
     with pytest.raises(CheckpointError, match="already holds a run"):
         CaptureRun(chosen)
     resumed = CaptureRun(dataclasses.replace(chosen, resume=True))
-    assert resumed.trainer.iteration == 2 == len([event for event in heard if isinstance(event, StepEvent)])
-    assert not held.train() and held.seconds > 0.0
-    held.finish()
+    assert resumed.trainer.iteration == 2 == len([event for event in events if isinstance(event, StepEvent)])
+    assert not run.train() and run.seconds > 0.0
+    run.finish()
     assert is_finished(dataclasses.replace(chosen, resume=True))
 
 
@@ -141,8 +141,8 @@ def test_an_interrupted_extension_gives_the_same_bytes(capture, whole, run):
     capture_run = CaptureRun(_taken_up(capture, run, "--iterations", "30", "--resume"))
     trainer = capture_run.trainer
     assert capture_run.train(lambda: trainer.iteration >= 23)
-    assert RunFolder(run).read_metrics()["iterations"] == 20, "it was not finished"
-    assert train(capture, run, "--resume") == 0, "the new length stands in config.json"
+    assert RunFolder(run).read_metrics()["iterations"] == 20, "the extension is not finished yet"
+    assert train(capture, run, "--resume") == 0, "config.json holds the new length"
     assert ply(run, 30) == ply(whole, 30)
 
 
@@ -184,7 +184,7 @@ def test_a_run_starts_from_a_run(capture, finished, tmp_path, capsys):
     loaded = load_ply(RunFolder(finished).scene(20))
     for name, tensor in loaded.tensors().items():
         assert torch.equal(trainer.gaussians.tensors()[name].detach(), tensor), name
-    # it is a better start than the points: that is what it is for
+    # The scene must be a better start than the points.
     scores = [RunFolder(folder).read_metrics()["train"]["psnr"] for folder in (finished, out)]
     assert scores[1] > scores[0]
 
@@ -205,7 +205,7 @@ def test_a_run_from_a_scene_is_resumed_with_it_or_without_its_name(capture, fini
     error = capsys.readouterr().err
     assert "was not started from" in error and error.count("\n") == 1
     scene.unlink()
-    assert train(capture, other, "--resume") == 0, "the checkpoint holds all that the scene gave"
+    assert train(capture, other, "--resume") == 0, "the checkpoint holds everything that came from the scene"
     assert ply(other, 8) == ply(out, 8)
     capsys.readouterr()
     assert train(capture, finished, "--iterations", "20", "--resume", "--from", str(out)) == 2
@@ -245,7 +245,7 @@ def test_scenes_of_other_degrees_origins_and_broken_splats(capture, finished, tm
     assert "contains harmonics up to degree 1; the others start at zero" in say.text
     assert trainer.gaussians.sh_rest.shape[1] == 8
     kept = [i for i in range(len(near)) if i not in (3, 5)]
-    # float32 near 2e5 keeps 2**-7 of a coordinate, half of that lost in writing
+    # float32 near 2e5 resolves 2**-7 of a coordinate; writing loses half of that.
     np.testing.assert_allclose(
         trainer.gaussians.means.detach() + torch.tensor(run.dataset.origin - shift).float(),
         near.means[kept],
@@ -262,7 +262,7 @@ class _Said:
         self.text += sentence + "\n"
 
 
-def test_antialiasing_that_does_not_match_is_told(capture, finished, tmp_path):
+def test_mismatched_antialiasing_is_reported(capture, finished, tmp_path):
     gaussians = load_ply(RunFolder(finished).scene(20))
     cases = (
         (True, [], "was trained with antialiasing, but this run trains without"),
@@ -286,7 +286,7 @@ def test_antialiasing_that_does_not_match_is_told(capture, finished, tmp_path):
     ],
 )
 @pytest.mark.usefixtures("as_shipped")
-def test_what_does_not_go_with_a_scene_is_one_line(capture, finished, tmp_path, capsys, words, says):
+def test_options_that_conflict_with_a_scene_are_refused(capture, finished, tmp_path, capsys, words, says):
     try:
         code = train(capture, tmp_path / "run", "--iterations", "4", "--from", str(finished), *words)
     except SystemExit as stop:
@@ -303,13 +303,13 @@ def changed(path):
 
 
 def copied(capture, tmp_path):
-    shutil.copytree(capture, tmp_path / "moved", copy_function=shutil.copyfile)  # other times
+    shutil.copytree(capture, tmp_path / "moved", copy_function=shutil.copyfile)  # with new modification times
     return tmp_path / "moved"
 
 
 @pytest.mark.parametrize("part", ["images", "masks"])
 def test_a_photo_that_changed_before_a_resume_is_named(capture, tmp_path, capsys, part):
-    """One in the middle, which the fingerprint of older runs does not cover; touching it is no change."""
+    """A photo in the middle, which the fingerprint of older runs does not cover. Touching it is not a change."""
     moved, out = copied(capture, tmp_path), tmp_path / "run"
     assert train(moved, out, "--iterations", "2", "--time-limit", "0.001s") == 0
     photo = moved / part / "view_003.png"
@@ -326,7 +326,7 @@ def test_a_photo_that_changed_before_a_resume_is_named(capture, tmp_path, capsys
     assert train(moved, out, "--iterations", "4", "--resume") == 0
 
 
-def test_an_older_run_resumes_by_the_older_check(capture, whole, tmp_path, capsys):
+def test_an_older_run_resumes_with_the_older_check(capture, whole, tmp_path, capsys):
     out = tmp_path / "run"
     first = CaptureRun(options(capture, out, "--iterations", "6"))
     trainer = first.trainer
@@ -342,7 +342,7 @@ def test_an_older_run_resumes_by_the_older_check(capture, whole, tmp_path, capsy
     assert train(capture, out, "--resume") == 0
 
 
-def test_a_photo_that_changes_in_mid_run_ends_it_with_its_state_saved(capture, tmp_path):
+def test_a_photo_that_changes_during_a_run_ends_it_with_its_state_saved(capture, tmp_path):
     moved, out = copied(capture, tmp_path), tmp_path / "run"
     words = ["--iterations", "12", "--image-memory", "0"]
     assert train(moved, tmp_path / "undisturbed", *words) == 0
@@ -355,7 +355,7 @@ def test_a_photo_that_changes_in_mid_run_ends_it_with_its_state_saved(capture, t
             for photo in photos:
                 changed(photo)
         for photo in photos:
-            os.utime(photo)  # which is no change
+            os.utime(photo)  # not a change of the content
         return False
 
     trainer = run.trainer
@@ -380,7 +380,7 @@ def test_a_folder_in_use_is_refused_by_train_and_eval(capture, run, tmp_path, ca
                 f"is in use by `gsplat-edu train`, process {os.getpid()} on " in error
                 and error.count("\n") == 1
             )
-        assert main(["eval", str(run), "--out", str(tmp_path / "apart")]) == 0, "it writes elsewhere"
+        assert main(["eval", str(run), "--out", str(tmp_path / "apart")]) == 0, "writes elsewhere"
     assert main(["eval", str(run)]) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 20
 

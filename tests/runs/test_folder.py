@@ -27,7 +27,7 @@ def views(count=3):
     return result
 
 
-def test_where_things_lie(folder):
+def test_the_layout_of_a_run_folder(folder):
     root = folder.path
     assert not folder.exists()
     folder.write_config({"version": "1"})
@@ -60,7 +60,7 @@ def test_json_is_strict(folder):
         folder.read_metrics()
 
 
-def test_what_is_missing_or_damaged_is_named(folder):
+def test_missing_and_damaged_files_are_named(folder):
     with pytest.raises(CheckpointError, match=r"run: is not a run: it has no config\.json; give the folder"):
         folder.read_config()
     with pytest.raises(CheckpointError, match="run: contains no scene"):
@@ -75,12 +75,12 @@ def test_what_is_missing_or_damaged_is_named(folder):
         assert "\n" not in str(caught.value)
 
 
-def test_a_torn_last_line_is_left_out_and_no_other(folder):
+def test_only_a_torn_last_line_is_left_out(folder):
     assert folder.log() == []
     folder.write_config({})
     lines = [{"iteration": 1, "loss": 0.5}, {"iteration": 2, "loss": 0.25}]
     text = "".join(json.dumps(line) + "\n" for line in lines)
-    for torn in ("", '{"iteration": 3, "lo', '{"iteration": 3}'):  # the last may have been longer
+    for torn in ("", '{"iteration": 3, "lo', '{"iteration": 3}'):  # the last one may have been cut too
         folder.log_file.write_text(text + torn)
         assert folder.log() == lines
     folder.log_file.write_text('{"iterat\n' + text)
@@ -91,12 +91,12 @@ def test_a_torn_last_line_is_left_out_and_no_other(folder):
         folder.log()
 
 
-def test_the_latest_scene_is_that_of_most_iterations(folder):
+def test_the_latest_scene_has_the_most_iterations(folder):
     for iteration in (900, 7000, 30):
         path = folder.scene(iteration)
         path.parent.mkdir(parents=True)
         path.write_bytes(b"")
-    folder.scene(99999).parent.mkdir()  # was being written when the run stopped
+    folder.scene(99999).parent.mkdir()  # the run stopped while writing it
     (folder.path / "point_cloud" / "iteration_best").mkdir()
     (folder.path / "point_cloud" / "iteration_best" / "point_cloud.ply").write_bytes(b"")
     assert folder.latest_scene() == (folder.scene(7000), 7000)
@@ -111,7 +111,7 @@ def same(a, b):
     )
 
 
-def test_cameras_come_back_to_the_bit(folder):
+def test_cameras_are_read_back_exactly(folder):
     train, test = views()[:2], views()[2:]
     folder.write_cameras(train, test)
     read = folder.read_cameras()
@@ -128,14 +128,14 @@ def test_cameras_are_written_as_viewers_read_them(folder):
     entry, camera = json.loads(folder.cameras.read_text())[1], views()[1].camera
     assert (entry["id"], entry["img_name"], entry["width"], entry["height"]) == (1, "left/1.jpg", 7, 5)
     np.testing.assert_array_equal(entry["position"], np.add(camera.eye, (100.0, 0.0, 0.0)))
-    # camera to world: the camera's forward axis is the third column
+    # Camera to world: the third column is the camera's forward axis.
     np.testing.assert_array_equal(np.array(entry["rotation"])[:, 2], camera.R[2])
     back = folder.read_cameras((100.0, 0.0, 0.0))[1][2]
-    np.testing.assert_allclose(back.eye, camera.eye, atol=1e-13)  # a float64 near 100 is within 2^-47
+    np.testing.assert_allclose(back.eye, camera.eye, atol=1e-13)  # float64 near 100 is accurate to 2^-47
 
 
-def test_a_file_without_our_keys_is_read(folder):
-    """Inria's: no principal point, so the image's middle; no split."""
+def test_a_cameras_file_without_our_keys_is_read(folder):
+    """Inria's files have no principal point, so the image's centre is used, and no split."""
     folder.write_cameras(views(1), [])
     (entry,) = json.loads(folder.cameras.read_text())
     folder.cameras.write_text(
@@ -184,7 +184,7 @@ def test_render_settings_come_from_the_config():
         ({"background": "white"}, "render: background: cannot be read"),
     ],
 )
-def test_render_settings_that_cannot_be_are_named(section, says):
+def test_invalid_render_settings_are_named(section, says):
     with pytest.raises(CheckpointError, match=rf"config\.json: {says}"):
         render_settings({"render": section})
 

@@ -1,7 +1,7 @@
-"""One capture in three layouts gives one scene: axes, pixel centres and frames cannot hide.
+"""One capture in three layouts gives one scene, so an error in axes, pixel centres or frames shows up.
 
-The capture's principal point is in the middle of the pixels, ((W - 1)/2, (H - 1)/2), the one place that all three
-can say; its scene has no symmetry. Every eighth view is for testing, in Blender's layout by its own split.
+The capture's principal point is the centre of the image, ((W - 1)/2, (H - 1)/2), the only one that all three can
+store, and its scene has no symmetry. Every eighth view is held out; Blender's layout has its own split for this.
 """
 
 import functools
@@ -47,7 +47,7 @@ def first_images(dataset):
         return [render(start(dataset, config), view.camera, settings=SETTINGS).image for view in dataset.test]
 
 
-def test_they_are_what_they_say(datasets):
+def test_the_datasets_have_their_layouts(datasets):
     for name, dataset in datasets.items():
         assert dataset.layout == name
         assert (len(dataset.train), len(dataset.test)) == (21, 3)
@@ -56,7 +56,7 @@ def test_they_are_what_they_say(datasets):
 @pytest.mark.parametrize("layout", LAYOUTS[1:])
 def test_first_images_agree(datasets, layout):
     for ours, theirs in zip(first_images(datasets["COLMAP"]), first_images(datasets[layout]), strict=True):
-        assert ours.max() > 0.1, "something is to be seen"
+        assert ours.max() > 0.1, "the image is not black"
         assert (ours - theirs).abs().max() < 1e-5
 
 
@@ -75,14 +75,14 @@ def trained_psnr(dataset):
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS[1:])
 def test_trained_scenes_agree(datasets, layout):
-    """Poses differ by rounding, so trainings part ways; what they come to does not."""
+    """Poses differ by rounding, so the trainings diverge, but their quality must agree."""
     ours, theirs = trained_psnr(datasets["COLMAP"]), trained_psnr(datasets[layout])
     assert ours > 24, "something was learned"
     assert theirs == pytest.approx(ours, abs=0.1)
 
 
-def test_a_mirrored_world_would_be_seen(datasets):
-    """The test can fail: with x flipped the first images are nothing alike."""
+def test_a_mirrored_world_is_detected(datasets):
+    """The comparison can fail: with x flipped the first images differ clearly."""
     dataset = datasets["COLMAP"]
     config = recipe(500)
     mirrored = from_points(dataset.points * np.array([-1.0, 1, 1]), dataset.colors, config)

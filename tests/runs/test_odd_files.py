@@ -1,4 +1,4 @@
-"""Files of a run with values of other types: one line that names the field, whichever command reads it."""
+"""Files of a run with values of wrong types: every command that reads them prints one line naming the field."""
 
 import json
 
@@ -12,7 +12,7 @@ from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
 
 ODD = ["text", -1.5, True, [], [1], {}, {"psnr": "x"}, 10**400, "\ud800\x1b"]
-"""Values; most are of another type than most fields have."""
+"""Values whose type is wrong for most fields."""
 
 FIELDS = [
     "config.json:version",
@@ -66,8 +66,8 @@ def changed(text: str, name: str, field: str, value: object) -> str:
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_a_field_of_another_type_is_one_line(run, capsys, field):
-    """Commands either end well or with one line; nothing else comes out of them."""
+def test_a_field_of_the_wrong_type_prints_at_most_one_line(run, capsys, field):
+    """Commands either succeed or print one line, and never send an escape code."""
     name, _, key = field.partition(":")
     path = run / "run" / name
     before = path.read_bytes() if path.exists() else None
@@ -82,7 +82,7 @@ def test_a_field_of_another_type_is_one_line(run, capsys, field):
             path.write_text(changed((before or b"").decode(), name, key, value))
             for command, *options in readers:
                 if command == "eval" and value not in ("text", True):
-                    continue  # as info, but slower
+                    continue  # reads the same as info, but slower
                 assert main([command, str(run / "run"), *options]) in (0, 2)
                 said = capsys.readouterr().err
                 assert said.count("\n") <= 1 and "\x1b" not in said, (value, said)

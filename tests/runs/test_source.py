@@ -17,7 +17,7 @@ def test_a_scene_of_a_run_has_the_runs_cameras_and_settings(tmp_path, by_file):
     assert source.scene.antialiased is True and source.settings.antialiased
     assert source.settings.background == (1.0, 0.5, 0.0)
     np.testing.assert_allclose(source.scene.up, RUN_UP, atol=1e-12)
-    # the run's file has the training views first; here they are in the capture's order
+    # The run's file lists the training views first; the source has them in the capture's order.
     assert [name for name, _ in source.cameras] == [
         "0.00.jpg",
         "1.26.jpg",
@@ -30,17 +30,17 @@ def test_a_scene_of_a_run_has_the_runs_cameras_and_settings(tmp_path, by_file):
         np.testing.assert_array_equal(found.eye, camera.eye)
 
 
-def test_far_from_zero_both_stand_around_the_runs_origin(tmp_path):
+def test_far_from_zero_scene_and_cameras_are_relative_to_the_runs_origin(tmp_path):
     origin = (4096.0, -8192.0, 16384.0)
     folder, gaussians, cameras = make_run(tmp_path / "run", origin)
     source = open_source(folder.path)
     assert source.origin == origin
-    # the file holds float32 numbers near 16384, 2^-10 apart; half of that and what the sum was rounded to
+    # The file holds float32 numbers near 16384, 2^-10 apart: half a step, plus the rounding of the sum.
     torch.testing.assert_close(source.scene.gaussians.means, gaussians.means, rtol=0, atol=2**-10)
     np.testing.assert_allclose(source.cameras[1][1].eye, cameras[0].eye, atol=1e-11)
 
 
-def test_a_file_alone_is_rendered_as_it_says(tmp_path):
+def test_a_bare_file_is_rendered_with_its_own_settings(tmp_path):
     write_scene(tmp_path / "a.ply", random_scene(10))
     source = open_source(tmp_path / "a.ply")
     assert source.cameras == () and source.scene.up == (0.0, -1.0, 0.0)
@@ -57,7 +57,7 @@ def test_probes_are_spread_over_the_cameras_and_small(tmp_path):
     assert source.probes(9, 100)[0][1] is source.cameras[0][1]
 
 
-def test_what_is_no_scene_is_one_line(tmp_path):
+def test_a_path_without_a_scene_is_a_one_line_error(tmp_path):
     with pytest.raises(ArgumentError, match="does not exist; give a scene file"):
         open_source(tmp_path / "gone.ply")
     with pytest.raises(ArgumentError, match="is not a run"):

@@ -1,4 +1,4 @@
-"""Whole runs, through the command line: what a folder holds, and what a kill, a full disk or a mistake costs."""
+"""Whole runs through the command line: the folder's contents, and the effect of a kill, a full disk or a mistake."""
 
 import dataclasses
 import errno
@@ -27,7 +27,7 @@ from processes import Program
 SHORT = ["--iterations", "40", "--eval-every", "20", "--save-every", "10", "--densify-start", "5"]
 SHORT += ["--densify-every", "10", "--densify-stop", "35", "--grad-threshold", "5e-5"]
 
-# Long enough to be killed on the way: about two seconds.
+# Long enough to be killed midway: about two seconds.
 LONG = ["--iterations", "600", "--eval-every", "150", "--save-every", "40", "--densify-start", "20"]
 LONG += ["--densify-every", "20", "--sh-every", "100"]
 ADC = ["--densify-stop", "500", "--grad-threshold", "5e-5"]
@@ -60,7 +60,7 @@ def finished(capture, tmp_path_factory):
     return out
 
 
-def test_a_run_folder_holds_what_it_should(finished):
+def test_a_run_folder_has_the_expected_contents(finished):
     folder = RunFolder(finished)
     metrics = json.loads(folder.metrics.read_text())
     assert metrics["iterations"] == 40 and metrics["seconds"] > 0
@@ -80,8 +80,8 @@ def test_a_run_folder_holds_what_it_should(finished):
     assert metrics["num_gaussians"] == len(load_ply(folder.latest_scene()[0]))
 
 
-def test_the_saved_scene_gives_the_same_images_to_the_bit(capture, tmp_path):
-    """What was trained, against what was written, read and rendered at every training camera."""
+def test_the_saved_scene_renders_bit_identical_images(capture, tmp_path):
+    """Compare the trained scene with the written one at every training camera."""
     words = ["train", str(capture), "--out", str(tmp_path / "run"), *SHORT, "--antialiased"]
     parsed = build_parser(words).parse_args(words)
     run = CaptureRun(options_from(parsed))
@@ -89,7 +89,7 @@ def test_the_saved_scene_gives_the_same_images_to_the_bit(capture, tmp_path):
     run.train()
     run.finish()
     scene = read_scene(run.folder.latest_scene()[0])
-    assert scene.antialiased is True, "the file itself says so, for other programs"
+    assert scene.antialiased is True, "the file itself records it, for other programs"
     loaded = scene.gaussians
     settings = render_settings(run.folder.read_config())
     cameras = {name: camera for name, _, camera in run.folder.read_cameras()}
@@ -112,14 +112,14 @@ def completed(capture, out, *options, threads=2):
 
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory):
-    """Runs that nobody interrupts, one for each strategy, on two threads."""
-    made = {}
+    """Uninterrupted runs, one for each strategy, on two threads."""
+    runs = {}
 
     def run(strategy):
-        if strategy not in made:
-            made[strategy] = tmp_path_factory.mktemp("whole") / strategy
-            completed(capture, made[strategy], *LONG, *STRATEGIES[strategy], threads=2)
-        return made[strategy]
+        if strategy not in runs:
+            runs[strategy] = tmp_path_factory.mktemp("whole") / strategy
+            completed(capture, runs[strategy], *LONG, *STRATEGIES[strategy], threads=2)
+        return runs[strategy]
 
     return run
 
@@ -147,7 +147,7 @@ def newest(out):
 @pytest.mark.own_process
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_killed_at_any_moment_and_resumed_gives_the_same_bytes(capture, whole, tmp_path, strategy):
-    """kill -9 before the first checkpoint and at two moments on the way; on one thread and two by turns."""
+    """kill -9 before the first checkpoint and at two later moments, alternating between one and two threads."""
     options, uninterrupted, out = [*LONG, *STRATEGIES[strategy]], whole(strategy), tmp_path / "killed"
     assert RunFolder(uninterrupted).read_metrics()["num_gaussians"] > 320
     moments = (
@@ -163,7 +163,7 @@ def test_killed_at_any_moment_and_resumed_gives_the_same_bytes(capture, whole, t
     completed(capture, out, *options, "--resume", threads=2)
     assert ply(out, 600) == ply(uninterrupted, 600)
     iterations = [line["iteration"] for line in RunFolder(out).log() if "loss" in line]
-    assert iterations == list(range(10, 601, 10)), "the log has every step once"
+    assert iterations == list(range(10, 601, 10)), "the log has every line once"
 
 
 DIES = """
@@ -211,8 +211,8 @@ DEATHS = (
 
 @pytest.mark.slow
 @pytest.mark.own_process
-def test_killed_around_the_renaming_of_every_file(capture, finished, tmp_path):
-    """One run, killed thirteen times: with each file still under its temporary name, or just renamed."""
+def test_a_run_killed_around_the_renaming_of_any_file_resumes(capture, finished, tmp_path):
+    """One run is killed thirteen times, while a file still has its temporary name or just after its renaming."""
     out = tmp_path / "run"
     words = ["train", str(capture), "--out", str(out), *SHORT]
     for name, moment in DEATHS:
@@ -234,7 +234,7 @@ def with_another_lens(view):
 
 
 def test_another_capture_is_refused(capture, finished, tmp_path, capsys):
-    """Fewer views, another camera, other photos, other points: each is named; a moved capture is not refused."""
+    """Fewer views, another camera, other photos and other points are each named. A moved capture is accepted."""
     views, points, colors = procedural_capture(64, 16)
     darker = [type(view)(view.camera, view.image // 2, name=view.name) for view in views]
     captures = {
@@ -256,7 +256,7 @@ def test_another_capture_is_refused(capture, finished, tmp_path, capsys):
     assert ply(out, 40) == ply(finished, 40)
 
 
-def test_checkpoints_without_their_config_are_not_taken_up(capture, tmp_path, capsys):
+def test_checkpoints_without_their_config_are_not_resumed(capture, tmp_path, capsys):
     out = tmp_path / "run"
     assert train(capture, out, *SHORT, "--time-limit", "0.001s") == 0
     (out / "config.json").unlink()
@@ -283,12 +283,12 @@ def test_a_damaged_run_folder_costs_one_line(capture, tmp_path, capsys, name, ch
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_scene_that_is_pruned_away_says_so(capture, tmp_path, capsys):
+def test_a_scene_that_is_pruned_away_is_reported(capture, tmp_path, capsys):
     assert train(capture, tmp_path / "run", *SHORT, "--min-opacity", "1") == 2
     assert "every Gaussian was pruned" in capsys.readouterr().err
 
 
-def test_gaussians_that_are_not_finite_are_left_out(capture, tmp_path):
+def test_nonfinite_gaussians_are_left_out(capture, tmp_path):
     words = ["train", str(capture), "--out", str(tmp_path / "run"), *SHORT, "--strategy", "none"]
     words = [word for word in words if word not in ("--densify-stop", "35", "--grad-threshold", "5e-5")]
     said = []
@@ -383,7 +383,7 @@ def test_a_time_limit_leaves_a_scene_and_metrics_and_can_be_lifted(capture, fini
 
 @pytest.mark.own_process
 def test_a_full_disk_leaves_the_last_checkpoint(capture, tmp_path):
-    """A limit on the size of files stands for the disk: the log still fits, the checkpoint that grew does not."""
+    """A limit on file size stands in for a full disk: the log still fits, the larger checkpoint does not."""
     out = tmp_path / "run"
     assert train(capture, out, *LONG, "--time-limit", "0.001s") == 0
     good = checkpoints(out)[-1]
@@ -396,7 +396,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(capture, tmp_path):
 
 
 def test_an_unwritable_folder_costs_one_line_before_photos_are_read(capture, tmp_path, capsys, monkeypatch):
-    """As it is for a read-only folder; root, whom nothing is forbidden, sees the same."""
+    """The failure of a read-only folder is simulated, because root may write everywhere."""
 
     def refuse(*words, **options):
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -408,7 +408,7 @@ def test_an_unwritable_folder_costs_one_line_before_photos_are_read(capture, tmp
     assert "cannot write to" in said and said.count("\n") == 1 and not (tmp_path / "run").exists()
 
 
-def test_a_file_in_the_place_of_the_folder(capture, tmp_path, capsys):
+def test_a_file_in_place_of_the_run_folder_is_a_one_line_error(capture, tmp_path, capsys):
     (tmp_path / "file").write_text("x")
     assert train(capture, tmp_path / "file", *SHORT) == 2
     assert train(capture, tmp_path / "file" / "run", *SHORT) == 2
@@ -425,10 +425,10 @@ def test_the_cap_holds_from_the_first_iteration_to_the_last(capture, tmp_path, s
     assert max(counts) <= cap and min(counts) > 0
     if strategy == "mcmc":
         reached = counts.index(cap)
-        assert set(counts[reached:]) == {cap}, "and stays there"
+        assert set(counts[reached:]) == {cap}, "the count stays at the cap"
 
 
-def test_far_coordinates_are_trained_near_and_written_far(tmp_path):
+def test_far_coordinates_are_trained_near_the_origin_and_written_far(tmp_path):
     views, points, colors = procedural_capture(48, 8)
     shift = np.array([1e5, -2e5, 3e4])
     moved = []

@@ -1,4 +1,4 @@
-"""Fixtures: scenes to look at, and a real browser that has no network."""
+"""Fixtures: scenes to view, and a real browser without a network."""
 
 import base64
 
@@ -24,13 +24,13 @@ PIXELS = """async (camera) => {
 
 
 def described(camera):
-    """The camera as the page takes it."""
+    """Return the camera in the form that the page expects."""
     numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "H", "W")}
     return {"R": camera.R.tolist(), "eye": camera.eye.tolist(), **numbers}
 
 
 class Visit:
-    """A page that somebody has opened; what went wrong in it is remembered."""
+    """An open page. It records the console messages, errors and requests."""
 
     def __init__(self, tab):
         self.tab = tab
@@ -49,18 +49,18 @@ class Visit:
         return self
 
     def message(self, text):
-        """Wait for a message."""
+        """Wait until the page shows this message."""
         self.tab.wait_for_selector(f'#message:has-text("{text}")')
 
     def camera(self):
-        """The camera of the screen."""
+        """The camera of the window's view."""
         found = self.tab.evaluate("viewer.camera()")
         for other in ("name", "held_out"):
             found.pop(other, None)
         return Camera(**found)
 
     def picture(self, camera):
-        """(H, W, 3) float32 as the page draws it."""
+        """Return the page's picture from this camera, (H, W, 3) float32."""
         encoded = self.tab.evaluate(PIXELS, described(camera))
         return np.frombuffer(base64.b64decode(encoded), "<f4").reshape(camera.H, camera.W, 3)
 
@@ -73,7 +73,7 @@ def browser():
 
 @pytest.fixture
 def visit(browser):
-    """Make tabs without a network; nothing may complain in them, and nothing may be fetched from anywhere."""
+    """Make tabs without a network. No tab may log a complaint or request anything from elsewhere."""
     contexts, visits = [], []
 
     def make(width=320, height=200, **options):
@@ -105,7 +105,7 @@ def show(visit, tmp_path):
 
 @pytest.fixture
 def random_gaussians():
-    """Make n random Gaussians around zero that store so many coefficients beyond the first."""
+    """Make n random Gaussians around zero with `rest` SH coefficients beyond the first."""
 
     def make(n, rest=15, seed=0):
         generator = torch.Generator().manual_seed(seed)
@@ -127,7 +127,7 @@ def random_gaussians():
 
 @pytest.fixture
 def camera():
-    """A camera whose image is not square and whose principal point is not its middle."""
+    """A camera whose image is not square and whose principal point is off-centre."""
     eye = (0.4, -0.6, -2.2)
     return Camera(look_at(eye, (0.1, 0.0, 0.0)), eye, fx=230.0, fy=250.0, cx=150.3, cy=108.6, H=200, W=320)
 

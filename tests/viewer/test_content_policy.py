@@ -1,4 +1,4 @@
-"""The policy of pages and reports, in a real browser: what we wrote works, what somebody slipped in does not run."""
+"""The content policy of pages and reports, in a real browser: our own code works, injected code does not run."""
 
 import numpy as np
 import pytest
@@ -29,12 +29,12 @@ def written_report(path, *_):
 
 
 @pytest.mark.parametrize("write", [written_page, written_report])
-def test_what_we_wrote_works_and_nothing_complains(visit, tmp_path, write, random_gaussians, three_views):
+def test_our_own_code_works_without_complaints(visit, tmp_path, write, random_gaussians, three_views):
     write(tmp_path / "a.html", random_gaussians, three_views)
     seen = visit().open(tmp_path / "a.html")
     if write is written_page:
         seen.ready()
-        return  # tests/viewer/test_page_drawing.py compares the pictures, worker and all
+        return  # tests/viewer/test_page_drawing.py compares the pictures, including the worker
     figure = seen.tab.locator("svg").first
     assert figure.is_visible()
     strokes = figure.locator("path").evaluate_all(
@@ -44,7 +44,7 @@ def test_what_we_wrote_works_and_nothing_complains(visit, tmp_path, write, rando
 
 
 @pytest.mark.parametrize("write", [written_page, written_report])
-def test_what_somebody_slipped_in_does_not_run(browser, tmp_path, write, random_gaussians, three_views):
+def test_injected_code_does_not_run(browser, tmp_path, write, random_gaussians, three_views):
     path = tmp_path / "a.html"
     write(path, random_gaussians, three_views)
     document = path.read_text("utf-8")
@@ -59,7 +59,7 @@ def test_what_somebody_slipped_in_does_not_run(browser, tmp_path, write, random_
     assert tab.evaluate("window.ran") is None
     assert tab.evaluate("getComputedStyle(document.body).color") != "rgb(1, 2, 3)"
     assert len([text for text in refusals if "Content Security Policy" in text]) >= 4
-    # and with no policy all of it runs: the test can fail
+    # Without the policy everything runs, so the test can fail.
     start = document.index('<meta http-equiv="Content-Security-Policy"')
     unguarded = document[:start] + document[document.index(">", start) + 1 :]
     path.write_text(unguarded.replace("<body>", f"<body>{INJECTED}"), "utf-8")
@@ -69,7 +69,7 @@ def test_what_somebody_slipped_in_does_not_run(browser, tmp_path, write, random_
 
 
 def test_nothing_leaves_the_page(visit, tmp_path):
-    """Not by a request of its own scripts either."""
+    """Not even its own scripts may send a request."""
     script = (
         "fetch('http://127.0.0.1:9/').catch(() => { document.title = 'refused' });"
         "new Image().src = 'http://127.0.0.1:9/a.png';"
@@ -85,14 +85,14 @@ def test_nothing_leaves_the_page(visit, tmp_path):
     refused = [text for text in seen.complaints if "Content Security Policy" in text]
     assert len(refused) >= 2
     seen.complaints.clear()
-    seen.requests.clear()  # Chromium lists requests that it refused
+    seen.requests.clear()  # Chromium also lists requests that it refused
 
 
-def test_a_policy_allows_what_it_is_given_and_no_more():
+def test_a_policy_allows_only_what_it_is_given():
     rules = dict(rule.split(" ", 1) for rule in content_policy().split("; "))
     assert {rules[name] for name in ("default-src", "script-src", "style-src", "worker-src")} == {"'none'"}
     assert rules["img-src"] == "data: blob:" and rules["connect-src"] == "'none'"
-    # sha256sum of "a": the known answer
+    # the known SHA-256 of "a"
     known = "'sha256-ypeBEsobvcr6wjGzmiPcTaeG7/gUfE5yuYB3ha/uSLs='"
     rules = dict(rule.split(" ", 1) for rule in content_policy(["a"], ["a"], workers=True).split("; "))
     assert rules["script-src"] == rules["style-src"] == known and rules["worker-src"] == "blob:"

@@ -1,4 +1,4 @@
-"""The live view: cameras, clients of its WebSocket, and trainings whose bits it does not change."""
+"""The live view: cameras, WebSocket clients, and trainings, whose results it leaves bit-identical."""
 
 import math
 import threading
@@ -32,8 +32,8 @@ def capture(tmp_path_factory):
     return folder
 
 
-def test_a_level_camera_sees_right_and_down_where_they_are():
-    """Half a field of view up and down, and as much more to the sides as the browser is wide."""
+def test_a_level_camera_has_right_and_down_in_place():
+    """It sees half the field of view up and down, and more to the sides by the browser's aspect ratio."""
     camera = browser_camera(LEVEL, (1.0, 2.0, 3.0), math.radians(90), (200, 100), 800)
     assert (camera.W, camera.H) == (200, 100), "no more pixels than the browser has"
     u, v, z = camera.project(camera.world_to_cam([[1 + 2 * 5.0, 2 + 5.0, 3 + 5.0], [1 - 10.0, 2 - 5.0, 8.0]]))
@@ -75,14 +75,14 @@ BAD_CAMERAS = (
 
 @pytest.mark.usefixtures("as_shipped")
 @pytest.mark.parametrize("changes", BAD_CAMERAS)
-def test_what_is_no_camera_is_refused(changes):
+def test_an_invalid_camera_is_refused(changes):
     pose = {**POSE, **changes}
     canvas = (pose["image_width"], pose["image_height"])
     with pytest.raises(ArgumentError):
         browser_camera(pose["wxyz"], pose["position"], pose["fov"], canvas, 800)
 
 
-def test_a_picture_is_our_own_render_from_the_clients_camera(capture, tmp_path):
+def test_a_picture_equals_our_own_render_from_the_clients_camera(capture, tmp_path):
     with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
         client.move()
         client.press("Pause")
@@ -94,9 +94,9 @@ def test_a_picture_is_our_own_render_from_the_clients_camera(capture, tmp_path):
             truth = render(
                 made.run.trainer.gaussians, camera, settings=made.run.options.render_settings
             ).image
-            # JPEG of quality 85 is off by some three levels: 38 dB and more; another camera is far below
+            # JPEG of quality 85 is off by about three levels, which is 38 dB or more; another camera scores far lower.
             assert psnr(picture / 255.0, truth.detach().clamp(0, 1).numpy()) > 32
-            assert picture.std() > 20, "there is something to see"
+            assert picture.std() > 20, "the picture is not blank"
 
 
 def test_while_the_camera_moves_pictures_are_smaller(capture, tmp_path):
@@ -108,11 +108,12 @@ def test_while_the_camera_moves_pictures_are_smaller(capture, tmp_path):
         client.pictures.clear()
         client.move(position=(0.0, 0.0, -4.0))
         widths = until(
-            lambda: len(client.listened().pictures) >= 2 and [p.shape for p in client.pictures], "two"
+            lambda: len(client.listened().pictures) >= 2 and [p.shape for p in client.pictures],
+            "two pictures",
         )
         assert widths == [(32, 48, 3), (80, 120, 3)], "0.4 of the width first"
         time.sleep(2 * live.STILL_EVERY)
-        assert len(client.listened().pictures) == 2, "paused and at rest, there is nothing to draw"
+        assert len(client.listened().pictures) == 2, "while paused and at rest, nothing is drawn"
 
 
 def test_the_panel_says_why_a_picture_is_missing(capture, tmp_path, monkeypatch):
@@ -158,7 +159,7 @@ def test_step_pauses_a_running_training(capture, tmp_path):
         assert client.paused_at() == made.iteration > 0
 
 
-def test_a_paused_training_that_nobody_watches_goes_on(capture, tmp_path, monkeypatch):
+def test_a_paused_training_continues_when_nobody_watches(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(live, "GRACE", 0.2)
     with training(capture, tmp_path / "run", "--iterations", "100000") as made:
         with Client(made.view) as client:
@@ -168,11 +169,11 @@ def test_a_paused_training_that_nobody_watches_goes_on(capture, tmp_path, monkey
         until(lambda: made.iteration > held + 20, "more iterations")
         with Client(made.view) as another:
             another.move()
-            another.press("Pause")  # and so says the button
+            another.press("Pause")  # the button must say Pause again
             another.paused_at()
 
 
-def test_the_end_of_the_program_ends_a_pause(capture, tmp_path):
+def test_stopping_the_program_ends_a_pause(capture, tmp_path):
     with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
         client.move()
         client.press("Pause")
@@ -181,11 +182,11 @@ def test_the_end_of_the_program_ends_a_pause(capture, tmp_path):
         made.ended()
         assert made.iteration == held
         (checkpoint,) = list_checkpoints(made.run.folder.checkpoints)[-1:]
-        assert checkpoint.stem == f"iteration_{held}", "what was trained is saved"
+        assert checkpoint.stem == f"iteration_{held}", "the training so far is saved"
 
 
 def test_a_pause_is_not_counted_as_training(capture, tmp_path, monkeypatch):
-    """The clock goes forward by an hour during the pause: the run takes less than that."""
+    """The clock jumps by an hour during the pause; the run's own time must be less."""
     clock, ahead = time.perf_counter, []
     monkeypatch.setattr(time, "perf_counter", lambda: clock() + sum(ahead))
     with training(capture, tmp_path / "run", "--iterations", "60") as made, Client(made.view) as client:
@@ -199,7 +200,7 @@ def test_a_pause_is_not_counted_as_training(capture, tmp_path, monkeypatch):
 
 
 def trained(out, capture, *words, watch=None):
-    """Return all of a checkpoint but its clock, and the scene's bytes, of a training that `watch` was let at."""
+    """Train while `watch` runs; return the state without its clock, and the scene's bytes."""
     with training(capture, out, "--iterations", "200", "--random-background", *words) as made:
         if watch is not None:
             watch(made)
@@ -212,8 +213,8 @@ def trained(out, capture, *words, watch=None):
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_a_training_has_the_same_bits_whoever_watches_it(capture, tmp_path, strategy):
-    """Alone; and with two cameras that move all the time, pauses and steps."""
+def test_watching_does_not_change_the_bits_of_a_training(capture, tmp_path, strategy):
+    """One training runs alone, the other with two moving cameras, pauses and steps."""
     seen = []
 
     def watch(made):
@@ -239,7 +240,7 @@ def test_a_training_has_the_same_bits_whoever_watches_it(capture, tmp_path, stra
 
 
 @pytest.mark.usefixtures("as_shipped")
-def test_clients_that_send_nonsense_end_nothing(capture, tmp_path, capfd):
+def test_clients_that_send_nonsense_do_no_harm(capture, tmp_path, capfd):
     with training(capture, tmp_path / "run", "--iterations", "100000") as made:
         for nonsense in (b"", b"\xff", msgspec.msgpack.encode({"type": "None"}), msgspec.msgpack.encode(7)):
             with Client(made.view) as client:
@@ -250,7 +251,7 @@ def test_clients_that_send_nonsense_end_nothing(capture, tmp_path, capfd):
                 before = made.iteration
                 until(lambda before=before: made.iteration > before + 5, "more iterations")
             client.move()
-            assert client.picture().shape[2] == 3, "a camera that is one is drawn again"
+            assert client.picture().shape[2] == 3, "a valid camera is drawn again"
             slider = made.view._width._impl.uuid
             for width in (10**12, -1, math.inf, math.nan):
                 client.send("GuiUpdateMessage", uuid=slider, updates={"value": width})
@@ -258,7 +259,7 @@ def test_clients_that_send_nonsense_end_nothing(capture, tmp_path, capfd):
     assert capfd.readouterr() == ("", ""), "the terminal stays clean"
 
 
-def test_nobody_opens_a_tunnel(capture, tmp_path, capfd):
+def test_a_client_cannot_open_a_tunnel(capture, tmp_path, capfd):
     with training(capture, tmp_path / "run", "--iterations", "100000") as made, Client(made.view) as client:
         client.move()
         client.send("ShareUrlRequest")
@@ -295,11 +296,11 @@ def test_the_camera_list_and_the_way_back(capture, tmp_path):
 
 
 def new_threads(before):
-    """Return the threads that were not there before, but for the trainer's own that reads photos."""
+    """Return the new threads, except the trainer's own that reads photos."""
     return {thread for thread in set(threading.enumerate()) - before if not thread.name.startswith("photo")}
 
 
-def test_everything_is_closed_and_put_back(capture, tmp_path, capfd):
+def test_everything_is_closed_and_restored(capture, tmp_path, capfd):
     threads, serve = set(threading.enumerate()), websockets.asyncio.server.serve
     with training(capture, tmp_path / "run", "--iterations", "30") as made:
         assert websockets.asyncio.server.serve is serve
@@ -322,23 +323,23 @@ def test_everything_is_closed_after_an_error(capture, tmp_path):
     until(lambda: new_threads(threads) == set(), "the end of its threads")
 
 
-def test_the_finished_scene_is_shown_until_the_last_browser_goes(capture, tmp_path, monkeypatch):
+def test_the_finished_scene_is_shown_until_the_last_browser_closes(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(live, "GRACE", 0.3)
     with training(capture, tmp_path / "run", "--iterations", "300") as made:
         with Client(made.view) as client:
             client.move()
-            until(lambda: made.view.watched, "somebody who looks")
+            until(lambda: made.view.watched, "a browser that is connected")
             made.ended()
             assert made.view.watched
             staying = threading.Thread(target=made.view.stay)
             staying.start()
             client.says(r"\*\*finished\*\*\s+iteration 300 of 300")
             client.move(position=(0.0, 0.0, -4.0))
-            assert client.picture(width=120).std() > 10, "and can be looked at from everywhere"
+            assert client.picture(width=120).std() > 10, "the finished scene is still drawn"
             assert staying.is_alive()
         staying.join(PATIENCE)
         assert not staying.is_alive() and not made.view.watched
         again = threading.Thread(target=made.view.stay)
         again.start()
         again.join(PATIENCE)
-        assert not again.is_alive(), "nobody is there: it does not stay"
+        assert not again.is_alive(), "without a browser it does not stay open"

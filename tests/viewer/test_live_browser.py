@@ -1,4 +1,4 @@
-"""The live view from outside: the whole command, a real browser, Ctrl-C."""
+"""The live view from outside: the whole command, a real browser and Ctrl-C."""
 
 import io
 import math
@@ -35,16 +35,16 @@ def capture(tmp_path_factory):
 
 
 class Tab:
-    """A real browser that looks at a training; what it complains of and asks for is remembered."""
+    """A real browser that views a training. It records complaints and requested URLs."""
 
     def __init__(self, browser, url):
-        self.complaints, self.asked = [], []
+        self.complaints, self.requested = [], []
         self.page = browser.new_page(viewport={"width": 700, "height": 500})
         self.page.set_default_timeout(1e3 * PATIENCE)
         self.page.on("console", self._note)
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.on("websocket", lambda socket: self.asked.append(socket.url.replace("ws:", "http:")))
+        self.page.on("request", lambda request: self.requested.append(request.url))
+        self.page.on("websocket", lambda socket: self.requested.append(socket.url.replace("ws:", "http:")))
         self.page.goto(url)
 
     def _note(self, message):
@@ -67,13 +67,13 @@ class Tab:
         return found and int(found[1].replace(",", ""))
 
     def picture(self):
-        """(H, W, 3) what it shows, but for the panel on the right and the notice on the left."""
+        """Return the screen, (H, W, 3), without the panel on the right and the notice on the left."""
         shown = Image.open(io.BytesIO(self.page.screenshot()))
         return np.asarray(shown.convert("RGB"), dtype=float)[150:, :350]
 
 
-def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path, browser):
-    """Three balls of viser's, drawn by the browser itself, against `browser_camera`: axes, signs, centre, scale."""
+def test_a_real_browser_draws_objects_where_our_camera_sees_them(capture, tmp_path, browser):
+    """Compare three balls that the browser itself draws with `browser_camera`: axes, signs, centre and scale."""
     window, where = 700, {0: (120, 220, 2.5), 1: (310, 420, 3.2), 2: (560, 330, 4.0)}  # column, row, depth
     with (
         training(capture, tmp_path / "run", "--iterations", "100000") as made,
@@ -81,11 +81,11 @@ def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path
     ):
         tab.says(r"iteration ([\d,]+) of")
         made.stopped.set()
-        made.ended()  # the server is there still, and nobody draws any more
+        made.ended()  # the server still runs, but draws no more pictures
         (client,) = made.view._server.get_clients().values()
         seen, start = client.camera, made.run.dataset.train[0].camera
         until(lambda: np.allclose(seen.position, start.eye, atol=1e-6), "the first training view")
-        # the cameras are level, so that the browser's up is theirs
+        # The cameras are level, so the browser's up direction equals theirs.
         np.testing.assert_allclose(quat_to_R(seen.wxyz).T, start.R, atol=1e-3)
         np.testing.assert_allclose(seen.fov, 2 * math.atan(start.H / 2 / start.fy), atol=1e-6)
         canvas = (seen.image_width, seen.image_height)
@@ -103,7 +103,7 @@ def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path
         top = 180  # the notice ends above
 
         def middle(channel):
-            """Column and row of the middle of what is of one colour, beside the panel and below the notice."""
+            """Return column and row of the centre of one colour, beside the panel and below the notice."""
             shown = np.asarray(Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB"), dtype=float)[
                 top:
             ]
@@ -113,9 +113,9 @@ def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path
 
         for channel, (column, row, _) in where.items():
             until(lambda channel=channel: middle(channel) is not None, "the ball")
-            # light from above moves the middle of what counts as coloured by a part of the radius, 6 to 9 px
+            # The radius is 6 to 9 px; light from above moves the centre of the coloured pixels by a part of it.
             np.testing.assert_allclose(middle(channel), (column, row), atol=3)
-        # a camera chosen from the list has the red ball, put before and below its eye, below the window's middle
+        # The red ball is put in front of and below a camera from the list, so it appears below the window's centre.
         chosen, below = made.run.dataset.test[0].camera, 130  # px
         place = chosen.eye + chosen.R.T @ (2.5 * np.array([0, below / scale / camera.fy, 1]))
         client.scene.add_icosphere("/ball0", 0.03, color=(1.0, 0.0, 0.0), position=tuple(place))
@@ -123,18 +123,18 @@ def test_a_real_browser_puts_things_where_our_camera_sees_them(capture, tmp_path
         expected = np.array([camera.W / 2 * scale, camera.H / 2 * scale + below])
         until(
             lambda: (found := middle(0)) is not None and np.abs(found - expected).max() < 3,
-            "the camera that was chosen",
+            "the chosen camera",
         )
     assert tab.complaints == []
 
 
 @contextmanager
 def commanded(capture, out, *words):
-    """Run the command with a view in a process of its own; yield the process and the URL it printed."""
+    """Run the command with a view in a separate process; yield the process and the URL it printed."""
     command = [*COMMAND, "train", str(capture), "--out", str(out), "--view", "--view-port", "0", *words]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        watchdog = threading.Timer(5 * PATIENCE, process.kill)  # so that no pipe is read for ever
+        watchdog = threading.Timer(5 * PATIENCE, process.kill)  # no pipe may block forever
         watchdog.start()
         while not (
             found := re.fullmatch(
@@ -150,15 +150,15 @@ def commanded(capture, out, *words):
 
 
 def bits(path):
-    """Return what a checkpoint holds but its clock: tensors, and what is not a tensor."""
+    """Return a checkpoint's tensors and other values, without its clock."""
     with safe_open(path, framework="np") as file:
         tensors = {name: file.get_tensor(name).tobytes() for name in sorted(file.keys())}
         return tensors, file.metadata()["state"]
 
 
 @pytest.mark.own_process
-def test_a_person_watches_pauses_steps_and_ends_a_training(capture, tmp_path, browser):
-    """The whole of it: command, browser, Ctrl-C; and the bits of a training without a view."""
+def test_a_user_watches_pauses_steps_and_ends_a_training(capture, tmp_path, browser):
+    """Command, browser and Ctrl-C together give the same bits as a training without a view."""
     out, words = tmp_path / "run", ["--iterations", "100000", *GROWING, *STRATEGIES["adc"]]
     with commanded(capture, out, *words) as (process, url), Tab(browser, url) as tab:
         tab.says(r"iteration ([\d,]+) of 100,000")
@@ -183,13 +183,15 @@ def test_a_person_watches_pauses_steps_and_ends_a_training(capture, tmp_path, br
         assert process.returncode == 130
         assert f"interrupted after {held} iterations" in complaints and complaints.count("\n") == 1
         assert "viser" not in printed and "Websocket" not in printed
-        errors = [text for text in tab.complaints if "WebSocket" not in text]  # the server is gone by now
+        errors = [text for text in tab.complaints if "WebSocket" not in text]  # the server has stopped by now
         assert errors == []
         own = url.partition("?")[0]
-        asked = [
-            one if one.startswith("blob:") else f"{one}/" for one in tab.asked
-        ]  # a socket's has no slash
-        assert [one for one in asked if not one.startswith((own, f"blob:{own}"))] == [], "it asks nobody else"
+        requested = [
+            one if one.startswith("blob:") else f"{one}/" for one in tab.requested
+        ]  # a socket's URL has no slash
+        assert [one for one in requested if not one.startswith((own, f"blob:{own}"))] == [], (
+            "nothing else is requested"
+        )
     alone = Training(capture, tmp_path / "alone", *words)
     with alone.view:
         pass
@@ -200,7 +202,7 @@ def test_a_person_watches_pauses_steps_and_ends_a_training(capture, tmp_path, br
 
 
 @pytest.mark.own_process
-def test_after_the_training_the_view_stays_until_ctrl_c_and_all_is_well(capture, tmp_path):
+def test_after_the_training_the_view_stays_until_ctrl_c_and_exits_with_0(capture, tmp_path):
     words = ["--iterations", "3000", "--view-host", "0.0.0.0", *GROWING, *STRATEGIES["adc"]]
     with commanded(capture, tmp_path / "run", *words) as (process, url):
         # Read here: `communicate` does not return what the pipe's reader has buffered behind the URL.

@@ -1,4 +1,4 @@
-"""Who may see the live view: its own pages, with the token, under its own name."""
+"""Only the view's own pages may connect, with the token and under its own host name."""
 
 import http.client
 import socket
@@ -28,20 +28,20 @@ def capture(tmp_path_factory):
 
 @pytest.fixture
 def guarded(capture, tmp_path):
-    """A view whose training never begins: who may come in does not depend on it."""
+    """A view whose training never starts; access does not depend on the training."""
     made = Training(capture, tmp_path / "guarded", "--iterations", "30")
     with made.view:
         yield made.view
 
 
 def parts(view):
-    """Address, port and token of a view."""
+    """Return the address, port and token of a view."""
     found = urllib.parse.urlsplit(view.url)
     return found.hostname, found.port, urllib.parse.parse_qs(found.query)["token"][0]
 
 
 def lets_in(view, *words, **options):
-    """Say whether a client may connect; a refusal is 403 and nothing else."""
+    """Return whether a client may connect. A refusal must be a 403."""
     try:
         with Client(view, *words, **options) as client:
             until(lambda: client.listened().buttons, "the panel")
@@ -61,7 +61,7 @@ def test_only_pages_of_its_own_origin_are_let_in(guarded):
         f"http://localhost.example.org:{port}",
         f"http://{host}:{port + 1}",
         f"http://{host}",
-        f"http://localhost:{port}",  # the page was not asked for under this name
+        f"http://localhost:{port}",  # the page was not requested under this name
         f"http://{host}:{port}.example.org",
         f"http://{host}:{port}/",
     ):
@@ -84,16 +84,16 @@ def test_without_the_token_there_is_no_page_and_no_websocket(guarded):
         assert not lets_in(guarded, url=bare, Cookie=cookie), cookie
     assert lets_in(guarded, url=bare, Cookie=f"other=1; gsplat_edu_{port}={token}")
 
-    assert asked(guarded, "/")[0] == asked(guarded, f"/?token={wrong}")[0] == 403
-    status, headers, body = asked(guarded, f"/?token={token}")
+    assert get(guarded, "/")[0] == get(guarded, f"/?token={wrong}")[0] == 403
+    status, headers, body = get(guarded, f"/?token={token}")
     assert status == 200 and b"<html" in body[:300].lower()
     cookie = f"gsplat_edu_{port}={token}; Path=/; HttpOnly; SameSite=Strict"
     assert headers["Set-Cookie"] == cookie and headers["Referrer-Policy"] == "no-referrer"
-    assert asked(guarded, "/", Cookie=cookie.partition(";")[0])[0] == 200
-    assert asked(guarded, "/", Upgrade="WebSocket")[0] == 403
+    assert get(guarded, "/", Cookie=cookie.partition(";")[0])[0] == 200
+    assert get(guarded, "/", Upgrade="WebSocket")[0] == 403
 
 
-def asked(view, path, **headers):
+def get(view, path, **headers):
     """Return status, headers and body for one request."""
     host, port, _ = parts(view)
     connection = http.client.HTTPConnection(host, port, timeout=PATIENCE)
@@ -106,18 +106,18 @@ def asked(view, path, **headers):
 
 
 @pytest.mark.parametrize("name", ["evil.example.org:PORT", "192.168.0.7:PORT", "", "a:PORT"])
-def test_a_name_that_points_here_is_turned_away(guarded, name):
-    """DNS rebinding: the page is of the same origin, and even has the token."""
+def test_a_foreign_host_name_is_refused(guarded, name):
+    """DNS rebinding: the page has the same origin and even the token."""
     _, port, token = parts(guarded)
-    assert asked(guarded, f"/?token={token}", Host=name.replace("PORT", str(port)))[0] == 403
-    # through a tunnel the port is another, and so is that of the origin
-    assert asked(guarded, f"/?token={token}", Host="localhost:9000")[0] == 200
+    assert get(guarded, f"/?token={token}", Host=name.replace("PORT", str(port)))[0] == 403
+    # Through a tunnel the port differs, and the origin's port must differ in the same way.
+    assert get(guarded, f"/?token={token}", Host="localhost:9000")[0] == 200
     assert (
-        asked(guarded, f"/?token={token}", Host="localhost:9000", Origin=f"http://localhost:{port}")[0] == 403
+        get(guarded, f"/?token={token}", Host="localhost:9000", Origin=f"http://localhost:{port}")[0] == 403
     )
 
 
-def test_each_run_has_a_token_of_its_own():
+def test_each_run_has_its_own_token():
     tokens = {Guard("127.0.0.1", 80).token for _ in range(100)}
     assert len(tokens) == 100 and all(len(token) >= 22 for token in tokens)  # 16 bytes in base64
 

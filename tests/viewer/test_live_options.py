@@ -1,4 +1,4 @@
-"""Options of the live view: each mistake costs one line, and nothing is written."""
+"""Options of the live view: each mistake gives a one-line error, and nothing is written."""
 
 import socket
 import sys
@@ -44,7 +44,7 @@ def capture(tmp_path_factory):
         ),
     ],
 )
-def test_a_view_that_cannot_be_had_costs_one_line_and_nothing_is_begun(
+def test_an_impossible_view_is_a_one_line_error_and_nothing_is_started(
     capture, tmp_path, capsys, words, says
 ):
     with socket.socket() as taken:
@@ -59,7 +59,7 @@ def test_a_view_that_cannot_be_had_costs_one_line_and_nothing_is_begun(
 
 
 @pytest.mark.usefixtures("as_shipped")
-def test_without_viser_one_line_says_how_to_get_it(capture, tmp_path, capsys, monkeypatch):
+def test_without_viser_one_line_says_how_to_install_it(capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.delitem(sys.modules, "gsplat_edu.viewer.live")
     assert main(["train", str(capture), "--out", str(tmp_path / "run"), "--view"]) == 2

@@ -1,4 +1,4 @@
-"""The file of a page: what is in it, and what comes back from it."""
+"""The file of a page: its contents, and reading it back."""
 
 import base64
 import gzip
@@ -23,12 +23,12 @@ NASTY = 'a </script><script>alert(1)</script> {{facts}} "&" äöü 兎 🐕'
 
 
 class Elements(HTMLParser):
-    """The elements of a page with their attributes and texts, as a browser takes the file apart."""
+    """The elements of a page with their attributes and texts, as a browser would parse them."""
 
     def __init__(self, document):
         super().__init__()
         self.found = []
-        self.inside = []  # the texts of what is open
+        self.inside = []  # the texts of the open elements
         self.feed(document.decode("utf-8"))
         self.close()
 
@@ -65,7 +65,7 @@ def test_the_same_scene_gives_the_same_bytes(tmp_path, random_gaussians, three_v
 
 @pytest.mark.parametrize("count", [0, 1, 9])
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
-def test_a_scene_comes_back_within_the_steps_of_its_numbers(tmp_path, random_gaussians, count, rest):
+def test_a_scene_is_read_back_within_its_quantization(tmp_path, random_gaussians, count, rest):
     gaussians = random_gaussians(count, rest)
     page.write(tmp_path / "a.html", Scene(gaussians, None, None))
     scene = page.read(tmp_path / "a.html")
@@ -75,22 +75,22 @@ def test_a_scene_comes_back_within_the_steps_of_its_numbers(tmp_path, random_gau
     for name in ("means", "log_scales"):
         assert torch.equal(given[name], found[name])
     unit = given["quats"] / given["quats"].norm(dim=1, keepdim=True)
-    # half a step of 1/32767, and float32's rounding of numbers up to 1
+    # half a step of 1/32767, plus float32's rounding of numbers up to 1
     np.testing.assert_allclose(found["quats"], unit, rtol=0, atol=0.5 / 32767 + 2e-7)
     for name in ("sh0", "sh_rest", "logit_opacities"):
-        # half floats have 11 bits: half a step is 2^-11 of the number, or 2^-25 where it is smaller than 2^-14
+        # Half floats have 11 bits: half a step is 2^-11 of the number, or 2^-25 below 2^-14.
         np.testing.assert_allclose(found[name], given[name], rtol=2**-11, atol=2**-25)
 
 
 @pytest.mark.parametrize("antialiased", [None, False, True])
 @pytest.mark.parametrize("up", [None, (0.6, 0.0, -0.8)])
-def test_what_else_the_scene_knows_comes_back(tmp_path, random_gaussians, antialiased, up):
+def test_other_facts_of_the_scene_are_read_back(tmp_path, random_gaussians, antialiased, up):
     page.write(tmp_path / "a.html", Scene(random_gaussians(2), antialiased, up))
     scene = page.read(tmp_path / "a.html")
     assert (scene.antialiased, scene.up) == (antialiased, up)
 
 
-def test_settings_left_out_are_those_of_a_scene_file(random_gaussians):
+def test_omitted_settings_are_those_of_a_scene_file(random_gaussians):
     facts = facts_of(page.html(Scene(random_gaussians(2), True)))
     assert facts["settings"] == {
         "background": [0, 0, 0],
@@ -108,7 +108,7 @@ def test_settings_left_out_are_those_of_a_scene_file(random_gaussians):
     }
 
 
-def test_numbers_no_format_of_16_bits_holds(tmp_path):
+def test_numbers_outside_the_range_of_16_bits(tmp_path):
     gaussians = Gaussians(
         means=torch.tensor([[1e39, -1e39, 0.0], [1.0, 2.0, 3.0]], dtype=torch.float64),
         quats=torch.tensor([[0.0, 0, 0, 0], [1e-300, 1e-300, 0, 0]], dtype=torch.float64),
@@ -120,7 +120,7 @@ def test_numbers_no_format_of_16_bits_holds(tmp_path):
     page.write(tmp_path / "a.html", Scene(gaussians))
     found = page.read(tmp_path / "a.html").gaussians
     assert torch.equal(found.quats[0], torch.zeros(4)), (
-        "no rotation: the page leaves it out, as the kernels do"
+        "without a rotation the page leaves it out, as the kernels do"
     )
     # half a step of 1/32767 of a component
     np.testing.assert_allclose(found.quats[1], [0.5**0.5, 0.5**0.5, 0, 0], atol=0.5 / 32767 + 2e-7)
@@ -128,7 +128,7 @@ def test_numbers_no_format_of_16_bits_holds(tmp_path):
     assert float(found.means.abs().max()) == np.finfo(np.float32).max
 
 
-def test_what_is_not_finite_is_refused(tmp_path, random_gaussians):
+def test_nonfinite_gaussians_are_refused(tmp_path, random_gaussians):
     gaussians = random_gaussians(3)
     gaussians.means[1, 2] = float("nan")
     with pytest.raises(ArgumentError, match="means"):
@@ -136,7 +136,7 @@ def test_what_is_not_finite_is_refused(tmp_path, random_gaussians):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_names_are_text_and_nothing_else(tmp_path, random_gaussians, camera):
+def test_names_are_only_text(tmp_path, random_gaussians, camera):
     document = page.html(Scene(random_gaussians(3)), [(NASTY, camera)], title=NASTY)
     elements = Elements(document)
     plain = Elements(page.html(Scene(random_gaussians(3)), [("a", camera)], title="a"))
@@ -148,10 +148,10 @@ def test_names_are_text_and_nothing_else(tmp_path, random_gaussians, camera):
     assert len(page.read(tmp_path / "a.html").gaussians) == 3
 
 
-def test_a_title_that_is_no_text(random_gaussians):
+def test_a_title_with_undecodable_bytes(random_gaussians):
     document = page.html(
         Scene(random_gaussians(3)), title="a\udcff"
-    )  # as Python spells a file name of stray bytes
+    )  # as Python decodes a file name with stray bytes
     assert Elements(document).texts("title") == ["a?"]
 
 
@@ -178,7 +178,7 @@ def test_nothing_is_fetched_from_elsewhere(random_gaussians, three_views):
     assert rules["style-src"].split() == hashes(elements.texts("style"))
 
 
-def test_splats_go_into_pieces_that_read_joins(tmp_path, monkeypatch, random_gaussians):
+def test_splats_are_split_into_pieces_that_read_joins(tmp_path, monkeypatch, random_gaussians):
     monkeypatch.setattr(page, "PIECE", 300)
     gaussians = random_gaussians(20)
     page.write(tmp_path / "a.html", Scene(gaussians))
@@ -202,7 +202,7 @@ def whole(random_gaussians):
     return page.html(Scene(random_gaussians(9)))
 
 
-def test_every_cut_is_told(tmp_path, whole):
+def test_every_truncation_is_reported(tmp_path, whole):
     path = tmp_path / "a.html"
     splats = whole.index(page.SPLATS_OPEN)
     last = whole.index(page.CLOSE, splats)
@@ -211,11 +211,11 @@ def test_every_cut_is_told(tmp_path, whole):
         refused(path)
 
 
-def test_every_changed_byte_of_the_splats_is_told(tmp_path, whole):
+def test_every_changed_byte_of_the_splats_is_reported(tmp_path, whole):
     path = tmp_path / "a.html"
     begin = whole.index(page.SPLATS_OPEN) + len(page.SPLATS_OPEN)
     end = whole.index(page.CLOSE, begin)
-    # the gzip header's first 10 bytes say nothing of the contents, beyond the first 4 of them
+    # Of the gzip header's 10 bytes, only the first 4 affect the contents.
     for at in [0, 3, *range(20, end - begin - 3, 13)]:
         changed = bytearray(whole)
         changed[begin + at] = ord("A") if changed[begin + at] != ord("A") else ord("B")
@@ -252,7 +252,7 @@ def test_damage_is_named(tmp_path, whole, old, new, says):
     assert says in refused(path)
 
 
-def test_what_is_no_page(tmp_path):
+def test_files_that_are_not_pages_are_refused(tmp_path):
     path = tmp_path / "a.html"
     for content in (b"", b"<!DOCTYPE html><p>hello</p>", bytes(range(256)) * 40):
         path.write_bytes(content)
@@ -263,7 +263,7 @@ def test_what_is_no_page(tmp_path):
         page.read(tmp_path / "none.html")
 
 
-def test_numbers_that_are_not_finite_are_counted(tmp_path, whole):
+def test_nonfinite_splats_are_counted(tmp_path, whole):
     begin = whole.index(page.SPLATS_OPEN) + len(page.SPLATS_OPEN)
     end = whole.index(page.CLOSE, begin)
     data = bytearray(gzip.decompress(base64.b64decode(whole[begin:end])))
@@ -273,7 +273,7 @@ def test_numbers_that_are_not_finite_are_counted(tmp_path, whole):
     assert "1 splats have NaN or infinite values" in refused(path)
 
 
-def test_a_bomb_is_not_inflated(tmp_path, whole):
+def test_a_decompression_bomb_is_refused(tmp_path, whole):
     begin = whole.index(page.SPLATS_OPEN) + len(page.SPLATS_OPEN)
     end = whole.index(page.CLOSE, begin)
     path = tmp_path / "a.html"
@@ -283,12 +283,12 @@ def test_a_bomb_is_not_inflated(tmp_path, whole):
 
 @pytest.mark.parametrize("gaussians", [0, 1, 40])
 @pytest.mark.parametrize("up", [None, (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
-def test_the_start_looks_at_the_scene_with_up_upwards(random_gaussians, gaussians, up):
+def test_the_start_view_faces_the_scene_with_up_upwards(random_gaussians, gaussians, up):
     start = facts_of(page.html(Scene(random_gaussians(gaussians), up=up)))["start"]
     assert start["up"] == list(up or (0, -1, 0))
     R, eye = np.array(start["camera"]["R"]), np.array(start["camera"]["eye"])
     if gaussians:
-        assert -R[1] @ start["up"] > 0.9  # an orbit stands 15 degrees above the horizon
+        assert -R[1] @ start["up"] > 0.9  # the orbit is 15 degrees above the horizon
     x, y, z = R @ (np.array(start["pivot"]) - eye)
     assert z > 0 and abs(x) < 1e-6 * z and abs(y) < 1e-6 * z
 
@@ -316,7 +316,7 @@ def test_the_start_is_the_first_camera_that_was_trained_on(random_gaussians, thr
 
 
 def facing_one_way(turn):
-    """Cameras side by side whose axes spread, by an angle or towards each other: they cross at random or behind."""
+    """Cameras side by side, each turned by `turn` from its neighbour: their axes cross anywhere, or behind them."""
     cameras = []
     for i in range(-4, 5):
         eye = np.array([0.3 * i, 0.02 * (-1) ** i, 0.0])
@@ -326,33 +326,33 @@ def facing_one_way(turn):
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.001, 0.05, -0.05, 0.2])
-def test_where_cameras_face_one_way_the_pivot_lies_at_what_they_see(turn):
-    """Where their axes cross (at 6, behind them, or nowhere) is no place to turn around."""
+def test_if_cameras_face_one_way_the_pivot_is_on_what_they_see(turn):
+    """The point where their axes cross (6 ahead, behind them, or nowhere) is no good pivot."""
     generator = np.random.default_rng(0)
     points = generator.uniform((-30, -30, 9.5), (30, 30, 10.5), (4000, 3))
     cameras = facing_one_way(turn)
     pivot = pivot_of(cameras, 4, points)
     np.testing.assert_allclose(pivot[:2], cameras[4].eye[:2], atol=1e-9)
-    if turn == -0.05:  # they do look at one point, 6 ahead: either will do
+    if turn == -0.05:  # they do look at one point, 6 ahead: either is fine
         assert 5 < pivot[2] < 10.6
     else:
         assert 9.5 < pivot[2] < 10.5
 
 
-def test_where_cameras_stand_around_something_the_pivot_is_its_centre():
+def test_if_cameras_surround_something_the_pivot_is_its_centre():
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     eyes = [np.array([3 * np.cos(a), -1.0, 3 * np.sin(a)]) for a in angles]
     cameras = [Camera(look_at(eye, (0, 0, 0)), eye, 200.0, 200.0, 80.0, 60.0, 120, 160) for eye in eyes]
     cameras[3] = Camera(look_at(eyes[3], (9, 0, 9)), eyes[3], 200.0, 200.0, 80.0, 60.0, 120, 160)
     surface = np.random.default_rng(0).normal(size=(900, 3))
     surface /= np.linalg.norm(surface, axis=1, keepdims=True)
-    # although one of them looks away, and its surface is nearer than the centre
+    # This holds although one camera looks away and the surface is nearer than the centre.
     np.testing.assert_allclose(pivot_of(cameras, 0, surface), 0, atol=1e-6)
     assert pivot_of(cameras[:1], 0, np.zeros((0, 3))) @ cameras[0].R[2] > cameras[0].eye @ cameras[0].R[2]
 
 
-def test_a_flight_or_an_arc_starts_in_its_middle_and_a_ring_at_its_first_camera():
-    """The page of 164 aerial photos began at the corner of the fields, half of the window on nothing."""
+def test_a_flight_or_an_arc_starts_in_the_middle_and_a_ring_at_its_first_camera():
+    """A page of 164 aerial photos used to start at a corner of the fields, with half of the window empty."""
     down = np.diag([1.0, -1.0, -1.0])  # looking along -z, from z = 10
     flight = [
         Camera(down, np.array([x, y, 10.0]), 80, 80, 40, 30, 60, 80) for y in range(5) for x in range(7)
@@ -360,7 +360,7 @@ def test_a_flight_or_an_arc_starts_in_its_middle_and_a_ring_at_its_first_camera(
     everywhere = range(len(flight))
     assert first_camera(flight, everywhere) == 17, "row 2 of 5, column 3 of 7"
     assert first_camera(flight, [i for i in everywhere if i != 17]) in (10, 16, 18, 24), "17 is held out"
-    assert first_camera(flight[17:] + flight[:17], everywhere) == 0, "the first stands well"
+    assert first_camera(flight[17:] + flight[:17], everywhere) == 0, "the first camera is already central"
     assert first_camera(flight[:1], [0]) == 0
     for turn, chosen in ((np.radians(90), 5), (np.radians(330), 1)):
         around = [

@@ -35,7 +35,7 @@ def drag(visit, dx, dy, button="left", steps=3):
 
 
 def touch(visit, before, after):
-    """Put fingers down, move them and lift them; each is (right, down) of the middle."""
+    """Put fingers down, move them and lift them; positions are (right, down) from the middle."""
     session = visit.tab.context.new_cdp_session(visit.tab)
     for kind, places in (("touchStart", before), ("touchMove", after), ("touchEnd", ())):
         fingers = [{"x": MIDDLE[0] + x, "y": MIDDLE[1] + y, "id": i} for i, (x, y) in enumerate(places)]
@@ -52,15 +52,15 @@ def test_a_drag_orbits_about_the_point_ahead(tour):
     distance = np.linalg.norm(before.eye - centre)
     assert np.linalg.norm(after.eye - centre) == pytest.approx(distance)
     moved = before.R @ (after.eye - before.eye)
-    # what is in front goes with the pointer, right and down: the camera goes left and up
+    # The scene follows the pointer right and down, so the camera moves left and up.
     assert moved[0] < -0.2 and moved[1] < -0.1
-    # half a turn for a drag across the longer side, 640 px: the cameras stand all around
+    # The cameras stand all around, so a drag across the longer side, 640 px, is half a turn.
     angles = np.pi / 640 * np.array([50, 20])
     between = np.arccos(after.R[2] @ before.R[2])
     assert max(angles) * 0.9 < between < np.hypot(*angles)
 
 
-def test_no_drag_turns_the_world_over(tour):
+def test_no_drag_turns_the_world_upside_down(tour):
     for dy in (90, 90, 90, -90, -90, -90, -90, -90, -90):
         after = drag(tour, 3, dy, steps=12)
         assert -after.R[1] @ tour.tab.evaluate("viewer.view.up") > 0
@@ -73,12 +73,12 @@ def test_a_right_drag_pans(tour):
             tour.tab.keyboard.down("Shift")
         after = drag(tour, 40, -30, button)
         np.testing.assert_array_equal(after.R, before.R)
-        # the point ahead stays under the pointer
+        # The point ahead stays under the pointer.
         was, is_now = (np.array(one.project(one.world_to_cam(centre))[:2]) for one in (before, after))
         np.testing.assert_allclose(is_now - was, (40, -30), atol=1e-6)
 
 
-def test_the_wheel_goes_nearer_and_farther(tour):
+def test_the_wheel_moves_nearer_and_farther(tour):
     centre = pivot(tour)
     distances = []
     for amount in (0, -300, 800):
@@ -109,7 +109,7 @@ def test_keys_move_along_the_cameras_axes_while_they_are_held(tour):
         np.testing.assert_array_equal(tour.camera().eye, after.eye)
 
 
-def test_a_key_let_go_elsewhere_does_not_move_on(tour):
+def test_a_key_released_outside_the_window_does_not_keep_moving(tour):
     tour.tab.keyboard.down("w")
     tour.tab.evaluate("dispatchEvent(new Event('blur'))")
     tour.tab.wait_for_timeout(60)
@@ -124,10 +124,10 @@ def test_flying_a_drag_looks_around(tour):
     assert tour.tab.get_attribute("#fly", "aria-pressed") == "true"
     after = drag(tour, 40, 10)
     np.testing.assert_array_equal(after.eye, before.eye)
-    assert before.R[0] @ after.R[2] > 0.1 and before.R[1] @ after.R[2] > 0.05, "to the right and down"
+    assert before.R[0] @ after.R[2] > 0.1 and before.R[1] @ after.R[2] > 0.05, "the view turns right and down"
     tour.tab.mouse.wheel(0, -200)
     tour.tab.wait_for_timeout(100)
-    assert after.R[2] @ (tour.camera().eye - after.eye) > 0.1, "forward"
+    assert after.R[2] @ (tour.camera().eye - after.eye) > 0.1, "the wheel moves forward"
     tour.tab.click("#fly")
     assert tour.tab.get_attribute("#fly", "aria-pressed") == "false"
     assert not np.array_equal(drag(tour, 40, 10).eye, after.eye)
@@ -149,7 +149,7 @@ def test_the_captures_cameras(tour, three_views):
     assert marked() == ["first"]
     tour.tab.click("text='second'")
     assert stands_at(tour, second) and marked() == ["second"]
-    # its image, 200 x 160, would fill the window's height at 2.5 times its size, and loses a fifth of it at most
+    # At 2.5 times its size, the 200 x 160 image would fill the window's height; at most a fifth of it is cropped.
     assert tour.camera().fx == pytest.approx(1.25 * 2.5 * second.fx)
     tour.tab.keyboard.press("ArrowRight")
     assert stands_at(tour, third)
@@ -179,18 +179,14 @@ def test_a_window_of_any_shape_keeps_the_middle_of_the_photo(tour, three_views, 
         left, right = (np.array([-0.5, width - 0.5]) - shown.cx) / scale + camera.cx
         top, bottom = (np.array([-0.5, height - 0.5]) - shown.cy) / scale + camera.cy
         assert left + right == pytest.approx(camera.W - 1) and top + bottom == pytest.approx(camera.H - 1)
-        if (
-            width / height < camera.W / camera.H
-        ):  # a narrow window shows the whole height and nothing beyond it
+        if width / height < camera.W / camera.H:  # narrow: shows exactly the whole height
             assert top == pytest.approx(-0.5)
-        else:  # a wide one shows four fifths of the height or more, and the whole width unless it is about as wide
+        else:  # wide: shows at least four fifths of the height, and the whole width
             assert bottom - top >= 0.8 * camera.H - 1e-9 and bottom - top <= camera.H + 1e-9
             assert right - left >= camera.W - 1e-9
 
 
-def test_held_out_cameras_are_marked_and_the_start_is_none_of_them(
-    visit, tmp_path, random_gaussians, three_views
-):
+def test_held_out_cameras_are_marked_and_none_is_the_start(visit, tmp_path, random_gaussians, three_views):
     page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views, held_out={"first"})
     seen = visit().open(tmp_path / "a.html").ready()
     seen.tab.click("summary")
@@ -205,7 +201,7 @@ def test_held_out_cameras_are_marked_and_the_start_is_none_of_them(
 
 
 def forward_cameras():
-    """Eleven cameras side by side that face one way, and look at what lies 4 ahead."""
+    """Eleven cameras side by side that face one way, at a subject 4 ahead."""
     eyes = [(0.2 * i, 0.05 * (i % 3), 0.0) for i in range(-5, 6)]
     return [
         (f"{i:02}", Camera(np.eye(3), eye, 250.0, 250.0, 160.0, 100.0, 200, 320))
@@ -221,7 +217,7 @@ def forward(show, random_gaussians):
 
 
 def off_the_cameras(visit):
-    """Angle, in degrees, between the direction of the view from its pivot and the nearest camera's."""
+    """Return the angle in degrees, seen from the pivot, between the view and the nearest camera."""
     centre, eye = pivot(visit), visit.camera().eye
 
     def unit(a):
@@ -231,23 +227,23 @@ def off_the_cameras(visit):
     return np.degrees(np.arccos(min(max(cosines), 1.0)))
 
 
-def test_a_drag_of_a_quarter_of_the_window_stays_near_what_was_captured(forward):
+def test_a_drag_across_a_quarter_of_the_window_stays_near_the_cameras(forward):
     distance = np.linalg.norm(forward.camera().eye - pivot(forward))
-    assert 3 < distance < 5, "the pivot is what the cameras see, although their axes cross nowhere"
+    assert 3 < distance < 5, "the pivot is on what the cameras see, although their axes cross nowhere"
     for dx, dy in ((160, 0), (-160, 0), (0, 100), (0, -100), (160, 100)):
         for steps in (1, 20):
             forward.tab.keyboard.press("r")
             after = drag(forward, dx, dy, steps=steps)
-            # 6 free degrees, and some more that get ever harder
+            # 6 degrees are free; beyond them, moving gets harder and harder.
             assert 0.5 < off_the_cameras(forward) < 15
             assert np.linalg.norm(after.eye - pivot(forward)) == pytest.approx(distance)
     moved = off_the_cameras(forward)
     for _ in range(4):
         drag(forward, 160, 100, steps=4)
-    assert moved < off_the_cameras(forward) < 35, "whoever insists gets on, slowly"
+    assert moved < off_the_cameras(forward) < 35, "repeated drags still move on, slowly"
 
 
-def test_who_has_flown_outside_can_orbit_there(forward):
+def test_after_flying_outside_one_can_orbit_there(forward):
     forward.tab.evaluate(
         "viewer.view.camera = {...viewer.view.camera, eye: [4, 0, 4]}; viewer.view.look(-1.5, 0)"
     )
@@ -265,7 +261,7 @@ def on_the_screen(visit, point):
 
 @pytest.fixture
 def wall(show):
-    """A near ball to the right of a far wall of balls: hard to hit by chance, and with something behind it."""
+    """A near ball in front of a far wall of balls, at the right: hard to hit by chance, with something behind it."""
     x, y = np.meshgrid(np.linspace(-4, 4, 15), np.linspace(-3, 3, 11))
     means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 6.0)], axis=1)
     means = np.concatenate([means, [[0.8, 0.3, 2.0]]])
@@ -283,10 +279,10 @@ def wall(show):
 
 
 def click_twice(visit, by, x, y, pause):
-    """Click or tap twice, so many seconds apart by the events' own clock, however slow this computer is."""
+    """Click or tap twice, `pause` seconds apart by the events' own clock, even on a slow computer."""
     session = visit.tab.context.new_cdp_session(visit.tab)
-    began = time.time()
-    for moment in (began, began + pause):
+    start = time.time()
+    for moment in (start, start + pause):
         for pressed in (True, False):
             at = {"timestamp": moment + (0.0 if pressed else 0.05)}
             if by == "mouse":
@@ -301,7 +297,7 @@ def click_twice(visit, by, x, y, pause):
                 kind = {"type": "touchStart" if pressed else "touchEnd", "touchPoints": places}
                 session.send("Input.dispatchTouchEvent", {**kind, **at})
     session.detach()
-    visit.tab.wait_for_timeout(1000 * pause + 500)  # until the last of these moments is past
+    visit.tab.wait_for_timeout(1000 * pause + 500)  # until the last event's time has passed
 
 
 @pytest.mark.parametrize("by", ["mouse", "finger"])
@@ -311,18 +307,18 @@ def test_a_double_click_or_tap_sets_the_pivot_on_the_surface_there(wall, by):
     click_twice(wall, by, column, row, pause=0.3)
     wall.tab.wait_for_function("element('point').style.left !== ''")
     found = pivot(wall)
-    # the ball's sigma is 0.08, and half of its opacity lies before its middle or in it
+    # The ball's sigma is 0.08, and half of its opacity is reached at or before its centre.
     np.testing.assert_allclose(found, (0.8, 0.3, 2.0), atol=0.1)
     np.testing.assert_array_equal(wall.camera().eye, before.eye)
     np.testing.assert_array_equal(wall.camera().R, before.R)
     after = drag(wall, 0, 30)
     np.testing.assert_allclose(pivot(wall), found)
     assert not np.array_equal(after.R, before.R)
-    # the point stays where it is in the window, and no camera moves about another
+    # The point stays in place in the window, because the view orbits about it.
     np.testing.assert_allclose(on_the_screen(wall, found) + 0.5, (column, row), atol=1)
     wall.tab.wait_for_selector("#point", state="hidden")
     wall.tab.keyboard.press("r")
-    assert np.linalg.norm(pivot(wall) - found) > 0.5, "the start has its own"
+    assert np.linalg.norm(pivot(wall) - found) > 0.5, "the start view has its own pivot"
 
 
 def test_one_click_or_two_far_apart_set_nothing(wall):
@@ -339,7 +335,7 @@ def test_one_click_or_two_far_apart_set_nothing(wall):
 @pytest.mark.parametrize(
     ("options", "shown"), [({}, "mouse"), ({"has_touch": True, "is_mobile": True}, "touch")]
 )
-def test_the_help_is_for_what_the_visitor_has(show, random_gaussians, options, shown):
+def test_the_help_matches_the_visitors_device(show, random_gaussians, options, shown):
     seen = show(random_gaussians(9), width=390, height=600, **options)
     seen.tab.click("#help-button")
     visible = seen.tab.locator("#help tr:visible")
@@ -349,7 +345,7 @@ def test_the_help_is_for_what_the_visitor_has(show, random_gaussians, options, s
     assert ("double tap" in text, "W A S D" in text) == (shown == "touch", shown == "mouse")
 
 
-def test_words_that_a_visitor_knows(tour):
+def test_the_panel_uses_words_that_a_visitor_knows(tour):
     tour.tab.wait_for_selector("#rate:empty", state="attached")
     text = tour.tab.inner_text("#panel")
     assert "reflections" in text and "harmonics" not in text and "rest" not in text
@@ -364,7 +360,7 @@ def test_back_to_the_start(tour, three_views):
         assert stands_at(tour, three_views[0][1])
 
 
-def test_help_is_there_when_it_is_asked_for(tour):
+def test_help_is_shown_on_request(tour):
     assert tour.tab.is_hidden("#help")
     tour.tab.keyboard.press("h")
     assert tour.tab.is_visible("#help")
@@ -388,7 +384,7 @@ def test_two_fingers_pan_and_pinch(tour):
     assert (before.R @ (panned.eye - before.eye))[1] < -0.1
 
     pinched = touch(tour, [(-20, 0), (20, 0)], [(-40, 0), (40, 0)])
-    # the fingers are twice as far apart: what is between them too
+    # The fingers are twice as far apart, so what is between them looks twice as large.
     assert np.linalg.norm(pinched.eye - pivot(tour)) == pytest.approx(distance / 2, rel=0.15)
 
 

@@ -1,4 +1,4 @@
-"""What a page draws, in a real browser, against the renderer."""
+"""A page's drawing in a real browser, compared with the renderer."""
 
 import base64
 import gzip
@@ -26,8 +26,9 @@ from gsplat_edu.viewer import page
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 ALIKE = 60.0
-"""dB. The page blends into half floats: 2^-12 of a value up to 1 at worst per splat, of which the splats in front leave
-little. Errors of 1e-3 everywhere would be 60 dB; measured are 71 to 77. A wrong convention costs 20 to 40 dB."""
+"""Required PSNR, dB. The page blends into half floats: at worst 2^-12 of a value up to 1 per splat, most of it hidden
+by the splats in front. Errors of 1e-3 everywhere would be 60 dB; 71 to 77 are measured. A wrong convention costs 20 to
+40 dB."""
 
 PLAIN = RenderSettings()
 
@@ -56,7 +57,7 @@ def test_the_page_draws_what_the_renderer_draws(show, random_gaussians, camera, 
     found = likeness(drawn, visit, gaussians, camera, settings)
     record_property("psnr", found)
     assert found >= ALIKE
-    # and from within the scene, where splats stand beside, behind and around the camera
+    # The same from within the scene, with splats beside, behind and around the camera.
     inside = Camera(
         look_at((0.1, 0.0, -0.3), (0.4, 0.2, 1.0)), (0.1, 0.0, -0.3), 150.0, 130.0, 61.7, 52.2, 90, 130
     )
@@ -81,7 +82,7 @@ def test_a_lower_degree_is_chosen(show, random_gaussians, camera):
 
 
 def test_extreme_splats(show, random_gaussians, camera):
-    """Needles, sheets, dust, giants, opaque and faint ones, and one without a rotation, which is left out."""
+    """Needles, sheets, dust, giants, opaque and faint splats, and one without a rotation, which is left out."""
     gaussians = random_gaussians(400)
     gaussians.log_scales[:40, 0] = -30.0
     gaussians.log_scales[40:80, :2] = -12.0
@@ -111,7 +112,7 @@ def test_equal_depths_keep_the_order_of_the_input(show, camera):
     assert visit.picture(camera).reshape(-1, 3).max(axis=0).argmax() == 0
 
 
-def test_the_order_is_that_of_depths_in_float32(show, random_gaussians, camera):
+def test_splats_are_sorted_by_float32_depth(show, random_gaussians, camera):
     gaussians = random_gaussians(20_000, 0)
     means = gaussians.means.numpy()
     means[:] = np.round(means * 8) / 8  # many equal depths
@@ -132,7 +133,7 @@ def test_the_order_is_that_of_depths_in_float32(show, random_gaussians, camera):
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_next_to_nothing(show, random_gaussians, camera, count):
+def test_no_splat_or_one_splat(show, random_gaussians, camera, count):
     settings = RenderSettings(background=(0.25, 0.5, 1.0))
     visit = show(random_gaussians(count), settings=settings)
     assert visit.tab.inner_text("#count") == ("1 splat" if count else "0 splats")
@@ -144,7 +145,7 @@ def test_next_to_nothing(show, random_gaussians, camera, count):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("size", [(0.0, 0.0, 0.0), (-12.0, -12.0, -12.0), (-5.0, -30.0, -30.0)])
 def test_one_black_splat_on_white(show, random_gaussians, camera, size, antialiased):
-    """Alone, every constant counts: the most that a splat hides, the dilation of a point, the edge at 1/255."""
+    """A single splat shows every constant: the maximum alpha, the dilation, the cut-off at 1/255."""
     gaussians = random_gaussians(1, 0)
     gaussians.means[0] = torch.tensor([0.1, 0.05, 0.0])
     gaussians.log_scales[0] = torch.tensor(size)
@@ -153,18 +154,18 @@ def test_one_black_splat_on_white(show, random_gaussians, camera, size, antialia
     settings = RenderSettings(background=(1.0, 1.0, 1.0), antialiased=antialiased)
     visit = show(gaussians, [("first", camera)], settings)
     truth = drawn(gaussians, camera, settings)
-    # a half float below 1 is rounded by 2^-12 at most; exp by float32
+    # A half float below 1 is rounded by at most 2^-12; exp is float32.
     np.testing.assert_allclose(visit.picture(camera), truth, atol=2**-12 + 1e-5)
 
 
-def test_colours_outside_the_screens_are_not_clipped(show, random_gaussians, camera):
+def test_colours_outside_the_screens_range_are_not_clipped(show, random_gaussians, camera):
     gaussians = random_gaussians(200)
     gaussians.sh0[:] *= 5.0
     settings = RenderSettings(background=(-0.5, 2.0, 0.0))
     visit = show(gaussians, [("first", camera)], settings)
     truth = drawn(gaussians, camera, settings)
     assert truth.max() > 2.5 and truth.min() < -0.4
-    # half floats of numbers up to 8: steps of 2^-8
+    # Half floats up to 8 have steps of up to 2^-8.
     np.testing.assert_allclose(visit.picture(camera), truth, atol=0.02)
 
 
@@ -186,7 +187,7 @@ def test_a_trained_scene(show):
         (160, 500, 2.5),  # narrow: the height fits, the sides are cropped
         (320, 200, 1.0),
         (400, 200, 1.25),  # wide: the width fits, a fifth of the height is cropped
-        (800, 200, 1.25),  # no more than that; the rest shows what is beside the image
+        (800, 200, 1.25),  # no more is cropped; the rest shows what is beside the image
     ],
 )
 def test_a_window_crops_the_sides_but_little_of_the_height(
@@ -199,7 +200,7 @@ def test_a_window_crops_the_sides_but_little_of_the_height(
 
 @pytest.mark.parametrize("dense", [1, 2])
 def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
-    """In a window of another shape the camera's image covers the window: the rest is cropped."""
+    """In a window of another shape, the camera's image covers the window and is cropped."""
     gaussians = random_gaussians(2000)
     visit = show(gaussians, [("first", camera)], PLAIN, width=360, height=180, device_scale_factor=dense)
     visit.tab.evaluate("document.getElementById('panel').hidden = true")
@@ -213,7 +214,7 @@ def test_the_screen_shows_the_picture(show, random_gaussians, camera, dense):
     visit.tab.evaluate("viewer.settled()")
     screen = np.asarray(Image.open(BytesIO(visit.tab.screenshot())).convert("RGB"))
     truth = np.round(255 * drawn(gaussians, window, PLAIN).clip(0, 1))
-    # rounded to bytes by the canvas: one step where the half float lies on the other side of it
+    # The canvas rounds to bytes, so a half float may land one step away.
     assert np.abs(screen - truth).max() <= 2
     assert (screen == truth).mean() > 0.9
 
@@ -225,7 +226,7 @@ def test_the_window_may_change_its_size(show, random_gaussians, camera):
     assert (visit.camera().W, visit.camera().H) == (200, 300)
 
 
-def test_names_stand_on_the_page_as_they_are(show, random_gaussians, camera, tmp_path, visit):
+def test_names_are_shown_unchanged(show, random_gaussians, camera, tmp_path, visit):
     name = "a </script><b>fat</b> {{facts}} äöü 兎 &amp;"
     path = tmp_path / "tüte 兎.html"
     page.write(path, Scene(random_gaussians(3)), [(name, camera)])
@@ -235,7 +236,7 @@ def test_names_stand_on_the_page_as_they_are(show, random_gaussians, camera, tmp
     assert one.tab.inner_text("#cameras button") == name
 
 
-def test_the_page_may_not_reach_the_network(show, random_gaussians):
+def test_the_page_cannot_reach_the_network(show, random_gaussians):
     visit = show(random_gaussians(3))
     refused = visit.tab.evaluate(
         """() => new Promise((resolve) => {
@@ -249,14 +250,14 @@ def test_the_page_may_not_reach_the_network(show, random_gaussians):
     visit.complaints.clear()
 
 
-def test_a_browser_without_webgl2_is_told(visit, tmp_path, random_gaussians):
+def test_a_browser_without_webgl2_gets_a_message(visit, tmp_path, random_gaussians):
     page.write(tmp_path / "a.html", Scene(random_gaussians(3)))
     one = visit()
     one.tab.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     one.open(tmp_path / "a.html").message("This page needs WebGL2")
 
 
-def test_a_graphics_processor_of_small_textures_is_told(visit, tmp_path, random_gaussians):
+def test_a_graphics_processor_with_small_textures_gets_a_message(visit, tmp_path, random_gaussians):
     page.write(tmp_path / "a.html", Scene(random_gaussians(20, 0)))
     limited = """
       const real = WebGL2RenderingContext.prototype.getParameter;
@@ -271,7 +272,7 @@ def test_a_graphics_processor_of_small_textures_is_told(visit, tmp_path, random_
         one.ready() if fits else one.message("more splats than this graphics processor's textures can hold")
 
 
-def test_a_browser_that_cannot_inflate_is_told(visit, tmp_path, random_gaussians):
+def test_a_browser_that_cannot_inflate_gets_a_message(visit, tmp_path, random_gaussians):
     page.write(tmp_path / "a.html", Scene(random_gaussians(3)))
     one = visit()
     one.tab.add_init_script("delete window.DecompressionStream")
@@ -279,7 +280,7 @@ def test_a_browser_that_cannot_inflate_is_told(visit, tmp_path, random_gaussians
 
 
 @pytest.mark.parametrize("damage", ["cut", "short", "long", "no gzip"])
-def test_damaged_splats_are_told(visit, tmp_path, random_gaussians, damage):
+def test_damaged_splats_are_reported(visit, tmp_path, random_gaussians, damage):
     whole = page.html(Scene(random_gaussians(30)))
     begin = whole.index(page.SPLATS_OPEN) + len(page.SPLATS_OPEN)
     end = whole.index(page.CLOSE, begin)
@@ -294,7 +295,7 @@ def test_damaged_splats_are_told(visit, tmp_path, random_gaussians, damage):
     visit().open(tmp_path / "a.html").message("The scene in this file is damaged")
 
 
-def test_a_lost_context_is_told(show, random_gaussians):
+def test_a_lost_context_is_reported(show, random_gaussians):
     visit = show(random_gaussians(3))
     visit.tab.evaluate("viewer.renderer.gl.getExtension('WEBGL_lose_context').loseContext()")
     visit.message("The graphics processor stopped drawing this page")

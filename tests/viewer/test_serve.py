@@ -1,4 +1,4 @@
-"""The page's server, asked by real sockets: one page, nothing else, and only by who may."""
+"""The page's server, tested with real sockets: it serves one page, nothing else, and only to allowed host names."""
 
 import http.client
 import io
@@ -55,7 +55,7 @@ def ask(server, method="GET", path="/", **headers):
 
 
 def ask_raw(server, request):
-    """Return all that comes back for bytes that need not be HTTP."""
+    """Send bytes that need not be HTTP; return the whole answer."""
     with socket.create_connection(server.server_address[:2], timeout=10) as connection:
         connection.sendall(request)
         connection.shutdown(socket.SHUT_WR)
@@ -65,7 +65,7 @@ def ask_raw(server, request):
     return answer
 
 
-def test_the_page_comes_as_it_is(server):
+def test_the_page_is_served_unchanged(server):
     status, headers, body = ask(server)
     assert (status, body) == (200, PAGE)
     assert headers["Content-Type"] == "text/html; charset=utf-8"
@@ -75,7 +75,7 @@ def test_the_page_comes_as_it_is(server):
     assert "Python" not in headers["Server"]
 
 
-def test_head_has_the_headers_alone(server):
+def test_head_returns_only_the_headers(server):
     status, headers, body = ask(server, "HEAD")
     assert (status, body) == (200, b"")
     assert headers["Content-Length"] == str(len(PAGE))
@@ -100,12 +100,12 @@ def test_head_has_the_headers_alone(server):
         "/" + "a" * 60_000,
     ],
 )
-def test_nothing_else_is_there(server, path):
+def test_no_other_path_is_served(server, path):
     answer = ask_raw(server, f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
     assert answer.split(b" ", 2)[1] in (b"404", b"400") and b"root:" not in answer and PAGE[:40] not in answer
 
 
-def test_nothing_is_listed_or_found_beside_the_program(server, tmp_path, monkeypatch):
+def test_files_of_the_working_folder_are_not_served(server, tmp_path, monkeypatch):
     (tmp_path / "secret.txt").write_text("secret")
     monkeypatch.chdir(tmp_path)
     assert ask(server, path="/secret.txt")[0] == 404
@@ -140,14 +140,14 @@ def test_names_of_this_computer_are_answered(server, host):
         None,
     ],
 )
-def test_other_names_are_turned_away(server, host):
-    """A page from elsewhere may have its own name point at 127.0.0.1."""
+def test_other_host_names_are_refused(server, host):
+    """A foreign page may let its own host name resolve to 127.0.0.1."""
     status, _, body = ask(server, Host=host)
     assert (status, body) == (403, b"403 Forbidden\n")
     assert ask(server, "HEAD", Host=host)[0] == 403
 
 
-def test_two_names_are_turned_away(server):
+def test_two_host_headers_are_refused(server):
     answer = ask_raw(server, b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: example.org\r\n\r\n")
     assert answer.startswith(b"HTTP/1.0 403")
 
@@ -155,14 +155,14 @@ def test_two_names_are_turned_away(server):
 @pytest.mark.parametrize(
     "request_", [b"", b"\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x00\xa5\x01\x00", b"GET /", b"\0" * 70_000]
 )
-def test_what_is_no_request_hurts_nobody(server, capsys, request_):
+def test_an_invalid_request_does_no_harm(server, capsys, request_):
     ask_raw(server, request_)
     assert ask(server)[2] == PAGE
     assert capsys.readouterr() == ("", ""), "the terminal stays clean"
 
 
 def cut_off(server, first, more, pieces):
-    """Send a request that never ends, and say whether the server closed the connection before it had all of it."""
+    """Send a request in `pieces` pieces; return whether the server closed the connection before the end."""
     with socket.create_connection(server.server_address[:2], timeout=PATIENCE) as connection:
         try:
             connection.sendall(first)
@@ -176,7 +176,7 @@ def cut_off(server, first, more, pieces):
 
 @pytest.mark.parametrize("first", [b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\nX: "])
 def test_a_request_that_trickles_in_is_cut_off(server, monkeypatch, capsys, first):
-    """A byte every 10 ms for 20 s, where 0.2 s are allowed; each read by itself is quick."""
+    """A byte every 10 ms for 20 s, while 0.2 s are allowed; each single read is quick."""
     monkeypatch.setattr(serve, "REQUEST_SECONDS", 0.2)
     assert cut_off(server, first, b"a", 2000)
     monkeypatch.undo()
@@ -185,18 +185,18 @@ def test_a_request_that_trickles_in_is_cut_off(server, monkeypatch, capsys, firs
 
 
 def test_a_request_without_end_is_cut_off(server):
-    # 100 headers of 60 KB: as many as http.server takes, and a hundred times what is allowed
+    # http.server accepts 100 headers. These are 90 of 60 KB, about a hundred times what is allowed.
     assert cut_off(server, b"GET / HTTP/1.1\r\n", b"X: " + b"a" * 60_000 + b"\r\n", 90)
 
 
-def test_more_connections_than_there_is_room_for_are_closed(server, monkeypatch):
-    """Those that wait hold their threads; the next one is not answered; once they are gone there is room again."""
+def test_connections_beyond_the_limit_are_closed(server, monkeypatch):
+    """Waiting connections hold their threads, so the next one gets no answer. Once they close, there is room again."""
     server._room = threading.Semaphore(3)
     waiting = [socket.create_connection(server.server_address[:2], timeout=10) for _ in range(3)]
     try:
         deadline = time.monotonic() + PATIENCE
         while server._room._value:
-            assert time.monotonic() < deadline, "their threads"
+            assert time.monotonic() < deadline, "the connections never took their threads"
             time.sleep(0.01)
         assert ask_raw(server, b"") == b""
         with pytest.raises((http.client.BadStatusLine, ConnectionError)):
@@ -205,7 +205,7 @@ def test_more_connections_than_there_is_room_for_are_closed(server, monkeypatch)
         for connection in waiting:
             connection.close()
     while server._room._value < 3:
-        assert time.monotonic() < deadline, "room again"
+        assert time.monotonic() < deadline, "the threads were never released"
         time.sleep(0.01)
     assert ask(server)[2] == PAGE
 
@@ -231,11 +231,11 @@ def test_more_connections_than_there_is_room_for_are_closed(server, monkeypatch)
         ("localhost:8080/", "0.0.0.0", False),
     ],
 )
-def test_names_that_a_page_from_elsewhere_could_have_are_turned_away(header, bound, is_ours):
+def test_only_names_of_this_computer_are_accepted(header, bound, is_ours):
     assert names_this_computer(header, bound) is is_ours
 
 
-def test_a_browser_that_goes_away_in_the_middle_hurts_nobody(server, capsys):
+def test_a_browser_that_disconnects_midway_does_no_harm(server, capsys):
     for _ in range(3):
         with socket.create_connection(server.server_address[:2], timeout=10) as connection:
             connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -261,13 +261,13 @@ def test_a_browser_draws_the_page_without_complaint(server, browser, random_gaus
         orange = np.abs(picture - 255.0 * np.array(ORANGE)).max(axis=2) < 3
         if 0.1 < orange.mean() < 0.95 and picture[~orange].std() > 20:
             break
-        assert time.monotonic() < deadline, "the scene before its background never came"
+        assert time.monotonic() < deadline, "the scene never appeared in front of its background"
     tab.close()
     assert complaints == []
     assert [one for one in urls if not one.startswith((server.url, "blob:", "data:"))] == []
 
 
-def test_bound_to_every_address_names_of_the_local_network_will_do():
+def test_bound_to_every_address_the_server_accepts_local_network_names():
     with PageServer(PAGE, "0.0.0.0") as open_to_all:
         thread = threading.Thread(target=open_to_all.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -292,7 +292,7 @@ def test_a_port_that_is_taken_is_named():
             PageServer(PAGE, port=port)
         with pytest.raises(ArgumentError, match=says):
             free_port("127.0.0.1", port, NAMES)
-    assert free_port("127.0.0.1", port, NAMES) == port, "closed is closed"
+    assert free_port("127.0.0.1", port, NAMES) == port, "a closed server frees its port"
 
 
 @pytest.mark.parametrize(
@@ -303,10 +303,10 @@ def test_a_port_that_is_taken_is_named():
         ("no such host", 0, "--host: 'no such host' is not an address"),
         ("a" * 300, 0, "--host: '"),
         ("", 0, "--host: '' is not an address"),
-        ("203.0.113.1", 0, "--host: cannot listen on 203.0.113.1"),  # documentation's: nobody has it
+        ("203.0.113.1", 0, "--host: cannot listen on 203.0.113.1"),  # for documentation: nobody has it
     ],
 )
-def test_an_address_that_cannot_be_had_costs_one_line(host, port, says):
+def test_an_unusable_address_is_a_one_line_error(host, port, says):
     for ask_for in (lambda: PageServer(PAGE, host, port), lambda: free_port(host, port, NAMES)):
         with pytest.raises(ArgumentError) as caught:
             ask_for()
@@ -319,7 +319,7 @@ def test_a_free_port_is_free():
         assert server.server_port == port
 
 
-def test_who_is_warned():
+def test_only_addresses_beyond_this_computer_give_a_warning():
     for host in ("127.0.0.1", "127.3.2.1", "localhost", "::1"):
         assert is_loopback(host) and exposure(host, "sees it") is None
     for host in ("0.0.0.0", "::", "192.168.0.7", "example.org"):

@@ -103,7 +103,7 @@ def predict(
     reading_again = measured.read * missing / torch.get_num_threads()
     each = speed.seconds(float(counts.mean()), facts.pixels) + reading_again
     footprint = Footprint(facts, measured.process, measured.pairs, config.sh_degree)
-    judged, saved = (last // every if every else 0 for every in (eval_every, save_every))
+    evaluations, saved = (last // every if every else 0 for every in (eval_every, save_every))
     saving = saving_seconds(float(counts.mean()), config.sh_degree)
     views = facts.train + facts.test
     return Forecast(
@@ -114,7 +114,7 @@ def predict(
         seconds={
             "reading": measured.read * views / facts.workers,
             "training": each * config.iterations,
-            "judging": judged * facts.test * measured.score * facts.pixels,
+            "judging": evaluations * facts.test * measured.score * facts.pixels,
             "saving": saved * saving,
             "ending": ending_seconds(facts, measured.score, measured.picture) + 2 * saving,
         },

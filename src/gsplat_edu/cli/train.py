@@ -206,8 +206,8 @@ def _train(
     ends: Callable[[], bool],
     callbacks: Sequence[Callback],
 ) -> None:
-    iterations, begun = capture.options.config.iterations, capture.trainer.iteration
-    task = bar.add_task("training", total=iterations, completed=begun, state="")
+    iterations, start = capture.options.config.iterations, capture.trainer.iteration
+    task = bar.add_task("training", total=iterations, completed=start, state="")
 
     def show(trainer: Trainer, event: Event) -> None:
         if not isinstance(event, StepEvent):

@@ -45,8 +45,8 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
         for key in sorted({*before, *now} - set(MAY_DIFFER.get(section, ()))):
             a, b = (_plain(values.get(key)) for values in (before, now))
             if a != b:
-                begun = f"--resume: {folder.path} was started with {key} = {a}, not {b}"
-                raise CheckpointError(f"{begun}; give the same options or another --out")
+                problem = f"--resume: {folder.path} was started with {key} = {a}, not {b}"
+                raise CheckpointError(f"{problem}; give the same options or another --out")
 
 
 def fingerprint(dataset: Dataset) -> str:

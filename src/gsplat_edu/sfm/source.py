@@ -136,8 +136,8 @@ def _holds_others(out: Path) -> bool:
     """
     work = out / "sfm"
     if not (work / "stages.json").is_file():
-        begun = is_folder(work) and any(path.name[0] != "." for path in entries(work))
-        return begun or _is_capture(out) or any((out / part).exists() for part in PARTS)
+        in_use = is_folder(work) and any(path.name[0] != "." for path in entries(work))
+        return in_use or _is_capture(out) or any((out / part).exists() for part in PARTS)
     others = {"images", "sparse"}.difference(published(work))
     return any((out / part).exists() for part in others)
 

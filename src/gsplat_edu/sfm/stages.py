@@ -70,10 +70,10 @@ class Stages:
         Returns:
             Whether it resumes an interrupted stage with the same options.
         """
-        goes_on = name in self._stages
+        resumes = name in self._stages
         self._stages[name] = {"options": options, "facts": None}
         self._write()
-        return goes_on
+        return resumes
 
     def end(self, name: str, facts: dict[str, Any]) -> None:
         """Record the completion of a stage and its facts."""

@@ -34,7 +34,7 @@ def packed(gaussians: Gaussians) -> bytes:
         gaussians: N Gaussians, all finite. SH coefficients and logits beyond the range of float16 are clamped to it.
 
     Returns:
-        The bytes, `size(N, degree)` of them.
+        `size(N, degree)` bytes.
     """
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     sh = np.empty((len(gaussians), 1 + gaussians.sh_rest.shape[1], 3), dtype="<f2")

@@ -24,7 +24,7 @@ CENTRAL_PART = 0.5
 
 
 MIDDLE_OF = 5
-"""Fewest cameras for which a middle is looked for."""
+"""The smallest number of cameras that has a middle."""
 
 FAR_FROM_MIDDLE = 1.25
 """A camera is at the edge if its distance from the middle is more than this many times the median distance. In a closed

@@ -175,16 +175,16 @@ def mapping(
     else:
         found = incremental(tell, mapped, photos, out, options)
     models = []
-    for number, begun in sorted(found.items()):
+    for number, mapped_model in sorted(found.items()):
         folder = Path(out) / str(number)
         folder.mkdir(exist_ok=True)
-        facts = _judged(begun, mapped, photos, folder, attempt, options)
+        facts = _judged(mapped_model, mapped, photos, folder, attempt, options)
         models += [] if facts is None else [facts]
     return {"models": models}
 
 
 def _judged(
-    begun: pycolmap.Reconstruction,
+    mapped_model: pycolmap.Reconstruction,
     database: str,
     photos: str,
     folder: Path,
@@ -193,8 +193,8 @@ def _judged(
 ) -> dict[str, Any] | None:
     """Keep the photos of a mapper's model whose pose counts, refine it, and write it; None if nothing remains."""
     auto, per_photo = attempt["model"] == "auto", attempt["per_photo"]
-    placed, kin, unclear = _names(begun), dict[int, Kin](), list[str]()
-    model = mended(begun, database, photos, folder, options)
+    placed, kin, unclear = _names(mapped_model), dict[int, Kin](), list[str]()
+    model = mended(mapped_model, database, photos, folder, options)
     if model.num_reg_images() < 2 or not model.num_points3D():
         return None
     if attempt["free"]:

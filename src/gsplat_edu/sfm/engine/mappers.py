@@ -51,7 +51,7 @@ def incremental(
         options.mapper.init_min_tri_angle, options.mapper.abs_pose_min_inlier_ratio = 4.0, 0.15
     placed = 0
 
-    def begun() -> None:
+    def first_pair() -> None:
         nonlocal placed
         placed = 2
         tell(placed)
@@ -67,7 +67,7 @@ def incremental(
         out,
         options,
         begin,
-        initial_image_pair_callback=begun,
+        initial_image_pair_callback=first_pair,
         next_image_callback=one_more,
     )
 
