@@ -10,6 +10,7 @@ set-up cells folded.
 from __future__ import annotations
 
 import argparse
+import ast
 import base64
 import importlib
 import inspect
@@ -180,12 +181,30 @@ def _figure(page: str, number: int) -> bytes:
 
 
 def _reference(name: str) -> str:
-    """Return the page of a module; the page of a package also lists its modules."""
+    """Return the page of a module; the page of a package also lists its modules.
+
+    These pages are not part of the sidebar: two hundred entries on every page would hide the others.
+    """
     # The package's own names are indexed where they are defined.
     again = "   :no-index:\n" if "." not in name else ""
-    page = f"# {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}```\n"
+    above = name.split(".")[:-1]
+    path = [f"[{'.'.join(above[: i + 1])}]({'.'.join(above[: i + 1])}.md)" for i in range(len(above))]
+    head = " / ".join(["[Reference](index.md)", *path])
+    page = f"---\norphan: true\n---\n\n{head}\n\n# {name}\n\n"
+    page += f"```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}```\n"
     inside = [other for other in modules() if other.rpartition(".")[0] == name and name != "gsplat_edu"]
-    return page + ("\n## Modules\n\n" + _toctree("maxdepth: 1", inside) if inside else "")
+    return page + ("\n## Modules\n\n" + _listed(inside) if inside else "")
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Return a list of modules, linked, with the first sentence of their docstrings."""
+    rows = []
+    for name in names:
+        path = ROOT / "src" / Path(*name.split("."))
+        source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        docstring = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
+        rows.append(f"- [{name}]({name}.md): {docstring.partition(chr(10))[0]}")
+    return "\n".join(rows) + "\n"
 
 
 def _public_api() -> str:
@@ -198,8 +217,8 @@ def _public_api() -> str:
         parts.append("")
     top = [name for name in modules() if name.count(".") == 1]
     packages = [name for name in top if any(other.startswith(f"{name}.") for other in modules())]
-    parts += ["## Packages\n", _toctree("maxdepth: 1", packages)]
-    parts += ["## Modules\n", _toctree("maxdepth: 1", ["gsplat_edu", *(n for n in top if n not in packages)])]
+    parts += ["## Packages\n", _listed(packages)]
+    parts += ["## Modules\n", _listed(["gsplat_edu", *(n for n in top if n not in packages)])]
     return "\n".join(parts)
 
 
