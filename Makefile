@@ -5,7 +5,8 @@ OUT ?= out/sphere.png
 # Processes that run the tests. Each test file stays in one process, so that its fixtures are made once; the longest
 # files start first (tests/slices.py), so that no process is left with a long one at the end.
 WORKERS ?= 2
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+# Bytecode is written even where the environment forbids it: the tests start Python a hundred times.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 BENCH := $(if $(SMOKE),--smoke)
 export PYTHON
 

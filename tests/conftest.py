@@ -1,5 +1,6 @@
 """Fixtures shared by many tests."""
 
+import hashlib
 import importlib.util
 import os
 import signal
@@ -45,19 +46,28 @@ def as_shipped() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def sphere_photographed_once() -> None:
-    """Keep the course's photos of the sphere: the reference renderer takes seconds, many tests need the same 25."""
+def sphere_photographed_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep the course's photos of the sphere: the reference renderer takes seconds, many tests need the same 25.
+
+    The processes that run tests share them in a folder.
+    """
     from gsplat_edu.data import synthetic
 
-    original = synthetic.render_gaussians
-    images: dict[tuple[object, ...], tuple[np.ndarray, np.ndarray]] = {}
+    original, folder = synthetic.render_gaussians, tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    (folder := folder / "sphere").mkdir(exist_ok=True)
 
     def photographed(camera: Camera, *shell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        key = (camera.intrinsics, camera.R.tobytes(), camera.eye.tobytes(), *(a.tobytes() for a in shell))
-        if key not in images:
-            images[key] = original(camera, *shell)
-        image, transmittance = images[key]
-        return image.copy(), transmittance.copy()
+        pose = repr(camera.intrinsics).encode() + camera.R.tobytes() + camera.eye.tobytes()
+        path = folder / f"{hashlib.sha256(pose + b''.join(a.tobytes() for a in shell)).hexdigest()}.npz"
+        if not path.exists():
+            image, transmittance = original(camera, *shell)
+            part = path.with_suffix(f".{os.getpid()}.npz")
+            np.savez(part, image=image, transmittance=transmittance)
+            part.replace(path)
+        with np.load(path) as kept:
+            return kept["image"], kept["transmittance"]
 
     synthetic.render_gaussians = photographed
 

@@ -15,6 +15,7 @@ SPILLED = 64
 
 
 @pytest.mark.own_process
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("capability", [80, 90])
 def test_every_kernel_compiles_with_few_spills(capability, tmp_path):
     environment = os.environ | {"TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
