@@ -47,6 +47,13 @@ def test_the_curves_of_a_run_share_their_iterations_and_cut_off_outliers():
     assert even.get_title() == "speed" and even.get_ylim()[1] > 22
 
 
+def test_a_count_that_hardly_changes_is_not_drawn_on_the_edge():
+    log = [{"iteration": i, "num_gaussians": 100_000 + i} for i in range(0, 900, 100)]
+    ((count,),) = [figure.axes for figure in run_curve_figures(log)]
+    bottom, top = count.get_ylim()
+    assert bottom == 0 and top > 1.03 * 100_800
+
+
 @pytest.mark.parametrize(("low", "high"), [(0.1, 0.29), (0.002, 0.4), (0.05, 0.06)])
 def test_the_loss_has_plain_numbers_on_its_axis(low, high):
     """A short run's loss used to be labelled 2.75 x 10^-1, 2.5 x 10^-1 and so on."""

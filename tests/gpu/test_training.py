@@ -13,7 +13,6 @@ from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.initialize import make_strategy, random_ball
 from gsplat_edu.train.trainer import Trainer
 
-
 ITERATIONS = 12
 
 

@@ -108,7 +108,7 @@ def run_curve_figures(log: Sequence[Mapping[str, Any]]) -> list[Figure]:
         if key in ("loss", "terms") and values.min() > 0:
             _decades(axes, values)
         if key in ("num_gaussians", "ms"):
-            axes.set_ylim(0, None)
+            axes.set_ylim(0, 1.05 * max(values.max(), 1.0))  # a count that hardly changes stays off the edge
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         if key == "ms":
             _cut_peaks(axes, title, values)
