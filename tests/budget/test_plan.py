@@ -297,7 +297,7 @@ def test_a_resumed_run_keeps_the_numbers_of_its_config(capture, tmp_path):
 def test_a_damaged_config_is_one_line(capture, tmp_path, stored, named):
     resumed = dataclasses.replace(options(capture, tmp_path / "run"), resume=True)
     resumed.folder.write_config(stored)
-    with pytest.raises(CheckpointError, match="(mend|fix) ") as refused:
+    with pytest.raises(CheckpointError, match="(restore|correct|fix or remove) the file") as refused:
         plan(resumed, Limits(memory=2**30))
     assert named in str(refused.value) and "\n" not in str(refused.value)
 

@@ -103,6 +103,19 @@ def test_box_stop_skips_hidden_splats():
     assert stopped.max() == 0 and 0 < drawn.max() < 1e-6
 
 
+def test_box_stop_draws_a_splat_that_shows_beside_the_walls():
+    """The walls hide columns 2 to 6 of a splat whose box spans columns 0 to 17: it is drawn, its hidden part too."""
+    cam = Camera(np.eye(3), (0, 0, 0), fx=100, fy=100, cx=15.5, cy=15.5, H=32, W=32)
+    means = [[z * (column - 15.5) / 100, 0, z] for column, z in ((4, 1), (4, 2), (4, 3), (8, 4))]
+    cov3ds = [np.diag([(0.03 * z) ** 2, 1e4, 1e-6]) for z in (1, 2, 3)] + [np.diag([0.12**2, 0.12**2, 1e-6])]
+    splats = means, cov3ds, [[0, 0, 0]] * 3 + [[1, 1, 1]], [1.0] * 4
+    stopped, T = render_gaussians(cam, *splats, stop="box")
+    drawn, _ = render_gaussians(cam, *splats, stop="none")
+    assert T[16, 4] < 1e-4 and T[16, 14] > 0.1, "hidden, and beside the walls"
+    assert 0 < drawn[16, 4].max() < 1e-4
+    np.testing.assert_array_equal(stopped, drawn)
+
+
 def test_alpha_is_clamped_and_floored():
     cam = Camera(np.eye(3), (0, 0, 0), 10, 10, 4, 4, 9, 9)
     _, T = render_gaussians(cam, [[0, 0, 1]], [np.eye(3)], [[1, 1, 1]], [1.0])
