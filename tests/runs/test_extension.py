@@ -281,7 +281,6 @@ def test_mismatched_antialiasing_is_reported(capture, finished, tmp_path):
     [
         (["--max-gaussians", "10"], "more than --max-gaussians 10"),
         (["--points", "x.ply"], "not allowed with argument"),
-        (["--max-memory", "4GiB"], "cannot be planned"),
         (["--start-opacity", "0.2"], "--start-opacity: only a start from points uses it"),
     ],
 )
