@@ -100,7 +100,7 @@ def test_time_holds_for_any_limit_and_more_time_is_never_worse():
     plans = [chosen(None, seconds) for seconds in limits]
     for seconds, found in zip(limits, plans, strict=True):
         assert found.forecast.total + SPENT <= seconds
-        assert found.by_time and found.options.time_limit is None
+        assert found.by_time
     assert [found.iterations for found in plans] == sorted(found.iterations for found in plans)
     assert plans[-1].iterations == 30_000, "the recipe's maximum"
     sizes = [found.resolution or 1.0 for found in plans]
@@ -204,7 +204,7 @@ def test_large_photos_leave_a_useful_cap_and_are_kept_if_that_is_cheaper():
 
 def test_nothing_is_planned_without_a_need(tmp_path):
     """The capture does not exist, so reading it would fail. It is not read."""
-    options = dataclasses.replace(OPTIONS, data=tmp_path / "nothing", time_limit=3.0)
+    options = dataclasses.replace(OPTIONS, data=tmp_path / "nothing")
     assert plan(options, Limits()).options is options
     assert plan(options, Limits(time=Deadline(3.0)), ["iterations"]).options is options
     with pytest.raises(ArgumentError, match="--backend torch"):

@@ -258,8 +258,6 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
         image_memory=choice.image_memory,
     )
     options = dataclasses.replace(request.options, config=config, data_settings=settings)
-    if request.by_time:
-        options = dataclasses.replace(options, time_limit=None)
     facts = request.facts.smaller(choice.factor)
     found = Plan(options, request.by_time, _predicted(request, measured, choice, config))
     at_cap = Footprint(facts, process, pairs, config.sh_degree).peak(

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.train.config import TrainConfig
@@ -30,7 +29,6 @@ class RunOptions:
         backend: Name of the rendering backend.
         eval_every: Iterations between evaluations on the test views; 0 evaluates only at the end.
         save_every: Iterations between checkpoints; 0 writes one only at the end or when the run is stopped.
-        time_limit: Seconds of training after which the run ends; None for no limit.
         resume: Continue from the last checkpoint of the folder.
 
     Raises:
@@ -46,15 +44,12 @@ class RunOptions:
     backend: str = "cpu"
     eval_every: int = 1_000
     save_every: int = 500
-    time_limit: float | None = None
     resume: bool = False
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         for name in ("eval_every", "save_every"):
             whole_number(name, getattr(self, name), 0)
-        if self.time_limit is not None and self.time_limit <= 0:
-            raise ArgumentError("time_limit: has to be above 0 seconds")
 
     @property
     def folder(self) -> RunFolder:

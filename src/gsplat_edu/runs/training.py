@@ -250,7 +250,7 @@ class CaptureRun:
         Returns:
             Whether `stop` ended the training.
         """
-        limit, asked, whole = self.options.time_limit, False, self.trainer.iteration
+        asked, whole = False, self.trainer.iteration
         self._began = time.perf_counter() - self.seconds
 
         def ends() -> bool:
@@ -259,11 +259,10 @@ class CaptureRun:
             if not asked:
                 self._judge_and_save_where_due(stop)
                 asked = stop()
-            return asked or (limit is not None and self._elapsed() >= limit)
+            return asked
 
         try:
-            if limit is None or self.seconds < limit:
-                self.trainer.run(ends, callbacks)
+            self.trainer.run(ends, callbacks)
         except DatasetError as error:
             if whole != self.trainer.iteration:
                 raise  # in the middle of an iteration: resume from the last checkpoint

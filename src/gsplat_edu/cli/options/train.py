@@ -260,7 +260,6 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         backend=backend,
         eval_every=arguments.eval_every,
         save_every=arguments.save_every,
-        time_limit=arguments.time_limit,
         resume=arguments.resume,
     )
 
