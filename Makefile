@@ -2,9 +2,10 @@
 # PYTHON=python3.12 in front or behind chooses the interpreter; the default is python3.
 BIN := .venv/bin
 OUT ?= out/sphere.png
-# Processes that run the tests. Each test file stays in one process, so that its fixtures are made once; the longest
-# files start first (tests/slices.py), so that no process is left with a long one at the end.
-WORKERS ?= 2
+# Processes that run the tests: one more than there are cores, because some tests wait for a browser, and at most 4, which
+# take up to 1 GiB each. Each test file stays in one process, so that its fixtures are made once; the longest files start
+# first (tests/slices.py), so that no process is left with a long one at the end.
+WORKERS ?= $(shell n=$$(nproc 2> /dev/null || echo 1); [ $$n -lt 3 ] && echo $$((n + 1)) || echo 4)
 # Bytecode is written even where the environment forbids it: the tests start Python a hundred times.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 BENCH := $(if $(SMOKE),--smoke)
