@@ -21,7 +21,7 @@ struct TileGradient {
 
 // Writes one splat's sums over the tile to `slot`.
 template <class T, bool WITH_DEPTH>
-GSPLAT_INLINE void undraw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileGradient<T> &tile, T *slot) {
+GSPLAT_INLINE void splat_backward(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileGradient<T> &tile, T *slot) {
     using V = typename Vector<T>::V;
     constexpr int LANES = Vector<T>::LANES;
     RowTerms<T> terms;
@@ -89,7 +89,7 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
 }
 
 template <class T, bool WITH_DEPTH>
-void undo_tile(const CompositeBackwardArgs<T> &args, int32_t index) {
+void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     const CompositeArgs<T> &forward = args.forward;
     const TileBox box = tile_box(forward.grid, forward.camera, index);
     TileGradient<T> tile;
@@ -108,13 +108,13 @@ void undo_tile(const CompositeBackwardArgs<T> &args, int32_t index) {
         if (k >= stop || rows.first[i] > rows.last[i])
             for (int j = 0; j < SLOT; ++j) slot[j] = 0;
         else
-            undraw<T, WITH_DEPTH>(forward.splats[forward.pairs[k].gaussian], box, rows.first[i], rows.last[i], tile, slot);
+            splat_backward<T, WITH_DEPTH>(forward.splats[forward.pairs[k].gaussian], box, rows.first[i], rows.last[i], tile, slot);
     }
 }
 
 template <class T>
 void composite_backward(const CompositeBackwardArgs<T> &args, int32_t tile) {
-    args.grad_depth ? undo_tile<T, true>(args, tile) : undo_tile<T, false>(args, tile);
+    args.grad_depth ? tile_backward<T, true>(args, tile) : tile_backward<T, false>(args, tile);
 }
 
 template void composite_backward<float>(const CompositeBackwardArgs<float> &, int32_t);

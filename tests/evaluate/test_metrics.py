@@ -162,7 +162,7 @@ def test_views_are_scored_over_the_background_in_their_order():
     ]
     seen = []
     scores = score_views(
-        no_gaussians(), views, grey_renderer, (1.0, 0.5, 0.5), lambda *told: seen.append(told[0].name)
+        no_gaussians(), views, grey_renderer, (1.0, 0.5, 0.5), lambda *scored: seen.append(scored[0].name)
     )
     assert [score.name for score in scores] == seen == ["black", "clear", "grey"]
     assert scores[0].psnr == pytest.approx(10 * math.log10(4), abs=1e-9)

@@ -41,9 +41,9 @@ def phone(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def done(colmap, phone, tmp_path_factory):
-    """The capture made from the phone's photos, with the messages (said) and progress (told) of the run."""
+    """The capture made from the phone's photos, with the messages (said) and the progress of the run."""
     out = tmp_path_factory.mktemp("done") / "capture"
-    said, told = [], []
+    said, progress = [], []
     options = SfmOptions(phone.folder, out, max_features=LIMIT)
-    assert reconstruct(options, said.append, lambda *progress: told.append(progress)) == out
-    return SimpleNamespace(out=out, said=said, told=told, options=options, truth=phone.truth)
+    assert reconstruct(options, said.append, lambda *step: progress.append(step)) == out
+    return SimpleNamespace(out=out, said=said, progress=progress, options=options, truth=phone.truth)

@@ -102,9 +102,9 @@ keep(9, seen(9)[0][:8])
 moved(9, [0.0, 0.0, 60.0], [0.0, 0.5, 0.0])
 moved(5, [1.0, 0.0, 0.0], [0.1, 0.0, 0.0])
 print(sorted(judge.agreement(model, database).contradictory | set(judge.unsupported(model))))
-mended = mappers.mended(model, database, photos, Path({str(tmp_path)!r}), mappers.Options(False, 1, 0))
-print(judge.unsupported(mended), judge.agreement(mended, database).contradictory, mended.num_reg_images())
-print(max(abs(mended.image(i).projection_center() - truth[i]).max() for i in truth))
+repaired = mappers.repaired(model, database, photos, Path({str(tmp_path)!r}), mappers.Options(False, 1, 0))
+print(judge.unsupported(repaired), judge.agreement(repaired, database).contradictory, repaired.num_reg_images())
+print(max(abs(repaired.image(i).projection_center() - truth[i]).max() for i in truth))
 """
     broken, after, off = printed(work + script)
     assert set(json.loads(broken)) >= {5, 9}

@@ -66,9 +66,11 @@ def test_copies_are_small_rgb_jpegs_with_plain_names(tmp_path):
         photo(source / "gray16.png", pixels=(PIXELS[..., 0].astype(np.uint16) * 257)),
         photo(source / "photo.webp", lossless=True),
     ]
-    told = []
-    found, unreadable = copy_photos(files, source, tmp_path / "copies", 20, lambda *count: told.append(count))
-    assert unreadable == [] and told == [(1, 3), (2, 3), (3, 3)]
+    progress = []
+    found, unreadable = copy_photos(
+        files, source, tmp_path / "copies", 20, lambda *count: progress.append(count)
+    )
+    assert unreadable == [] and progress == [(1, 3), (2, 3), (3, 3)]
     assert [f.name for f in found] == ["ä b.png", "gray16.png", "photo.webp"]
     assert [f.copy for f in found] == ["000000.jpg", "000001.jpg", "000002.jpg"]
     for fact in found:

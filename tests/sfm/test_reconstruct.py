@@ -88,9 +88,9 @@ def test_points_lie_on_the_box_and_the_floor(done):
 
 
 def test_progress_counts_photos_and_pairs(done):
-    stages = list(dict.fromkeys(stage for stage, _, _ in done.told))
+    stages = list(dict.fromkeys(stage for stage, _, _ in done.progress))
     assert stages == ["photos", "features", "matches", "mapping", "undistorting"]
-    last = {stage: (count, total) for stage, count, total in done.told}
+    last = {stage: (count, total) for stage, count, total in done.progress}
     pairs = 14 * 13 // 2
     assert last == {stage: (pairs, pairs) if stage == "matches" else (14, 14) for stage in stages}
     assert [sentence.split(":")[0] for sentence in done.said] == list(STAGES)
@@ -335,11 +335,11 @@ def test_focal_lengths_from_exif_separate_two_cameras(tmp_path):
 def test_the_last_attempt_registers_most_photos(done, tmp_path):
     """The last attempt uses a camera per photo and lower thresholds."""
     way = attempts("auto", "auto", 14, 1, one_lens=False)[-1]
-    work, told = done.out / "sfm", []
+    work, progress = done.out / "sfm", []
     models = call(
         "mapping",
         tmp_path / "log.txt",
-        told.append,
+        progress.append,
         database=str(work / "database.db"),
         photos=str(work / "photos"),
         out=str(tmp_path),
@@ -349,6 +349,6 @@ def test_the_last_attempt_registers_most_photos(done, tmp_path):
         seed=0,
     )["models"]
     best = max(models, key=lambda model: len(model["names"]))
-    assert len(best["names"]) >= 12 and max(told) >= 12
+    assert len(best["names"]) >= 12 and max(progress) >= 12
     lenses = read_cameras(tmp_path / best["folder"] / "cameras.bin")
     assert len({lens.fx for lens in lenses.values()}) >= 12

@@ -57,10 +57,10 @@ def walk(tmp_path_factory):
 
 
 def test_sharp_frames_are_chosen_at_equal_steps_of_motion(walk):
-    told = []
-    chosen = choose_frames(walk.path, 24, lambda *progress: told.append(progress))
+    steps = []
+    chosen = choose_frames(walk.path, 24, lambda *step: steps.append(step))
     assert set(chosen) & set(BLURRED) == set()
-    assert told[-1] == ("choosing frames", 120, 120)
+    assert steps[-1] == ("choosing frames", 120, 120)
     assert len(chosen) == 24
     assert sum(number < 20 for number in chosen) == 1, "one of the frames in which the camera stands still"
     fast, slow = (sum(low <= n < high for n in chosen) for low, high in ((20, 70), (70, 120)))

@@ -171,7 +171,7 @@ class _Run:
         if facts is not None:
             self._say(f"{name}: {facts['summary']} (done before)")
             return facts
-        if not self.stages.begun(name, wanted):
+        if not self.stages.begin(name, wanted):
             for path in rubbish:
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
             tidy()

@@ -64,7 +64,7 @@ class Stages:
         self.forget(name)
         return None
 
-    def begun(self, name: str, options: dict[str, Any]) -> bool:
+    def begin(self, name: str, options: dict[str, Any]) -> bool:
         """Record the start of a stage.
 
         Returns:

@@ -174,8 +174,8 @@ class _MeanOpacity(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
-        (pull,) = ctx.saved_tensors
-        return pull * grad, None
+        (gradient,) = ctx.saved_tensors
+        return gradient * grad, None
 
 
 class _MeanScale(torch.autograd.Function):
@@ -184,12 +184,12 @@ class _MeanScale(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, log_scales: Tensor, weight: float) -> Tensor:  # noqa: ANN401
         with one_thread():
-            pull = weight * torch.exp(log_scales) / max(log_scales.numel(), 1)
-            ctx.save_for_backward(pull)
-            return pull.sum()
+            gradient = weight * torch.exp(log_scales) / max(log_scales.numel(), 1)
+            ctx.save_for_backward(gradient)
+            return gradient.sum()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
-        (pull,) = ctx.saved_tensors
-        return pull * grad, None
+        (gradient,) = ctx.saved_tensors
+        return gradient * grad, None

@@ -20,7 +20,7 @@ from .database import add_camera, add_photo, opened, with_cameras
 from .judge import agreement, scattered, steady_points
 from .kin import placed_anew
 from .lenses import Kin, refined, simplified
-from .mappers import Options, Tell, all_at_once, incremental, mended, without_doubtful
+from .mappers import Options, Tell, all_at_once, incremental, repaired, without_doubtful
 
 BLOCK = 64
 """Pairs matched between two writes to the database: the most that is lost if the program is interrupted."""
@@ -194,7 +194,7 @@ def _judged(
     """Keep the photos of a mapper's model whose pose counts, refine it, and write it; None if nothing remains."""
     auto, per_photo = attempt["model"] == "auto", attempt["per_photo"]
     placed, kin, unclear = _names(mapped_model), dict[int, Kin](), list[str]()
-    model = mended(mapped_model, database, photos, folder, options)
+    model = repaired(mapped_model, database, photos, folder, options)
     if model.num_reg_images() < 2 or not model.num_points3D():
         return None
     if attempt["free"]:

@@ -84,7 +84,7 @@ def all_at_once(database: str, photos: str, out: str, common: Options) -> dict[i
     return pycolmap.global_mapping(database, photos, out, options)
 
 
-def mended(
+def repaired(
     model: pycolmap.Reconstruction, database: str, photos: str, folder: Path, options: Options
 ) -> pycolmap.Reconstruction:
     """Remove photos with unreliable poses, and let the mapper register them again in the remaining model.

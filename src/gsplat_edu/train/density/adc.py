@@ -81,7 +81,7 @@ class AdaptiveDensityControl:
         self, iteration: int, gaussians: Gaussians, optimizer: Adam
     ) -> tuple[Gaussians, DensifyEvent]:
         config = self.config
-        pull = self.norm_sums / self.times_visible.clamp(min=1)
+        mean_norms = self.norm_sums / self.times_visible.clamp(min=1)
         size = gaussians.scales.amax(dim=-1)
         keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
         if config.adc.reset_every and iteration > config.adc.reset_every:
@@ -89,11 +89,11 @@ class AdaptiveDensityControl:
                 keep &= size <= config.adc.prune_scale * self.extent
             if config.adc.prune_screen_size:
                 keep &= self.largest_radii <= config.adc.prune_screen_size
-        hot = keep & (pull > config.adc.grad_threshold)
+        selected = keep & (mean_norms > config.adc.grad_threshold)
         if config.adc.over_cap == "strongest":
-            hot = self._within_cap(pull, hot, int(keep.sum()))
+            selected = self._within_cap(mean_norms, selected, int(keep.sum()))
         large = size > config.adc.percent_dense * self.extent
-        clone, split = hot & ~large, hot & large
+        clone, split = selected & ~large, selected & large
 
         clones = gaussians.map(lambda tensor: tensor[clone])
         parents = gaussians.map(lambda tensor: tensor[split])
@@ -103,16 +103,20 @@ class AdaptiveDensityControl:
         counts = len(clones), 2 * len(parents), int((~keep).sum())
         return replaced, DensifyEvent(iteration, *counts, num_gaussians=len(replaced))
 
-    def _within_cap(self, pull: Tensor, hot: Bool[Tensor, " N"], num_kept: int) -> Bool[Tensor, " N"]:
+    def _within_cap(
+        self, mean_norms: Tensor, selected: Bool[Tensor, " N"], num_kept: int
+    ) -> Bool[Tensor, " N"]:
         """Keep as many as the cap allows, those with the largest gradients; a clone or a split adds one Gaussian."""
         room = (
-            len(pull) if self.config.max_gaussians is None else max(self.config.max_gaussians - num_kept, 0)
+            len(mean_norms)
+            if self.config.max_gaussians is None
+            else max(self.config.max_gaussians - num_kept, 0)
         )
-        candidates = torch.nonzero(hot)[:, 0]
+        candidates = torch.nonzero(selected)[:, 0]
         if len(candidates) <= room:
-            return hot
-        order = torch.argsort(pull[candidates], descending=True, stable=True)
-        chosen = torch.zeros_like(hot)
+            return selected
+        order = torch.argsort(mean_norms[candidates], descending=True, stable=True)
+        chosen = torch.zeros_like(selected)
         chosen[candidates[order[:room]]] = True
         return chosen
 
