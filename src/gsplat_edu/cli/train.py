@@ -179,9 +179,7 @@ def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None])
     say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
     if (planned := trainer.config.iterations) > trainer.iteration:
         folder = capture.folder.path
-        say(
-            f"the time limit ended training before {planned}; use --resume with a longer limit to continue: {folder}"
-        )
+        say(f"the time limit ended training before iteration {planned}; --resume continues it: {folder}")
 
 
 def _live(arguments: argparse.Namespace) -> ModuleType | None:

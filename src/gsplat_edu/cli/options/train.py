@@ -107,7 +107,8 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
         "--time-limit",
         type=seconds_text,
         metavar="TIME",
-        help="stop after this time, for example 90s, 20m or 2h; without --iterations, run as many as fit",
+        help="end this long after the start of the command, for example 90s, 20m or 2h;"
+        " without --iterations, run as many as fit",
     )
     group.add_argument(
         "--max-memory",
