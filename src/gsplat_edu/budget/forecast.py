@@ -17,8 +17,8 @@ SAVING = 4e8
 """Write speed of checkpoints, bytes per second."""
 
 ENDING = 6.0
-"""Seconds to write the scene file, the report and the last checkpoint's bookkeeping on a slow machine; 2.5 on a fast one.
-With 2.5, a slow and busy machine exceeded a limit of two minutes by 3 s."""
+"""Seconds to write the scene file, the report and the last checkpoint's bookkeeping on a slow machine; a fast one takes
+2.5, with which a slow and busy machine exceeded a limit of two minutes by 3 s."""
 
 SURE = 1.6
 """The time of a whole training is known within this factor on a quiet machine: the number of Gaussians that a scene
