@@ -1,7 +1,7 @@
 """The type checker behind the shape-checking hook: beartype, which accepts an int where a float is annotated.
 
-A function is checked for its first calls in each test, then no longer: a training calls some functions a hundred
-thousand times, and checking all of those calls doubles the time of the suite. conftest.py takes the hook from here.
+Only the first calls of a function in each test are checked: a training calls some functions a hundred thousand times,
+and checking all of those calls doubles the time of the suite. conftest.py takes the hook from here.
 """
 
 import functools
@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from beartype import BeartypeConf, beartype
 
-CALLS = 200
-"""Checked calls of a function in each test."""
+CHECKS = 200
+"""Checks of a function in each test. Arguments and result are checked apart, so these are its first 100 calls."""
 
 _beartyped = beartype(conf=BeartypeConf(is_pep484_tower=True))
 _counts: dict[tuple[str, str], int] = {}
@@ -29,7 +29,7 @@ def checked(stub: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(stub)
     def counting(*arguments: Any, **keywords: Any) -> Any:
         _counts[name] = count = _counts.get(name, 0) + 1
-        if count == CALLS and (function := _find(*name)) is not None:
+        if count == CHECKS and (function := _find(*name)) is not None:
             function.__no_type_check__ = True  # jaxtyping then calls the function directly
             _unchecked.append(function)
         return check(*arguments, **keywords)
