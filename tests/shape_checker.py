@@ -22,12 +22,17 @@ _unchecked: list[Callable[..., Any]] = []
 
 
 def checked(stub: Callable[..., Any]) -> Callable[..., Any]:
-    """Check a function's arguments or its result; jaxtyping calls this for each, with a stub of the same signature."""
-    check = _beartyped(stub)
+    """Check a function's arguments or its result; jaxtyping calls this for each, with a stub of the same signature.
+
+    beartype writes the check at the first call, because most processes call only some of the functions they import.
+    """
+    check: Callable[..., Any] | None = None
     name = (stub.__module__, stub.__qualname__)
 
     @functools.wraps(stub)
     def counting(*arguments: Any, **keywords: Any) -> Any:
+        nonlocal check
+        check = check or _beartyped(stub)
         _counts[name] = count = _counts.get(name, 0) + 1
         if count == CHECKS and (function := _find(*name)) is not None:
             function.__no_type_check__ = True  # jaxtyping then calls the function directly
