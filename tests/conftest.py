@@ -46,30 +46,31 @@ def as_shipped() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def sphere_photographed_once(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Keep the course's photos of the sphere: the reference renderer takes seconds, many tests need the same 25.
+def photographed_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep the photos of the course's sphere and of the procedural scene: the reference renderer takes seconds, and
+    dozens of tests need the same ones.
 
     The processes that run tests share them in a folder.
     """
-    from gsplat_edu.data import synthetic
+    from gsplat_edu.data import procedural, synthetic
 
     original, folder = synthetic.render_gaussians, tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
-    (folder := folder / "sphere").mkdir(exist_ok=True)
+    (folder := folder / "photos").mkdir(exist_ok=True)
 
-    def photographed(camera: Camera, *shell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def photographed(camera: Camera, *splats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         pose = repr(camera.intrinsics).encode() + camera.R.tobytes() + camera.eye.tobytes()
-        path = folder / f"{hashlib.sha256(pose + b''.join(a.tobytes() for a in shell)).hexdigest()}.npz"
+        path = folder / f"{hashlib.sha256(pose + b''.join(a.tobytes() for a in splats)).hexdigest()}.npz"
         if not path.exists():
-            image, transmittance = original(camera, *shell)
+            image, transmittance = original(camera, *splats)
             part = path.with_suffix(f".{os.getpid()}.npz")
             np.savez(part, image=image, transmittance=transmittance)
             part.replace(path)
         with np.load(path) as kept:
             return kept["image"], kept["transmittance"]
 
-    synthetic.render_gaussians = photographed
+    synthetic.render_gaussians = procedural.render_gaussians = photographed
 
 
 @pytest.fixture

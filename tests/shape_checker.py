@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from beartype import BeartypeConf, beartype
 
-CHECKS = 200
-"""Checks of a function in each test. Arguments and result are checked apart, so these are its first 100 calls."""
+CHECKS = 40
+"""Checks of a function in each test. Arguments and result are checked apart, so these are its first 20 calls."""
 
 _beartyped = beartype(conf=BeartypeConf(is_pep484_tower=True))
 _counts: dict[tuple[str, str], int] = {}

@@ -1,4 +1,6 @@
-"""Compile every kernel for a GPU that may be absent: python compile_kernels.py CAPABILITY
+"""Compile every kernel for a GPU that may be absent: python compile_kernels.py CAPABILITY least|most
+
+Kernels that have variants are compiled without their options (least) or with all of them (most).
 
 Prints the name of each kernel and the bytes per thread that it spills from registers, as the assembler reports.
 test_compile.py runs this in a new process, because importing a kernel fixes the choice of the interpreter.
@@ -25,7 +27,7 @@ KINDS = {
 }
 FLOATS = "*fp32"
 SIZE = ("i32", "i32")
-CAPABILITY = int(sys.argv[1])
+CAPABILITY, MOST = int(sys.argv[1]), sys.argv[2] == "most"
 
 
 def spilled(ptx: str) -> int:
@@ -58,15 +60,13 @@ def stage(kernel, warps=4, **constants) -> None:
 
 def main() -> None:
     warnings.simplefilter("ignore")
-    for degree, rest in ((0, 0), (3, 15)):
-        shape = {"DEGREE": degree, "REST": rest, "ANTIALIASED": degree == 3}
-        stage(project.project_kernel, **shape, BLOCK=128)
-        stage(project.project_backward_kernel, 2, **shape, BLOCK=64)
+    shape = {"DEGREE": 3 * MOST, "REST": 15 * MOST, "ANTIALIASED": MOST}
+    stage(project.project_kernel, **shape, BLOCK=128)
+    stage(project.project_backward_kernel, 2, **shape, BLOCK=64)
     stage(intersect.count_kernel, BLOCK=128)
     stage(intersect.emit_kernel, BLOCK=128)
-    for both in (False, True):
-        stage(composite.composite_kernel, WITH_DEPTH=both, BATCH=16, PRECISION="ieee")
-        stage(composite.composite_backward_kernel, 8, WITH_DEPTH=both, WITH_T=both, BATCH=16)
+    stage(composite.composite_kernel, WITH_DEPTH=MOST, BATCH=16, PRECISION="ieee")
+    stage(composite.composite_backward_kernel, 8, WITH_DEPTH=MOST, WITH_T=MOST, BATCH=16)
     image = {"image": FLOATS, "target": "*u8", "planes": FLOATS}
     sums = {"sums": FLOATS, "size": SIZE}
     build(loss._moments_across, image | {"size": SIZE, "scale": "fp32"}, warps=16)

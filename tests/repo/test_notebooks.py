@@ -1,6 +1,7 @@
 """The chapters redefine nothing that the package has, and the shipped notebooks were executed from their sources."""
 
 import ast
+import functools
 import importlib.util
 import os
 import re
@@ -34,6 +35,7 @@ def top_level_names(text: str) -> set[str]:
     return names
 
 
+@functools.cache
 def public_names() -> set[str]:
     modules = (ROOT / "src" / "gsplat_edu").rglob("*.py")
     names = {name for module in modules for name in top_level_names(module.read_text())}

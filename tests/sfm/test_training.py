@@ -18,7 +18,7 @@ from sfm.textured_box import cameras_of, check
 TRAINING = ["--no-rescale", "--strategy", "none", "--eval-every", "0", "--save-every", "0"]
 
 
-def trained(source, run, iterations=300):
+def trained(source, run, iterations=200):
     """Train from the command line; return the mean PSNR of the test views and of the training views."""
     assert main(["train", str(source), "--out", str(run), "--iterations", str(iterations), *TRAINING]) == 0
     metrics = json.loads((run / "metrics.json").read_text())

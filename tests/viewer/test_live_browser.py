@@ -203,7 +203,7 @@ def test_a_user_watches_pauses_steps_and_ends_a_training(capture, tmp_path, brow
 
 @pytest.mark.own_process
 def test_after_the_training_the_view_stays_until_ctrl_c_and_exits_with_0(capture, tmp_path):
-    words = ["--iterations", "3000", "--view-host", "0.0.0.0", *GROWING, *STRATEGIES["adc"]]
+    words = ["--iterations", "600", "--view-host", "0.0.0.0", *GROWING, *STRATEGIES["adc"]]
     with commanded(capture, tmp_path / "run", *words) as (process, url):
         # Read here: `communicate` does not return what the pipe's reader has buffered behind the URL.
         warning = process.stdout.readline()
@@ -212,7 +212,7 @@ def test_after_the_training_the_view_stays_until_ctrl_c_and_exits_with_0(capture
         )
         with Client(SimpleNamespace(url=url)) as client:
             client.move()
-            client.says(r"\*\*finished\*\*\s+iteration 3,000 of 3,000")
+            client.says(r"\*\*finished\*\*\s+iteration 600 of 600")
             assert (tmp_path / "run" / "metrics.json").exists() and process.poll() is None
             process.send_signal(signal.SIGINT)
             printed, complaints = process.communicate(timeout=PATIENCE)
