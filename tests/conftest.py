@@ -1,6 +1,5 @@
 """Fixtures shared by many tests."""
 
-import hashlib
 import importlib.util
 import os
 import signal
@@ -23,6 +22,7 @@ if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: to
     sys.modules["gsplat_edu._native"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(sys.modules["gsplat_edu._native"])
 
+import photos
 import slices
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
 from shape_checker import pytest_runtest_setup  # noqa: F401
@@ -47,30 +47,12 @@ def as_shipped() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def photographed_once(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Keep the photos of the course's sphere and of the procedural scene: the reference renderer takes seconds, and
-    dozens of tests need the same ones.
-
-    The processes that run tests share them in a folder.
-    """
-    from gsplat_edu.data import procedural, synthetic
-
-    original, folder = synthetic.render_gaussians, tmp_path_factory.getbasetemp()
+    """Share the photos that many tests need."""
+    folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
-    (folder := folder / "photos").mkdir(exist_ok=True)
-
-    def photographed(camera: Camera, *splats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pose = repr(camera.intrinsics).encode() + camera.R.tobytes() + camera.eye.tobytes()
-        path = folder / f"{hashlib.sha256(pose + b''.join(a.tobytes() for a in splats)).hexdigest()}.npz"
-        if not path.exists():
-            image, transmittance = original(camera, *splats)
-            part = path.with_suffix(f".{os.getpid()}.npz")
-            np.savez(part, image=image, transmittance=transmittance)
-            part.replace(path)
-        with np.load(path) as kept:
-            return kept["image"], kept["transmittance"]
-
-    synthetic.render_gaussians = procedural.render_gaussians = photographed
+    os.environ[photos.VARIABLE] = str(folder / "photos")
+    photos.keep()
 
 
 @pytest.fixture

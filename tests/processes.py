@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["processes", "gsplat_edu.cli.main", "gsplat_edu.cli.train"])
+CONTEXT.set_forkserver_preload(["processes", "photos", "gsplat_edu.cli.main", "gsplat_edu.cli.train"])
 
 
 def _run(code: str, words: Sequence[str], threads: int, out: Path, err: Path) -> None:
@@ -26,7 +26,10 @@ def _run(code: str, words: Sequence[str], threads: int, out: Path, err: Path) ->
     sys.argv = ["-c", *words]
     import torch
 
+    import photos
+
     torch.set_num_threads(threads)
+    photos.keep()
     exec(compile(code, "program", "exec"), {"__name__": "__main__"})
 
 

@@ -1,6 +1,6 @@
 """Build the site: chapters, documents and the reference of every module, as pages that open from disk.
 
-    python tools/build_site.py [--out out/site]
+    python tools/build_site.py [--out out/site] [--members gsplat_edu.camera ...]
 
 Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
 reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
@@ -20,7 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -131,11 +131,12 @@ def relinked(text: str, page: Path, stage: Path) -> str:
     return LINK.sub(replaced, text)
 
 
-def gather(stage: Path) -> None:
+def gather(stage: Path, members: Collection[str]) -> None:
     """Write all pages to a folder.
 
     Args:
         stage: An empty folder.
+        members: Modules whose functions and classes are documented, not only the modules themselves.
     """
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
     documents = [Path(name) for name in (*USE, *BUILD_ON) if not name.endswith("/index.md")]
@@ -150,7 +151,7 @@ def gather(stage: Path) -> None:
         fold_set_up(notebook)
         _write(stage / page, json.dumps(notebook))
     for name in modules():
-        _write(stage / "reference" / f"{name}.md", _reference(name))
+        _write(stage / "reference" / f"{name}.md", _reference(name, name in members))
     _write(stage / "reference" / "index.md", _public_api())
     _write(stage / "docs" / "decisions" / "index.md", _records(records))
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
@@ -180,7 +181,7 @@ def _figure(page: str, number: int) -> bytes:
     return base64.b64decode("".join(figures[number]))
 
 
-def _reference(name: str) -> str:
+def _reference(name: str, members: bool) -> str:
     """Return the page of a module; the page of a package also lists its modules.
 
     These pages are not part of the sidebar: two hundred entries on every page would hide the others.
@@ -191,7 +192,8 @@ def _reference(name: str) -> str:
     path = [f"[{'.'.join(above[: i + 1])}]({'.'.join(above[: i + 1])}.md)" for i in range(len(above))]
     head = " / ".join(["[Reference](index.md)", *path])
     page = f"---\norphan: true\n---\n\n{head}\n\n# {name}\n\n"
-    page += f"```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}```\n"
+    options = ("   :members:\n" if members else "") + again
+    page += f"```{{eval-rst}}\n.. automodule:: {name}\n{options}```\n"
     inside = [other for other in modules() if other.rpartition(".")[0] == name and name != "gsplat_edu"]
     return page + ("\n## Modules\n\n" + _listed(inside) if inside else "")
 
@@ -220,6 +222,14 @@ def _public_api() -> str:
     parts += ["## Packages\n", _listed(packages)]
     parts += ["## Modules\n", _listed(["gsplat_edu", *(n for n in top if n not in packages)])]
     return "\n".join(parts)
+
+
+def _public_modules() -> set[str]:
+    """Return the modules that define the public API."""
+    listed = [_names(names) if isinstance(names, str) else names for names in PUBLIC.values()]
+    return {
+        getattr(_found(name), "__module__", name.rpartition(".")[0]) for names in listed for name in names
+    }
 
 
 def _names(module: str) -> list[str]:
@@ -277,13 +287,21 @@ def main() -> int:
     """Build the site; return 1 if the generator warned."""
     parser = argparse.ArgumentParser(description="Build the site of chapters, documents and reference.")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "site", help="folder (default: out/site)")
-    out = parser.parse_args().out.resolve()
+    parser.add_argument(
+        "--members",
+        nargs="*",
+        metavar="MODULE",
+        help="leave out the members of all others except the public API",
+    )
+    given = parser.parse_args()
+    members = modules() if given.members is None else {*given.members, *_public_modules()}
+    out = given.out.resolve()
     if out.exists() and not (out / "objects.inv").is_file() and not (out.is_dir() and not any(out.iterdir())):
         print(f"build_site.py: --out: {out} exists and is not a site; choose another folder", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory() as scratch:
         stage, made = Path(scratch) / "source", Path(scratch) / "site"
-        gather(stage)
+        gather(stage, members)
         command = [
             sys.executable,
             "-m",

@@ -48,7 +48,7 @@ from gsplat_edu.train.trainer import Trainer
 
 # GSPLAT_EDU_BUDGET=reduced runs this page in less than a minute: smaller images, fewer splats, fewer steps.
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
-SIZE, CAP, ITERATIONS = (48, 500, 150) if SHORT else (128, 1600, 800)
+SIZE, CAP, ITERATIONS = (32, 800, 300) if SHORT else (128, 1600, 800)
 print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
 print(f"budget: {ITERATIONS} iterations, {SIZE} px, at most {CAP} splats{' (reduced)' if SHORT else ''}")
 

@@ -5,12 +5,21 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
 
+from processes import Program
+
 SCRIPT = Path(__file__).parents[2] / "train" / "train_3d.py"
+RUN = """
+import runpy, sys
+sys.argv.pop(0)
+sys.stdout.reconfigure(line_buffering=True)
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
 
 
 def run(*arguments, **options):
@@ -51,35 +60,24 @@ def test_the_default_budget_trains_end_to_end(tmp_path):
 
 def test_the_budget_on_the_command_line(tmp_path):
     budget = ["--iters", 3, "--k0", 12, "--cap", 20, "--size", 9, "--seed", 4, "--backend", "torch"]
-    done = run(*budget, "--out", tmp_path / "x.png")
-    assert done.returncode == 0, done.stderr
-    assert "reduced" not in done.stdout, "nothing was chosen for the user"
-    assert "ms/iter at 9 px, K~12" in done.stdout
-    assert done.stdout.splitlines()[-1] == "wrote " + ", ".join(
+    code, said, complained = Program(RUN, [SCRIPT, *budget, "--out", tmp_path / "x.png"], tmp_path).ended()
+    assert code == 0, complained
+    assert "reduced" not in said, "nothing was chosen for the user"
+    assert "ms/iter at 9 px, K~12" in said
+    assert said.splitlines()[-1] == "wrote " + ", ".join(
         str(tmp_path / name) for name in ("x.png", "x_curves.png", "x.ply")
     )
 
 
 def test_an_interrupt_is_one_line_and_exit_code_130(tmp_path):
-    command = [
-        sys.executable,
-        "-u",
-        str(SCRIPT),
-        "--iters",
-        "100000",
-        "--size",
-        "16",
-        "--out",
-        tmp_path / "x.png",
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        for line in process.stdout:  # the loop also ends if the process dies
-            if line.startswith("iter "):
-                break
-        else:
-            pytest.fail(process.stderr.read())
-        process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert stderr == "train_3d.py: interrupted\n"
-    assert list(tmp_path.iterdir()) == []
+    out = tmp_path / "out"
+    out.mkdir()
+    words = [SCRIPT, "--iters", 100_000, "--size", 16, "--out", out / "x.png"]
+    program, said = Program(RUN, words, tmp_path), tmp_path / "stdout.txt"
+    while not (said.exists() and "\niter " in "\n" + said.read_text()):
+        assert program.runs, program.ended()
+        time.sleep(0.01)
+    program.send(signal.SIGINT)
+    code, _, complained = program.ended()
+    assert (code, complained) == (130, "train_3d.py: interrupted\n")
+    assert list(out.iterdir()) == []

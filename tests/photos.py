@@ -1,0 +1,36 @@
+"""Photos of the course's sphere and of the procedural scene, taken once.
+
+The reference renderer takes seconds for them, and dozens of tests need the same ones. The processes of a test run, and
+the programs that `processes.Program` starts, share them in a folder.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+
+from gsplat_edu import Camera
+from gsplat_edu.data import procedural, synthetic
+
+VARIABLE = "GSPLAT_TEST_PHOTOS"
+"""The environment's variable that names the folder."""
+
+
+def keep() -> None:
+    """From now on, read photos that are in the folder, and add those that are not."""
+    original, folder = synthetic.render_gaussians, Path(os.environ[VARIABLE])
+    folder.mkdir(exist_ok=True)
+
+    def photographed(camera: Camera, *splats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pose = repr(camera.intrinsics).encode() + camera.R.tobytes() + camera.eye.tobytes()
+        path = folder / f"{hashlib.sha256(pose + b''.join(a.tobytes() for a in splats)).hexdigest()}.npz"
+        if not path.exists():
+            image, transmittance = original(camera, *splats)
+            part = path.with_suffix(f".{os.getpid()}.npz")
+            np.savez(part, image=image, transmittance=transmittance)
+            part.replace(path)
+        with np.load(path) as kept:
+            return kept["image"], kept["transmittance"]
+
+    synthetic.render_gaussians = procedural.render_gaussians = photographed
