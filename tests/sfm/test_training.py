@@ -58,7 +58,7 @@ def test_a_video_becomes_a_scene_in_one_command(tmp_path):
     video, run = tmp_path / "orbit.mp4", tmp_path / "run"
     path = [box_camera(angle, 0.45 + 0.15 * np.sin(3 * angle)) for angle in angles]
     write_video(video, [photograph_box(camera) for camera in path])
-    reached, _ = trained(video, run)
+    reached, _ = trained(video, run, 300)
     assert reached > 20.0
     found = cameras_of(run / "capture")
     numbers = {name: int(re.fullmatch(r"frame_(\d{6})\.jpg", name)[1]) for name in found}
