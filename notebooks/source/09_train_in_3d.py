@@ -46,7 +46,7 @@ from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
 
-# GSPLAT_EDU_BUDGET=reduced runs this page in less than a minute: smaller images, fewer splats, fewer steps.
+# GSPLAT_EDU_BUDGET=reduced runs this page in about a minute: smaller images, fewer splats, fewer steps.
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 SIZE, CAP, ITERATIONS = (32, 800, 300) if SHORT else (128, 1600, 800)
 print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
