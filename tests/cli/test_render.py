@@ -1,8 +1,5 @@
 import dataclasses
-import os
 import signal
-import subprocess
-import sys
 import time
 
 import cv2
@@ -17,6 +14,7 @@ from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
+from processes import Program
 from splats import splats_on
 
 ORIGIN = (512.0, -64.0, 8.0)
@@ -152,24 +150,23 @@ def test_help_shows_an_example(cli, capsys):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_render_leaves_no_temporary_file(made, cli, tmp_path, number):
     """SIGTERM used to leave one. The next render removes what SIGKILL leaves."""
-    (tmp_path / ".mine.original.mp4").write_text("a user's own hidden file")
-    program = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
-    words = ["render", str(made[2]), "--size", "64", "--out", str(tmp_path / "x.mp4")]
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, *words, "--frames", "3000"],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        stderr=subprocess.PIPE,
-        text=True,
+    folder, program = (
+        tmp_path / "videos",
+        "import sys; from gsplat_edu.cli.main import main; sys.exit(main())",
     )
-    while process.poll() is None and not list(tmp_path.glob(".x.*.mp4")):
+    folder.mkdir()
+    (folder / ".mine.original.mp4").write_text("a user's own hidden file")
+    words = ["render", str(made[2]), "--size", "64", "--out", str(folder / "x.mp4")]
+    rendering = Program(program, [*words, "--frames", "3000"], tmp_path)
+    while rendering.runs and not list(folder.glob(".x.*.mp4")):
         time.sleep(0.05)
-    process.send_signal(number)
-    said = process.communicate()[1]
-    left = {path.name for path in tmp_path.iterdir()} - {".mine.original.mp4"}
+    rendering.send(number)
+    code, _, said = rendering.ended()
+    left = {path.name for path in folder.iterdir()} - {".mine.original.mp4"}
     if number == signal.SIGKILL:
-        assert len(left) == 1
+        assert code == -number and len(left) == 1
         assert cli([*words, "--frames", "2"]) == 0
-        left = {path.name for path in tmp_path.iterdir()} - {".mine.original.mp4", "x.mp4"}
+        left = {path.name for path in folder.iterdir()} - {".mine.original.mp4", "x.mp4"}
     else:
-        assert process.returncode == 130 and said.count("\n") == 1, said
+        assert code == 130 and said.count("\n") == 1, said
     assert left == set()
