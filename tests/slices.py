@@ -35,10 +35,10 @@ HOW_TO_REPEAT = f"set GSPLAT_EDU_SLICE={SEED} in the environment to run it again
 
 FIRST = (
     "tests/repo/test_site.py",
-    "tests/runs/test_training.py",
     "tests/repo/test_notebooks.py",
     "tests/viewer/test_page_drawing.py",
     "tests/viewer/test_live_browser.py",
+    "tests/runs/test_training.py",
     "tests/gpu/test_training.py",
     "tests/sfm/test_training.py",
     "tests/viewer/test_page_controls.py",

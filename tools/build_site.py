@@ -136,7 +136,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
 
     Args:
         stage: An empty folder.
-        members: Modules whose functions and classes are documented, not only the modules themselves.
+        members: Modules whose pages show their documentation; those of the others have only a title and links.
     """
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
     documents = [Path(name) for name in (*USE, *BUILD_ON) if not name.endswith("/index.md")]
@@ -151,7 +151,7 @@ def gather(stage: Path, members: Collection[str]) -> None:
         fold_set_up(notebook)
         _write(stage / page, json.dumps(notebook))
     for name in modules():
-        _write(stage / "reference" / f"{name}.md", _reference(name, name in members))
+        _write(stage / "reference" / f"{name}.md", _reference(name, documented=name in members))
     _write(stage / "reference" / "index.md", _public_api())
     _write(stage / "docs" / "decisions" / "index.md", _records(records))
     shutil.copytree(ROOT / "docs" / "site", stage, dirs_exist_ok=True)
@@ -181,7 +181,7 @@ def _figure(page: str, number: int) -> bytes:
     return base64.b64decode("".join(figures[number]))
 
 
-def _reference(name: str, members: bool) -> str:
+def _reference(name: str, *, documented: bool) -> str:
     """Return the page of a module; the page of a package also lists its modules.
 
     These pages are not part of the sidebar: two hundred entries on every page would hide the others.
@@ -192,8 +192,8 @@ def _reference(name: str, members: bool) -> str:
     path = [f"[{'.'.join(above[: i + 1])}]({'.'.join(above[: i + 1])}.md)" for i in range(len(above))]
     head = " / ".join(["[Reference](index.md)", *path])
     page = f"---\norphan: true\n---\n\n{head}\n\n# {name}\n\n"
-    options = ("   :members:\n" if members else "") + again
-    page += f"```{{eval-rst}}\n.. automodule:: {name}\n{options}```\n"
+    automodule = f".. automodule:: {name}\n   :members:\n{again}"
+    page += f"```{{eval-rst}}\n{automodule if documented else f'.. py:module:: {name}'}\n```\n"
     inside = [other for other in modules() if other.rpartition(".")[0] == name and name != "gsplat_edu"]
     return page + ("\n## Modules\n\n" + _listed(inside) if inside else "")
 
@@ -291,7 +291,7 @@ def main() -> int:
         "--members",
         nargs="*",
         metavar="MODULE",
-        help="leave out the members of all others except the public API",
+        help="document only these modules and the public API",
     )
     given = parser.parse_args()
     members = modules() if given.members is None else {*given.members, *_public_modules()}
@@ -302,18 +302,12 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch:
         stage, made = Path(scratch) / "source", Path(scratch) / "site"
         gather(stage, members)
-        command = [
-            sys.executable,
-            "-m",
-            "sphinx",
-            "-b",
-            "html",
-            "-q",
-            "-W",
-            "--keep-going",
-            "-d",
-            f"{scratch}/trees",
-        ]
+        # Python's collector would look through all pages again and again.
+        program = (
+            "import gc, sys; gc.set_threshold(200_000); from sphinx.cmd.build import main; sys.exit(main())"
+        )
+        options = ["-b", "html", "-q", "-W", "--keep-going", "-d", f"{scratch}/trees"]
+        command = [sys.executable, "-c", program, *options]
         done = subprocess.run([*command, str(stage), str(made)], check=False)
         if done.returncode:
             print(

@@ -1,7 +1,7 @@
 """The site builds without a warning, opens from disk, and has no broken link.
 
-Every page is built. Of the modules, a quarter and the public API are documented with their members, drawn by the
-commit; `make soak` documents all, which takes twice as long.
+Every page is built. A quarter of the modules, drawn by the commit, and the public API are documented there; `make soak`
+documents all, which takes twice as long.
 """
 
 import random
