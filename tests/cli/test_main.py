@@ -7,7 +7,7 @@ import pytest
 from gsplat_edu.cli.main import COMMANDS, main
 from gsplat_edu.cli.train import interruptible
 
-TINY = ["demo", "--iters", "2", "--k0", "5", "--cap", "8", "--size", "8"]
+TINY = ["demo", "--iters", "2", "--k0", "5", "--cap", "8", "--size", "16"]
 
 
 def test_demo_writes_figure_curves_and_scene(tmp_path, capsys):
@@ -50,7 +50,7 @@ def test_the_seed_decides_the_run(tmp_path, capsys):
 
 
 def test_options_left_out_of_the_budget_are_chosen_by_the_backend(tmp_path, capsys):
-    arguments = ["demo", "--iters", "1", "--size", "8", "--k0", "5", "--out", str(tmp_path / "s.png")]
+    arguments = ["demo", "--iters", "1", "--size", "16", "--k0", "5", "--out", str(tmp_path / "s.png")]
     assert main([*arguments, "--backend", "torch"]) == 0
     assert "reduced to --cap 800 (the chapter uses --cap 1600)" in capsys.readouterr().out
     assert main(arguments) == 0

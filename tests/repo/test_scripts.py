@@ -26,7 +26,7 @@ MADE = {
 
 TRAININGS = {
     "train_2d.py": ("--splats", "5", "--iters", "2", "--size", "12"),
-    "train_3d.py": ("--iters", "3", "--size", "12", "--k0", "10"),
+    "train_3d.py": ("--iters", "3", "--size", "16", "--k0", "10"),
 }
 
 ELSEWHERE = {
