@@ -68,3 +68,18 @@ def test_the_loss_has_plain_numbers_on_its_axis(low, high):
     ]
     assert 1 <= len(texts) <= 8 and all(float(text) > 0 for text in texts), "numbers, not formulas"
     assert not any(label.get_text() for label in axis.get_ticklabels(minor=True))
+
+
+@pytest.mark.parametrize("count", [5, 20_000, 6_543_210])
+def test_no_label_of_a_curve_is_cut_off(count):
+    terms = {"l1": 0.1, "scale": 3e-5}
+    line = {"num_gaussians": count, "ms": 1234.5, "psnr": 27.125}
+    log = [{"iteration": i, "loss": 0.3 / i, "terms": terms, **line} for i in (1, 100, 30_000)]
+    figures = run_curve_figures(log)
+    assert len(figures) == 5
+    for figure in figures:
+        FigureCanvasAgg(figure).draw()
+        (axes,), whole = figure.axes, figure.bbox
+        shown = axes.get_tightbbox()
+        assert whole.x0 <= shown.x0 and shown.x1 <= whole.x1, axes.get_title()
+        assert whole.y0 <= shown.y0 and shown.y1 <= whole.y1, axes.get_title()

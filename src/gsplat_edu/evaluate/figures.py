@@ -128,7 +128,7 @@ def _set_margins(figure: Figure, values: Float[np.ndarray, " Q"]) -> None:
     width, height = CURVE_INCHES
     characters = max(len("0.0001"), len(f"{values.max():,.0f}"))
     left = LABELS_INCHES + CHARACTER_INCHES * characters
-    figure.subplots_adjust(left / width, 0.5 / height, 1 - 0.1 / width, 1 - 0.32 / height)
+    figure.subplots_adjust(left / width, 0.5 / height, 1 - 0.2 / width, 1 - 0.32 / height)
 
 
 def _decades(axes: Axes, values: Float[np.ndarray, " Q"]) -> None:
