@@ -32,7 +32,8 @@ def run(*arguments, **options):
 def test_the_default_budget_trains_end_to_end(tmp_path):
     """The dense backend's reduced budget cuts the held-out error at least threefold.
 
-    This takes minutes, so only `make soak` runs it. tests/golden checks the first hundred iterations on every run.
+    This takes minutes, so only `make soak` runs it. tests/golden checks the first iteration on every run, and the first
+    hundred with the kernels.
     """
     out = tmp_path / "new" / "folder" / "sphere.png"
     # Use one thread: torch's threads wait for each other, which takes minutes on a busy machine.
