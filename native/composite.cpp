@@ -11,48 +11,54 @@ namespace GSPLAT_ISA {
 
 template <class T>
 struct TileState {
-    alignas(64) T transmittance[TILE][TILE];
-    alignas(64) T red[TILE][TILE], green[TILE][TILE], blue[TILE][TILE], depth[TILE][TILE];
+    Plane<T> transmittance, red, green, blue, depth;
 };
 
-// Draws one splat; returns whether any pixel in the rows it touched still has a transmittance of T_STOP or more.
+// Draws one splat into the blocks it touches; returns whether any of their pixels still has a transmittance of T_STOP or more.
 template <class T, bool DEPTH>
-GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileState<T> &tile) {
+GSPLAT_INLINE bool draw(const Splat<T> &splat_, const TileBox &box, typename Touched<T>::Mask blocks, TileState<T> &tile) {
     using V = typename Vector<T>::V;
-    constexpr int LANES = Vector<T>::LANES;
-    RowTerms<T> terms;
-    row_terms(s, box, terms);
+    const Slope<T> at = slope(splat_, box);
+    const V red = splat(splat_.color[0]), green = splat(splat_.color[1]), blue = splat(splat_.color[2]);
     V brightest = V{};
-    for (int column = 0; column < TILE; column += LANES) {
-        const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
-        const V across = splat(s.s0) + splat(s.sx) * dx;
-        for (int row = first; row <= last; ++row) {
-            const V q = across + splat(terms.shift[row]);
-            const V alpha = exp2_between(splat(terms.base[row]) - q * q, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
-            V t = load<V>(&tile.transmittance[row][column]);
-            const V w = t * alpha;
-            store(&tile.red[row][column], load<V>(&tile.red[row][column]) + w * splat(s.color[0]));
-            store(&tile.green[row][column], load<V>(&tile.green[row][column]) + w * splat(s.color[1]));
-            store(&tile.blue[row][column], load<V>(&tile.blue[row][column]) + w * splat(s.color[2]));
-            if (DEPTH) store(&tile.depth[row][column], load<V>(&tile.depth[row][column]) + w * splat(s.depth));
-            t -= w;
-            store(&tile.transmittance[row][column], t);
-            brightest = brightest > t ? brightest : t;
-        }
+    for (; blocks; blocks &= blocks - 1) {
+        const int b = lowest_bit(blocks);
+        V s, t;
+        const V alpha = exp2_between(exponent(at, b, s, t), T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
+        const V before = tile.transmittance.block(b), w = before * alpha, after = before - w;
+        tile.red.set_block(b, tile.red.block(b) + w * red);
+        tile.green.set_block(b, tile.green.block(b) + w * green);
+        tile.blue.set_block(b, tile.blue.block(b) + w * blue);
+        if (DEPTH) tile.depth.set_block(b, tile.depth.block(b) + w * splat(splat_.depth));
+        tile.transmittance.set_block(b, after);
+        brightest = brightest > after ? brightest : after;
     }
     return any_at_least(brightest, T(T_STOP));
 }
 
 template <class T>
 GSPLAT_INLINE bool lets_light_through(const TileState<T> &tile) {
-    using V = typename Vector<T>::V;
-    V brightest = V{};
-    for (int row = 0; row < TILE; ++row)
-        for (int column = 0; column < TILE; column += Vector<T>::LANES) {
-            const V t = load<V>(&tile.transmittance[row][column]);
-            brightest = brightest > t ? brightest : t;
-        }
+    typename Vector<T>::V brightest{};
+    for (int b = 0; b < Blocks<T>::COUNT; ++b) {
+        const auto t = tile.transmittance.block(b);
+        brightest = brightest > t ? brightest : t;
+    }
     return any_at_least(brightest, T(T_STOP));
+}
+
+// Writes the pixels of a tile, over the background.
+template <class T, bool DEPTH>
+GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box, const TileState<T> &tile) {
+    using Q = typename Four<T>::V;
+    const double *bg = args.settings.background;
+    for_each_four<T>(box, args.camera.W, [&](int from, int64_t pixel, int count) {
+        const Q t = load<Q>(tile.transmittance.values + from);
+        const Q rgb[3] = {load<Q>(tile.red.values + from) + t * T(bg[0]), load<Q>(tile.green.values + from) + t * T(bg[1]),
+                          load<Q>(tile.blue.values + from) + t * T(bg[2])};
+        store_colors<T>(args.image + 3 * pixel, count, rgb);
+        memcpy(args.transmittance + pixel, &t, size_t(count) * sizeof(T));
+        if (DEPTH) memcpy(args.depth + pixel, tile.depth.values + from, size_t(count) * sizeof(T));
+    });
 }
 
 template <class T, bool DEPTH>
@@ -61,35 +67,26 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     TileState<T> tile;
     memset(&tile, 0, sizeof tile);
     for (int y = 0; y < box.height; ++y)
-        for (int x = 0; x < box.width; ++x) tile.transmittance[y][x] = 1;
+        for (int x = 0; x < box.width; ++x) tile.transmittance.values[Blocks<T>::index(x, y)] = 1;
 
     const uint32_t begin = args.tile_begin[index], end = args.tile_begin[index + 1];
     uint32_t k = begin;
-    Rows rows;
+    Touched<T> touched;
     for (; k < end; ++k) {
         const uint32_t i = (k - begin) % BATCH;
         if (i == 0) {
             fetch_next(args.splats, args.pairs + k, end - k);
-            rows_of(args.splats, args.pairs + k, vmin(BATCH, end - k), box, rows);
+            find_touched(args.splats, args.pairs + k, vmin(BATCH, end - k), box, touched);
         }
-        if (rows.first[i] > rows.last[i]) continue;
+        if (!touched.masks[i]) continue;
         const Splat<T> &s = args.splats[args.pairs[k].gaussian];
-        if (!draw<T, DEPTH>(s, box, rows.first[i], rows.last[i], tile) && !lets_light_through(tile)) {
+        if (!draw<T, DEPTH>(s, box, touched.masks[i], tile) && !lets_light_through(tile)) {
             ++k;
             break;
         }
     }
     args.done[index] = k - begin;
-    for (int y = 0; y < box.height; ++y)
-        for (int x = 0; x < box.width; ++x) {
-            const int64_t pixel = int64_t(box.y0 + y) * args.camera.W + box.x0 + x;
-            const T t = tile.transmittance[y][x];
-            args.image[3 * pixel] = tile.red[y][x] + t * T(args.settings.background[0]);
-            args.image[3 * pixel + 1] = tile.green[y][x] + t * T(args.settings.background[1]);
-            args.image[3 * pixel + 2] = tile.blue[y][x] + t * T(args.settings.background[2]);
-            args.transmittance[pixel] = t;
-            if (DEPTH) args.depth[pixel] = tile.depth[y][x];
-        }
+    finish_tile<T, DEPTH>(args, box, tile);
 }
 
 template <class T>

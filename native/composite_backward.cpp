@@ -5,8 +5,7 @@
 //     cg = g . c;   w = T alpha;   R -= w cg;   dL/dalpha = T cg - R / (1 - alpha);   T -= w
 //     h = alpha dL/dalpha, 0 where alpha was clamped
 //
-// Every pair writes its sums over the tile's pixels, w g and the moments of h about the splat's reference point, to its own
-// slot.
+// Every pair writes its sums over the tile's pixels, w g and the moments of h in s and t (see Splat), to its own slot.
 #include "isa.h"
 #include "tile.h"
 
@@ -15,77 +14,66 @@ namespace GSPLAT_ISA {
 
 template <class T>
 struct TileGradient {
-    alignas(64) T transmittance[TILE][TILE], rest[TILE][TILE];
-    alignas(64) T red[TILE][TILE], green[TILE][TILE], blue[TILE][TILE], depth[TILE][TILE];
+    Plane<T> transmittance, rest, red, green, blue, depth;
 };
 
 // Writes one splat's sums over the tile to `slot`.
 template <class T, bool WITH_DEPTH>
-GSPLAT_INLINE void splat_backward(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileGradient<T> &tile, T *slot) {
+GSPLAT_INLINE void splat_backward(const Splat<T> &splat_, const TileBox &box, typename Touched<T>::Mask blocks, TileGradient<T> &tile,
+                                  T *slot) {
     using V = typename Vector<T>::V;
-    constexpr int LANES = Vector<T>::LANES;
-    RowTerms<T> terms;
-    row_terms(s, box, terms);
-    // w g (3) and the moments of h, 1, x, xx, y, xy, in the order of a slot; then yy and w z.
-    V sums[8] = {}, hyy = V{}, wz = V{};
-    for (int column = 0; column < TILE; column += LANES) {
-        const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
-        const V across = splat(s.s0) + splat(s.sx) * dx;
-        V wr = V{}, wg = V{}, wb = V{};
-        V sum0 = V{}, sum1 = V{}, sum2 = V{};  // h, h dy, h dy²; multiplied by dx once per splat
-        V dy = splat(T(first + box.y0) - s.y);
-        for (int row = first; row <= last; ++row, dy += splat(T(1))) {
-            const V q = across + splat(terms.shift[row]), p = splat(terms.base[row]) - q * q;
-            const V alpha = exp2_between(p, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
-            const V r = load<V>(&tile.red[row][column]), g = load<V>(&tile.green[row][column]);
-            const V b = load<V>(&tile.blue[row][column]);
-            V cg = r * splat(s.color[0]) + g * splat(s.color[1]) + b * splat(s.color[2]);
-            const V t = load<V>(&tile.transmittance[row][column]);
-            const V w = t * alpha;
-            if (WITH_DEPTH) {
-                const V z = load<V>(&tile.depth[row][column]);
-                cg += z * splat(s.depth);
-                wz += w * z;
-            }
-            const V rest = load<V>(&tile.rest[row][column]) - w * cg;
-            const V h = where_below(p, T(LOG2_ALPHA_MAX), alpha * (t * cg - rest * reciprocal(splat(T(1)) - alpha)));
-            store(&tile.rest[row][column], rest);
-            store(&tile.transmittance[row][column], t - w);
-            wr += w * r, wg += w * g, wb += w * b;
-            const V hdy = h * dy;
-            sum0 += h, sum1 += hdy, sum2 += hdy * dy;
+    const Slope<T> at = slope(splat_, box);
+    const V red = splat(splat_.color[0]), green = splat(splat_.color[1]), blue = splat(splat_.color[2]);
+    V sums[8] = {}, htt = V{}, wz = V{};  // in the order of a slot
+    for (; blocks; blocks &= blocks - 1) {
+        const int b = lowest_bit(blocks);
+        V s, t;
+        const V p = exponent(at, b, s, t), alpha = exp2_between(p, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
+        const V gr = tile.red.block(b), gg = tile.green.block(b), gb = tile.blue.block(b);
+        V cg = gr * red + gg * green + gb * blue;
+        const V before = tile.transmittance.block(b), w = before * alpha;
+        if (WITH_DEPTH) {
+            const V gz = tile.depth.block(b);
+            cg += gz * splat(splat_.depth);
+            wz += w * gz;
         }
-        const V hdx = sum0 * dx;
-        sums[0] += wr, sums[1] += wg, sums[2] += wb;
-        sums[3] += sum0, sums[4] += hdx, sums[5] += hdx * dx, sums[6] += sum1, sums[7] += sum1 * dx;
-        hyy += sum2;
+        const V rest = tile.rest.block(b) - w * cg;
+        const V h = where_below(p, T(LOG2_ALPHA_MAX), alpha * (before * cg - rest * reciprocal(splat(T(1)) - alpha)));
+        tile.rest.set_block(b, rest);
+        tile.transmittance.set_block(b, before - w);
+        sums[RED] += w * gr, sums[GREEN] += w * gg, sums[BLUE] += w * gb;
+        const V hs = h * s, ht = h * t;
+        sums[H] += h, sums[HS] += hs, sums[HSS] += hs * s, sums[HT] += ht, sums[HST] += hs * t, htt += ht * t;
     }
     sum8(sums, slot);
-    slot[HYY] = sum(hyy), slot[DEPTH] = WITH_DEPTH ? sum(wz) : T(0);
+    slot[HTT] = sum(htt), slot[DEPTH] = WITH_DEPTH ? sum(wz) : T(0);
 }
 
 // Loads the inputs of a tile's pixels; returns the sum of g T_final through `background`.
 template <class T, bool WITH_DEPTH>
 GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBox &box, TileGradient<T> &tile, T *background) {
+    using Q = typename Four<T>::V;
     const CompositeArgs<T> &forward = args.forward;
     memset(&tile, 0, sizeof tile);
-    background[0] = background[1] = background[2] = 0;
-    for (int y = 0; y < box.height; ++y)
-        for (int x = 0; x < box.width; ++x) {
-            const int64_t pixel = int64_t(box.y0 + y) * forward.camera.W + box.x0 + x;
-            const T *g = args.grad_image + 3 * pixel;
-            const T t = forward.transmittance[pixel];
-            tile.transmittance[y][x] = 1;
-            tile.red[y][x] = g[0], tile.green[y][x] = g[1], tile.blue[y][x] = g[2];
-            T rest = dot3(g, forward.image + 3 * pixel);
-            if (args.grad_transmittance) rest += args.grad_transmittance[pixel] * t;
-            if (WITH_DEPTH) {
-                tile.depth[y][x] = args.grad_depth[pixel];
-                rest += args.grad_depth[pixel] * forward.depth[pixel];
-            }
-            tile.rest[y][x] = rest;
-            for (int k = 0; k < 3; ++k) background[k] += g[k] * t;
+    Q sums[3] = {};
+    for_each_four<T>(box, forward.camera.W, [&](int to, int64_t pixel, int count) {
+        Q g[3], drawn[3];
+        load_colors(args.grad_image + 3 * pixel, count, g);
+        load_colors(forward.image + 3 * pixel, count, drawn);
+        const Q t = load_some(forward.transmittance + pixel, count);
+        Q rest = g[0] * drawn[0] + g[1] * drawn[1] + g[2] * drawn[2];
+        if (args.grad_transmittance) rest += load_some(args.grad_transmittance + pixel, count) * t;
+        if (WITH_DEPTH) {
+            const Q gz = load_some(args.grad_depth + pixel, count);
+            store(tile.depth.values + to, gz);
+            rest += gz * load_some(forward.depth + pixel, count);
         }
+        store(tile.rest.values + to, rest);
+        store(tile.red.values + to, g[0]), store(tile.green.values + to, g[1]), store(tile.blue.values + to, g[2]);
+        for (int i = 0; i < count; ++i) tile.transmittance.values[to + i] = 1;
+        for (int k = 0; k < 3; ++k) sums[k] += g[k] * t;
+    });
+    for (int k = 0; k < 3; ++k) background[k] = (sums[k][0] + sums[k][2]) + (sums[k][1] + sums[k][3]);
 }
 
 template <class T, bool WITH_DEPTH>
@@ -96,19 +84,19 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     begin_tile<T, WITH_DEPTH>(args, box, tile, args.tile_background + 3 * index);
     const uint32_t begin = forward.tile_begin[index], end = forward.tile_begin[index + 1];
     const uint32_t stop = begin + forward.done[index];
-    Rows rows;
+    Touched<T> touched;
     for (uint32_t k = begin; k < end; ++k) {
         T *slot = args.slots + int64_t(SLOT) * forward.pairs[k].slot;
         const uint32_t i = (k - begin) % BATCH;
         if (k + 4 < end) __builtin_prefetch(args.slots + int64_t(SLOT) * forward.pairs[k + 4].slot, 1);
         if (i == 0 && k < stop) {
             fetch_next(forward.splats, forward.pairs + k, stop - k);
-            rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
+            find_touched(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, touched);
         }
-        if (k >= stop || rows.first[i] > rows.last[i])
+        if (k >= stop || !touched.masks[i])
             for (int j = 0; j < SLOT; ++j) slot[j] = 0;
         else
-            splat_backward<T, WITH_DEPTH>(forward.splats[forward.pairs[k].gaussian], box, rows.first[i], rows.last[i], tile, slot);
+            splat_backward<T, WITH_DEPTH>(forward.splats[forward.pairs[k].gaussian], box, touched.masks[i], tile, slot);
     }
 }
 

@@ -8,8 +8,10 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__AVX512F__)
+#if defined(__SSE__)
 #include <immintrin.h>
+#elif defined(__ARM_NEON)
+#include <arm_neon.h>
 #endif
 
 #if defined(__AVX512F__)
@@ -35,11 +37,12 @@ struct Vector<float> {
     static constexpr int LANES = GSPLAT_VECTOR_BYTES / 4;
 };
 
+// At least four lanes, in two registers where one has 16 bytes: a block of pixels is four columns wide.
 template <>
 struct Vector<double> {
-    typedef double V __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));
-    typedef int64_t M __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));
-    static constexpr int LANES = GSPLAT_VECTOR_BYTES / 8;
+    static constexpr int LANES = GSPLAT_VECTOR_BYTES == 64 ? 8 : 4;
+    typedef double V __attribute__((vector_size(8 * LANES)));
+    typedef int64_t M __attribute__((vector_size(8 * LANES)));
 };
 
 using VF = Vector<float>::V;
@@ -106,6 +109,12 @@ GSPLAT_INLINE double sum(VD v) {
 GSPLAT_INLINE bool any_at_least(VF v, float x) {
 #if GSPLAT_VECTOR_BYTES == 64
     return _mm512_cmp_ps_mask((__m512)v, _mm512_set1_ps(x), _CMP_GE_OQ) != 0;
+#elif GSPLAT_VECTOR_BYTES == 32
+    return _mm256_movemask_ps((__m256)(v >= splat(x))) != 0;
+#elif defined(__SSE__)
+    return _mm_movemask_ps((__m128)(v >= splat(x))) != 0;
+#elif defined(__ARM_NEON)
+    return vmaxvq_f32((float32x4_t)v) >= x;
 #else
     auto mask = v >= splat(x);
     int32_t any = 0;
@@ -130,12 +139,11 @@ GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
     const __m512 n = _mm512_roundscale_ps((__m512)p, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
     const VF f = p - (VF)n;
 #else
-    const VF magic = splat(12582912.0f), bottom = splat(least), top = splat(most);
-    const auto keep = p >= bottom;
+    const VF magic = splat(12582912.0f), top = splat(most);
+    const auto keep = p >= splat(least);
     p = p < top ? p : top;
-    p = p > bottom ? p : bottom;  // a smaller value would overflow the exponent bits
-    const VF n = (p + magic) - magic;
-    const VF f = p - n;
+    const VF rounded = p + magic;  // its lowest bits are those of n
+    const VF f = p - (rounded - magic);
 #endif
     VF y = splat(1.33952915e-3f);
     y = y * f + splat(9.67037690e-3f);
@@ -146,8 +154,8 @@ GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
 #if GSPLAT_VECTOR_BYTES == 64
     return (VF)_mm512_maskz_scalef_ps(keep, (__m512)y, n);
 #else
-    const Vector<float>::M e = __builtin_convertvector(n, Vector<float>::M);
-    return keep ? (VF)((Vector<float>::M)y + (e << 23)) : VF{};
+    typedef uint32_t Bits __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));  // wraps; a lane that overflows is not kept
+    return keep ? (VF)((Bits)y + ((Bits)rounded << 23)) : VF{};
 #endif
 }
 
@@ -179,24 +187,39 @@ GSPLAT_INLINE VF reciprocal(VF x) {
 
 GSPLAT_INLINE VD reciprocal(VD x) { return splat(1.0) / x; }
 
-// Writes the lane sums of eight vectors to out[0..7]: three rounds fold pairs of vectors into one, which leaves every sum
-// split over the two halves of the register.
+// Writes the lane sums of eight vectors to out[0..7]: each round folds pairs of vectors into one.
 GSPLAT_INLINE void sum8(const VF *v, float *out) {
 #if GSPLAT_VECTOR_BYTES == 64
     VF a[4], b[2];
     for (int i = 0; i < 4; ++i)
-        a[i] = __builtin_shufflevector(v[2 * i], v[2 * i + 1], 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30) +
-               __builtin_shufflevector(v[2 * i], v[2 * i + 1], 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
+        a[i] = __builtin_shufflevector(v[2 * i], v[2 * i + 1], 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29) +
+               __builtin_shufflevector(v[2 * i], v[2 * i + 1], 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
     for (int i = 0; i < 2; ++i)
         b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
                __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
     const VF c = __builtin_shufflevector(b[0], b[1], 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27) +
                  __builtin_shufflevector(b[0], b[1], 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
-    typedef float H __attribute__((vector_size(32)));
-    const H h = __builtin_shufflevector(c, c, 0, 1, 2, 3, 4, 5, 6, 7) + __builtin_shufflevector(c, c, 8, 9, 10, 11, 12, 13, 14, 15);
+    typedef float Half __attribute__((vector_size(32)));
+    const Half h = __builtin_shufflevector(c, c, 0, 1, 2, 3, 4, 5, 6, 7) + __builtin_shufflevector(c, c, 8, 9, 10, 11, 12, 13, 14, 15);
     memcpy(out, &h, sizeof h);
+#elif GSPLAT_VECTOR_BYTES == 32
+    VF a[4], b[2];
+    for (int i = 0; i < 4; ++i)
+        a[i] = __builtin_shufflevector(v[2 * i], v[2 * i + 1], 0, 8, 1, 9, 4, 12, 5, 13) +
+               __builtin_shufflevector(v[2 * i], v[2 * i + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+    for (int i = 0; i < 2; ++i)
+        b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 8, 9, 4, 5, 12, 13) +
+               __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 3, 10, 11, 6, 7, 14, 15);
+    store(out, VF(__builtin_shufflevector(b[0], b[1], 0, 1, 2, 3, 8, 9, 10, 11) +
+                  __builtin_shufflevector(b[0], b[1], 4, 5, 6, 7, 12, 13, 14, 15)));
 #else
-    for (int i = 0; i < 8; ++i) out[i] = sum(v[i]);
+    for (int half = 0; half < 8; half += 4) {
+        VF a[2];
+        for (int i = 0; i < 2; ++i)
+            a[i] = __builtin_shufflevector(v[half + 2 * i], v[half + 2 * i + 1], 0, 4, 1, 5) +
+                   __builtin_shufflevector(v[half + 2 * i], v[half + 2 * i + 1], 2, 6, 3, 7);
+        store(out + half, VF(__builtin_shufflevector(a[0], a[1], 0, 1, 4, 5) + __builtin_shufflevector(a[0], a[1], 2, 3, 6, 7)));
+    }
 #endif
 }
 
