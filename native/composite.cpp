@@ -14,36 +14,40 @@ struct TileState {
     Plane<T> transmittance, red, green, blue, depth;
 };
 
-// Draws one splat into the blocks it touches; returns whether any of their pixels still has a transmittance of T_STOP or more.
-template <class T, bool DEPTH>
-GSPLAT_INLINE bool draw(const Splat<T> &splat_, const TileBox &box, typename Touched<T>::Mask blocks, TileState<T> &tile) {
+// Draws one splat.
+template <class T, bool DEPTH, bool GENTLY>
+GSPLAT_INLINE void draw(const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i, TileState<T> &tile) {
     using V = typename Vector<T>::V;
-    const Slope<T> at = slope(splat_, box);
-    const V red = splat(splat_.color[0]), green = splat(splat_.color[1]), blue = splat(splat_.color[2]);
-    V brightest = V{};
-    for (; blocks; blocks &= blocks - 1) {
-        const int b = lowest_bit(blocks);
-        V s, t;
-        const V alpha = exp2_between(exponent(at, b, s, t), T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
-        const V before = tile.transmittance.block(b), w = before * alpha, after = before - w;
-        tile.red.set_block(b, tile.red.block(b) + w * red);
-        tile.green.set_block(b, tile.green.block(b) + w * green);
-        tile.blue.set_block(b, tile.blue.block(b) + w * blue);
-        if (DEPTH) tile.depth.set_block(b, tile.depth.block(b) + w * splat(splat_.depth));
-        tile.transmittance.set_block(b, after);
-        brightest = brightest > after ? brightest : after;
+    Falloff<T, GENTLY> falloff;
+    falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
+    const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
+    for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
+        const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
+        if (first > last) continue;
+        falloff.begin_strip(s, iota<T>() + splat(T(column + box.x0) - s.x), T(first + box.y0) - s.y);
+        for (int32_t row = first; row <= last; ++row) {
+            const int at = row * TILE + column;
+            V key;
+            const V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at), w = t * alpha;
+            store(tile.red.values + at, load<V>(tile.red.values + at) + w * red);
+            store(tile.green.values + at, load<V>(tile.green.values + at) + w * green);
+            store(tile.blue.values + at, load<V>(tile.blue.values + at) + w * blue);
+            if (DEPTH) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
+            store(tile.transmittance.values + at, t - w);
+            falloff.step(row - first);
+        }
     }
-    return any_at_least(brightest, T(T_STOP));
 }
 
+// Whether any pixel still has a transmittance of T_STOP or more. Looks first where one had it the last time.
 template <class T>
-GSPLAT_INLINE bool lets_light_through(const TileState<T> &tile) {
-    typename Vector<T>::V brightest{};
-    for (int b = 0; b < Blocks<T>::COUNT; ++b) {
-        const auto t = tile.transmittance.block(b);
-        brightest = brightest > t ? brightest : t;
-    }
-    return any_at_least(brightest, T(T_STOP));
+GSPLAT_INLINE bool lets_light_through(const TileState<T> &tile, int &where) {
+    using V = typename Vector<T>::V;
+    if (any_at_least(load<V>(tile.transmittance.values + where), T(T_STOP))) return true;
+    for (where = 0; where < TILE * TILE; where += Vector<T>::LANES)
+        if (any_at_least(load<V>(tile.transmittance.values + where), T(T_STOP))) return true;
+    where = 0;
+    return false;
 }
 
 // Writes the pixels of a tile, over the background.
@@ -67,20 +71,22 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     TileState<T> tile;
     memset(&tile, 0, sizeof tile);
     for (int y = 0; y < box.height; ++y)
-        for (int x = 0; x < box.width; ++x) tile.transmittance.values[Blocks<T>::index(x, y)] = 1;
+        for (int x = 0; x < box.width; ++x) tile.transmittance.values[y * TILE + x] = 1;
 
     const uint32_t begin = args.tile_begin[index], end = args.tile_begin[index + 1];
     uint32_t k = begin;
-    Touched<T> touched;
+    Rows<T> rows;
+    int bright = 0;
     for (; k < end; ++k) {
         const uint32_t i = (k - begin) % BATCH;
         if (i == 0) {
             fetch_next(args.splats, args.pairs + k, end - k);
-            find_touched(args.splats, args.pairs + k, vmin(BATCH, end - k), box, touched);
+            rows_of(args.splats, args.pairs + k, vmin(BATCH, end - k), box, rows);
         }
-        if (!touched.masks[i]) continue;
+        if (rows.top[i] > rows.bottom[i]) continue;
         const Splat<T> &s = args.splats[args.pairs[k].gaussian];
-        if (!draw<T, DEPTH>(s, box, touched.masks[i], tile) && !lets_light_through(tile)) {
+        rows.gentle[i] ? draw<T, DEPTH, true>(s, box, rows, i, tile) : draw<T, DEPTH, false>(s, box, rows, i, tile);
+        if (!lets_light_through(tile, bright)) {
             ++k;
             break;
         }

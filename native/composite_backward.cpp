@@ -5,7 +5,8 @@
 //     cg = g . c;   w = T alpha;   R -= w cg;   dL/dalpha = T cg - R / (1 - alpha);   T -= w
 //     h = alpha dL/dalpha, 0 where alpha was clamped
 //
-// Every pair writes its sums over the tile's pixels, w g and the moments of h in s and t (see Splat), to its own slot.
+// Every pair writes its sums over the tile's pixels, w g and the moments of h about the splat's reference point, to its own
+// slot.
 #include "isa.h"
 #include "tile.h"
 
@@ -18,35 +19,49 @@ struct TileGradient {
 };
 
 // Writes one splat's sums over the tile to `slot`.
-template <class T, bool WITH_DEPTH>
-GSPLAT_INLINE void splat_backward(const Splat<T> &splat_, const TileBox &box, typename Touched<T>::Mask blocks, TileGradient<T> &tile,
-                                  T *slot) {
+template <class T, bool WITH_DEPTH, bool GENTLY>
+GSPLAT_INLINE void splat_backward(const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i, TileGradient<T> &tile, T *slot) {
     using V = typename Vector<T>::V;
-    const Slope<T> at = slope(splat_, box);
-    const V red = splat(splat_.color[0]), green = splat(splat_.color[1]), blue = splat(splat_.color[2]);
-    V sums[8] = {}, htt = V{}, wz = V{};  // in the order of a slot
-    for (; blocks; blocks &= blocks - 1) {
-        const int b = lowest_bit(blocks);
-        V s, t;
-        const V p = exponent(at, b, s, t), alpha = exp2_between(p, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
-        const V gr = tile.red.block(b), gg = tile.green.block(b), gb = tile.blue.block(b);
-        V cg = gr * red + gg * green + gb * blue;
-        const V before = tile.transmittance.block(b), w = before * alpha;
-        if (WITH_DEPTH) {
-            const V gz = tile.depth.block(b);
-            cg += gz * splat(splat_.depth);
-            wz += w * gz;
+    Falloff<T, GENTLY> falloff;
+    falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
+    const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
+    V sums[8] = {}, hyy = V{}, wz = V{};  // in the order of a slot
+    for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
+        const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
+        if (first > last) continue;
+        const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
+        falloff.begin_strip(s, dx, T(first + box.y0) - s.y);
+        V wr = V{}, wg = V{}, wb = V{};
+        V sum0 = V{}, sum1 = V{}, sum2 = V{};  // h, h dy, h dy²; multiplied by dx once per strip
+        V dy = splat(T(first + box.y0) - s.y);
+        for (int32_t row = first; row <= last; ++row, dy += splat(T(1))) {
+            const int at = row * TILE + column;
+            V key;
+            const V alpha = falloff.alpha(row, key);
+            const V r = load<V>(tile.red.values + at), g = load<V>(tile.green.values + at), b = load<V>(tile.blue.values + at);
+            V cg = r * red + g * green + b * blue;
+            const V t = load<V>(tile.transmittance.values + at), w = t * alpha;
+            if (WITH_DEPTH) {
+                const V z = load<V>(tile.depth.values + at);
+                cg += z * splat(s.depth);
+                wz += w * z;
+            }
+            const V rest = load<V>(tile.rest.values + at) - w * cg;
+            const V h = falloff.where_open(key, alpha * (t * cg - rest * reciprocal(splat(T(1)) - alpha)));
+            store(tile.rest.values + at, rest);
+            store(tile.transmittance.values + at, t - w);
+            wr += w * r, wg += w * g, wb += w * b;
+            const V hdy = h * dy;
+            sum0 += h, sum1 += hdy, sum2 += hdy * dy;
+            falloff.step(row - first);
         }
-        const V rest = tile.rest.block(b) - w * cg;
-        const V h = where_below(p, T(LOG2_ALPHA_MAX), alpha * (before * cg - rest * reciprocal(splat(T(1)) - alpha)));
-        tile.rest.set_block(b, rest);
-        tile.transmittance.set_block(b, before - w);
-        sums[RED] += w * gr, sums[GREEN] += w * gg, sums[BLUE] += w * gb;
-        const V hs = h * s, ht = h * t;
-        sums[H] += h, sums[HS] += hs, sums[HSS] += hs * s, sums[HT] += ht, sums[HST] += hs * t, htt += ht * t;
+        const V hdx = sum0 * dx;
+        sums[RED] += wr, sums[GREEN] += wg, sums[BLUE] += wb;
+        sums[H] += sum0, sums[HX] += hdx, sums[HXX] += hdx * dx, sums[HY] += sum1, sums[HXY] += sum1 * dx;
+        hyy += sum2;
     }
     sum8(sums, slot);
-    slot[HTT] = sum(htt), slot[DEPTH] = WITH_DEPTH ? sum(wz) : T(0);
+    slot[HYY] = sum(hyy), slot[DEPTH] = WITH_DEPTH ? sum(wz) : T(0);
 }
 
 // Loads the inputs of a tile's pixels; returns the sum of g T_final through `background`.
@@ -84,19 +99,22 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     begin_tile<T, WITH_DEPTH>(args, box, tile, args.tile_background + 3 * index);
     const uint32_t begin = forward.tile_begin[index], end = forward.tile_begin[index + 1];
     const uint32_t stop = begin + forward.done[index];
-    Touched<T> touched;
+    Rows<T> rows;
     for (uint32_t k = begin; k < end; ++k) {
         T *slot = args.slots + int64_t(SLOT) * forward.pairs[k].slot;
         const uint32_t i = (k - begin) % BATCH;
         if (k + 4 < end) __builtin_prefetch(args.slots + int64_t(SLOT) * forward.pairs[k + 4].slot, 1);
         if (i == 0 && k < stop) {
             fetch_next(forward.splats, forward.pairs + k, stop - k);
-            find_touched(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, touched);
+            rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
         }
-        if (k >= stop || !touched.masks[i])
+        if (k >= stop || rows.top[i] > rows.bottom[i]) {
             for (int j = 0; j < SLOT; ++j) slot[j] = 0;
-        else
-            splat_backward<T, WITH_DEPTH>(forward.splats[forward.pairs[k].gaussian], box, touched.masks[i], tile, slot);
+            continue;
+        }
+        const Splat<T> &s = forward.splats[forward.pairs[k].gaussian];
+        rows.gentle[i] ? splat_backward<T, WITH_DEPTH, true>(s, box, rows, i, tile, slot)
+                       : splat_backward<T, WITH_DEPTH, false>(s, box, rows, i, tile, slot);
     }
 }
 

@@ -68,9 +68,8 @@ struct Pair {
     uint32_t slot;
 };
 
-// Partial sums of one pair, in this order: w g by colour channel, the moments of h in s and t, and w times the depth's
-// gradient.
-enum Sum { RED, GREEN, BLUE, H, HS, HSS, HT, HST, HTT, DEPTH, SLOT };
+// Partial sums of one pair, in this order: w g by colour channel, the moments of h, and w times the depth's gradient.
+enum Sum { RED, GREEN, BLUE, H, HX, HXX, HY, HXY, HYY, DEPTH, SLOT };
 
 // Neighbouring tiles of one row.
 struct TileRun {

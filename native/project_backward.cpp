@@ -15,13 +15,19 @@ struct Whitened {
     double m00, m01, m11;  // sum h y0², sum h y0 y1, sum h y1²; minus sum h on the diagonal with antialiasing
 };
 
-// Computed from the moments of h in s and t, which are y times sqrt(log2(e) / 2).
-GSPLAT_INLINE Whitened whiten(const Settings &set, const Projected &g, const double *slot) {
-    constexpr double SQUARE = 2 * 0.6931471805599453, ROOT = 1.1774100225154747;
+// Computed from the moments of h about the splat's reference point.
+template <class T>
+GSPLAT_INLINE Whitened whiten(const Camera &cam, const Settings &set, const Projected &g, const double *slot) {
     Whitened w;
     w.sx = sqrt_(g.c * g.inverse_det), w.sy = -g.b / g.c * w.sx, w.ty = sqrt_(1 / g.c);
-    w.m0 = ROOT * slot[HS], w.m1 = ROOT * slot[HT];
-    w.m00 = SQUARE * slot[HSS], w.m01 = SQUARE * slot[HST], w.m11 = SQUARE * slot[HTT];
+    const Position<T> at = position<T>(g, cam);
+    const double dx = double(at.x) - at.u, dy = double(at.y) - at.v;
+    const double s = w.sx * dx + w.sy * dy, t = w.ty * dy;  // y of the reference point
+    const double along = w.sx * slot[HX] + w.sy * slot[HY], down = w.ty * slot[HY];
+    w.m0 = s * slot[H] + along, w.m1 = t * slot[H] + down;
+    w.m00 = s * (s * slot[H] + 2 * along) + w.sx * (w.sx * slot[HXX] + 2 * w.sy * slot[HXY]) + w.sy * w.sy * slot[HYY];
+    w.m01 = s * (t * slot[H] + down) + t * along + w.ty * (w.sx * slot[HXY] + w.sy * slot[HYY]);
+    w.m11 = t * (t * slot[H] + 2 * down) + w.ty * w.ty * slot[HYY];
     if (set.antialiased) w.m00 -= slot[H], w.m11 -= slot[H];  // the opacity's factor contains det^(-1/2)
     return w;
 }
@@ -151,7 +157,7 @@ void one(const ProjectBackwardArgs<T> &args, int64_t i) {
 
     double slot[SLOT];
     for (int j = 0; j < SLOT; ++j) slot[j] = double(sums[j]);
-    const Whitened m = whiten(args.settings, g, slot);
+    const Whitened m = whiten<T>(args.camera, args.settings, g, slot);
     const double uv[2] = {m.sx * m.m0, m.sy * m.m0 + m.ty * m.m1};
     const double nx = uv[0] * args.camera.W / 2, ny = uv[1] * args.camera.H / 2;
     args.grads.means2d_norm[i] = T(sqrt_(nx * nx + ny * ny));

@@ -23,6 +23,7 @@
 #endif
 
 #define GSPLAT_INLINE static inline __attribute__((always_inline))
+#define GSPLAT_METHOD inline __attribute__((always_inline))
 
 namespace gsplat {
 namespace GSPLAT_ISA {
@@ -37,12 +38,11 @@ struct Vector<float> {
     static constexpr int LANES = GSPLAT_VECTOR_BYTES / 4;
 };
 
-// At least four lanes, in two registers where one has 16 bytes: a block of pixels is four columns wide.
 template <>
 struct Vector<double> {
-    static constexpr int LANES = GSPLAT_VECTOR_BYTES == 64 ? 8 : 4;
-    typedef double V __attribute__((vector_size(8 * LANES)));
-    typedef int64_t M __attribute__((vector_size(8 * LANES)));
+    typedef double V __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));
+    typedef int64_t M __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));
+    static constexpr int LANES = GSPLAT_VECTOR_BYTES / 8;
 };
 
 using VF = Vector<float>::V;
@@ -130,38 +130,62 @@ GSPLAT_INLINE bool any_at_least(VD v, double x) {
     return any != 0;
 }
 
-// 2^min(p, most), 0 where p < least; most <= 0 and -126 <= least. n = round(p) (by adding and subtracting 1.5 * 2^23, which -ffast-math
-// would fold away), then a polynomial of degree 5 on [-1/2, 1/2] fitted for its relative error, 2.4e-7.
-GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
-#if GSPLAT_VECTOR_BYTES == 64
-    const __mmask16 keep = _mm512_cmp_ps_mask((__m512)p, _mm512_set1_ps(least), _CMP_GE_OQ);
-    p = (VF)_mm512_min_ps((__m512)p, _mm512_set1_ps(most));
-    const __m512 n = _mm512_roundscale_ps((__m512)p, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-    const VF f = p - (VF)n;
-#else
-    const VF magic = splat(12582912.0f), top = splat(most);
-    const auto keep = p >= splat(least);
-    p = p < top ? p : top;
-    const VF rounded = p + magic;  // its lowest bits are those of n
-    const VF f = p - (rounded - magic);
-#endif
+// 2^f on [-1/2, 1/2], a polynomial of degree 5 fitted for its relative error, 2.4e-7.
+GSPLAT_INLINE VF exp2_fraction(VF f) {
     VF y = splat(1.33952915e-3f);
     y = y * f + splat(9.67037690e-3f);
     y = y * f + splat(5.55033013e-2f);
     y = y * f + splat(2.40222633e-1f);
     y = y * f + splat(6.93147182e-1f);
-    y = y * f + splat(1.0f);
+    return y * f + splat(1.0f);
+}
+
+// 2^p for -126 <= p < 128. n = round(p), by adding and subtracting 1.5 * 2^23, which -ffast-math would fold away; the lowest
+// bits of the sum are those of n, and go to the exponent.
+GSPLAT_INLINE VF exp2_(VF p) {
+    typedef uint32_t Bits __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));  // wraps instead of overflowing
+    const VF magic = splat(12582912.0f), rounded = p + magic;
+    return (VF)((Bits)exp2_fraction(p - (rounded - magic)) + ((Bits)rounded << 23));
+}
+
+GSPLAT_INLINE VD exp2_(VD p) {
+    for (int i = 0; i < Vector<double>::LANES; ++i) p[i] = exp2(p[i]);
+    return p;
+}
+
+// 2^min(p, most), 0 where p < least; most <= 0 and -126 <= least.
+GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
 #if GSPLAT_VECTOR_BYTES == 64
-    return (VF)_mm512_maskz_scalef_ps(keep, (__m512)y, n);
+    const __mmask16 keep = _mm512_cmp_ps_mask((__m512)p, _mm512_set1_ps(least), _CMP_GE_OQ);
+    p = (VF)_mm512_min_ps((__m512)p, _mm512_set1_ps(most));
+    const __m512 n = _mm512_roundscale_ps((__m512)p, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    return (VF)_mm512_maskz_scalef_ps(keep, (__m512)exp2_fraction(p - (VF)n), n);
 #else
-    typedef uint32_t Bits __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));  // wraps; a lane that overflows is not kept
-    return keep ? (VF)((Bits)y + ((Bits)rounded << 23)) : VF{};
+    const VF top = splat(most);
+    const auto keep = p >= splat(least);
+    const VF y = exp2_(p < top ? p : top);  // garbage where p is too small, which is not kept
+    return keep ? y : VF{};
 #endif
 }
 
 GSPLAT_INLINE VD exp2_between(VD p, double least, double most) {
     for (int i = 0; i < Vector<double>::LANES; ++i) p[i] = p[i] >= least ? exp2(p[i] < most ? p[i] : most) : 0.0;
     return p;
+}
+
+// min(x, most), 0 where x < least.
+GSPLAT_INLINE VF between(VF x, float least, float most) {
+#if GSPLAT_VECTOR_BYTES == 64
+    return (VF)_mm512_maskz_min_ps(_mm512_cmp_ps_mask((__m512)x, _mm512_set1_ps(least), _CMP_GE_OQ), (__m512)x, _mm512_set1_ps(most));
+#else
+    const VF top = splat(most), y = x < top ? x : top;
+    return x >= splat(least) ? y : VF{};
+#endif
+}
+
+GSPLAT_INLINE VD between(VD x, double least, double most) {
+    const VD top = splat(most), y = x < top ? x : top;
+    return x >= splat(least) ? y : VD{};
 }
 
 // x where key is below the limit, otherwise 0.

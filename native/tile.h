@@ -20,23 +20,10 @@ GSPLAT_INLINE TileBox tile_box(const Grid &grid, const gsplat::Camera &cam, int3
     return box;
 }
 
-// A vector holds one block of pixels: four columns and as many rows as there are lanes for. A tile's blocks are counted
-// down its first four columns, then down the next four; block b is bit b of a mask, and a plane of a tile stores its pixels
-// block by block.
-template <class T>
-struct Blocks {
-    static constexpr int LANES = Vector<T>::LANES, WIDTH = 4, ROWS = LANES / WIDTH;
-    static constexpr int STRIPS = TILE / WIDTH, DOWN = TILE / ROWS, COUNT = STRIPS * DOWN;
-    // Where a plane stores the pixel (x, y) of the tile.
-    static constexpr int index(int x, int y) { return (x / WIDTH * DOWN + y / ROWS) * LANES + y % ROWS * WIDTH + x % WIDTH; }
-};
-
+// One number per pixel of a tile, row by row.
 template <class T>
 struct alignas(64) Plane {
-    using V = typename Vector<T>::V;
     T values[TILE * TILE];
-    V block(int b) const { return load<V>(values + b * Blocks<T>::LANES); }
-    void set_block(int b, V v) { store(values + b * Blocks<T>::LANES, v); }
 };
 
 // Four neighbouring pixels of a row.
@@ -84,51 +71,14 @@ GSPLAT_INLINE typename Four<T>::V load_some(const T *from, int count) {
 template <class T, class F>
 GSPLAT_INLINE void for_each_four(const TileBox &box, int32_t image_width, F visit) {
     for (int y = 0; y < box.height; ++y)
-        for (int x = 0; x < box.width; x += 4)
-            visit(Blocks<T>::index(x, y), int64_t(box.y0 + y) * image_width + box.x0 + x, vmin(4, box.width - x));
+        for (int x = 0; x < box.width; x += 4) visit(y * TILE + x, int64_t(box.y0 + y) * image_width + box.x0 + x, vmin(4, box.width - x));
 }
 
-// Coordinates of a tile's pixels, as planes. (Vectors of equal numbers would be multiplied as scalars and then broadcast.)
+// A tile's columns, in strips of one vector each.
 template <class T>
-struct Coordinates {
-    alignas(64) T x[TILE * TILE], y[TILE * TILE];
-    constexpr Coordinates() : x(), y() {
-        for (int row = 0; row < TILE; ++row)
-            for (int column = 0; column < TILE; ++column)
-                x[Blocks<T>::index(column, row)] = T(column), y[Blocks<T>::index(column, row)] = T(row);
-    }
+struct Strips {
+    static constexpr int WIDTH = Vector<T>::LANES, COUNT = TILE / WIDTH;
 };
-
-template <class T>
-static constexpr Coordinates<T> coordinates{};
-
-// A splat's s and t (see Splat) at the corner of a tile, and how they change per pixel.
-template <class T>
-struct Slope {
-    typename Vector<T>::V s, t, sx, sy, ty, log2_o;
-};
-
-template <class T>
-GSPLAT_INLINE Slope<T> slope(const Splat<T> &from, const TileBox &box) {
-    const T dx = T(box.x0) - from.x, dy = T(box.y0) - from.y;
-    return {splat(from.s0 + from.sx * dx + from.sy * dy),
-            splat(from.t0 + from.ty * dy),
-            splat(from.sx),
-            splat(from.sy),
-            splat(from.ty),
-            splat(from.log2_o)};
-}
-
-// The exponent p at the pixels of a block, and s and t there.
-template <class T, class V>
-GSPLAT_INLINE V exponent(const Slope<T> &at, int block, V &s, V &t) {
-    const V x = load<V>(coordinates<T>.x + block * Blocks<T>::LANES), y = load<V>(coordinates<T>.y + block * Blocks<T>::LANES);
-    s = at.s + at.sx * x + at.sy * y, t = at.t + at.ty * y;
-    return at.log2_o - t * t - s * s;
-}
-
-GSPLAT_INLINE int lowest_bit(uint32_t mask) { return __builtin_ctz(mask); }
-GSPLAT_INLINE int lowest_bit(uint64_t mask) { return __builtin_ctzll(mask); }
 
 constexpr uint32_t BATCH = 16;
 
@@ -142,26 +92,27 @@ GSPLAT_INLINE void fetch_next(const Splat<T> *splats, const Pair *pairs, uint32_
     }
 }
 
-// The blocks of a tile that each of the next splats can touch, as masks.
+// For each of the next splats, the rows that it can touch in every strip of the tile, first > last if none, and whether its
+// exponent stays in a range where 2^p can be stepped from row to row (see Falloff).
+constexpr double GENTLE = 92;  // largest s² + t² of a gentle splat: 2^-92 alone would leave 34 steps of the exponent
+
 template <class T>
-struct Touched {
-    static constexpr int COUNT = Blocks<T>::COUNT;
-    using Mask = std::conditional_t<(COUNT > 32), uint64_t, uint32_t>;
-    Mask masks[BATCH];
+struct Rows {
+    int32_t first[Strips<T>::COUNT][BATCH], last[Strips<T>::COUNT][BATCH], top[BATCH], bottom[BATCH];
+    bool gentle[BATCH];
 };
 
-// Over the columns [low, high] (relative to the mean) of four pixels the ellipse spans from its highest to its lowest point;
-// if one lies outside the columns, the nearest column counts. At width dx it spans dy = tangent dx +- half sqrt(1 - (dx / ex)²).
+// Over the columns [low, high] (relative to the mean) of a strip the ellipse spans from its highest to its lowest point; if one
+// lies outside the columns, the nearest column counts. At width dx it spans dy = tangent dx +- half sqrt(1 - (dx / ex)²).
 // Plain loops over BATCH lanes, which the compiler vectorises.
 template <class T>
-GSPLAT_INLINE void find_touched(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, Touched<T> &out) {
-    using B = Blocks<T>;
-    using Mask = typename Touched<T>::Mask;
-    T u[BATCH], v[BATCH], sx[BATCH], sy[BATCH], ty[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
+GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, Rows<T> &rows) {
+    using S = Strips<T>;
+    T u[BATCH], v[BATCH], x[BATCH], y[BATCH], sx[BATCH], sy[BATCH], ty[BATCH], s0[BATCH], t0[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
     for (uint32_t i = 0; i < BATCH; ++i) {
         const Splat<T> &s = splats[pairs[i < count ? i : 0].gaussian];
-        u[i] = s.u - T(box.x0), v[i] = s.v - T(box.y0);
-        sx[i] = s.sx, sy[i] = s.sy, ty[i] = s.ty, ex[i] = s.extent[0], ey[i] = s.extent[1];
+        u[i] = s.u - T(box.x0), v[i] = s.v - T(box.y0), x[i] = T(box.x0) - s.x, y[i] = T(box.y0) - s.y;
+        sx[i] = s.sx, sy[i] = s.sy, ty[i] = s.ty, s0[i] = s.s0, t0[i] = s.t0, ex[i] = s.extent[0], ey[i] = s.extent[1];
         drop[i] = s.log2_o - T(LOG2_ALPHA_MIN);
     }
     T tangent[BATCH], half[BATCH], foot[BATCH], inverse_ex[BATCH], slack[BATCH];
@@ -170,22 +121,80 @@ GSPLAT_INLINE void find_touched(const Splat<T> *splats, const Pair *pairs, uint3
         tangent[i] = -sx[i] * sy[i] / yy, half[i] = sqrt_(vmax(drop[i] / yy, T(0)));
         slack[i] = rim_slack(abs_(v[i]) + abs_(tangent[i]) * vmax(abs_(u[i]), abs_(T(TILE - 1) - u[i])) + half[i]);
         foot[i] = -sy[i] / sx[i] * ey[i], inverse_ex[i] = 1 / ex[i];
-        out.masks[i] = 0;
+        rows.top[i] = TILE, rows.bottom[i] = -1;
     }
     const T lowest = T(box.height - 1);
-    for (int strip = 0; strip < B::STRIPS; ++strip)
+    for (int strip = 0; strip < S::COUNT; ++strip)
         for (uint32_t i = 0; i < BATCH; ++i) {
-            const T low = T(B::WIDTH * strip) - u[i], high = low + T(B::WIDTH - 1);
+            const T low = T(S::WIDTH * strip) - u[i], high = low + T(S::WIDTH - 1);
             const T xb = vmin(vmax(foot[i], low), high), xt = vmin(vmax(-foot[i], low), high);
             const T rb = xb * inverse_ex[i], rt = xt * inverse_ex[i];
             const T bottom = v[i] + tangent[i] * xb + half[i] * sqrt_(vmax(1 - rb * rb, T(0))) + slack[i];
             const T top = v[i] + tangent[i] * xt - half[i] * sqrt_(vmax(1 - rt * rt, T(0))) - slack[i];
-            const int32_t first = int32_t(ceil_(vmin(vmax(top, T(0)), T(TILE))));
-            const int32_t last = int32_t(floor_(vmin(vmax(bottom, T(-1)), lowest)));
-            const uint32_t bits = (2u << uint32_t(vmax(last, 0)) / B::ROWS) - (1u << uint32_t(first) / B::ROWS);
-            out.masks[i] |= Mask(first <= last ? bits : 0) << strip * B::DOWN;
+            rows.first[strip][i] = int32_t(ceil_(vmin(vmax(top, T(0)), T(TILE))));
+            rows.last[strip][i] = int32_t(floor_(vmin(vmax(bottom, T(-1)), lowest)));
+            rows.top[i] = vmin(rows.top[i], rows.first[strip][i]), rows.bottom[i] = vmax(rows.bottom[i], rows.last[strip][i]);
         }
+    for (uint32_t i = 0; i < BATCH; ++i) {  // the largest |s| and |t| in the touched rows of the tile
+        const T across = T(TILE - 1) / 2, middle = T(rows.top[i] + rows.bottom[i]) / 2, down = T(rows.bottom[i] - rows.top[i]) / 2;
+        const T s = abs_(s0[i] + sx[i] * (x[i] + across) + sy[i] * (y[i] + middle)) + abs_(sx[i]) * across + abs_(sy[i]) * down;
+        const T t = abs_(t0[i] + ty[i] * (y[i] + middle)) + ty[i] * down;
+        rows.gentle[i] = s * s + t * t <= T(GENTLE);
+    }
 }
+
+// alpha down one strip of a tile. Where a splat is gentle, 2^p is stepped from row to row without an exponential each: p is
+// quadratic in y, so with k rows from the first
+//
+//     2^p(k + 1) = 2^p(k) r(0) f(k),   r(0) = 2^(p(1) - p(0)),   f(k) = 2^(-2 k (sy² + ty²))
+//
+// Otherwise every row takes its exponential, because r and f would leave the range of a float.
+template <class T, bool GENTLY>
+struct Falloff {
+    using V = typename Vector<T>::V;
+    T base[TILE], shift[TILE];          // of a splat that is not gentle: p = base - (across + shift)², row by row
+    alignas(64) T factors[TILE];        // f
+    V across, value, ratio;
+
+    GSPLAT_METHOD void begin_splat(const Splat<T> &s, const TileBox &box, int32_t top, int32_t bottom) {
+        if (GENTLY) {
+            const V curve = splat(-2 * (s.sy * s.sy + s.ty * s.ty));
+            for (int32_t k = 0; k < bottom - top; k += Vector<T>::LANES) store(factors + k, exp2_(curve * (iota<T>() + splat(T(k)))));
+        } else {
+            for (int row = 0; row < TILE; ++row) {
+                const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;
+                base[row] = s.log2_o - t * t, shift[row] = s.sy * dy;
+            }
+        }
+    }
+
+    GSPLAT_METHOD void begin_strip(const Splat<T> &s, V dx, T dy) {
+        across = splat(s.s0) + splat(s.sx) * dx;
+        if (!GENTLY) return;
+        const T t = s.t0 + s.ty * dy;
+        const V along = across + splat(s.sy * dy);
+        value = exp2_(splat(s.log2_o - t * t) - along * along);
+        ratio = exp2_(splat(-s.ty * (2 * t + s.ty) - s.sy * s.sy) - splat(2 * s.sy) * along);
+    }
+
+    // alpha, 0 below 1/255, and the number by which it is clamped, as `where_open` takes it.
+    GSPLAT_METHOD V alpha(int32_t row, V &key) const {
+        if (GENTLY) {
+            key = value;
+            return between(value, T(ALPHA_MIN), T(ALPHA_MAX));
+        }
+        const V q = across + splat(shift[row]);
+        key = splat(base[row]) - q * q;
+        return exp2_between(key, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
+    }
+
+    // x where alpha is not clamped, otherwise 0.
+    GSPLAT_METHOD static V where_open(V key, V x) { return where_below(key, GENTLY ? T(ALPHA_MAX) : T(LOG2_ALPHA_MAX), x); }
+
+    GSPLAT_METHOD void step(int32_t k) {
+        if (GENTLY) value *= ratio * splat(factors[k]);
+    }
+};
 
 }  // namespace GSPLAT_ISA
 }  // namespace gsplat
