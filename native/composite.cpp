@@ -11,48 +11,58 @@ namespace GSPLAT_ISA {
 
 template <class T>
 struct TileState {
-    alignas(64) T transmittance[TILE][TILE];
-    alignas(64) T red[TILE][TILE], green[TILE][TILE], blue[TILE][TILE], depth[TILE][TILE];
+    Plane<T> transmittance, red, green, blue, depth;
 };
 
-// Draws one splat; returns whether any pixel in the rows it touched still has a transmittance of T_STOP or more.
-template <class T, bool DEPTH>
-GSPLAT_INLINE bool draw(const Splat<T> &s, const TileBox &box, int32_t first, int32_t last, TileState<T> &tile) {
+// Draws one splat.
+template <class T, bool DEPTH, bool GENTLY>
+GSPLAT_INLINE void draw(const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i, TileState<T> &tile) {
     using V = typename Vector<T>::V;
-    constexpr int LANES = Vector<T>::LANES;
-    RowTerms<T> terms;
-    row_terms(s, box, terms);
-    V brightest = V{};
-    for (int column = 0; column < TILE; column += LANES) {
-        const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
-        const V across = splat(s.s0) + splat(s.sx) * dx;
-        for (int row = first; row <= last; ++row) {
-            const V q = across + splat(terms.shift[row]);
-            const V alpha = exp2_between(splat(terms.base[row]) - q * q, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
-            V t = load<V>(&tile.transmittance[row][column]);
-            const V w = t * alpha;
-            store(&tile.red[row][column], load<V>(&tile.red[row][column]) + w * splat(s.color[0]));
-            store(&tile.green[row][column], load<V>(&tile.green[row][column]) + w * splat(s.color[1]));
-            store(&tile.blue[row][column], load<V>(&tile.blue[row][column]) + w * splat(s.color[2]));
-            if (DEPTH) store(&tile.depth[row][column], load<V>(&tile.depth[row][column]) + w * splat(s.depth));
-            t -= w;
-            store(&tile.transmittance[row][column], t);
-            brightest = brightest > t ? brightest : t;
+    Falloff<T, GENTLY> falloff;
+    falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
+    const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
+    for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
+        const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
+        if (first > last) continue;
+        falloff.begin_strip(s, iota<T>() + splat(T(column + box.x0) - s.x), T(first + box.y0) - s.y);
+        for (int32_t row = first; row <= last; ++row) {
+            const int at = row * TILE + column;
+            V key;
+            const V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at), w = t * alpha;
+            store(tile.red.values + at, load<V>(tile.red.values + at) + w * red);
+            store(tile.green.values + at, load<V>(tile.green.values + at) + w * green);
+            store(tile.blue.values + at, load<V>(tile.blue.values + at) + w * blue);
+            if (DEPTH) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
+            store(tile.transmittance.values + at, t - w);
+            falloff.step(row - first);
         }
     }
-    return any_at_least(brightest, T(T_STOP));
 }
 
+// Whether any pixel still has a transmittance of T_STOP or more. Looks first where one had it the last time.
 template <class T>
-GSPLAT_INLINE bool lets_light_through(const TileState<T> &tile) {
+GSPLAT_INLINE bool lets_light_through(const TileState<T> &tile, int &where) {
     using V = typename Vector<T>::V;
-    V brightest = V{};
-    for (int row = 0; row < TILE; ++row)
-        for (int column = 0; column < TILE; column += Vector<T>::LANES) {
-            const V t = load<V>(&tile.transmittance[row][column]);
-            brightest = brightest > t ? brightest : t;
-        }
-    return any_at_least(brightest, T(T_STOP));
+    if (any_at_least(load<V>(tile.transmittance.values + where), T(T_STOP))) return true;
+    for (where = 0; where < TILE * TILE; where += Vector<T>::LANES)
+        if (any_at_least(load<V>(tile.transmittance.values + where), T(T_STOP))) return true;
+    where = 0;
+    return false;
+}
+
+// Writes the pixels of a tile, over the background.
+template <class T, bool DEPTH>
+GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box, const TileState<T> &tile) {
+    using Q = typename Four<T>::V;
+    const double *bg = args.settings.background;
+    for_each_four<T>(box, args.camera.W, [&](int from, int64_t pixel, int count) {
+        const Q t = load<Q>(tile.transmittance.values + from);
+        const Q rgb[3] = {load<Q>(tile.red.values + from) + t * T(bg[0]), load<Q>(tile.green.values + from) + t * T(bg[1]),
+                          load<Q>(tile.blue.values + from) + t * T(bg[2])};
+        store_colors<T>(args.image + 3 * pixel, count, rgb);
+        memcpy(args.transmittance + pixel, &t, size_t(count) * sizeof(T));
+        if (DEPTH) memcpy(args.depth + pixel, tile.depth.values + from, size_t(count) * sizeof(T));
+    });
 }
 
 template <class T, bool DEPTH>
@@ -61,35 +71,28 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     TileState<T> tile;
     memset(&tile, 0, sizeof tile);
     for (int y = 0; y < box.height; ++y)
-        for (int x = 0; x < box.width; ++x) tile.transmittance[y][x] = 1;
+        for (int x = 0; x < box.width; ++x) tile.transmittance.values[y * TILE + x] = 1;
 
     const uint32_t begin = args.tile_begin[index], end = args.tile_begin[index + 1];
     uint32_t k = begin;
-    Rows rows;
+    Rows<T> rows;
+    int bright = 0;
     for (; k < end; ++k) {
         const uint32_t i = (k - begin) % BATCH;
         if (i == 0) {
             fetch_next(args.splats, args.pairs + k, end - k);
             rows_of(args.splats, args.pairs + k, vmin(BATCH, end - k), box, rows);
         }
-        if (rows.first[i] > rows.last[i]) continue;
+        if (rows.top[i] > rows.bottom[i]) continue;
         const Splat<T> &s = args.splats[args.pairs[k].gaussian];
-        if (!draw<T, DEPTH>(s, box, rows.first[i], rows.last[i], tile) && !lets_light_through(tile)) {
+        rows.gentle[i] ? draw<T, DEPTH, true>(s, box, rows, i, tile) : draw<T, DEPTH, false>(s, box, rows, i, tile);
+        if (!lets_light_through(tile, bright)) {
             ++k;
             break;
         }
     }
     args.done[index] = k - begin;
-    for (int y = 0; y < box.height; ++y)
-        for (int x = 0; x < box.width; ++x) {
-            const int64_t pixel = int64_t(box.y0 + y) * args.camera.W + box.x0 + x;
-            const T t = tile.transmittance[y][x];
-            args.image[3 * pixel] = tile.red[y][x] + t * T(args.settings.background[0]);
-            args.image[3 * pixel + 1] = tile.green[y][x] + t * T(args.settings.background[1]);
-            args.image[3 * pixel + 2] = tile.blue[y][x] + t * T(args.settings.background[2]);
-            args.transmittance[pixel] = t;
-            if (DEPTH) args.depth[pixel] = tile.depth[y][x];
-        }
+    finish_tile<T, DEPTH>(args, box, tile);
 }
 
 template <class T>

@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "dispatch.h"
+#include "scan.h"
 #include "sort.h"
 #include "threads.h"
 
@@ -40,25 +41,58 @@ template <class T>
 void Frame<T>::project(const Scene<T> &scene) {
     Timer timer(seconds_[0]);
     const size_t n = size_t(std::max<int64_t>(n_, 1));
-    Buffer block_visible;
     ProjectArgs<T> args{scene,
                         camera_,
                         settings_,
                         static_cast<Splat<T> *>(splats_.reserve(n * sizeof(Splat<T>))),
-                        static_cast<uint32_t *>(visible_.reserve(n * 4)),
-                        static_cast<uint32_t *>(block_visible.reserve(size_t(blocks() + 1) * 4))};
+                        static_cast<uint32_t *>(block_ids_.reserve(n * 4)),
+                        static_cast<uint32_t *>(block_begin_.reserve(size_t(blocks() + 1) * 4))};
     parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project(args, block); });
-    for (int64_t block = 0; block < blocks(); ++block) {
-        std::memmove(args.visible + visible_count_, args.visible + block * BLOCK, args.block_visible[block] * 4);
-        visible_count_ += args.block_visible[block];
-    }
+    args.block_visible[blocks()] = 0;
+    visible_count_ = int64_t(exclusive_sums(threads_, blocks() + 1, args.block_visible));
 }
 
 template <class T>
 void Frame<T>::sort() {
     Timer timer(seconds_[1]);
-    auto *sorted = static_cast<uint32_t *>(sorted_.reserve((size_t(visible_count_) + 1) * 4));
-    sort_by_depth(splats(), visible(), visible_count_, sorted);
+    const size_t count = size_t(visible_count_) + 1;
+    Buffer key_buffer;
+    auto *keys = static_cast<DepthKey<T> *>(key_buffer.reserve(count * sizeof(DepthKey<T>)));
+    auto *ids = static_cast<uint32_t *>(visible_.reserve(count * 4));
+    const uint32_t *begin = block_begin_.as<uint32_t>();
+    parallel(threads_, blocks(), [&](int64_t block, int) {
+        const uint32_t *from = block_ids_.as<uint32_t>() + block * BLOCK;
+        for (uint32_t k = begin[block]; k < begin[block + 1]; ++k) {
+            ids[k] = keys[k].id = *from++;
+            std::memcpy(&keys[k].key, &splats()[ids[k]].depth, sizeof(T));
+        }
+    });
+    sort_by_depth(threads_, visible_count_, keys, static_cast<uint32_t *>(sorted_.reserve(count * 4)));
+}
+
+// Turns the counts of pairs, a row of tiles for each chunk, into the places where the chunks write theirs, and computes where
+// each tile's list begins.
+static void lay_out(int threads, int64_t tiles, int64_t chunks, uint32_t *table, uint32_t *tile_begin) {
+    constexpr int64_t RANGE = 1 << 10;
+    const int64_t ranges = (tiles + RANGE - 1) / RANGE;
+    auto end = [&](int64_t range) { return std::min((range + 1) * RANGE, tiles); };
+    parallel(threads, ranges, [&](int64_t range, int) {
+        std::fill(tile_begin + range * RANGE, tile_begin + end(range), 0);
+        for (int64_t c = 0; c < chunks; ++c)
+            for (int64_t tile = range * RANGE; tile < end(range); ++tile) tile_begin[tile] += table[c * tiles + tile];
+    });
+    tile_begin[tiles] = 0;
+    exclusive_sums(threads, tiles + 1, tile_begin);
+    parallel(threads, ranges, [&](int64_t range, int) {
+        uint32_t next[RANGE];
+        std::copy(tile_begin + range * RANGE, tile_begin + end(range), next);
+        for (int64_t c = 0; c < chunks; ++c)
+            for (int64_t tile = range * RANGE; tile < end(range); ++tile) {
+                const uint32_t count = table[c * tiles + tile];
+                table[c * tiles + tile] = next[tile - range * RANGE];
+                next[tile - range * RANGE] += count;
+            }
+    });
 }
 
 // Counts pairs per chunk and tile, lays out the lists, and writes them. Every list is in depth order and is the same for any
@@ -68,31 +102,30 @@ void Frame<T>::intersect() {
     Timer timer(seconds_[2]);
     const int64_t tiles = grid_.tiles();
     const int64_t chunks =
-        std::clamp<int64_t>(visible_count_ / 512, 1, std::min<int64_t>(16 * int64_t(threads_), 1 + 8 * visible_count_ / tiles));
-    Buffer next_buffer;
-    auto *next = static_cast<uint32_t *>(next_buffer.reserve(size_t(chunks * tiles) * 4));
-    std::memset(next, 0, size_t(chunks * tiles) * 4);
+        std::clamp<int64_t>(visible_count_ / 512, 1, std::min<int64_t>(8 * int64_t(threads_), 1 + 8 * visible_count_ / tiles));
+    Buffer table_buffer, runs;
+    auto *table = static_cast<uint32_t *>(table_buffer.reserve(size_t(chunks * tiles) * 4));
     const size_t n = size_t(std::max<int64_t>(n_, 1));
     auto *pairs_of = static_cast<uint32_t *>(pairs_of_.reserve(n * 4));
     auto *slot_begin = static_cast<uint32_t *>(slot_begin_.reserve(n * 4));
-    std::memset(pairs_of, 0, n * 4);
-    IntersectArgs<T> args{splats(), sorted_.as<uint32_t>(), grid_, camera_, pairs_of, slot_begin, nullptr};
+    auto *kept = static_cast<TileRuns *>(runs.reserve(size_t(visible_count_ + 1) * sizeof(TileRuns)));
+    IntersectArgs<T> args{splats(), sorted_.as<uint32_t>(), grid_, camera_, kept, pairs_of, slot_begin, nullptr};
     auto begin = [&](int64_t chunk) { return visible_count_ * chunk / chunks; };
-    parallel(threads_, chunks, [&](int64_t c, int) { kernels<T>().count(args, begin(c), begin(c + 1), next + c * tiles); });
-
-    uint64_t total = 0;
-    for (int64_t i = 0; i < n_; ++i) slot_begin[i] = uint32_t(total), total += pairs_of[i];
+    parallel(threads_, blocks(),
+             [&](int64_t block, int) { std::fill(pairs_of + block * BLOCK, pairs_of + std::min((block + 1) * BLOCK, n_), 0); });
+    parallel(threads_, chunks, [&](int64_t c, int) {
+        std::fill(table + c * tiles, table + (c + 1) * tiles, 0);
+        kernels<T>().count(args, begin(c), begin(c + 1), table + c * tiles);
+    });
+    parallel(threads_, blocks(), [&](int64_t block, int) {
+        std::copy(pairs_of + block * BLOCK, pairs_of + std::min((block + 1) * BLOCK, n_), slot_begin + block * BLOCK);
+    });
+    const uint64_t total = exclusive_sums(threads_, n_, slot_begin);
     if (total >= (uint64_t(1) << 32)) throw std::length_error("more than 4,294,967,295 pairs of Gaussian and tile");
     pairs_count_ = int64_t(total);
-    auto *tile_begin = static_cast<uint32_t *>(tile_begin_.reserve(size_t(tiles + 1) * 4));
-    uint32_t running = 0;
-    for (int64_t tile = 0; tile < tiles; ++tile) {
-        tile_begin[tile] = running;
-        for (int64_t c = 0; c < chunks; ++c) running += std::exchange(next[c * tiles + tile], running);
-    }
-    tile_begin[tiles] = running;
+    lay_out(threads_, tiles, chunks, table, static_cast<uint32_t *>(tile_begin_.reserve(size_t(tiles + 1) * 4)));
     args.pairs = static_cast<Pair *>(pairs_.reserve((size_t(total) + 1) * sizeof(Pair)));
-    parallel(threads_, chunks, [&](int64_t c, int) { kernels<T>().scatter(args, begin(c), begin(c + 1), next + c * tiles); });
+    parallel(threads_, chunks, [&](int64_t c, int) { kernels<T>().scatter(args, begin(c), begin(c + 1), table + c * tiles); });
 }
 
 template <class T>

@@ -46,7 +46,7 @@ class Frame {
     int threads_;
     int64_t visible_count_ = 0, pairs_count_ = 0;
     std::array<double, 6> seconds_{};
-    Buffer splats_, visible_, sorted_, pairs_of_, slot_begin_, pairs_, tile_begin_, done_;
+    Buffer splats_, block_ids_, block_begin_, visible_, sorted_, pairs_of_, slot_begin_, pairs_, tile_begin_, done_;
 };
 
 }  // namespace gsplat

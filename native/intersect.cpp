@@ -32,37 +32,57 @@ GSPLAT_INLINE Ellipse<T> ellipse(const Splat<T> &s) {
     return e;
 }
 
-// Calls visit(tile_y, first tile_x, last tile_x) for every row of tiles that the ellipse meets.
+// Calls visit(first tile, number of tiles) for every row of tiles that the ellipse meets, top to bottom. Rows are worked out
+// four at a time, in plain loops that the compiler vectorises.
 template <class T, class F>
-GSPLAT_INLINE void rows_of_tiles(const Ellipse<T> &e, const Camera &cam, F visit) {
+GSPLAT_INLINE void for_each_run(const Ellipse<T> &e, const Camera &cam, const Grid &grid, F visit) {
     const T above = rim_slack(abs_(e.v) + e.ey);
     const int32_t first = int32_t(vmin(vmax(ceil_(e.v - e.ey - above), T(0)), T(cam.H)));
     const int32_t last = int32_t(vmax(vmin(floor_(e.v + e.ey + above), T(cam.H - 1)), T(-1)));
     if (first > last) return;
     const T slack = rim_slack(abs_(e.u) + abs_(e.tangent) * vmin(e.ey, abs_(e.v) + T(cam.H)) + e.half);
-    for (int32_t ty = first / TILE; ty <= last / TILE; ++ty) {
-        T low = T(ty * TILE) - e.v, high = T(ty * TILE + TILE - 1) - e.v;
-        low = vmax(low, -e.ey), high = vmin(high, e.ey);
-        if (low > high) low = high = (low + high) / 2;  // met by the slack alone
-        const T right = vmin(vmax(-e.slant * e.ex, low), high), left = vmin(vmax(e.slant * e.ex, low), high);
-        const T qr = 1 - (right * e.inverse_ey) * (right * e.inverse_ey), ql = 1 - (left * e.inverse_ey) * (left * e.inverse_ey);
-        const T x1 = e.u + e.tangent * right + e.half * sqrt_(vmax(qr, T(0))) + slack;
-        const T x0 = e.u + e.tangent * left - e.half * sqrt_(vmax(ql, T(0))) - slack;
-        const int32_t c0 = int32_t(vmin(vmax(ceil_(x0), T(0)), T(cam.W))), c1 = int32_t(vmax(vmin(floor_(x1), T(cam.W - 1)), T(-1)));
-        if (c0 <= c1) visit(ty, c0 / TILE, c1 / TILE);
+    const T end = T(cam.W - 1), rightmost = -e.slant * e.ex;
+    for (int32_t ty = first / TILE; ty <= last / TILE; ty += 4) {
+        int32_t c0[4], c1[4];
+        for (int32_t r = 0; r < 4; ++r) {
+            T low = T((ty + r) * TILE) - e.v, high = T((ty + r) * TILE + TILE - 1) - e.v;
+            low = vmax(low, -e.ey), high = vmin(high, e.ey);
+            const T middle = (low + high) / 2;  // of a row that only the slack meets
+            const bool crossed = low > high;
+            low = crossed ? middle : low, high = crossed ? middle : high;
+            const T right = vmin(vmax(rightmost, low), high), left = vmin(vmax(-rightmost, low), high);
+            const T yr = right * e.inverse_ey, yl = left * e.inverse_ey;
+            const T x1 = e.u + e.tangent * right + e.half * sqrt_(vmax(1 - yr * yr, T(0))) + slack;
+            const T x0 = e.u + e.tangent * left - e.half * sqrt_(vmax(1 - yl * yl, T(0))) - slack;
+            c0[r] = int32_t(vmin(vmax(ceil_(x0), T(0)), T(cam.W))), c1[r] = int32_t(vmax(vmin(floor_(x1), end), T(-1)));
+        }
+        for (int32_t r = 0; r < 4 && ty + r <= last / TILE; ++r)
+            if (c0[r] <= c1[r]) {
+                const int32_t tx = c0[r] / TILE;
+                visit(uint32_t((ty + r) * grid.tiles_x + tx), uint32_t(c1[r] / TILE - tx + 1));
+            }
     }
+}
+
+template <class T>
+GSPLAT_INLINE void fetch(const Splat<T> *record) {
+    __builtin_prefetch(record);
+    if (sizeof *record > 64) __builtin_prefetch(reinterpret_cast<const char *>(record) + 64);
 }
 
 template <class T>
 void count(const IntersectArgs<T> &args, int64_t begin, int64_t end, uint32_t *per_tile) {
     for (int64_t k = begin; k < end; ++k) {
         const uint32_t id = args.sorted[k];
-        if (k + AHEAD < end) __builtin_prefetch(args.splats + args.sorted[k + AHEAD]);
-        uint32_t total = 0;
-        rows_of_tiles(ellipse(args.splats[id]), args.camera, [&](int32_t ty, int32_t tx0, int32_t tx1) {
-            for (int32_t tx = tx0; tx <= tx1; ++tx) ++per_tile[ty * args.grid.tiles_x + tx];
-            total += uint32_t(tx1 - tx0 + 1);
+        if (k + AHEAD < end) fetch(args.splats + args.sorted[k + AHEAD]);
+        uint32_t total = 0, rows = 0;
+        TileRuns &kept = args.runs[k];
+        for_each_run(ellipse(args.splats[id]), args.camera, args.grid, [&](uint32_t first, uint32_t tiles) {
+            for (uint32_t tile = first; tile < first + tiles; ++tile) ++per_tile[tile];
+            if (rows < TileRuns::KEPT) kept.runs[rows] = {first, tiles};
+            total += tiles, ++rows;
         });
+        kept.rows = rows;
         args.pairs_of[id] = total;
     }
 }
@@ -71,11 +91,15 @@ template <class T>
 void scatter(const IntersectArgs<T> &args, int64_t begin, int64_t end, uint32_t *next) {
     for (int64_t k = begin; k < end; ++k) {
         const uint32_t id = args.sorted[k];
-        if (k + AHEAD < end) __builtin_prefetch(args.splats + args.sorted[k + AHEAD]);
+        const TileRuns &kept = args.runs[k];
         uint32_t slot = args.slot_begin[id];
-        rows_of_tiles(ellipse(args.splats[id]), args.camera, [&](int32_t ty, int32_t tx0, int32_t tx1) {
-            for (int32_t tx = tx0; tx <= tx1; ++tx) args.pairs[next[ty * args.grid.tiles_x + tx]++] = Pair{id, slot++};
-        });
+        auto write = [&](uint32_t first, uint32_t tiles) {
+            for (uint32_t tile = first; tile < first + tiles; ++tile) args.pairs[next[tile]++] = Pair{id, slot++};
+        };
+        if (kept.rows > TileRuns::KEPT)
+            for_each_run(ellipse(args.splats[id]), args.camera, args.grid, write);
+        else
+            for (uint32_t row = 0; row < kept.rows; ++row) write(kept.runs[row].first, kept.runs[row].count);
     }
 }
 

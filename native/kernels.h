@@ -71,6 +71,18 @@ struct Pair {
 // Partial sums of one pair, in this order: w g by colour channel, the moments of h, and w times the depth's gradient.
 enum Sum { RED, GREEN, BLUE, H, HX, HXX, HY, HXY, HYY, DEPTH, SLOT };
 
+// Neighbouring tiles of one row.
+struct TileRun {
+    uint32_t first, count;
+};
+
+// The runs of tiles that one Gaussian meets, top to bottom, as far as there is room: only the others are found again.
+struct TileRuns {
+    static constexpr uint32_t KEPT = 3;
+    uint32_t rows;                                     // number of runs; none is kept if there are more than KEPT
+    TileRun runs[KEPT];
+};
+
 struct Grid {
     int32_t tiles_x, tiles_y;
     int32_t tiles() const { return tiles_x * tiles_y; }
@@ -82,7 +94,7 @@ struct ProjectArgs {
     Camera camera;
     Settings settings;
     Splat<T> *splats;                                  // N, filled where visible
-    uint32_t *visible;                                 // ids, contiguous within each block
+    uint32_t *visible;                                 // ids, at the beginning of each block
     uint32_t *block_visible;                           // count per block of BLOCK Gaussians
 };
 
@@ -92,6 +104,7 @@ struct IntersectArgs {
     const uint32_t *sorted;                            // ids, near to far
     Grid grid;
     Camera camera;
+    TileRuns *runs;                                    // of the sorted Gaussians
     uint32_t *pairs_of;                                // N, number of tiles that each Gaussian touches
     const uint32_t *slot_begin;                        // N, first slot of each Gaussian
     Pair *pairs;

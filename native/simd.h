@@ -8,8 +8,10 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__AVX512F__)
+#if defined(__SSE__)
 #include <immintrin.h>
+#elif defined(__ARM_NEON)
+#include <arm_neon.h>
 #endif
 
 #if defined(__AVX512F__)
@@ -21,6 +23,7 @@
 #endif
 
 #define GSPLAT_INLINE static inline __attribute__((always_inline))
+#define GSPLAT_METHOD inline __attribute__((always_inline))
 
 namespace gsplat {
 namespace GSPLAT_ISA {
@@ -106,6 +109,12 @@ GSPLAT_INLINE double sum(VD v) {
 GSPLAT_INLINE bool any_at_least(VF v, float x) {
 #if GSPLAT_VECTOR_BYTES == 64
     return _mm512_cmp_ps_mask((__m512)v, _mm512_set1_ps(x), _CMP_GE_OQ) != 0;
+#elif GSPLAT_VECTOR_BYTES == 32
+    return _mm256_movemask_ps((__m256)(v >= splat(x))) != 0;
+#elif defined(__SSE__)
+    return _mm_movemask_ps((__m128)(v >= splat(x))) != 0;
+#elif defined(__ARM_NEON)
+    return vmaxvq_f32((float32x4_t)v) >= x;
 #else
     auto mask = v >= splat(x);
     int32_t any = 0;
@@ -121,39 +130,62 @@ GSPLAT_INLINE bool any_at_least(VD v, double x) {
     return any != 0;
 }
 
-// 2^min(p, most), 0 where p < least; most <= 0 and -126 <= least. n = round(p) (by adding and subtracting 1.5 * 2^23, which -ffast-math
-// would fold away), then a polynomial of degree 5 on [-1/2, 1/2] fitted for its relative error, 2.4e-7.
-GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
-#if GSPLAT_VECTOR_BYTES == 64
-    const __mmask16 keep = _mm512_cmp_ps_mask((__m512)p, _mm512_set1_ps(least), _CMP_GE_OQ);
-    p = (VF)_mm512_min_ps((__m512)p, _mm512_set1_ps(most));
-    const __m512 n = _mm512_roundscale_ps((__m512)p, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-    const VF f = p - (VF)n;
-#else
-    const VF magic = splat(12582912.0f), bottom = splat(least), top = splat(most);
-    const auto keep = p >= bottom;
-    p = p < top ? p : top;
-    p = p > bottom ? p : bottom;  // a smaller value would overflow the exponent bits
-    const VF n = (p + magic) - magic;
-    const VF f = p - n;
-#endif
+// 2^f on [-1/2, 1/2], a polynomial of degree 5 fitted for its relative error, 2.4e-7.
+GSPLAT_INLINE VF exp2_fraction(VF f) {
     VF y = splat(1.33952915e-3f);
     y = y * f + splat(9.67037690e-3f);
     y = y * f + splat(5.55033013e-2f);
     y = y * f + splat(2.40222633e-1f);
     y = y * f + splat(6.93147182e-1f);
-    y = y * f + splat(1.0f);
+    return y * f + splat(1.0f);
+}
+
+// 2^p for -126 <= p < 128. n = round(p), by adding and subtracting 1.5 * 2^23, which -ffast-math would fold away; the lowest
+// bits of the sum are those of n, and go to the exponent.
+GSPLAT_INLINE VF exp2_(VF p) {
+    typedef uint32_t Bits __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));  // wraps instead of overflowing
+    const VF magic = splat(12582912.0f), rounded = p + magic;
+    return (VF)((Bits)exp2_fraction(p - (rounded - magic)) + ((Bits)rounded << 23));
+}
+
+GSPLAT_INLINE VD exp2_(VD p) {
+    for (int i = 0; i < Vector<double>::LANES; ++i) p[i] = exp2(p[i]);
+    return p;
+}
+
+// 2^min(p, most), 0 where p < least; most <= 0 and -126 <= least.
+GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
 #if GSPLAT_VECTOR_BYTES == 64
-    return (VF)_mm512_maskz_scalef_ps(keep, (__m512)y, n);
+    const __mmask16 keep = _mm512_cmp_ps_mask((__m512)p, _mm512_set1_ps(least), _CMP_GE_OQ);
+    p = (VF)_mm512_min_ps((__m512)p, _mm512_set1_ps(most));
+    const __m512 n = _mm512_roundscale_ps((__m512)p, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    return (VF)_mm512_maskz_scalef_ps(keep, (__m512)exp2_fraction(p - (VF)n), n);
 #else
-    const Vector<float>::M e = __builtin_convertvector(n, Vector<float>::M);
-    return keep ? (VF)((Vector<float>::M)y + (e << 23)) : VF{};
+    const VF top = splat(most);
+    const auto keep = p >= splat(least);
+    const VF y = exp2_(p < top ? p : top);  // garbage where p is too small, which is not kept
+    return keep ? y : VF{};
 #endif
 }
 
 GSPLAT_INLINE VD exp2_between(VD p, double least, double most) {
     for (int i = 0; i < Vector<double>::LANES; ++i) p[i] = p[i] >= least ? exp2(p[i] < most ? p[i] : most) : 0.0;
     return p;
+}
+
+// min(x, most), 0 where x < least.
+GSPLAT_INLINE VF between(VF x, float least, float most) {
+#if GSPLAT_VECTOR_BYTES == 64
+    return (VF)_mm512_maskz_min_ps(_mm512_cmp_ps_mask((__m512)x, _mm512_set1_ps(least), _CMP_GE_OQ), (__m512)x, _mm512_set1_ps(most));
+#else
+    const VF top = splat(most), y = x < top ? x : top;
+    return x >= splat(least) ? y : VF{};
+#endif
+}
+
+GSPLAT_INLINE VD between(VD x, double least, double most) {
+    const VD top = splat(most), y = x < top ? x : top;
+    return x >= splat(least) ? y : VD{};
 }
 
 // x where key is below the limit, otherwise 0.
@@ -179,24 +211,39 @@ GSPLAT_INLINE VF reciprocal(VF x) {
 
 GSPLAT_INLINE VD reciprocal(VD x) { return splat(1.0) / x; }
 
-// Writes the lane sums of eight vectors to out[0..7]: three rounds fold pairs of vectors into one, which leaves every sum
-// split over the two halves of the register.
+// Writes the lane sums of eight vectors to out[0..7]: each round folds pairs of vectors into one.
 GSPLAT_INLINE void sum8(const VF *v, float *out) {
 #if GSPLAT_VECTOR_BYTES == 64
     VF a[4], b[2];
     for (int i = 0; i < 4; ++i)
-        a[i] = __builtin_shufflevector(v[2 * i], v[2 * i + 1], 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30) +
-               __builtin_shufflevector(v[2 * i], v[2 * i + 1], 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
+        a[i] = __builtin_shufflevector(v[2 * i], v[2 * i + 1], 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29) +
+               __builtin_shufflevector(v[2 * i], v[2 * i + 1], 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
     for (int i = 0; i < 2; ++i)
         b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
                __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
     const VF c = __builtin_shufflevector(b[0], b[1], 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27) +
                  __builtin_shufflevector(b[0], b[1], 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
-    typedef float H __attribute__((vector_size(32)));
-    const H h = __builtin_shufflevector(c, c, 0, 1, 2, 3, 4, 5, 6, 7) + __builtin_shufflevector(c, c, 8, 9, 10, 11, 12, 13, 14, 15);
+    typedef float Half __attribute__((vector_size(32)));
+    const Half h = __builtin_shufflevector(c, c, 0, 1, 2, 3, 4, 5, 6, 7) + __builtin_shufflevector(c, c, 8, 9, 10, 11, 12, 13, 14, 15);
     memcpy(out, &h, sizeof h);
+#elif GSPLAT_VECTOR_BYTES == 32
+    VF a[4], b[2];
+    for (int i = 0; i < 4; ++i)
+        a[i] = __builtin_shufflevector(v[2 * i], v[2 * i + 1], 0, 8, 1, 9, 4, 12, 5, 13) +
+               __builtin_shufflevector(v[2 * i], v[2 * i + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+    for (int i = 0; i < 2; ++i)
+        b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 8, 9, 4, 5, 12, 13) +
+               __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 3, 10, 11, 6, 7, 14, 15);
+    store(out, VF(__builtin_shufflevector(b[0], b[1], 0, 1, 2, 3, 8, 9, 10, 11) +
+                  __builtin_shufflevector(b[0], b[1], 4, 5, 6, 7, 12, 13, 14, 15)));
 #else
-    for (int i = 0; i < 8; ++i) out[i] = sum(v[i]);
+    for (int half = 0; half < 8; half += 4) {
+        VF a[2];
+        for (int i = 0; i < 2; ++i)
+            a[i] = __builtin_shufflevector(v[half + 2 * i], v[half + 2 * i + 1], 0, 4, 1, 5) +
+                   __builtin_shufflevector(v[half + 2 * i], v[half + 2 * i + 1], 2, 6, 3, 7);
+        store(out + half, VF(__builtin_shufflevector(a[0], a[1], 0, 1, 4, 5) + __builtin_shufflevector(a[0], a[1], 2, 3, 6, 7)));
+    }
 #endif
 }
 

@@ -1,43 +1,50 @@
 #include "sort.h"
 
-#include <cstring>
-#include <type_traits>
+#include <algorithm>
 #include <utility>
-#include <vector>
 
 #include "buffers.h"
+#include "scan.h"
+#include "threads.h"
 
 namespace gsplat {
+namespace {
 
-// A stable radix sort by the bits of the depths: positive floats have the same order as their bits.
+constexpr int DIGIT = 11, BINS = 1 << DIGIT;
+constexpr int64_t CHUNK = 1 << 13;  // keys per task at least: four times the bins
+
+}  // namespace
+
+// A radix sort, least digit first. Every chunk of keys counts its digits; the running sums of the counts, digit by digit and
+// chunk by chunk within each, are where it writes them. So the order is the same for any number of chunks.
 template <class T>
-void sort_by_depth(const Splat<T> *splats, const uint32_t *ids, int64_t visible, uint32_t *sorted) {
-    using Key = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
-    struct Item {
-        Key key;
-        uint32_t id;
-    };
-    constexpr int DIGIT = 11, BINS = 1 << DIGIT;
-    const size_t count = size_t(visible);
-    Buffer a, b;
-    auto *from = static_cast<Item *>(a.reserve((count + 1) * sizeof(Item)));
-    auto *to = static_cast<Item *>(b.reserve((count + 1) * sizeof(Item)));
-    for (size_t k = 0; k < count; ++k) {
-        from[k].id = ids[k];
-        std::memcpy(&from[k].key, &splats[from[k].id].depth, sizeof(Key));
-    }
-    for (int shift = 0; shift < int(8 * sizeof(Key)); shift += DIGIT) {
-        std::vector<uint32_t> next(BINS + 1);
-        for (size_t k = 0; k < count; ++k) ++next[((from[k].key >> shift) & (BINS - 1)) + 1];
-        if (count && next[((from[0].key >> shift) & (BINS - 1)) + 1] == count) continue;  // all keys share this digit
-        for (int bin = 0; bin < BINS; ++bin) next[bin + 1] += next[bin];
-        for (size_t k = 0; k < count; ++k) to[next[(from[k].key >> shift) & (BINS - 1)]++] = from[k];
+void sort_by_depth(int threads, int64_t count, DepthKey<T> *keys, uint32_t *sorted) {
+    const int64_t chunks = std::clamp<int64_t>(count / CHUNK, 1, 2 * int64_t(threads));
+    auto begin = [&](int64_t chunk) { return count * chunk / chunks; };
+    Buffer other, table;
+    DepthKey<T> *from = keys, *to = static_cast<DepthKey<T> *>(other.reserve(size_t(count + 1) * sizeof(DepthKey<T>)));
+    auto *places = static_cast<uint32_t *>(table.reserve(size_t(chunks) * BINS * 4));
+    for (int shift = 0; shift < int(8 * sizeof keys->key); shift += DIGIT) {
+        auto digit = [&](const DepthKey<T> &item) { return size_t(item.key >> shift) & (BINS - 1); };
+        parallel(threads, chunks, [&](int64_t chunk, int) {
+            uint32_t counts[BINS] = {};
+            for (int64_t k = begin(chunk); k < begin(chunk + 1); ++k) ++counts[digit(from[k])];
+            for (int64_t bin = 0; bin < BINS; ++bin) places[bin * chunks + chunk] = counts[bin];
+        });
+        exclusive_sums(threads, BINS * chunks, places);
+        parallel(threads, chunks, [&](int64_t chunk, int) {
+            uint32_t next[BINS];
+            for (int64_t bin = 0; bin < BINS; ++bin) next[bin] = places[bin * chunks + chunk];
+            for (int64_t k = begin(chunk); k < begin(chunk + 1); ++k) to[next[digit(from[k])]++] = from[k];
+        });
         std::swap(from, to);
     }
-    for (size_t k = 0; k < count; ++k) sorted[k] = from[k].id;
+    parallel(threads, chunks, [&](int64_t chunk, int) {
+        for (int64_t k = begin(chunk); k < begin(chunk + 1); ++k) sorted[k] = from[k].id;
+    });
 }
 
-template void sort_by_depth<float>(const Splat<float> *, const uint32_t *, int64_t, uint32_t *);
-template void sort_by_depth<double>(const Splat<double> *, const uint32_t *, int64_t, uint32_t *);
+template void sort_by_depth<float>(int, int64_t, DepthKey<float> *, uint32_t *);
+template void sort_by_depth<double>(int, int64_t, DepthKey<double> *, uint32_t *);
 
 }  // namespace gsplat

@@ -3,6 +3,7 @@
 #include <pthread.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <memory>
@@ -24,6 +25,7 @@ class Pool {
             task_ = &task;
             count_ = count;
             next_.store(0);
+            claim_ = std::clamp<int64_t>(count / (32 * int64_t(threads)), 1, 8);
             helpers_ = threads - 1;
             open_ = true;
             round_.fetch_add(1);
@@ -38,8 +40,10 @@ class Pool {
     }
 
   private:
+    // Claims several tasks at a time, so that many threads do not wait for one counter.
     void drain(int worker) {
-        for (int64_t i = next_.fetch_add(1); i < count_; i = next_.fetch_add(1)) (*task_)(i, worker);
+        for (int64_t begin = next_.fetch_add(claim_); begin < count_; begin = next_.fetch_add(claim_))
+            for (int64_t i = begin; i < std::min(begin + claim_, count_); ++i) (*task_)(i, worker);
     }
 
     void work(int id) {
@@ -61,11 +65,12 @@ class Pool {
     std::vector<std::thread> workers_;
     std::mutex mutex_;
     std::condition_variable wake_;
-    std::atomic<uint64_t> round_{0};
-    std::atomic<int64_t> next_{0};
-    std::atomic<int> active_{0};
-    const Task *task_ = nullptr;
-    int64_t count_ = 0;
+    // Each on a cache line of its own: all threads write next_ while they read the others.
+    alignas(64) std::atomic<uint64_t> round_{0};
+    alignas(64) std::atomic<int64_t> next_{0};
+    alignas(64) std::atomic<int> active_{0};
+    alignas(64) const Task *task_ = nullptr;
+    int64_t count_ = 0, claim_ = 1;
     int helpers_ = 0;
     bool open_ = false;
 };

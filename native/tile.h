@@ -1,6 +1,8 @@
 // Code shared by the forward and backward pass of a tile.
 #pragma once
 
+#include <type_traits>
+
 #include "gaussian_math.h"
 
 namespace gsplat {
@@ -18,26 +20,67 @@ GSPLAT_INLINE TileBox tile_box(const Grid &grid, const gsplat::Camera &cam, int3
     return box;
 }
 
-// The per-row part of a splat's exponent: p = base - (shift + s0 + sx dx)².
+// One number per pixel of a tile, row by row.
 template <class T>
-struct RowTerms {
-    alignas(64) T base[TILE], shift[TILE];
+struct alignas(64) Plane {
+    T values[TILE * TILE];
 };
 
+// Four neighbouring pixels of a row.
 template <class T>
-GSPLAT_INLINE void row_terms(const Splat<T> &s, const TileBox &box, RowTerms<T> &terms) {
-    for (int row = 0; row < TILE; ++row) {
-        const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;
-        terms.base[row] = s.log2_o - t * t, terms.shift[row] = s.sy * dy;
+struct Four {
+    typedef T V __attribute__((vector_size(4 * sizeof(T))));
+};
+
+// Reads `count` pixels of an interleaved image, at most four; the others are 0.
+template <class T>
+GSPLAT_INLINE void load_colors(const T *from, int count, typename Four<T>::V *rgb) {
+    using Q = typename Four<T>::V;
+    alignas(Q) T part[12] = {};
+    if (count < 4) {
+        for (int i = 0; i < 3 * count; ++i) part[i] = from[i];
+        from = part;
     }
+    const Q a = load<Q>(from), b = load<Q>(from + 4), c = load<Q>(from + 8);
+    rgb[0] = __builtin_shufflevector(__builtin_shufflevector(a, b, 0, 3, 6, 0), c, 0, 1, 2, 5);
+    rgb[1] = __builtin_shufflevector(__builtin_shufflevector(a, b, 1, 4, 7, 0), c, 0, 1, 2, 6);
+    rgb[2] = __builtin_shufflevector(__builtin_shufflevector(a, b, 2, 5, 0, 0), c, 0, 1, 4, 7);
 }
 
-// The rows of a tile that each of the next splats can touch; first > last if it touches none.
-constexpr uint32_t BATCH = 16;
+template <class T>
+GSPLAT_INLINE void store_colors(T *to, int count, const typename Four<T>::V *rgb) {
+    using Q = typename Four<T>::V;
+    const Q r = rgb[0], g = rgb[1], b = rgb[2];
+    const Q out[3] = {__builtin_shufflevector(__builtin_shufflevector(r, g, 0, 4, 1, 1), b, 0, 1, 4, 2),
+                      __builtin_shufflevector(__builtin_shufflevector(g, b, 1, 5, 2, 2), r, 0, 1, 6, 2),
+                      __builtin_shufflevector(__builtin_shufflevector(b, r, 2, 7, 3, 3), g, 0, 1, 7, 2)};
+    memcpy(to, out, size_t(3 * count) * sizeof(T));
+}
 
-struct Rows {
-    int32_t first[BATCH], last[BATCH];
+// Reads `count` numbers of a plane of an image, at most four; the others are 0.
+template <class T>
+GSPLAT_INLINE typename Four<T>::V load_some(const T *from, int count) {
+    using Q = typename Four<T>::V;
+    if (count == 4) return load<Q>(from);
+    Q v{};
+    for (int i = 0; i < count; ++i) v[i] = from[i];
+    return v;
+}
+
+// Calls visit(index in a plane, index in the image, count) for every run of at most four pixels of the tile.
+template <class T, class F>
+GSPLAT_INLINE void for_each_four(const TileBox &box, int32_t image_width, F visit) {
+    for (int y = 0; y < box.height; ++y)
+        for (int x = 0; x < box.width; x += 4) visit(y * TILE + x, int64_t(box.y0 + y) * image_width + box.x0 + x, vmin(4, box.width - x));
+}
+
+// A tile's columns, in strips of one vector each.
+template <class T>
+struct Strips {
+    static constexpr int WIDTH = Vector<T>::LANES, COUNT = TILE / WIDTH;
 };
+
+constexpr uint32_t BATCH = 16;
 
 // Prefetches the records of the batch after the one that begins at `pairs`; a record may span two cache lines.
 template <class T>
@@ -49,32 +92,109 @@ GSPLAT_INLINE void fetch_next(const Splat<T> *splats, const Pair *pairs, uint32_
     }
 }
 
-// Over the tile's columns [low, high] (relative to the mean) the ellipse spans from its highest to its lowest point; if one
+// For each of the next splats, the rows that it can touch in every strip of the tile, first > last if none, and whether its
+// exponent stays in a range where 2^p can be stepped from row to row (see Falloff).
+constexpr double GENTLE = 92;  // largest s² + t² of a gentle splat: 2^-92 alone would leave 34 steps of the exponent
+
+template <class T>
+struct Rows {
+    int32_t first[Strips<T>::COUNT][BATCH], last[Strips<T>::COUNT][BATCH], top[BATCH], bottom[BATCH];
+    bool gentle[BATCH];
+};
+
+// Over the columns [low, high] (relative to the mean) of a strip the ellipse spans from its highest to its lowest point; if one
 // lies outside the columns, the nearest column counts. At width dx it spans dy = tangent dx +- half sqrt(1 - (dx / ex)²).
 // Plain loops over BATCH lanes, which the compiler vectorises.
 template <class T>
-GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, Rows &rows) {
-    T u[BATCH], v[BATCH], sx[BATCH], sy[BATCH], ty[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
+GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, Rows<T> &rows) {
+    using S = Strips<T>;
+    T u[BATCH], v[BATCH], x[BATCH], y[BATCH], sx[BATCH], sy[BATCH], ty[BATCH], s0[BATCH], t0[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
     for (uint32_t i = 0; i < BATCH; ++i) {
         const Splat<T> &s = splats[pairs[i < count ? i : 0].gaussian];
-        u[i] = s.u - T(box.x0), v[i] = s.v - T(box.y0);
-        sx[i] = s.sx, sy[i] = s.sy, ty[i] = s.ty, ex[i] = s.extent[0], ey[i] = s.extent[1];
+        u[i] = s.u - T(box.x0), v[i] = s.v - T(box.y0), x[i] = T(box.x0) - s.x, y[i] = T(box.y0) - s.y;
+        sx[i] = s.sx, sy[i] = s.sy, ty[i] = s.ty, s0[i] = s.s0, t0[i] = s.t0, ex[i] = s.extent[0], ey[i] = s.extent[1];
         drop[i] = s.log2_o - T(LOG2_ALPHA_MIN);
     }
-    const T lowest = T(box.height - 1);
+    T tangent[BATCH], half[BATCH], foot[BATCH], inverse_ex[BATCH], slack[BATCH];
     for (uint32_t i = 0; i < BATCH; ++i) {
-        const T low = -u[i], high = low + T(TILE - 1), yy = sy[i] * sy[i] + ty[i] * ty[i];
-        const T tangent = -sx[i] * sy[i] / yy, half = sqrt_(vmax(drop[i] / yy, T(0)));
-        const T slack = rim_slack(abs_(v[i]) + abs_(tangent) * vmax(abs_(low), abs_(high)) + half);
-        const T foot = -sy[i] / sx[i] * ey[i];
-        const T xb = vmin(vmax(foot, low), high), xt = vmin(vmax(-foot, low), high);
-        const T qb = vmax(1 - (xb / ex[i]) * (xb / ex[i]), T(0)), qt = vmax(1 - (xt / ex[i]) * (xt / ex[i]), T(0));
-        const T bottom = v[i] + tangent * xb + half * sqrt_(qb) + slack;
-        const T top = v[i] + tangent * xt - half * sqrt_(qt) - slack;
-        rows.first[i] = int32_t(ceil_(vmin(vmax(top, T(0)), T(TILE))));
-        rows.last[i] = int32_t(floor_(vmin(vmax(bottom, T(-1)), lowest)));
+        const T yy = sy[i] * sy[i] + ty[i] * ty[i];
+        tangent[i] = -sx[i] * sy[i] / yy, half[i] = sqrt_(vmax(drop[i] / yy, T(0)));
+        slack[i] = rim_slack(abs_(v[i]) + abs_(tangent[i]) * vmax(abs_(u[i]), abs_(T(TILE - 1) - u[i])) + half[i]);
+        foot[i] = -sy[i] / sx[i] * ey[i], inverse_ex[i] = 1 / ex[i];
+        rows.top[i] = TILE, rows.bottom[i] = -1;
+    }
+    const T lowest = T(box.height - 1);
+    for (int strip = 0; strip < S::COUNT; ++strip)
+        for (uint32_t i = 0; i < BATCH; ++i) {
+            const T low = T(S::WIDTH * strip) - u[i], high = low + T(S::WIDTH - 1);
+            const T xb = vmin(vmax(foot[i], low), high), xt = vmin(vmax(-foot[i], low), high);
+            const T rb = xb * inverse_ex[i], rt = xt * inverse_ex[i];
+            const T bottom = v[i] + tangent[i] * xb + half[i] * sqrt_(vmax(1 - rb * rb, T(0))) + slack[i];
+            const T top = v[i] + tangent[i] * xt - half[i] * sqrt_(vmax(1 - rt * rt, T(0))) - slack[i];
+            rows.first[strip][i] = int32_t(ceil_(vmin(vmax(top, T(0)), T(TILE))));
+            rows.last[strip][i] = int32_t(floor_(vmin(vmax(bottom, T(-1)), lowest)));
+            rows.top[i] = vmin(rows.top[i], rows.first[strip][i]), rows.bottom[i] = vmax(rows.bottom[i], rows.last[strip][i]);
+        }
+    for (uint32_t i = 0; i < BATCH; ++i) {  // the largest |s| and |t| in the touched rows of the tile
+        const T across = T(TILE - 1) / 2, middle = T(rows.top[i] + rows.bottom[i]) / 2, down = T(rows.bottom[i] - rows.top[i]) / 2;
+        const T s = abs_(s0[i] + sx[i] * (x[i] + across) + sy[i] * (y[i] + middle)) + abs_(sx[i]) * across + abs_(sy[i]) * down;
+        const T t = abs_(t0[i] + ty[i] * (y[i] + middle)) + ty[i] * down;
+        rows.gentle[i] = s * s + t * t <= T(GENTLE);
     }
 }
+
+// alpha down one strip of a tile. Where a splat is gentle, 2^p is stepped from row to row without an exponential each: p is
+// quadratic in y, so with k rows from the first
+//
+//     2^p(k + 1) = 2^p(k) r(0) f(k),   r(0) = 2^(p(1) - p(0)),   f(k) = 2^(-2 k (sy² + ty²))
+//
+// Otherwise every row takes its exponential, because r and f would leave the range of a float.
+template <class T, bool GENTLY>
+struct Falloff {
+    using V = typename Vector<T>::V;
+    T base[TILE], shift[TILE];          // of a splat that is not gentle: p = base - (across + shift)², row by row
+    alignas(64) T factors[TILE];        // f
+    V across, value, ratio;
+
+    GSPLAT_METHOD void begin_splat(const Splat<T> &s, const TileBox &box, int32_t top, int32_t bottom) {
+        if (GENTLY) {
+            const V curve = splat(-2 * (s.sy * s.sy + s.ty * s.ty));
+            for (int32_t k = 0; k < bottom - top; k += Vector<T>::LANES) store(factors + k, exp2_(curve * (iota<T>() + splat(T(k)))));
+        } else {
+            for (int row = 0; row < TILE; ++row) {
+                const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;
+                base[row] = s.log2_o - t * t, shift[row] = s.sy * dy;
+            }
+        }
+    }
+
+    GSPLAT_METHOD void begin_strip(const Splat<T> &s, V dx, T dy) {
+        across = splat(s.s0) + splat(s.sx) * dx;
+        if (!GENTLY) return;
+        const T t = s.t0 + s.ty * dy;
+        const V along = across + splat(s.sy * dy);
+        value = exp2_(splat(s.log2_o - t * t) - along * along);
+        ratio = exp2_(splat(-s.ty * (2 * t + s.ty) - s.sy * s.sy) - splat(2 * s.sy) * along);
+    }
+
+    // alpha, 0 below 1/255, and the number by which it is clamped, as `where_open` takes it.
+    GSPLAT_METHOD V alpha(int32_t row, V &key) const {
+        if (GENTLY) {
+            key = value;
+            return between(value, T(ALPHA_MIN), T(ALPHA_MAX));
+        }
+        const V q = across + splat(shift[row]);
+        key = splat(base[row]) - q * q;
+        return exp2_between(key, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
+    }
+
+    // x where alpha is not clamped, otherwise 0.
+    GSPLAT_METHOD static V where_open(V key, V x) { return where_below(key, GENTLY ? T(ALPHA_MAX) : T(LOG2_ALPHA_MAX), x); }
+
+    GSPLAT_METHOD void step(int32_t k) {
+        if (GENTLY) value *= ratio * splat(factors[k]);
+    }
+};
 
 }  // namespace GSPLAT_ISA
 }  // namespace gsplat
