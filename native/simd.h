@@ -8,7 +8,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__AVX512F__)
+#if defined(__AVX2__)
 #include <immintrin.h>
 #endif
 
@@ -59,6 +59,30 @@ GSPLAT_INLINE V load(const T *p) {
 template <class V, class T>
 GSPLAT_INLINE void store(T *p, V v) {
     memcpy(p, &v, sizeof(V));
+}
+
+// A vector of bytes, as floats. (GCC 12 converts lane by lane.)
+template <class V>
+GSPLAT_INLINE V load_bytes(const uint8_t *p);
+
+template <>
+inline __attribute__((always_inline)) VF load_bytes<VF>(const uint8_t *p) {
+#if GSPLAT_VECTOR_BYTES == 64
+    return (VF)_mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(load<__m128i>(p)));
+#elif defined(__AVX2__)
+    return (VF)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i *>(p))));
+#else
+    Vector<float>::M v;
+    for (int i = 0; i < Vector<float>::LANES; ++i) v[i] = p[i];
+    return __builtin_convertvector(v, VF);
+#endif
+}
+
+template <>
+inline __attribute__((always_inline)) VD load_bytes<VD>(const uint8_t *p) {
+    VD v;
+    for (int i = 0; i < Vector<double>::LANES; ++i) v[i] = p[i];
+    return v;
 }
 
 // 0, 1, 2, ... in the lanes.
