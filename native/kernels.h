@@ -134,6 +134,14 @@ struct AdamArgs {
     double rate, beta1, beta2, eps, correction1, correction2;
 };
 
+template <class T>
+struct NoiseArgs {
+    T *means;                                          // N 3
+    const T *quats, *log_scales, *logit_opacities;     // N 4, N 3, N
+    uint64_t seed;
+    double amount, sharpness, threshold;
+};
+
 constexpr int SSIM_HALF = 5;                           // taps on each side of the central one
 constexpr int SSIM_BLOCK = 2 * SSIM_HALF;              // rows that are processed together
 constexpr int64_t SSIM_ROWS = 160;                     // image rows per task, at most
@@ -172,6 +180,7 @@ struct Kernels {
     void (*project_backward)(const ProjectBackwardArgs<T> &, int64_t block);
     void (*adam)(const AdamArgs<T> &, int64_t begin, int64_t end);
     void (*loss)(const LossArgs<T> &, int64_t task, T *scratch);
+    void (*noise)(const NoiseArgs<T> &, int64_t begin, int64_t end);
 };
 
 struct Isa {

@@ -8,7 +8,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__AVX2__)
+#if defined(__SSE2__)
 #include <immintrin.h>
 #endif
 
@@ -44,6 +44,7 @@ struct Vector<double> {
 
 using VF = Vector<float>::V;
 using VD = Vector<double>::V;
+typedef uint64_t VU __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));
 
 // A scalar in every lane; written as scalar + zero vector, which compiles to one broadcast.
 GSPLAT_INLINE VF splat(float x) { return x - VF{}; }
@@ -59,6 +60,19 @@ GSPLAT_INLINE V load(const T *p) {
 template <class V, class T>
 GSPLAT_INLINE void store(T *p, V v) {
     memcpy(p, &v, sizeof(V));
+}
+
+// Products of the lower halves of the lanes and a number of 32 bits.
+GSPLAT_INLINE VU multiply_low(VU a, uint32_t b) {
+#if GSPLAT_VECTOR_BYTES == 64
+    return (VU)_mm512_mul_epu32((__m512i)a, _mm512_set1_epi64(b));
+#elif defined(__AVX2__)
+    return (VU)_mm256_mul_epu32((__m256i)a, _mm256_set1_epi64x(b));
+#elif defined(__SSE2__)
+    return (VU)_mm_mul_epu32((__m128i)a, _mm_set1_epi64x(b));
+#else
+    return (a & 0xFFFFFFFFu) * b;
+#endif
 }
 
 // A vector of bytes, as floats. (GCC 12 converts lane by lane.)
