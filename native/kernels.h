@@ -145,7 +145,7 @@ struct NoiseArgs {
 constexpr int SSIM_HALF = 5;                           // taps on each side of the central one
 constexpr int SSIM_BLOCK = 2 * SSIM_HALF;              // rows that are processed together
 constexpr int64_t SSIM_ROWS = 160;                     // image rows per task, at most
-constexpr int64_t SSIM_STRIP = 384;                    // and numbers of each row; a multiple of every vector width,
+constexpr int64_t SSIM_STRIP = 768;                    // and numbers of each row; a multiple of every vector width,
 constexpr int64_t SSIM_EDGE = 16;                      // like this, which is at least half a window
 
 template <class T>
@@ -163,8 +163,7 @@ struct LossArgs {
     int64_t rows() const { return H ? ((H + bands() - 1) / bands() + SSIM_BLOCK - 1) / SSIM_BLOCK * SSIM_BLOCK : 0; }
     int64_t tasks() const { return strips() * bands(); }
     // Number of scratch values that a thread needs.
-    static constexpr int64_t SCRATCH =
-        SSIM_BLOCK * ((2 * 4 + 3) * (SSIM_STRIP + 2 * SSIM_EDGE) + 2 * 3 * SSIM_STRIP) + 4 * (SSIM_STRIP + 4 * SSIM_EDGE);
+    static constexpr int64_t SCRATCH = 2 * 3 * SSIM_BLOCK * (SSIM_STRIP + 2 * SSIM_EDGE);
 };
 
 constexpr int64_t BLOCK = 256;                         // Gaussians per task

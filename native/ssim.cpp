@@ -8,9 +8,9 @@
 //     dsum(S)/dx = G dS/dmx + 2 x G dS/dv + y G dS/dc
 //
 // A task is a strip of the image: some rows of some columns. Its rows pass through in blocks of as many as the window has
-// besides its centre. Therefore a blur along y needs exactly two blocks, and the two latest ones of everything that is blurred
-// along x are all that is kept: images are read from and written to memory, nothing else is. Channels are interleaved, so the
-// next tap to the right is three numbers away.
+// besides its centre, so that a blur along y needs exactly two blocks. Of every block, a few columns at a time are blurred along y
+// and then along x, while they are in the first cache; only the maps of two blocks outlive that. Images are read from and
+// written to memory, nothing else is. Channels are interleaved, so the next tap to the right is three numbers away.
 #include "gaussian_math.h"
 #include "isa.h"
 
@@ -18,8 +18,8 @@ namespace gsplat {
 namespace GSPLAT_ISA {
 
 constexpr int HALF = SSIM_HALF, ROWS = SSIM_BLOCK, CHANNELS = 3;
-constexpr int64_t STRIP = SSIM_STRIP, EDGE = SSIM_EDGE;
-constexpr int64_t MAP = STRIP + 2 * EDGE, INPUT = MAP + 2 * EDGE;  // numbers per row: of the maps of S, of the images that they need
+constexpr int64_t STRIP = SSIM_STRIP, EDGE = SSIM_EDGE, MAP = STRIP + 2 * EDGE;
+constexpr int64_t CHUNK = 64;  // columns that are blurred at a time
 
 // An array of rows for each of some maps.
 template <class T, int MAPS, int64_t NUMBERS>
@@ -27,13 +27,12 @@ struct Block {
     alignas(64) T rows[MAPS][ROWS][NUMBERS];
 };
 
+// Columns that are blurred along y, with half a window on each side.
+template <class T, int MAPS>
+using Columns = Block<T, MAPS, CHUNK + 2 * EDGE>;
+
 template <class T>
-struct Scratch {
-    Block<T, 4, MAP> inputs[2];    // G along x of x, y, x² + y², xy
-    Block<T, 3, MAP> maps;         // half of dS/dmx, dS/dv, half of dS/dc
-    Block<T, 3, STRIP> blurred[2]; // G along x of these
-    alignas(64) T row[4][INPUT];   // x, y, x² + y², xy
-};
+using Maps = Block<T, 3, MAP>;  // half of dS/dmx, dS/dv, half of dS/dc
 
 // Image rows first .. last - 1, numbers x0 .. x0 + count - 1 of each.
 struct Strip {
@@ -70,18 +69,6 @@ GSPLAT_INLINE typename Vector<T>::V target_numbers(const LossArgs<T> &args, int6
     return numbers<T>(args.target + row * width, n, width);
 }
 
-// Asks for an image row, for the next block.
-template <class T>
-GSPLAT_INLINE void fetch(const LossArgs<T> &args, const Strip &s, int64_t row) {
-    if (row >= s.height) return;
-    const int64_t line = 64 / int64_t(sizeof(T)), start = row * s.width + vmax<int64_t>(s.x0 - 2 * EDGE, 0);
-    for (int64_t i = 0; i < s.count + 4 * EDGE; i += line) __builtin_prefetch(args.image + start + i);
-    if (args.target_bytes)
-        for (int64_t i = 0; i < s.count + 4 * EDGE; i += 64) __builtin_prefetch(args.target_bytes + start + i);
-    else
-        for (int64_t i = 0; i < s.count + 4 * EDGE; i += line) __builtin_prefetch(args.target + start + i);
-}
-
 template <class V, class T>
 GSPLAT_INLINE V blur_x(const T *in) {
     V total = splat(T(SSIM_TAP[0])) * load<V>(in);
@@ -103,61 +90,89 @@ GSPLAT_INLINE void blur_y(const T *above, const T *below, int64_t stride, V *out
     if constexpr (ROW + 1 < 2 * ROWS) blur_y<ROW + 1>(above, below, stride, out);
 }
 
-// G along x of x, y, x² + y² and xy, of the image rows from `first`.
-template <class T>
-GSPLAT_INLINE void blur_inputs(const LossArgs<T> &args, const Strip &s, int64_t first, Scratch<T> &scratch, Block<T, 4, MAP> &out) {
-    using V = typename Vector<T>::V;
-    auto &numbers_of = scratch.row;
-    for (int r = 0; r < ROWS; ++r) {
-        const int64_t row = first + r;
-        if (row < 0 || row >= vmin(s.height, s.last + 2 * HALF)) {
-            for (int p = 0; p < 4; ++p) memset(out.rows[p][r], 0, sizeof out.rows[p][r]);
-            continue;
-        }
-        fetch(args, s, row + ROWS);
-        for (int64_t i = 0; i < s.count + 4 * EDGE; i += Vector<T>::LANES) {
-            const V x = numbers<T>(args.image + row * s.width, s.x0 + i - 2 * EDGE, s.width);
-            const V y = target_numbers(args, row, s.x0 + i - 2 * EDGE, s.width);
-            store(numbers_of[0] + i, x), store(numbers_of[1] + i, y);
-            store(numbers_of[2] + i, x * x + y * y), store(numbers_of[3] + i, x * y);
-        }
-        for (int64_t i = 0; i < s.count + 2 * EDGE; i += Vector<T>::LANES)
-            for (int p = 0; p < 4; ++p) store(out.rows[p][r] + i, blur_x<V>(numbers_of[p] + EDGE + i));
+// Calls make(n, at) to fill the columns from `at`, numbers n of all maps, and use(n, at) for those whose neighbours are there.
+template <class T, int MAPS, class Make, class Use>
+GSPLAT_INLINE void slide(Columns<T, MAPS> &columns, int64_t count, Make make, Use use) {
+    constexpr int64_t LANES = Vector<T>::LANES;
+    for (int64_t start = 0; start < count; start += CHUNK) {
+        if (start)
+            for (auto &map : columns.rows)
+                for (T *row : map) memcpy(row, row + CHUNK, 2 * EDGE * sizeof(T));
+        const int64_t end = vmin<int64_t>(CHUNK, count - start);
+        for (int64_t at = start ? 2 * EDGE : 0; at < end + 2 * EDGE; at += LANES) make(start + at, at);
+        for (int64_t at = 0; at < end; at += LANES) use(start + at, at + EDGE);
     }
 }
 
-// Three maps of the image rows from `first`, blurred along x; zero outside the image. Returns the sum of S over the strip.
+// Numbers n .. n + LANES - 1 of 2 ROWS image rows, from row `first`; zero outside the image. Asks for those that the next block needs.
+template <class T, class S, class V>
+GSPLAT_INLINE void load_rows(const S *image, const Strip &s, int64_t first, int64_t n, V *out) {
+    const int begin = int(vmax<int64_t>(-first, 0)), end = int(vmin<int64_t>(2 * ROWS, s.height - first));
+    for (int r = 0; r < begin; ++r) out[r] = V{};
+    for (int r = vmax(end, 0); r < 2 * ROWS; ++r) out[r] = V{};
+    const S *at = image + (first + begin) * s.width;
+    if (n >= 0 && n + Vector<T>::LANES <= s.width)
+        for (int r = begin; r < end; ++r, at += s.width) {
+            __builtin_prefetch(at + ROWS * s.width + n);
+            out[r] = load_numbers<V>(at + n);
+        }
+    else
+        for (int r = begin; r < end; ++r, at += s.width) out[r] = numbers<T>(at, n, s.width);
+}
+
+// G along y of x, y, x² + y² and xy at the numbers from n, for the ROWS image rows from `first`.
+template <class T, class V>
+GSPLAT_INLINE void blur_inputs(const LossArgs<T> &args, const Strip &s, int64_t first, int64_t n, V (*out)[ROWS]) {
+    V in[4][2 * ROWS];
+    load_rows<T>(args.image, s, first - HALF, n, in[0]);
+    if (args.target_bytes)
+        load_rows<T>(args.target_bytes, s, first - HALF, n, in[1]);
+    else
+        load_rows<T>(args.target, s, first - HALF, n, in[1]);
+    const V unit = splat(args.target_bytes ? T(1) / T(255) : T(1));
+    for (int r = 0; r < 2 * ROWS; ++r) {
+        const V x = in[0][r], y = in[1][r] * unit;
+        in[1][r] = y, in[2][r] = x * x + y * y, in[3][r] = x * y;
+    }
+    for (int p = 0; p < 4; ++p)
+        blur_y(reinterpret_cast<const T *>(in[p]), reinterpret_cast<const T *>(in[p] + ROWS), Vector<T>::LANES, out[p]);
+}
+
+// The maps of the image rows from `first`; zero outside the image. Returns the sum of S over the strip.
 template <class T>
-GSPLAT_INLINE double blur_maps(const Strip &s, int64_t first, const Block<T, 4, MAP> *const in[2], Block<T, 3, MAP> &maps,
-                               Block<T, 3, STRIP> &out) {
+GSPLAT_INLINE double make_maps(const LossArgs<T> &args, const Strip &s, int64_t first, Maps<T> &maps) {
     using V = typename Vector<T>::V;
     const V C1 = splat(T(SSIM_C1)), C2 = splat(T(SSIM_C2)), one = splat(T(1)), two = splat(T(2));
     const int begin = int(vmax<int64_t>(-first, 0)), end = int(vmin<int64_t>(ROWS, vmin(s.height, s.last + HALF) - first));
-    V total{}, column = iota<T>() - splat(T(EDGE));
-    for (int64_t i = 0; i < s.count + 2 * EDGE; i += Vector<T>::LANES, column += splat(T(Vector<T>::LANES))) {
-        V sums[4][ROWS], S_sum{};
-        for (int p = 0; p < 4; ++p) blur_y(in[0]->rows[p][0] + i, in[1]->rows[p][0] + i, MAP, sums[p]);
+    Columns<T, 4> columns;
+    V total{};
+    const auto make = [&](int64_t n, int64_t at) {
+        V sums[4][ROWS];
+        blur_inputs(args, s, first, s.x0 + n - 2 * EDGE, sums);
+        for (int p = 0; p < 4; ++p)
+            for (int r = 0; r < ROWS; ++r) store(columns.rows[p][r] + at, sums[p][r]);
+    };
+    const auto use = [&](int64_t n, int64_t at) {
+        V S_sum{};
         for (int r = begin; r < end; ++r) {
-            const V mx = sums[0][r], my = sums[1][r], product = mx * my, squares = mx * mx + my * my;
-            const V v = sums[2][r] - squares, c = sums[3][r] - product;
+            const V mx = blur_x<V>(columns.rows[0][r] + at), my = blur_x<V>(columns.rows[1][r] + at);
+            const V product = mx * my, squares = mx * mx + my * my;
+            const V v = blur_x<V>(columns.rows[2][r] + at) - squares, c = blur_x<V>(columns.rows[3][r] + at) - product;
             const V A1 = two * product + C1, A2 = two * c + C2, B1 = squares + C1, B2 = v + C2;
-            const V inverse = reciprocal(B1 * B2), dc = A1 * inverse, S = A2 * dc, part = S * inverse, dv = -part * B1;
-            store(maps.rows[0][r] + i, my * (A2 * inverse - dc) - mx * (part * (B2 - B1)));
-            store(maps.rows[1][r] + i, dv), store(maps.rows[2][r] + i, dc);
+            const V inverse = reciprocal(B1 * B2), dc = A1 * inverse, S = A2 * dc, part = S * inverse;
+            store(maps.rows[0][r] + n, my * (A2 * inverse - dc) - mx * (part * (B2 - B1)));
+            store(maps.rows[1][r] + n, -part * B1), store(maps.rows[2][r] + n, dc);
             if (first + r >= s.first && first + r < s.last) S_sum += S;
         }
+        const V column = iota<T>() + splat(T(n - EDGE));
         total += (column >= V{} ? one : V{}) * (column < splat(T(s.count)) ? S_sum : V{});
-    }
+    };
+    slide<T, 4>(columns, s.count + 2 * EDGE, make, use);
     const int64_t left = vmax<int64_t>(EDGE - s.x0, 0), right = vmin<int64_t>(s.width - s.x0 + EDGE, MAP);
-    for (int p = 0; p < 3; ++p)
+    for (auto &map : maps.rows)
         for (int r = 0; r < ROWS; ++r) {
-            T *row = maps.rows[p][r];
-            if (r < begin || r >= end) {
-                memset(out.rows[p][r], 0, sizeof out.rows[p][r]);
-                continue;
-            }
-            memset(row, 0, size_t(left) * sizeof(T)), memset(row + right, 0, size_t(MAP - right) * sizeof(T));
-            for (int64_t i = 0; i < s.count; i += Vector<T>::LANES) store(out.rows[p][r] + i, blur_x<V>(row + EDGE + i));
+            if (r < begin || r >= end) memset(map[r], 0, sizeof map[r]);
+            memset(map[r], 0, size_t(left) * sizeof(T)), memset(map[r] + right, 0, size_t(MAP - right) * sizeof(T));
         }
     return double(sum(total));
 }
@@ -169,25 +184,34 @@ GSPLAT_INLINE void store_some(T *to, V v, int64_t count) {
     memcpy(to, &v, size_t(count) * sizeof(T));
 }
 
-// The gradient of the image rows from `first`; returns the sum of |x - y|.
+// The gradient of the image rows from `first`, from the maps of the rows around them; returns the sum of |x - y|.
 template <class T>
-GSPLAT_INLINE double gradient(const LossArgs<T> &args, const Strip &s, int64_t first, const Block<T, 3, STRIP> *const in[2]) {
+GSPLAT_INLINE double gradient(const LossArgs<T> &args, const Strip &s, int64_t first, const Maps<T> &above, const Maps<T> &below) {
     using V = typename Vector<T>::V;
     const double size = double(args.H) * args.W * CHANNELS;
     const V l1 = splat(T((1 - args.ssim_weight) / size)), ssim = splat(T(2 * args.ssim_weight / size));
     const int64_t end = vmin<int64_t>(ROWS, s.last - first);
+    Columns<T, 3> columns;
     V total{};
-    for (int64_t i = 0; i < s.count; i += Vector<T>::LANES) {
-        V sums[3][ROWS];
-        for (int p = 0; p < 3; ++p) blur_y(in[0]->rows[p][0] + i, in[1]->rows[p][0] + i, STRIP, sums[p]);
-        for (int64_t r = 0; r < end; ++r) {
-            const int64_t row = first + r, n = s.x0 + i;
-            const V x = numbers<T>(args.image + row * s.width, n, s.width), y = target_numbers(args, row, n, s.width);
+    const auto make = [&](int64_t n, int64_t at) {
+        for (int p = 0; p < 3; ++p) {
+            V sums[ROWS];
+            blur_y(above.rows[p][0] + n, below.rows[p][0] + n, MAP, sums);
+            for (int r = 0; r < ROWS; ++r) store(columns.rows[p][r] + at, sums[r]);
+        }
+    };
+    const auto use = [&](int64_t n, int64_t at) {
+        for (int r = 0; r < end; ++r) {
+            const int64_t row = first + r, i = s.x0 + n;
+            const V x = numbers<T>(args.image + row * s.width, i, s.width), y = target_numbers(args, row, i, s.width);
             const V sign = (x > y ? l1 : V{}) - (x < y ? l1 : V{}), difference = x - y;
-            store_some(args.grad + row * s.width + n, sign - ssim * (sums[0][r] + x * sums[1][r] + y * sums[2][r]), s.count - i);
+            const V d =
+                blur_x<V>(columns.rows[0][r] + at) + x * blur_x<V>(columns.rows[1][r] + at) + y * blur_x<V>(columns.rows[2][r] + at);
+            store_some(args.grad + row * s.width + i, sign - ssim * d, s.count - n);
             total += difference > V{} ? difference : -difference;
         }
-    }
+    };
+    slide<T, 3>(columns, s.count, make, use);
     return double(sum(total));
 }
 
@@ -213,7 +237,7 @@ GSPLAT_INLINE double l1_gradient(const LossArgs<T> &args, const Strip &s) {
 
 template <class T>
 void loss(const LossArgs<T> &args, int64_t task, T *room) {
-    static_assert(sizeof(Scratch<T>) == sizeof(T) * LossArgs<T>::SCRATCH);
+    static_assert(2 * sizeof(Maps<T>) == sizeof(T) * LossArgs<T>::SCRATCH);
     const int64_t width = int64_t(args.W) * CHANNELS, height = args.H, strips = args.strips();
     const int64_t first = task / strips * args.rows(), x0 = task % strips * STRIP;
     const Strip s{first, vmin(first + args.rows(), height), x0, vmin(STRIP, width - x0), width, height};
@@ -221,15 +245,11 @@ void loss(const LossArgs<T> &args, int64_t task, T *room) {
     if (args.ssim_weight == 0) {
         sum_l1 = l1_gradient(args, s);
     } else {
-        auto &scratch = *reinterpret_cast<Scratch<T> *>(room);
-        for (int64_t k = 0; s.first + (k - 2) * ROWS < s.last; ++k) {
-            const int now = k % 2, before = 1 - now;
-            const Block<T, 4, MAP> *const inputs[2] = {&scratch.inputs[before], &scratch.inputs[now]};
-            const Block<T, 3, STRIP> *const blurred[2] = {&scratch.blurred[now], &scratch.blurred[before]};
-            const int64_t row = s.first + k * ROWS;
-            blur_inputs(args, s, row - 2 * HALF, scratch, scratch.inputs[now]);
-            if (k >= 1) sum_ssim += blur_maps(s, row - ROWS - HALF, inputs, scratch.maps, scratch.blurred[before]);
-            if (k >= 2) sum_l1 += gradient(args, s, row - 2 * ROWS, blurred);
+        auto *maps = reinterpret_cast<Maps<T> *>(room);
+        sum_ssim = make_maps(args, s, first - HALF, maps[0]);
+        for (int64_t row = first, k = 0; row < s.last; row += ROWS, ++k) {
+            sum_ssim += make_maps(args, s, row + ROWS - HALF, maps[(k + 1) % 2]);
+            sum_l1 += gradient(args, s, row, maps[k % 2], maps[(k + 1) % 2]);
         }
     }
     args.sums[2 * task] = sum_l1, args.sums[2 * task + 1] = sum_ssim;
