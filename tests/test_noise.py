@@ -8,7 +8,7 @@ import torch
 
 from gsplat_edu import noise
 from gsplat_edu.gaussians import cov3d_t
-from gsplat_edu.noise import NoiseNumbers, add_noise, normals, philox
+from gsplat_edu.noise import NoiseNumbers, add_noise, philox, standard_normals
 from gsplat_edu.threads import native_threads, one_thread
 from gsplat_edu.train.initialize import random_ball
 
@@ -53,7 +53,7 @@ def test_philox_gives_the_published_words(counter, key, words):
 def test_normals_have_the_moments_of_the_normal_distribution():
     """Allow five standard errors: 1 / sqrt(N) for means, covariances and correlations, sqrt(96 / N) for E n^4 = 3."""
     count = 200_000
-    n = normals(5, count, LIKE).numpy()
+    n = standard_normals(5, count, LIKE).numpy()
     error = 5 / math.sqrt(count)
     assert np.abs(n.mean(axis=0)).max() < error
     assert np.abs(n.T @ n / count - np.eye(3)).max() < math.sqrt(2) * error
@@ -69,7 +69,7 @@ def test_normals_have_the_moments_of_the_normal_distribution():
 
 @pytest.mark.parametrize("other", [6, 5 + 2**32, 2**62 + 5])
 def test_other_seeds_give_independent_numbers(other):
-    a, b = normals(5, 50_000, LIKE), normals(other, 50_000, LIKE)
+    a, b = standard_normals(5, 50_000, LIKE), standard_normals(other, 50_000, LIKE)
     assert (a.T @ b / 50_000).abs().max() < 5 / math.sqrt(50_000)
 
 
@@ -101,7 +101,7 @@ def test_the_step_is_the_formula():
     gaussians = scene(50)
     gate = 1 / (1 + torch.exp(-100 * (0.005 - torch.sigmoid(gaussians.logit_opacities))))
     sigma = cov3d_t(gaussians.log_scales, gaussians.quats)
-    n = normals(NUMBERS.seed, 50, LIKE)
+    n = standard_normals(NUMBERS.seed, 50, LIKE)
     expected = gaussians.means + 0.7 * gate[:, None] * torch.einsum("nij,nj->ni", sigma, n)
     torch.testing.assert_close(moved(gaussians), expected, rtol=0, atol=1e-13)
 

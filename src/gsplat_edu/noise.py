@@ -65,7 +65,7 @@ def add_noise(gaussians: Gaussians, numbers: NoiseNumbers) -> None:
         _add_in_torch(gaussians, numbers)
 
 
-def normals(seed: int, count: int, like: Tensor) -> Float[Tensor, "count 3"]:
+def standard_normals(seed: int, count: int, like: Tensor) -> Float[Tensor, "count 3"]:
     """Draw three standard normal numbers per Gaussian, of this tensor's dtype and device.
 
     n = (r cos 2 pi v, r sin 2 pi v, r' cos 2 pi v'),  r = sqrt(-2 log u),  r' = sqrt(-2 log u')
@@ -121,7 +121,7 @@ def _add_natively(gaussians: Gaussians, numbers: NoiseNumbers) -> None:
 
 def _add_in_torch(gaussians: Gaussians, numbers: NoiseNumbers) -> None:
     means = gaussians.means
-    draw = normals(numbers.seed, len(means), means.detach())
+    draw = standard_normals(numbers.seed, len(means), means.detach())
     R, scales = unchecked_rotations(gaussians.quats.detach()), gaussians.scales
     wander = (R @ (scales.square() * (R.mT @ draw[..., None])[..., 0])[..., None])[..., 0]
     x = numbers.sharpness * (gaussians.opacities - numbers.threshold)
