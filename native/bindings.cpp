@@ -251,6 +251,24 @@ void adam(nb::args positional, nb::kwargs given) {
              [&](int64_t task, int) { kernels<T>().adam(args, task * GRAIN, std::min(size, (task + 1) * GRAIN)); });
 }
 
+template <class T>
+void noise(nb::args positional, nb::kwargs given) {
+    Arguments a("noise", positional, given);
+    const Array means = a.array("means", {KIND<T>}, {ANY, 3}, true);
+    const int64_t n = means.shape[0];
+    const Array quats = a.array("quats", {KIND<T>}, {n, 4}), log_scales = a.array("log_scales", {KIND<T>}, {n, 3});
+    const Array logit_opacities = a.array("logit_opacities", {KIND<T>}, {n});
+    NoiseArgs<T> args{
+        means.as<T>(),      quats.as<T>(),         log_scales.as<T>(),   logit_opacities.as<T>(), uint64_t(a.whole("seed", 0, INT64_MAX)),
+        a.number("amount"), a.number("sharpness"), a.number("threshold")};
+    const int threads = int(a.whole("threads", 1, MOST_THREADS));
+    a.finish();
+    nb::gil_scoped_release release;
+    constexpr int64_t GRAIN = 1 << 12;
+    parallel(threads, (n + GRAIN - 1) / GRAIN,
+             [&](int64_t task, int) { kernels<T>().noise(args, task * GRAIN, std::min(n, (task + 1) * GRAIN)); });
+}
+
 // Returns (mean |x - y|, mean SSIM) and writes the gradient.
 template <class T>
 std::array<double, 2> loss_of(nb::args positional, nb::kwargs given) {
@@ -324,6 +342,8 @@ NB_MODULE(_native, m) {
     bind_frame<double>(m, "FrameF64");
     m.def("adam_f32", &adam<float>);
     m.def("adam_f64", &adam<double>);
+    m.def("noise_f32", &noise<float>);
+    m.def("noise_f64", &noise<double>);
     m.def("loss_f32", &loss_of<float>);
     m.def("loss_f64", &loss_of<double>);
     m.def("ask_before_large_blocks", [](const nb::object &function) {

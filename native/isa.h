@@ -12,7 +12,8 @@ template <class T> void scatter(const IntersectArgs<T> &, int64_t begin, int64_t
 template <class T> void composite(const CompositeArgs<T> &, int32_t tile);
 template <class T> void composite_backward(const CompositeBackwardArgs<T> &, int32_t tile);
 template <class T> void project_backward(const ProjectBackwardArgs<T> &, int64_t block);
-template <class T> void loss(const LossArgs<T> &, int64_t band, T *scratch);
+template <class T> void loss(const LossArgs<T> &, int64_t task, T *scratch);
+template <class T> void noise(const NoiseArgs<T> &, int64_t begin, int64_t end);
 template <class T> void adam(const AdamArgs<T> &, int64_t begin, int64_t end);
 
 }  // namespace GSPLAT_ISA

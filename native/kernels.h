@@ -147,10 +147,19 @@ struct AdamArgs {
     double rate, beta1, beta2, eps, correction1, correction2;
 };
 
+template <class T>
+struct NoiseArgs {
+    T *means;                                          // N 3
+    const T *quats, *log_scales, *logit_opacities;     // N 4, N 3, N
+    uint64_t seed;
+    double amount, sharpness, threshold;
+};
+
 constexpr int SSIM_HALF = 5;                           // taps on each side of the central one
-constexpr int64_t SSIM_BAND = 64;                      // image rows per task
-constexpr int64_t SSIM_STRIP = 192;                    // and numbers of each row; multiples of every vector width,
-constexpr int64_t SSIM_MAP = 224;                      // like this: a strip plus half a window on each side
+constexpr int SSIM_BLOCK = 2 * SSIM_HALF;              // rows that are processed together
+constexpr int64_t SSIM_ROWS = 160;                     // image rows per task, at most
+constexpr int64_t SSIM_STRIP = 768;                    // and numbers of each row; a multiple of every vector width,
+constexpr int64_t SSIM_EDGE = 16;                      // like this, which is at least half a window
 
 template <class T>
 struct LossArgs {
@@ -159,11 +168,15 @@ struct LossArgs {
     int32_t H, W;
     double ssim_weight;
     T *grad;                                           // H W 3
-    double *sums;                                      // bands x 2: sums of |x - y| and of SSIM
+    double *sums;                                      // tasks x 2: sums of |x - y| and of SSIM
 
-    int64_t bands() const { return (H + SSIM_BAND - 1) / SSIM_BAND; }
+    // Tasks depend on the size of the image only, so that the order of the sums does.
+    int64_t strips() const { return (3 * int64_t(W) + SSIM_STRIP - 1) / SSIM_STRIP; }
+    int64_t bands() const { return (H + SSIM_ROWS - 1) / SSIM_ROWS; }
+    int64_t rows() const { return H ? ((H + bands() - 1) / bands() + SSIM_BLOCK - 1) / SSIM_BLOCK * SSIM_BLOCK : 0; }
+    int64_t tasks() const { return strips() * bands(); }
     // Number of scratch values that a thread needs.
-    static constexpr int64_t SCRATCH = 4 * (SSIM_BAND + 4 * SSIM_HALF) * SSIM_MAP + 3 * (SSIM_BAND + 2 * SSIM_HALF) * SSIM_STRIP;
+    static constexpr int64_t SCRATCH = 2 * 3 * SSIM_BLOCK * (SSIM_STRIP + 2 * SSIM_EDGE);
 };
 
 constexpr int64_t BLOCK = 256;                         // Gaussians per task
@@ -178,7 +191,8 @@ struct Kernels {
     void (*composite_backward)(const CompositeBackwardArgs<T> &, int32_t tile);
     void (*project_backward)(const ProjectBackwardArgs<T> &, int64_t block);
     void (*adam)(const AdamArgs<T> &, int64_t begin, int64_t end);
-    void (*loss)(const LossArgs<T> &, int64_t band, T *scratch);
+    void (*loss)(const LossArgs<T> &, int64_t task, T *scratch);
+    void (*noise)(const NoiseArgs<T> &, int64_t begin, int64_t end);
 };
 
 struct Isa {

@@ -8,7 +8,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__SSE__)
+#if defined(__SSE2__)
 #include <immintrin.h>
 #elif defined(__ARM_NEON)
 #include <arm_neon.h>
@@ -47,6 +47,7 @@ struct Vector<double> {
 
 using VF = Vector<float>::V;
 using VD = Vector<double>::V;
+typedef uint64_t VU __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));
 
 // A scalar in every lane; written as scalar + zero vector, which compiles to one broadcast.
 GSPLAT_INLINE VF splat(float x) { return x - VF{}; }
@@ -62,6 +63,43 @@ GSPLAT_INLINE V load(const T *p) {
 template <class V, class T>
 GSPLAT_INLINE void store(T *p, V v) {
     memcpy(p, &v, sizeof(V));
+}
+
+// Products of the lower halves of the lanes and a number of 32 bits.
+GSPLAT_INLINE VU multiply_low(VU a, uint32_t b) {
+#if GSPLAT_VECTOR_BYTES == 64
+    return (VU)_mm512_mul_epu32((__m512i)a, _mm512_set1_epi64(b));
+#elif defined(__AVX2__)
+    return (VU)_mm256_mul_epu32((__m256i)a, _mm256_set1_epi64x(b));
+#elif defined(__SSE2__)
+    return (VU)_mm_mul_epu32((__m128i)a, _mm_set1_epi64x(b));
+#else
+    return (a & 0xFFFFFFFFu) * b;
+#endif
+}
+
+// A vector of bytes, as floats. (GCC 12 converts lane by lane.)
+template <class V>
+GSPLAT_INLINE V load_bytes(const uint8_t *p);
+
+template <>
+inline __attribute__((always_inline)) VF load_bytes<VF>(const uint8_t *p) {
+#if GSPLAT_VECTOR_BYTES == 64
+    return (VF)_mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(load<__m128i>(p)));
+#elif defined(__AVX2__)
+    return (VF)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i *>(p))));
+#else
+    Vector<float>::M v;
+    for (int i = 0; i < Vector<float>::LANES; ++i) v[i] = p[i];
+    return __builtin_convertvector(v, VF);
+#endif
+}
+
+template <>
+inline __attribute__((always_inline)) VD load_bytes<VD>(const uint8_t *p) {
+    VD v;
+    for (int i = 0; i < Vector<double>::LANES; ++i) v[i] = p[i];
+    return v;
 }
 
 // 0, 1, 2, ... in the lanes.
@@ -111,7 +149,7 @@ GSPLAT_INLINE bool any_at_least(VF v, float x) {
     return _mm512_cmp_ps_mask((__m512)v, _mm512_set1_ps(x), _CMP_GE_OQ) != 0;
 #elif GSPLAT_VECTOR_BYTES == 32
     return _mm256_movemask_ps((__m256)(v >= splat(x))) != 0;
-#elif defined(__SSE__)
+#elif defined(__SSE2__)
     return _mm_movemask_ps((__m128)(v >= splat(x))) != 0;
 #elif defined(__ARM_NEON)
     return vmaxvq_f32((float32x4_t)v) >= x;

@@ -31,10 +31,12 @@ def by_convolution(x, y, weight):
     return (1 - weight) * (x - y).abs().mean() + weight * (1 - ssim)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 50), (33, 17), (70, 141)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (3, 2), (3, 50), (33, 17), (11, 500), (12, 129), (170, 141), (325, 9), (25, 261)]
+)
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_l1_ssim_matches_the_definition_in_value_and_gradient(size, weight):
-    """float64, with sizes below the window and above one band of rows and one strip of columns."""
+    """float64, with sizes below the window and above one strip of rows and columns."""
     generator = torch.Generator().manual_seed(0)
     x, y = (torch.rand(*size, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()

@@ -9,16 +9,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
+
+_outside: ContextVar[int] = ContextVar("_outside", default=0)
+"""Torch's number of threads before the outermost `one_thread`; 0 outside of any."""
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch's operations on one thread inside the block; the native kernels are not affected."""
+    """Run torch's operations on one thread inside the block; see `native_threads` for the native kernels."""
     threads = torch.get_num_threads()
+    token = _outside.set(_outside.get() or threads)
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+        _outside.reset(token)
+
+
+def native_threads() -> int:
+    """Return the number of threads for native kernels, whose bits it does not change: torch's outside `one_thread`."""
+    return _outside.get() or torch.get_num_threads()

@@ -70,6 +70,12 @@ def adam(**changes):
     _native.adam_f32(**fields | {"threads": 2} | changes)
 
 
+def noise(**changes):
+    fields = {name: parameters()[name] for name in ("means", "quats", "log_scales", "logit_opacities")}
+    fields |= {"seed": 3, "amount": 0.5, "sharpness": 100.0, "threshold": 0.005}
+    _native.noise_f32(**fields | {"threads": 2} | changes)
+
+
 def loss(**changes):
     fields = {name: torch.zeros(H, W, 3) for name in ("image", "target", "gradient")}
     return _native.loss_f32(**fields | {"ssim_weight": 0.2, "threads": 2} | changes)
@@ -86,6 +92,10 @@ CALLS = {
     backward: ("scene", "images", "incoming", "gradients"),
     adam: (*("parameter", "first", "second", "gradient", "rate", "beta1"), "correction2", "threads"),
     loss: ("image", "target", "gradient", "ssim_weight", "threads"),
+    noise: (
+        *("means", "quats", "log_scales", "logit_opacities"),
+        *("seed", "amount", "sharpness", "threshold", "threads"),
+    ),
 }
 EVERY = [(call, name) for call, names in CALLS.items() for name in names]
 
@@ -124,13 +134,13 @@ class Dropping:
 
 
 ARRAYS = {scene: RAW, gradients: CALLS[gradients], images: CALLS[images], adam: CALLS[adam][:4]}
-ARRAYS |= {loss: CALLS[loss][:3], visible: CALLS[visible]}
+ARRAYS |= {loss: CALLS[loss][:3], visible: CALLS[visible], noise: CALLS[noise][:4]}
 EACH_ARRAY = [(call, name) for call, names in ARRAYS.items() for name in names]
 
 
 def valid_array(call, name):
     """Return a valid array for this argument."""
-    if call in (scene, gradients) and name in RAW:
+    if call in (scene, gradients, noise) and name in RAW:
         return parameters()[name].clone()
     shapes = {"means2d_norm": (N,), "background": (3,), "ids": (N,), "radii": (N, 2), "depth": (H, W)}
     shapes |= {"transmittance": (H, W)}

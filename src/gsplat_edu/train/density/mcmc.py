@@ -18,7 +18,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians, unchecked_rotations
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.noise import NoiseNumbers, add_noise
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
@@ -116,17 +117,10 @@ class MCMC:
 
     def _add_noise(self, gaussians: Gaussians, rate: float) -> None:
         """Means += rate noise sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I)."""
-        means = gaussians.means
-        generator = self.generator
-        # A GPU draws its own numbers, seeded by the CPU generator that checkpoints store.
-        if means.device.type != "cpu":
-            seed = int(torch.randint(2**62, (1,), generator=self.generator))
-            generator = torch.Generator(means.device).manual_seed(seed)
-        draw = torch.randn(len(means), 3, generator=generator, dtype=means.dtype, device=means.device)
-        R, scales = unchecked_rotations(gaussians.quats.detach()), gaussians.scales
-        wander = (R @ (scales.square() * (R.mT @ draw[..., None])[..., 0])[..., None])[..., 0]
-        gate = torch.sigmoid(NOISE_SHARPNESS * (NOISE_THRESHOLD - gaussians.opacities))
-        means += (rate * self.config.mcmc.noise) * gate[:, None] * wander
+        seed = int(torch.randint(2**62, (1,), generator=self.generator))  # checkpoints store the generator
+        add_noise(
+            gaussians, NoiseNumbers(seed, rate * self.config.mcmc.noise, NOISE_SHARPNESS, NOISE_THRESHOLD)
+        )
 
     def state(self) -> State:
         """Return the generator."""
