@@ -150,6 +150,15 @@ GSPLAT_INLINE void gather(const Scene<T> &scene, const uint32_t *ids, int count,
     }
 }
 
+// Fetches `count` numbers into the first cache while others are computed; `WRITE`: in order to write them.
+template <int WRITE, class T>
+GSPLAT_INLINE void fetch(const T *from, int count) {
+    const char *byte = reinterpret_cast<const char *>(from);
+    const int bytes = count * int(sizeof(T));
+    for (int offset = 0; offset < bytes; offset += 64) __builtin_prefetch(byte + offset, WRITE);
+    if (bytes) __builtin_prefetch(byte + bytes - 1, WRITE);
+}
+
 // Intermediate values of a projection, kept for the backward pass. Always in double: distant cameras, long lenses and thin
 // ellipses lose digits here that float cannot spare, and the cost is once per Gaussian (docs/PRECISION.md).
 struct Projected {
@@ -309,17 +318,25 @@ GSPLAT_INLINE typename Channels<T>::V channels(const T *rgb) {
 }
 
 // colour = sum_i b_i(direction) sh_i + 0.5, before the floor, of Gaussian i in lane l.
-template <class T>
-GSPLAT_INLINE typename Channels<T>::V color_of(const Scene<T> &scene, int degree, const Shade<T> &shade, int l, int64_t i) {
+template <int DEGREE, class T>
+GSPLAT_INLINE typename Channels<T>::V color_of(const Scene<T> &scene, const Shade<T> &shade, int l, int64_t i) {
     using V = typename Channels<T>::V;
-    if (!scene.quats) return channels(scene.colors + 3 * i);
-    const int used = (degree + 1) * (degree + 1);
-    V sum = channels(scene.sh0 + 3 * i) * shade.basis[0][l] + T(SH_OFFSET);
-    if (used == 1) return sum;
+    constexpr int LAST = (DEGREE + 1) * (DEGREE + 1) - 1;
+    V even = channels(scene.sh0 + 3 * i) * shade.basis[0][l] + T(SH_OFFSET), odd = V{};
+    if (LAST == 0) return even;
     const T *sh = scene.sh_rest + 3 * int64_t(scene.rest) * i;
-    V odd = V{};
-    for (int j = 1; j < used - 1; ++j) (j % 2 ? odd : sum) += load<V>(sh + 3 * j - 3) * shade.basis[j][l];
-    return sum + odd + channels(sh + 3 * used - 6) * shade.basis[used - 1][l];  // a load of four could leave the array
+#pragma GCC unroll 16
+    for (int j = 1; j < LAST; ++j) (j % 2 ? odd : even) += load<V>(sh + 3 * j - 3) * shade.basis[j][l];
+    return even + odd + channels(sh + 3 * LAST - 3) * shade.basis[LAST][l];  // a load of four could leave the array
+}
+
+// Calls f with the degree as a constant: f.template operator()<DEGREE>().
+template <class F>
+GSPLAT_INLINE void with_degree(int degree, F f) {
+    if (degree == 0) f.template operator()<0>();
+    if (degree == 1) f.template operator()<1>();
+    if (degree == 2) f.template operator()<2>();
+    if (degree == 3) f.template operator()<3>();
 }
 
 }  // namespace GSPLAT_ISA

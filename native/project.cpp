@@ -79,29 +79,46 @@ GSPLAT_INLINE void write(const Records<T> &in, int l, const T *color, Splat<T> &
     for (int k = 0; k < 3; ++k) s.color[k] = color[k];
 }
 
-template <class T>
-uint32_t project_chunk(const ProjectArgs<T> &args, const uint32_t *ids, int count, uint32_t *visible) {
-    using C = typename Channels<T>::V;
-    const bool raw = args.scene.quats != nullptr;
-    const int degree = args.settings.sh_degree;
-    Chunk<T> in;
-    Records<T> records;
-    Shade<T> shades;
-    gather(args.scene, ids, count, in);
-    for (int l = 0; l < in.padded; l += WIDE) ellipses(args, in, l, records);
-    extents(args.camera, in.padded, records);
-    if (raw) shade(in, args.camera, degree, shades);
+// Writes the splats of the chunk that meet the image and have a colour; returns their number.
+template <class T, class F>
+GSPLAT_INLINE uint32_t finish(const ProjectArgs<T> &args, const uint32_t *ids, int count, const Records<T> &records, uint32_t *visible,
+                              F color_in_lane) {
     uint32_t found = 0;
     for (int l = 0; l < count; ++l) {
         if (!records.drawn[l / Vector<T>::LANES][l % Vector<T>::LANES]) continue;
         T color[4];
-        C c = color_of(args.scene, degree, shades, l, ids[l]);
-        store(color, c);
+        store(color, color_in_lane(l, ids[l]));
         if (!is_color(color)) continue;
-        if (raw) store(color, c > C{} ? c : C{});
+        if (args.scene.quats)
+            for (int k = 0; k < 3; ++k) color[k] = vmax(color[k], T(0));
         write(records, l, color, args.splats[ids[l]]);
         visible[found++] = ids[l];
     }
+    return found;
+}
+
+// Projects the chunk and lists the visible ones; returns their number.
+template <class T>
+uint32_t project_chunk(const ProjectArgs<T> &args, const uint32_t *ids, int count, uint32_t *visible) {
+    const Scene<T> &scene = args.scene;
+    Chunk<T> in;
+    Records<T> records;
+    gather(scene, ids, count, in);
+    for (int l = 0; l < in.padded; l += WIDE) {
+        for (int k = l; k < vmin(l + WIDE, count); ++k) {
+            fetch<0>(scene.sh_rest + 3 * int64_t(scene.rest) * ids[k], 3 * scene.rest);
+            fetch<1>(&args.splats[ids[k]].u, sizeof(Splat<T>) / sizeof(T));
+        }
+        ellipses(args, in, l, records);
+    }
+    extents(args.camera, in.padded, records);
+    if (!scene.quats) return finish(args, ids, count, records, visible, [&](int, int64_t i) { return channels(scene.colors + 3 * i); });
+    Shade<T> shades;
+    shade(in, args.camera, args.settings.sh_degree, shades);
+    uint32_t found = 0;
+    with_degree(args.settings.sh_degree, [&]<int DEGREE>() {
+        found = finish(args, ids, count, records, visible, [&](int l, int64_t i) { return color_of<DEGREE>(scene, shades, l, i); });
+    });
     return found;
 }
 

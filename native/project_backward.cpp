@@ -125,6 +125,22 @@ GSPLAT_INLINE void sum_slots(const ProjectBackwardArgs<T> &args, const uint32_t 
     }
 }
 
+// Propagates the colours' gradients to the harmonics: db[j] = dL/db_j.
+template <int DEGREE, class T>
+GSPLAT_INLINE void basis_gradient(const Scene<T> &scene, const uint32_t *ids, int count, const Shade<T> &shades, const T (*sums)[CHUNK],
+                                  Gradients<T> &out, T (*db)[CHUNK]) {
+    for (int l = 0; l < count; ++l) {
+        const int64_t i = ids[l];
+        T color[4], dc[4];
+        store(color, color_of<DEGREE>(scene, shades, l, i));
+        out.drawn[l] = is_color(color) ? T(1) : T(0);
+        for (int k = 0; k < 3; ++k) out.color[k][l] = dc[k] = color[k] > 0 ? sums[k][l] : T(0);
+        const T *sh = scene.sh_rest + 3 * int64_t(scene.rest) * i;
+#pragma GCC unroll 16
+        for (int j = 1; j < (DEGREE + 1) * (DEGREE + 1); ++j) db[j][l] = dot3(sh + 3 * (j - 1), dc);
+    }
+}
+
 // Propagates the colours' gradients to the coefficients (as `out.color` and `out.basis`) and, through the viewing direction,
 // to the mean: `dmean`, world axes.
 template <class T>
@@ -132,19 +148,10 @@ GSPLAT_INLINE void color_gradient(const ProjectBackwardArgs<T> &args, const uint
                                   Gradients<T> &out, T (*dmean)[CHUNK]) {
     using V = typename Vector<T>::V;
     const int degree = args.settings.sh_degree, used = (degree + 1) * (degree + 1);
-    const Scene<T> &scene = args.scene;
     Shade<T> shades;
-    alignas(64) T db[16][CHUNK];
+    alignas(64) T db[16][CHUNK] = {};
     shade(in, args.camera, degree, shades);
-    for (int l = 0; l < in.padded; ++l) {
-        const int64_t i = ids[l < in.count ? l : 0];
-        T color[4], dc[4];
-        store(color, color_of(scene, degree, shades, l, i));
-        out.drawn[l] = is_color(color) ? T(1) : T(0);
-        for (int k = 0; k < 3; ++k) out.color[k][l] = dc[k] = color[k] > 0 ? sums[k][l] : T(0);
-        const T *sh = scene.sh_rest + 3 * int64_t(scene.rest) * i;
-        for (int j = 1; j < used; ++j) db[j][l] = dot3(sh + 3 * (j - 1), dc);
-    }
+    with_degree(degree, [&]<int DEGREE>() { basis_gradient<DEGREE>(args.scene, ids, in.count, shades, sums, out, db); });
     for (int l = 0; l < in.padded; l += Vector<T>::LANES) {
         V b[16], d[3], dir[3];
         for (int j = 1; j < used; ++j) b[j] = load<V>(db[j] + l);
@@ -183,9 +190,9 @@ GSPLAT_INLINE void shape_gradient(const ProjectBackwardArgs<T> &args, const Chun
     narrowed(out.drawn + l, g.valid ? widened(out.drawn + l) : VD{});
 }
 
-// The gradients of up to CHUNK Gaussians.
+// The gradients of up to CHUNK Gaussians; `next` more follow in the list.
 template <class T>
-GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint32_t *ids, int count, Gradients<T> &out) {
+GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint32_t *ids, int count, int next, Gradients<T> &out) {
     Chunk<T> in;
     alignas(64) T sums[SLOT][CHUNK], through_color[3][CHUNK] = {};
     gather(args.scene, ids, count, in);
@@ -198,7 +205,12 @@ GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint3
             for (int k = 0; k < 3; ++k) out.color[k][l] = sums[k][l];
         }
     }
-    for (int l = 0; l < in.padded; l += WIDE) shape_gradient(args, in, l, sums, through_color, out);
+    const int row = 3 * args.scene.rest;
+    for (int l = 0; l < in.padded; l += WIDE) {
+        for (int k = l; k < vmin(l + WIDE, count); ++k) fetch<1>(args.grads.sh_rest + int64_t(row) * ids[k], row);
+        for (int k = l; k < vmin(l + WIDE, next); ++k) fetch<0>(args.scene.sh_rest + int64_t(row) * ids[count + k], row);
+        shape_gradient(args, in, l, sums, through_color, out);
+    }
 }
 
 // Writes zeros for Gaussian i.
@@ -221,10 +233,24 @@ GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
     }
 }
 
+// Writes the products basis[j] color[k] in lane l to Gaussian i.
+template <int DEGREE, class T>
+GSPLAT_INLINE void write_harmonics(const SceneGrads<T> &grads, int rest, const Gradients<T> &in, int l, int64_t i) {
+    constexpr int USED = (DEGREE + 1) * (DEGREE + 1);
+    const typename Channels<T>::V color = {in.color[0][l], in.color[1][l], in.color[2][l], T(0)};
+    for (int k = 0; k < 3; ++k) grads.sh0[3 * i + k] = in.basis[0][l] * color[k];
+    if (USED == 1 && rest == 0) return;
+    T *out = grads.sh_rest + 3 * int64_t(rest) * i;
+#pragma GCC unroll 16
+    for (int j = 1; j < USED - 1; ++j) store(out + 3 * (j - 1), color * in.basis[j][l]);  // the next store overwrites the fourth number
+    if (USED > 1)
+        for (int k = 0; k < 3; ++k) out[3 * (USED - 2) + k] = in.basis[USED - 1][l] * color[k];
+    if (USED <= rest) memset(out + 3 * (USED - 1), 0, 3 * size_t(rest + 1 - USED) * sizeof(T));
+}
+
 // Writes the gradients in lane l to Gaussian i.
 template <class T>
 GSPLAT_INLINE void write(const ProjectBackwardArgs<T> &args, const Gradients<T> &in, int l, int64_t i) {
-    using C = typename Channels<T>::V;
     const SceneGrads<T> &grads = args.grads;
     if (in.drawn[l] == 0) return zero(args, i);
     for (int k = 0; k < 3; ++k) grads.means[3 * i + k] = in.mean[k][l];
@@ -238,17 +264,7 @@ GSPLAT_INLINE void write(const ProjectBackwardArgs<T> &args, const Gradients<T> 
     for (int k = 0; k < 4; ++k) grads.quats[4 * i + k] = in.quat[k][l];
     for (int k = 0; k < 3; ++k) grads.log_scales[3 * i + k] = in.log_scale[k][l];
     grads.logit_opacities[i] = in.opacity[l];
-    const C color = {in.color[0][l], in.color[1][l], in.color[2][l], T(0)};
-    for (int k = 0; k < 3; ++k) grads.sh0[3 * i + k] = in.basis[0][l] * color[k];
-    const int degree = args.settings.sh_degree, used = (degree + 1) * (degree + 1), rest = args.scene.rest;
-    T *out = grads.sh_rest + 3 * int64_t(rest) * i;
-    for (int j = 1; j < used; ++j) {
-        if (j < rest)
-            store(out + 3 * (j - 1), color * in.basis[j][l]);  // the fourth number is overwritten by the next coefficient
-        else
-            for (int k = 0; k < 3; ++k) out[3 * (j - 1) + k] = in.basis[j][l] * color[k];
-    }
-    if (used <= rest) memset(out + 3 * (used - 1), 0, 3 * size_t(rest + 1 - used) * sizeof(T));
+    with_degree(args.settings.sh_degree, [&]<int DEGREE>() { write_harmonics<DEGREE>(grads, args.scene.rest, in, l, i); });
 }
 
 template <class T>
@@ -265,7 +281,7 @@ void project_backward(const ProjectBackwardArgs<T> &args, int64_t block) {
     for (int first = 0; first < drawn; first += CHUNK) {
         const int count = vmin(CHUNK, drawn - first);
         Gradients<T> gradients;
-        differentiate(args, ids + first, count, gradients);
+        differentiate(args, ids + first, count, drawn - first - count, gradients);
         for (int l = 0; l < count; ++l) write(args, gradients, l, ids[first + l]);
     }
 }
