@@ -9,12 +9,14 @@
 namespace gsplat {
 namespace GSPLAT_ISA {
 
+constexpr uint32_t MOST_FETCHED = 32;  // slots of a Gaussian, in advance
+
 // Gradients of a chunk, an array for each number. Those of the harmonics' coefficients are products, basis[j] color[k].
 template <class T>
 struct Gradients {
     alignas(64) T mean[3][CHUNK], quat[4][CHUNK], log_scale[3][CHUNK], opacity[CHUNK];  // opacity: raw or direct
     T cov3d[9][CHUNK], color[3][CHUNK], means2d_norm[CHUNK];
-    T basis[16][CHUNK];
+    Shade<T> shades;
     T drawn[CHUNK];  // 0 where all gradients are 0
 };
 
@@ -127,12 +129,12 @@ GSPLAT_INLINE void sum_slots(const ProjectBackwardArgs<T> &args, const uint32_t 
 
 // Propagates the colours' gradients to the harmonics: db[j] = dL/db_j.
 template <int DEGREE, class T>
-GSPLAT_INLINE void basis_gradient(const Scene<T> &scene, const uint32_t *ids, int count, const Shade<T> &shades, const T (*sums)[CHUNK],
-                                  Gradients<T> &out, T (*db)[CHUNK]) {
-    for (int l = 0; l < count; ++l) {
-        const int64_t i = ids[l];
+GSPLAT_INLINE void basis_gradient(const Scene<T> &scene, const uint32_t *ids, const Chunk<T> &in, const T (*sums)[CHUNK], Gradients<T> &out,
+                                  T (*db)[CHUNK]) {
+    for (int l = 0; l < in.padded; ++l) {
+        const int64_t i = ids[l < in.count ? l : 0];
         T color[4], dc[4];
-        store(color, color_of<DEGREE>(scene, shades, l, i));
+        store(color, color_of<DEGREE>(scene, out.shades, l, i));
         out.drawn[l] = is_color(color) ? T(1) : T(0);
         for (int k = 0; k < 3; ++k) out.color[k][l] = dc[k] = color[k] > 0 ? sums[k][l] : T(0);
         const T *sh = scene.sh_rest + 3 * int64_t(scene.rest) * i;
@@ -148,19 +150,17 @@ GSPLAT_INLINE void color_gradient(const ProjectBackwardArgs<T> &args, const uint
                                   Gradients<T> &out, T (*dmean)[CHUNK]) {
     using V = typename Vector<T>::V;
     const int degree = args.settings.sh_degree, used = (degree + 1) * (degree + 1);
-    Shade<T> shades;
-    alignas(64) T db[16][CHUNK] = {};
-    shade(in, args.camera, degree, shades);
-    with_degree(degree, [&]<int DEGREE>() { basis_gradient<DEGREE>(args.scene, ids, in.count, shades, sums, out, db); });
+    alignas(64) T db[16][CHUNK];
+    shade(in, args.camera, degree, out.shades);
+    with_degree(degree, [&]<int DEGREE>() { basis_gradient<DEGREE>(args.scene, ids, in, sums, out, db); });
     for (int l = 0; l < in.padded; l += Vector<T>::LANES) {
         V b[16], d[3], dir[3];
         for (int j = 1; j < used; ++j) b[j] = load<V>(db[j] + l);
-        for (int k = 0; k < 3; ++k) dir[k] = load<V>(shades.dir[k] + l);
+        for (int k = 0; k < 3; ++k) dir[k] = load<V>(out.shades.dir[k] + l);
         harmonics_backward<T>(degree, dir[0], dir[1], dir[2], b, d);
-        const V along = dot3(d, dir), inverse = load<V>(shades.inverse_distance + l);
+        const V along = dot3(d, dir), inverse = load<V>(out.shades.inverse_distance + l);
         for (int k = 0; k < 3; ++k) store(dmean[k] + l, (d[k] - along * dir[k]) * inverse);
     }
-    memcpy(out.basis, shades.basis, sizeof out.basis);
 }
 
 // Propagates the sums of WIDE Gaussians to shape, mean and opacity.
@@ -208,7 +208,11 @@ GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint3
     const int row = 3 * args.scene.rest;
     for (int l = 0; l < in.padded; l += WIDE) {
         for (int k = l; k < vmin(l + WIDE, count); ++k) fetch<1>(args.grads.sh_rest + int64_t(row) * ids[k], row);
-        for (int k = l; k < vmin(l + WIDE, next); ++k) fetch<0>(args.scene.sh_rest + int64_t(row) * ids[count + k], row);
+        for (int k = l; k < vmin(l + WIDE, next); ++k) {
+            const uint32_t i = ids[count + k];
+            fetch<0>(args.scene.sh_rest + int64_t(row) * i, row);
+            fetch<0>(args.slots + int64_t(SLOT) * args.slot_begin[i], int(vmin(args.pairs_of[i], MOST_FETCHED)) * SLOT);
+        }
         shape_gradient(args, in, l, sums, through_color, out);
     }
 }
@@ -238,13 +242,14 @@ template <int DEGREE, class T>
 GSPLAT_INLINE void write_harmonics(const SceneGrads<T> &grads, int rest, const Gradients<T> &in, int l, int64_t i) {
     constexpr int USED = (DEGREE + 1) * (DEGREE + 1);
     const typename Channels<T>::V color = {in.color[0][l], in.color[1][l], in.color[2][l], T(0)};
-    for (int k = 0; k < 3; ++k) grads.sh0[3 * i + k] = in.basis[0][l] * color[k];
+    for (int k = 0; k < 3; ++k) grads.sh0[3 * i + k] = in.shades.basis[0][l] * color[k];
     if (USED == 1 && rest == 0) return;
     T *out = grads.sh_rest + 3 * int64_t(rest) * i;
 #pragma GCC unroll 16
-    for (int j = 1; j < USED - 1; ++j) store(out + 3 * (j - 1), color * in.basis[j][l]);  // the next store overwrites the fourth number
+    for (int j = 1; j < USED - 1; ++j)
+        store(out + 3 * (j - 1), color * in.shades.basis[j][l]);  // the next store overwrites the fourth number
     if (USED > 1)
-        for (int k = 0; k < 3; ++k) out[3 * (USED - 2) + k] = in.basis[USED - 1][l] * color[k];
+        for (int k = 0; k < 3; ++k) out[3 * (USED - 2) + k] = in.shades.basis[USED - 1][l] * color[k];
     if (USED <= rest) memset(out + 3 * (USED - 1), 0, 3 * size_t(rest + 1 - USED) * sizeof(T));
 }
 
