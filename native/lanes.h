@@ -16,8 +16,19 @@ constexpr int WIDE = Vector<double>::LANES;
 // As many floats as a vector of doubles has lanes.
 typedef float HalfF __attribute__((vector_size(WIDE * sizeof(float))));
 
+// To double. GCC 12 converts the two halves of a wider vector separately, hence the intrinsics.
+GSPLAT_INLINE VD widened(HalfF v) {
+#if GSPLAT_VECTOR_BYTES == 64
+    return (VD)_mm512_cvtps_pd((__m256)v);
+#elif GSPLAT_VECTOR_BYTES == 32
+    return (VD)_mm256_cvtps_pd((__m128)v);
+#else
+    return __builtin_convertvector(v, VD);
+#endif
+}
+
 // WIDE numbers of the scene's type as doubles, and back, rounded.
-GSPLAT_INLINE VD widened(const float *p) { return __builtin_convertvector(load<HalfF>(p), VD); }
+GSPLAT_INLINE VD widened(const float *p) { return widened(load<HalfF>(p)); }
 GSPLAT_INLINE VD widened(const double *p) { return load<VD>(p); }
 GSPLAT_INLINE void narrowed(float *p, VD v) { store(p, __builtin_convertvector(v, HalfF)); }
 GSPLAT_INLINE void narrowed(double *p, VD v) { store(p, v); }
@@ -26,18 +37,10 @@ GSPLAT_INLINE void narrowed(double *p, VD v) { store(p, v); }
 template <class T>
 GSPLAT_INLINE VD rounded(VD v) {
     if (sizeof(T) == sizeof(double)) return v;
-    return __builtin_convertvector(__builtin_convertvector(v, HalfF), VD);
+    return widened(__builtin_convertvector(v, HalfF));
 }
 
 GSPLAT_INLINE MD finite(VD v) { return v - v == VD{}; }
-
-template <class M>
-GSPLAT_INLINE bool any(M mask) {
-    int64_t lanes[sizeof(M) / sizeof(int64_t)], found = 0;
-    memcpy(lanes, &mask, sizeof mask);
-    for (int64_t lane : lanes) found |= lane;
-    return found != 0;
-}
 
 GSPLAT_INLINE VF sqrt_(VF v) {
 #if GSPLAT_VECTOR_BYTES == 64
