@@ -1,9 +1,9 @@
-// The mathematics of one Gaussian, forward and backward: quaternion, covariance, projection, harmonics.
-// Mirrors src/gsplat_edu/gaussian_math.py and sh.py. Compiled once per instruction set, like simd.h.
+// The mathematics of a Gaussian, forward and backward: quaternion, covariance, projection, harmonics; a lane for each
+// Gaussian. Mirrors src/gsplat_edu/gaussian_math.py and sh.py. Compiled once per instruction set, like simd.h.
 #pragma once
 
 #include "kernels.h"
-#include "simd.h"
+#include "lanes.h"
 
 namespace gsplat {
 namespace GSPLAT_ISA {
@@ -34,10 +34,10 @@ GSPLAT_INLINE bool is_color(const T *c) {
 }
 
 // Bound on the rounding error of a rim, px, if it is computed from numbers whose magnitudes add up to `size`.
-template <class T>
-GSPLAT_INLINE T rim_slack(T size) {
-    return T(RIM_SLACK) + T(sizeof(T) == sizeof(float) ? 0x1p-21 : 0x1p-50) * size;
-}
+GSPLAT_INLINE float rim_slack(float size) { return float(RIM_SLACK) + 0x1p-21f * size; }
+GSPLAT_INLINE double rim_slack(double size) { return RIM_SLACK + 0x1p-50 * size; }
+GSPLAT_INLINE VF rim_slack(VF size) { return splat(float(RIM_SLACK)) + splat(0x1p-21f) * size; }
+GSPLAT_INLINE VD rim_slack(VD size) { return splat(RIM_SLACK) + splat(0x1p-50) * size; }
 
 GSPLAT_INLINE float abs_(float x) { return fabsf(x); }
 GSPLAT_INLINE double abs_(double x) { return fabs(x); }
@@ -47,190 +47,296 @@ GSPLAT_INLINE T dot3(const T *a, const T *b) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-GSPLAT_INLINE void cross3(const double *a, const double *b, double *out) {
+template <class T>
+GSPLAT_INLINE void cross3(const T *a, const T *b, T *out) {
     out[0] = a[1] * b[2] - a[2] * b[1], out[1] = a[2] * b[0] - a[0] * b[2], out[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// R(q) of a unit quaternion (w, x, y, z), row-major.
-template <class T>
-GSPLAT_INLINE void rotation(const T *q, T *R) {
-    const T w = q[0], x = q[1], y = q[2], z = q[3];
-    R[0] = 1 - 2 * (y * y + z * z), R[1] = 2 * (x * y - w * z), R[2] = 2 * (x * z + w * y);
-    R[3] = 2 * (x * y + w * z), R[4] = 1 - 2 * (x * x + z * z), R[5] = 2 * (y * z - w * x);
-    R[6] = 2 * (x * z - w * y), R[7] = 2 * (y * z + w * x), R[8] = 1 - 2 * (x * x + y * y);
+// R(q) of the quaternion (w, x, y, z) of any length, row-major; `inverse` is 1 / |q|².
+GSPLAT_INLINE void rotation(const VD *q, VD inverse, VD *R) {
+    const VD w = q[0], x = q[1], y = q[2], z = q[3], one = splat(1.0), k = inverse + inverse;
+    R[0] = one - k * (y * y + z * z), R[1] = k * (x * y - w * z), R[2] = k * (x * z + w * y);
+    R[3] = k * (x * y + w * z), R[4] = one - k * (x * x + z * z), R[5] = k * (y * z - w * x);
+    R[6] = k * (x * z - w * y), R[7] = k * (y * z + w * x), R[8] = one - k * (x * x + y * y);
 }
 
-// dL/dq of a unit quaternion from G = dL/dR.
-template <class T>
-GSPLAT_INLINE void rotation_backward(const T *q, const T *G, T *dq) {
-    const T w = q[0], x = q[1], y = q[2], z = q[3];
-    dq[0] = 2 * (x * (G[7] - G[5]) + y * (G[2] - G[6]) + z * (G[3] - G[1]));
-    dq[1] = 2 * (y * (G[1] + G[3]) + z * (G[2] + G[6]) + w * (G[7] - G[5]) - 2 * x * (G[4] + G[8]));
-    dq[2] = 2 * (x * (G[1] + G[3]) + z * (G[5] + G[7]) + w * (G[2] - G[6]) - 2 * y * (G[0] + G[8]));
-    dq[3] = 2 * (x * (G[2] + G[6]) + y * (G[5] + G[7]) + w * (G[3] - G[1]) - 2 * z * (G[0] + G[4]));
+// dL/dq of that quaternion from G = dL/dR: the gradient for a unit quaternion, less its part along q.
+GSPLAT_INLINE void rotation_backward(const VD *q, VD inverse, const VD *G, VD *dq) {
+    const VD w = q[0], x = q[1], y = q[2], z = q[3], k = inverse + inverse;
+    dq[0] = k * (x * (G[7] - G[5]) + y * (G[2] - G[6]) + z * (G[3] - G[1]));
+    dq[1] = k * (y * (G[1] + G[3]) + z * (G[2] + G[6]) + w * (G[7] - G[5]) - (x + x) * (G[4] + G[8]));
+    dq[2] = k * (x * (G[1] + G[3]) + z * (G[5] + G[7]) + w * (G[2] - G[6]) - (y + y) * (G[0] + G[8]));
+    dq[3] = k * (x * (G[2] + G[6]) + y * (G[5] + G[7]) + w * (G[3] - G[1]) - (z + z) * (G[0] + G[4]));
+    const VD along = inverse * (dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z);
+    for (int k = 0; k < 4; ++k) dq[k] -= along * q[k];
 }
 
 // The real spherical harmonics up to `degree` in direction (x, y, z): b has (degree + 1)² entries.
-template <class T>
-GSPLAT_INLINE void harmonics(int degree, T x, T y, T z, T *b) {
-    b[0] = T(C0);
+template <class T, class V>
+GSPLAT_INLINE void harmonics(int degree, V x, V y, V z, V *b) {
+    b[0] = splat(T(C0));
     if (degree < 1) return;
-    b[1] = T(-C1) * y, b[2] = T(C1) * z, b[3] = T(-C1) * x;
+    b[1] = splat(T(-C1)) * y, b[2] = splat(T(C1)) * z, b[3] = splat(T(-C1)) * x;
     if (degree < 2) return;
-    const T xx = x * x, yy = y * y, zz = z * z;
-    b[4] = T(C2[0]) * x * y, b[5] = T(C2[1]) * y * z, b[6] = T(C2[2]) * (2 * zz - xx - yy);
-    b[7] = T(C2[3]) * x * z, b[8] = T(C2[4]) * (xx - yy);
+    const V xx = x * x, yy = y * y, zz = z * z, zz2 = zz + zz;
+    b[4] = splat(T(C2[0])) * x * y, b[5] = splat(T(C2[1])) * y * z, b[6] = splat(T(C2[2])) * (zz2 - xx - yy);
+    b[7] = splat(T(C2[3])) * x * z, b[8] = splat(T(C2[4])) * (xx - yy);
     if (degree < 3) return;
-    b[9] = T(C3[0]) * y * (3 * xx - yy), b[10] = T(C3[1]) * x * y * z;
-    b[11] = T(C3[2]) * y * (4 * zz - xx - yy), b[12] = T(C3[3]) * z * (2 * zz - 3 * xx - 3 * yy);
-    b[13] = T(C3[4]) * x * (4 * zz - xx - yy), b[14] = T(C3[5]) * z * (xx - yy);
-    b[15] = T(C3[6]) * x * (xx - 3 * yy);
+    const V xx3 = splat(T(3)) * xx, yy3 = splat(T(3)) * yy, ring = zz2 + zz2 - xx - yy;
+    b[9] = splat(T(C3[0])) * y * (xx3 - yy), b[10] = splat(T(C3[1])) * x * y * z, b[11] = splat(T(C3[2])) * y * ring;
+    b[12] = splat(T(C3[3])) * z * (zz2 - xx3 - yy3), b[13] = splat(T(C3[4])) * x * ring;
+    b[14] = splat(T(C3[5])) * z * (xx - yy), b[15] = splat(T(C3[6])) * x * (xx - yy3);
 }
 
 // dL/d(x, y, z) from g_i = dL/db_i.
-template <class T>
-GSPLAT_INLINE void harmonics_backward(int degree, T x, T y, T z, const T *g, T *d) {
-    d[0] = d[1] = d[2] = 0;
+template <class T, class V>
+GSPLAT_INLINE void harmonics_backward(int degree, V x, V y, V z, const V *g, V *d) {
+    d[0] = d[1] = d[2] = V{};
     if (degree < 1) return;
-    d[0] = T(-C1) * g[3], d[1] = T(-C1) * g[1], d[2] = T(C1) * g[2];
+    const V c1 = splat(T(C1));
+    d[0] = -c1 * g[3], d[1] = -c1 * g[1], d[2] = c1 * g[2];
     if (degree < 2) return;
-    const T p = T(C2[0]), q = T(C2[2]), r = T(C2[4]);
-    d[0] += p * y * g[4] - 2 * q * x * g[6] - p * z * g[7] + 2 * r * x * g[8];
-    d[1] += p * x * g[4] - p * z * g[5] - 2 * q * y * g[6] - 2 * r * y * g[8];
-    d[2] += -p * y * g[5] + 4 * q * z * g[6] - p * x * g[7];
+    const V p = splat(T(C2[0])), q2 = splat(T(2 * C2[2])), r2 = splat(T(2 * C2[4]));
+    d[0] += p * y * g[4] - q2 * x * g[6] - p * z * g[7] + r2 * x * g[8];
+    d[1] += p * x * g[4] - p * z * g[5] - q2 * y * g[6] - r2 * y * g[8];
+    d[2] += (q2 + q2) * z * g[6] - p * y * g[5] - p * x * g[7];
     if (degree < 3) return;
-    const T xx = x * x, yy = y * y, zz = z * z;
-    const T a = T(C3[6]), b = T(C3[1]), c = T(C3[4]), e = T(C3[3]), f = T(C3[5]);
-    d[0] += 6 * a * x * y * g[9] + b * y * z * g[10] - 2 * c * x * y * g[11] - 6 * e * x * z * g[12] + c * (4 * zz - 3 * xx - yy) * g[13] +
-            2 * f * x * z * g[14] + 3 * a * (xx - yy) * g[15];
-    d[1] += 3 * a * (xx - yy) * g[9] + b * x * z * g[10] + c * (4 * zz - xx - 3 * yy) * g[11] - 6 * e * y * z * g[12] -
-            2 * c * x * y * g[13] - 2 * f * y * z * g[14] - 6 * a * x * y * g[15];
-    d[2] += b * x * y * g[10] + 8 * c * y * z * g[11] + 3 * e * (2 * zz - xx - yy) * g[12] + 8 * c * x * z * g[13] + f * (xx - yy) * g[14];
+    const V xx = x * x, yy = y * y, zz4 = splat(T(4)) * z * z, three = splat(T(3));
+    const V a3 = splat(T(3 * C3[6])), b = splat(T(C3[1])), c = splat(T(C3[4])), e3 = splat(T(3 * C3[3])), f = splat(T(C3[5]));
+    const V xy2 = (x + x) * y, xz2 = (x + x) * z, yz2 = (y + y) * z, saddle = xx - yy;
+    d[0] += a3 * xy2 * g[9] + b * y * z * g[10] - c * xy2 * g[11] - e3 * xz2 * g[12] + c * (zz4 - three * xx - yy) * g[13] +
+            f * xz2 * g[14] + a3 * saddle * g[15];
+    d[1] += a3 * saddle * g[9] + b * x * z * g[10] + c * (zz4 - xx - three * yy) * g[11] - e3 * yz2 * g[12] - c * xy2 * g[13] -
+            f * yz2 * g[14] - a3 * xy2 * g[15];
+    const V c8 = splat(T(8)) * c * z;
+    d[2] += b * x * y * g[10] + c8 * y * g[11] + e3 * (splat(T(0.5)) * zz4 - xx - yy) * g[12] + c8 * x * g[13] + f * saddle * g[14];
 }
 
-// Intermediate values of one Gaussian's projection, kept for the backward pass. Always in double: distant cameras, long
-// lenses and thin ellipses lose digits here that float cannot spare, and the cost is once per Gaussian
-// (docs/PRECISION.md).
+// Gaussians whose numbers a kernel holds on its stack at a time, an array for each number; a multiple of every vector width.
+constexpr int CHUNK = 64;
+
+// The parameters of up to CHUNK Gaussians. The arrays are filled up to a whole vector with copies of the first one.
+template <class T>
+struct Chunk {
+    int count, padded;
+    alignas(64) T mean[3][CHUNK];
+    T quat[4][CHUNK], scale[3][CHUNK];  // raw parameters; scales after exp
+    T cov3d[9][CHUNK];                  // covariances given directly
+    T opacity[CHUNK];                   // after the sigmoid
+};
+
+template <class T>
+GSPLAT_INLINE void gather(const Scene<T> &scene, const uint32_t *ids, int count, Chunk<T> &in) {
+    using V = typename Vector<T>::V;
+    constexpr int LANES = Vector<T>::LANES;
+    in.count = count, in.padded = (count + LANES - 1) / LANES * LANES;
+    for (int l = 0; l < in.padded; ++l) {
+        const int64_t i = ids[l < count ? l : 0];
+        for (int k = 0; k < 3; ++k) in.mean[k][l] = scene.means[3 * i + k];
+        if (scene.quats) {
+            for (int k = 0; k < 4; ++k) in.quat[k][l] = scene.quats[4 * i + k];
+            for (int k = 0; k < 3; ++k) in.scale[k][l] = scene.log_scales[3 * i + k];
+            in.opacity[l] = scene.logit_opacities[i];
+        } else {
+            for (int k = 0; k < 9; ++k) in.cov3d[k][l] = scene.cov3ds[9 * i + k];
+            in.opacity[l] = scene.opacities[i];
+        }
+    }
+    if (!scene.quats) return;
+    const V one = splat(T(1));
+    for (int l = 0; l < in.padded; l += LANES) {
+        for (int k = 0; k < 3; ++k) store(in.scale[k] + l, exp_(load<V>(in.scale[k] + l)));
+        store(in.opacity + l, one / (one + exp_(-load<V>(in.opacity + l))));
+    }
+}
+
+// Fetches `count` numbers into the first cache while others are computed; `WRITE`: in order to write them.
+template <int WRITE, class T>
+GSPLAT_INLINE void fetch(const T *from, int count) {
+    const char *byte = reinterpret_cast<const char *>(from);
+    const int bytes = count * int(sizeof(T));
+    for (int offset = 0; offset < bytes; offset += 64) __builtin_prefetch(byte + offset, WRITE);
+    if (bytes) __builtin_prefetch(byte + bytes - 1, WRITE);
+}
+
+// Intermediate values of a projection, kept for the backward pass. Always in double: distant cameras, long lenses and thin
+// ellipses lose digits here that float cannot spare, and the cost is once per Gaussian (docs/PRECISION.md).
 struct Projected {
-    double offset[3], p[3];                   // mean - eye in world axes; mean in camera axes
-    double iz, ratio[2];                      // 1/z; x/z and y/z, clamped for the Jacobian
-    bool clamped[2];                          // whether each was clamped
-    double t0[3], t1[3];                      // rows of J W
-    double q[4], inverse_q_norm, R[9], s[3];  // unit quaternion, 1 / its original length, rotation, scales
-    double r0[3], r1[3], n[3];                // rows of J W M, M = R S, and their cross product
-    double a0, b0, c0, det0;                  // screen covariance before the dilation
-    double a, b, c, det, inverse_det;         // and after it
-    double opacity, compensation;             // opacity before antialiasing's compensation, and that factor
+    VD offset[3], p[3];                   // mean - eye in world axes; mean in camera axes
+    VD iz, ratio[2];                      // 1/z; x/z and y/z, clamped for the Jacobian
+    MD clamped[2];                        // whether each was clamped
+    VD t0[3], t1[3];                      // rows of J W
+    VD q[4], inverse_q2, q_scale;         // quaternion times q_scale, 1 / |q|²
+    VD R[9], s[3];                        // rotation, scales
+    VD r0[3], r1[3], n[3];                // rows of J W M, M = R S, and their cross product
+    VD a0, b0, c0, det0;                  // screen covariance before the dilation
+    VD a, b, c, inverse_c, inverse_det;   // and after it
+    VD opacity, compensation;             // opacity before antialiasing's compensation, and that factor
+    MD valid;                             // before the camera, bright enough and finite
 };
 
-// Intermediate values of its colour.
+// The quaternion and 1 / |q|². Clears `valid` where q has zero length.
 template <class T>
-struct Shade {
-    T dir[3], distance;          // viewing direction
-    T basis[16], color[3];       // harmonics; colour before the floor at 0
-};
-
-// The unit quaternion and 1 / |q|. False if q has zero length.
-template <class T>
-GSPLAT_INLINE bool unit_quaternion(const T *q, Projected &g) {
-    double scale = 1, norm = 0;
+GSPLAT_INLINE void quaternion(const Chunk<T> &in, int l, Projected &g) {
+    for (int k = 0; k < 4; ++k) g.q[k] = widened(in.quat[k] + l);
+    g.q_scale = splat(1.0);
     if (sizeof(T) == sizeof(double)) {  // squares of float neither overflow nor underflow in double; those of double may
-        double largest = 0;
-        for (int k = 0; k < 4; ++k) largest = vmax(largest, double(q[k] < 0 ? -q[k] : q[k]));
-        scale = 1 / largest;
-        if (!finite(scale)) return false;
+        VD largest = VD{};
+        for (int k = 0; k < 4; ++k) largest = vmax(largest, abs_(g.q[k]));
+        g.q_scale = splat(1.0) / largest;
+        g.valid &= finite(g.q_scale);
+        for (int k = 0; k < 4; ++k) g.q[k] *= g.q_scale;
     }
-    for (int k = 0; k < 4; ++k) g.q[k] = double(q[k]) * scale, norm += g.q[k] * g.q[k];
-    const double inverse = 1 / sqrt_(norm);
-    if (!finite(inverse)) return false;
-    for (int k = 0; k < 4; ++k) g.q[k] *= inverse;
-    g.inverse_q_norm = inverse * scale;
-    return true;
+    g.inverse_q2 = splat(1.0) / (g.q[0] * g.q[0] + g.q[1] * g.q[1] + g.q[2] * g.q[2] + g.q[3] * g.q[3]);
+    g.valid &= finite(g.inverse_q2);
 }
 
-// Sigma2d = (J W M)(J W M)' + 0.3 I, and opacity. False if the Gaussian is behind the camera, too faint or not finite.
+// Mean in camera axes, and J W.
 template <class T>
-GSPLAT_INLINE bool project_shape(const Scene<T> &scene, const Camera &cam, const Settings &set, int64_t i, Projected &g) {
-    for (int k = 0; k < 3; ++k) g.offset[k] = double(scene.means[3 * i + k]) - cam.eye[k];
-    for (int k = 0; k < 3; ++k) g.p[k] = dot3(cam.R + 3 * k, g.offset);
-    const double z = g.p[2];
-    if (!(z > set.z_near)) return false;
-    g.iz = 1 / z;
-    const double x_z = g.p[0] * g.iz, y_z = g.p[1] * g.iz;
-    g.clamped[0] = x_z < cam.x_low || x_z > cam.x_high, g.clamped[1] = y_z < cam.y_low || y_z > cam.y_high;
-    g.ratio[0] = vmin(vmax(x_z, cam.x_low), cam.x_high), g.ratio[1] = vmin(vmax(y_z, cam.y_low), cam.y_high);
-    for (int k = 0; k < 3; ++k) {
-        g.t0[k] = cam.fx * g.iz * (cam.R[k] - g.ratio[0] * cam.R[6 + k]);
-        g.t1[k] = cam.fy * g.iz * (cam.R[3 + k] - g.ratio[1] * cam.R[6 + k]);
+GSPLAT_INLINE void project_mean(const Chunk<T> &in, int l, const Camera &cam, const Settings &set, Projected &g) {
+    const double *R = cam.R;
+    for (int k = 0; k < 3; ++k) g.offset[k] = widened(in.mean[k] + l) - splat(cam.eye[k]);
+    for (int k = 0; k < 3; ++k)
+        g.p[k] = splat(R[3 * k]) * g.offset[0] + splat(R[3 * k + 1]) * g.offset[1] + splat(R[3 * k + 2]) * g.offset[2];
+    g.valid = g.p[2] > splat(set.z_near);
+    g.iz = splat(1.0) / g.p[2];
+    const double low[2] = {cam.x_low, cam.y_low}, high[2] = {cam.x_high, cam.y_high};
+    for (int k = 0; k < 2; ++k) {
+        const VD r = g.p[k] * g.iz, least = splat(low[k]), most = splat(high[k]);
+        g.clamped[k] = (r < least) | (r > most);
+        g.ratio[k] = vmin(vmax(r, least), most);
     }
-    if (scene.quats) {
-        if (!unit_quaternion(scene.quats + 4 * i, g)) return false;
-        rotation(g.q, g.R);
+    const VD fx = splat(cam.fx) * g.iz, fy = splat(cam.fy) * g.iz;
+    for (int k = 0; k < 3; ++k) {
+        g.t0[k] = fx * (splat(R[k]) - g.ratio[0] * splat(R[6 + k]));
+        g.t1[k] = fy * (splat(R[3 + k]) - g.ratio[1] * splat(R[6 + k]));
+    }
+}
+
+// Sigma2d before the dilation, (J W M)(J W M)'.
+template <class T>
+GSPLAT_INLINE void project_covariance(const Chunk<T> &in, int l, bool raw, Projected &g) {
+    if (raw) {
+        quaternion(in, l, g);
+        rotation(g.q, g.inverse_q2, g.R);
         for (int k = 0; k < 3; ++k) {
-            g.s[k] = double(exp_(scene.log_scales[3 * i + k]));
+            g.s[k] = widened(in.scale[k] + l);
             g.r0[k] = (g.t0[0] * g.R[k] + g.t0[1] * g.R[3 + k] + g.t0[2] * g.R[6 + k]) * g.s[k];
             g.r1[k] = (g.t1[0] * g.R[k] + g.t1[1] * g.R[3 + k] + g.t1[2] * g.R[6 + k]) * g.s[k];
         }
         g.a0 = dot3(g.r0, g.r0), g.b0 = dot3(g.r0, g.r1), g.c0 = dot3(g.r1, g.r1);
         // |n|² = a0 c0 - b0² without cancellation. n is not computed from r0 and r1, which are almost parallel for a needle.
-        double flat[3];
+        VD flat[3];
         cross3(g.t0, g.t1, flat);
         for (int k = 0; k < 3; ++k)
             g.n[k] = g.s[(k + 1) % 3] * g.s[(k + 2) % 3] * (g.R[k] * flat[0] + g.R[3 + k] * flat[1] + g.R[6 + k] * flat[2]);
         g.det0 = dot3(g.n, g.n);
-        g.opacity = double(1 / (1 + exp_(-scene.logit_opacities[i])));
     } else {
-        double S[9];
-        for (int k = 0; k < 9; ++k) S[k] = double(scene.cov3ds[9 * i + k]);
+        VD S[9];
+        for (int k = 0; k < 9; ++k) S[k] = widened(in.cov3d[k] + l);
         for (int k = 0; k < 3; ++k) {  // r = t S here
             g.r0[k] = g.t0[0] * S[k] + g.t0[1] * S[3 + k] + g.t0[2] * S[6 + k];
             g.r1[k] = g.t1[0] * S[k] + g.t1[1] * S[3 + k] + g.t1[2] * S[6 + k];
         }
         g.a0 = dot3(g.r0, g.t0), g.b0 = dot3(g.r0, g.t1), g.c0 = dot3(g.r1, g.t1);
-        g.det0 = vmax(g.a0 * g.c0 - g.b0 * g.b0, 0.0);
-        g.opacity = double(scene.opacities[i]);
+        g.det0 = vmax(g.a0 * g.c0 - g.b0 * g.b0, VD{});
     }
-    const double d = DILATION;
-    g.a = g.a0 + d, g.b = g.b0, g.c = g.c0 + d;
-    g.det = g.det0 + d * (g.a0 + g.c0) + d * d, g.inverse_det = 1 / g.det;
-    g.compensation = set.antialiased ? sqrt_(vmax(g.det0, DET_FLOOR) * g.inverse_det) : 1.0;
-    // The mean must be finite in the scene's type, the type of its gradients; so must z², so that weighted depths can be added.
-    return finite(T(g.p[0] + g.p[1] + z * z)) && g.a + g.c <= SPLAT_LIMIT * SPLAT_LIMIT && finite(g.det) && g.det > 0 &&
-           g.opacity * g.compensation >= ALPHA_MIN;
 }
 
-// The mean on the screen, u = fx x/z + cx and v, and the nearest point of the image, in the splat's type.
+// Sigma2d = (J W M)(J W M)' + 0.3 I, and opacity, of the Gaussians in lanes l and up.
 template <class T>
+GSPLAT_INLINE void project_shape(const Chunk<T> &in, int l, bool raw, const Camera &cam, const Settings &set, Projected &g) {
+    project_mean(in, l, cam, set, g);
+    project_covariance(in, l, raw, g);
+    g.opacity = widened(in.opacity + l);
+    const VD d = splat(DILATION);
+    g.a = g.a0 + d, g.b = g.b0, g.c = g.c0 + d;
+    const VD det = g.det0 + d * (g.a0 + g.c0) + d * d;
+    const VD inverse = splat(1.0) / (g.c * det);  // one division for two
+    g.inverse_c = inverse * det, g.inverse_det = inverse * g.c;
+    g.compensation = splat(1.0);
+    if (set.antialiased) g.compensation = sqrt_(vmax(g.det0, splat(DET_FLOOR)) * g.inverse_det);
+    // The mean must be finite in the scene's type, the type of its gradients; so must z², so that weighted depths can be added.
+    g.valid &= finite(rounded<T>(g.p[0] + g.p[1] + g.p[2] * g.p[2])) & (g.a + g.c <= splat(SPLAT_LIMIT * SPLAT_LIMIT)) & finite(det) &
+               (det > VD{}) & (g.opacity * g.compensation >= splat(ALPHA_MIN));
+}
+
+// The mean on the screen, u = fx x/z + cx and v, and the nearest point of the image, rounded to the splat's type.
 struct Position {
-    double u, v;
-    T x, y;
+    VD u, v, x, y;
 };
 
 template <class T>
-GSPLAT_INLINE Position<T> position(const Projected &g, const Camera &cam) {
-    Position<T> at;
-    at.u = cam.fx * g.p[0] * g.iz + cam.cx, at.v = cam.fy * g.p[1] * g.iz + cam.cy;
-    at.x = T(vmin(vmax(at.u, 0.0), double(cam.W - 1))), at.y = T(vmin(vmax(at.v, 0.0), double(cam.H - 1)));
+GSPLAT_INLINE Position position(const Projected &g, const Camera &cam) {
+    Position at;
+    at.u = splat(cam.fx) * g.p[0] * g.iz + splat(cam.cx), at.v = splat(cam.fy) * g.p[1] * g.iz + splat(cam.cy);
+    at.x = rounded<T>(vmin(vmax(at.u, VD{}), splat(double(cam.W - 1))));
+    at.y = rounded<T>(vmin(vmax(at.v, VD{}), splat(double(cam.H - 1))));
     return at;
 }
 
-// colour = sum_i b_i sh_i + 0.5, before the floor. False if it is not finite.
+// Viewing directions and harmonics of a chunk.
 template <class T>
-GSPLAT_INLINE bool project_color(const Scene<T> &scene, const Settings &set, int64_t i, const Projected &g, Shade<T> &shade) {
-    if (!scene.quats) {
-        for (int k = 0; k < 3; ++k) shade.color[k] = scene.colors[3 * i + k];
-        return is_color(shade.color);
+struct Shade {
+    alignas(64) T dir[3][CHUNK], inverse_distance[CHUNK];
+    T basis[16][CHUNK];
+};
+
+template <class T>
+GSPLAT_INLINE void shade(const Chunk<T> &in, const Camera &cam, int degree, Shade<T> &out) {
+    using V = typename Vector<T>::V;
+    for (int l = 0; l < in.padded; l += WIDE)
+        for (int k = 0; k < 3; ++k) narrowed(out.dir[k] + l, widened(in.mean[k] + l) - splat(cam.eye[k]));
+    for (int l = 0; l < in.padded; l += Vector<T>::LANES) {
+        V d[3], b[16];
+        for (int k = 0; k < 3; ++k) d[k] = load<V>(out.dir[k] + l);
+        const V inverse = splat(T(1)) / sqrt_(dot3(d, d));
+        for (int k = 0; k < 3; ++k) d[k] *= inverse, store(out.dir[k] + l, d[k]);
+        store(out.inverse_distance + l, inverse);
+        harmonics<T>(degree, d[0], d[1], d[2], b);
+        for (int j = 0; j < (degree + 1) * (degree + 1); ++j) store(out.basis[j] + l, b[j]);
     }
-    for (int k = 0; k < 3; ++k) shade.dir[k] = T(g.offset[k]);
-    shade.distance = sqrt_(dot3(shade.dir, shade.dir));
-    for (int k = 0; k < 3; ++k) shade.dir[k] /= shade.distance;
-    harmonics(set.sh_degree, shade.dir[0], shade.dir[1], shade.dir[2], shade.basis);
-    const int rest = (set.sh_degree + 1) * (set.sh_degree + 1) - 1;
+}
+
+// Four numbers: the three channels, and one that is not used.
+template <class T>
+struct Channels;
+
+template <>
+struct Channels<float> {
+    typedef float V __attribute__((vector_size(16)));
+};
+
+template <>
+struct Channels<double> {
+    typedef double V __attribute__((vector_size(32)));
+};
+
+template <class T>
+GSPLAT_INLINE typename Channels<T>::V channels(const T *rgb) {
+    return typename Channels<T>::V{rgb[0], rgb[1], rgb[2], T(0)};
+}
+
+// colour = sum_i b_i(direction) sh_i + 0.5, before the floor, of Gaussian i in lane l.
+template <int DEGREE, class T>
+GSPLAT_INLINE typename Channels<T>::V color_of(const Scene<T> &scene, const Shade<T> &shade, int l, int64_t i) {
+    using V = typename Channels<T>::V;
+    constexpr int LAST = (DEGREE + 1) * (DEGREE + 1) - 1;
+    V even = channels(scene.sh0 + 3 * i) * shade.basis[0][l] + T(SH_OFFSET), odd = V{};
+    if (LAST == 0) return even;
     const T *sh = scene.sh_rest + 3 * int64_t(scene.rest) * i;
-    for (int k = 0; k < 3; ++k) shade.color[k] = shade.basis[0] * scene.sh0[3 * i + k] + T(SH_OFFSET);
-    for (int j = 0; j < rest; ++j)
-        for (int k = 0; k < 3; ++k) shade.color[k] += shade.basis[j + 1] * sh[3 * j + k];
-    return is_color(shade.color);
+#pragma GCC unroll 16
+    for (int j = 1; j < LAST; ++j) (j % 2 ? odd : even) += load<V>(sh + 3 * j - 3) * shade.basis[j][l];
+    return even + odd + channels(sh + 3 * LAST - 3) * shade.basis[LAST][l];  // a load of four could leave the array
+}
+
+// Calls f with the degree as a constant: f.template operator()<DEGREE>().
+template <class F>
+GSPLAT_INLINE void with_degree(int degree, F f) {
+    if (degree == 0) f.template operator()<0>();
+    if (degree == 1) f.template operator()<1>();
+    if (degree == 2) f.template operator()<2>();
+    if (degree == 3) f.template operator()<3>();
 }
 
 }  // namespace GSPLAT_ISA

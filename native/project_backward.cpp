@@ -1,130 +1,223 @@
 // project_backward: sum each Gaussian's slots in a fixed order and propagate the gradient to its raw parameters.
 //
 //     moments of h -> J W M -> (J W, quaternion, log scale) -> mean;   colour -> (coefficients, direction -> mean)
+//
+// Lanes are Gaussians. `differentiate` finds the gradients of a chunk, `write` stores those of one Gaussian.
 #include "gaussian_math.h"
 #include "isa.h"
 
 namespace gsplat {
 namespace GSPLAT_ISA {
 
+constexpr uint32_t MOST_FETCHED = 32;  // slots of a Gaussian, in advance
+
+// Gradients of a chunk, an array for each number. Those of the harmonics' coefficients are products, basis[j] color[k].
+template <class T>
+struct Gradients {
+    alignas(64) T mean[3][CHUNK], quat[4][CHUNK], log_scale[3][CHUNK], opacity[CHUNK];  // opacity: raw or direct
+    T cov3d[9][CHUNK], color[3][CHUNK], means2d_norm[CHUNK];
+    Shade<T> shades;
+    T drawn[CHUNK];  // 0 where all gradients are 0
+};
+
 // Sigma2d^-1 = L' L, y = L d of a pixel d px from the mean: y0 = sx dx + sy dy, y1 = ty dy. The moments of h are taken
 // in y, where they are of order 1; in d they grow with the ellipse and cancel.
 struct Whitened {
-    double sx, sy, ty;
-    double m0, m1;         // sum h y0, sum h y1
-    double m00, m01, m11;  // sum h y0², sum h y0 y1, sum h y1²; minus sum h on the diagonal with antialiasing
+    VD sx, sy, ty;
+    VD m0, m1;         // sum h y0, sum h y1
+    VD m00, m01, m11;  // sum h y0², sum h y0 y1, sum h y1²; minus sum h on the diagonal with antialiasing
 };
 
 // Computed from the moments of h about the splat's reference point.
 template <class T>
-GSPLAT_INLINE Whitened whiten(const Camera &cam, const Settings &set, const Projected &g, const double *slot) {
+GSPLAT_INLINE Whitened whiten(const Camera &cam, const Settings &set, const Projected &g, const VD *slot) {
     Whitened w;
-    w.sx = sqrt_(g.c * g.inverse_det), w.sy = -g.b / g.c * w.sx, w.ty = sqrt_(1 / g.c);
-    const Position<T> at = position<T>(g, cam);
-    const double dx = double(at.x) - at.u, dy = double(at.y) - at.v;
-    const double s = w.sx * dx + w.sy * dy, t = w.ty * dy;  // y of the reference point
-    const double along = w.sx * slot[HX] + w.sy * slot[HY], down = w.ty * slot[HY];
+    w.sx = sqrt_(g.c * g.inverse_det), w.sy = -g.b * g.inverse_c * w.sx, w.ty = sqrt_(g.inverse_c);
+    const Position at = position<T>(g, cam);
+    const VD dx = at.x - at.u, dy = at.y - at.v;
+    const VD s = w.sx * dx + w.sy * dy, t = w.ty * dy;  // y of the reference point
+    const VD along = w.sx * slot[HX] + w.sy * slot[HY], down = w.ty * slot[HY];
     w.m0 = s * slot[H] + along, w.m1 = t * slot[H] + down;
-    w.m00 = s * (s * slot[H] + 2 * along) + w.sx * (w.sx * slot[HXX] + 2 * w.sy * slot[HXY]) + w.sy * w.sy * slot[HYY];
+    w.m00 = s * (s * slot[H] + along + along) + w.sx * (w.sx * slot[HXX] + (w.sy + w.sy) * slot[HXY]) + w.sy * w.sy * slot[HYY];
     w.m01 = s * (t * slot[H] + down) + t * along + w.ty * (w.sx * slot[HXY] + w.sy * slot[HYY]);
-    w.m11 = t * (t * slot[H] + 2 * down) + w.ty * w.ty * slot[HYY];
+    w.m11 = t * (t * slot[H] + down + down) + w.ty * w.ty * slot[HYY];
     if (set.antialiased) w.m00 -= slot[H], w.m11 -= slot[H];  // the opacity's factor contains det^(-1/2)
     return w;
 }
 
 // Propagates gradients d of J W (two rows t; `total` is the sum of d . t) and of the image position to the mean in camera
 // axes.
-GSPLAT_INLINE void mean_gradient(const Projected &g, const Camera &cam, const double *d0, const double *d1, double total, const double *uv,
-                                 double *dp) {
-    const double iz = g.iz, x = g.p[0] * iz, y = g.p[1] * iz;  // x/z, y/z
-    double w0 = 0, w1 = 0;                                     // d . (row 2 of W)
-    for (int k = 0; k < 3; ++k) w0 += d0[k] * cam.R[6 + k], w1 += d1[k] * cam.R[6 + k];
+GSPLAT_INLINE void mean_gradient(const Projected &g, const Camera &cam, const VD *d0, const VD *d1, VD total, const VD *uv, VD *dp) {
+    const VD iz = g.iz, x = g.p[0] * iz, y = g.p[1] * iz;  // x/z, y/z
+    VD w0 = VD{}, w1 = VD{};                               // d . (row 2 of W)
+    for (int k = 0; k < 3; ++k) w0 += d0[k] * splat(cam.R[6 + k]), w1 += d1[k] * splat(cam.R[6 + k]);
     // J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³ W_2. A clamped x/z is a constant.
-    if (g.clamped[0]) w0 = 0;
-    if (g.clamped[1]) w1 = 0;
-    const double fx = cam.fx * iz, fy = cam.fy * iz;
+    w0 = g.clamped[0] ? VD{} : w0;
+    w1 = g.clamped[1] ? VD{} : w1;
+    const VD fx = splat(cam.fx) * iz, fy = splat(cam.fy) * iz;
     dp[0] = fx * uv[0] - fx * iz * w0;
     dp[1] = fy * uv[1] - fy * iz * w1;
-    dp[2] = -x * fx * uv[0] - y * fy * uv[1] - iz * total + iz * (fx * x * w0 + fy * y * w1);
-}
-
-// Propagates the colour gradient to the coefficients, and through the viewing direction to the mean (world axes, added).
-template <class T>
-GSPLAT_INLINE void color_gradient(const ProjectBackwardArgs<T> &args, int64_t i, const Shade<T> &shade, const T *slot, double *dmean) {
-    const Scene<T> &scene = args.scene;
-    T dc[3];
-    for (int k = 0; k < 3; ++k) dc[k] = shade.color[k] > 0 ? slot[k] : T(0);
-    const int degree = args.settings.sh_degree, used = (degree + 1) * (degree + 1);
-    const T *sh = scene.sh_rest + 3 * int64_t(scene.rest) * i;
-    T *out = args.grads.sh_rest + 3 * int64_t(scene.rest) * i;
-    T db[16];
-    db[0] = 0;
-    for (int k = 0; k < 3; ++k) args.grads.sh0[3 * i + k] = shade.basis[0] * dc[k];
-    for (int j = 1; j < used; ++j) {
-        db[j] = dot3(sh + 3 * (j - 1), dc);
-        for (int k = 0; k < 3; ++k) out[3 * (j - 1) + k] = shade.basis[j] * dc[k];
-    }
-    for (int j = used; j <= scene.rest; ++j)
-        for (int k = 0; k < 3; ++k) out[3 * (j - 1) + k] = 0;
-    T dd[3];
-    harmonics_backward(degree, shade.dir[0], shade.dir[1], shade.dir[2], db, dd);
-    const T along = dot3(dd, shade.dir);
-    for (int k = 0; k < 3; ++k) dmean[k] += double((dd[k] - along * shade.dir[k]) / shade.distance);
+    dp[2] = iz * (fx * x * w0 + fy * y * w1 - total) - x * fx * uv[0] - y * fy * uv[1];
 }
 
 // Propagates the moments to M = R S and J W, for raw parameters; returns d0 . t0 + d1 . t1. With r = (J W) M (two rows), w = L r and
-// N the matrix of moments: dL/dSigma2d = L' N L / 2, dL/dr = L' N w; w is of order 1, however long the ellipse.
+// N the matrix of moments: dL/dSigma2d = L' N L / 2, dL/dr = L' N w; w is of order 1, however long the ellipse. `lit` is
+// antialiasing's part: the opacity's factor contains det0^(1/2), so dL/dr = sum h Sigma^-1 r, Sigma before the dilation.
 template <class T>
-GSPLAT_INLINE double raw_gradient(const ProjectBackwardArgs<T> &args, int64_t i, const Projected &g, const Whitened &m, double h,
-                                  double *d0, double *d1) {
-    double across0[3], across1[3], dR[9], dr0[3], dr1[3], total = 0;
+GSPLAT_INLINE VD raw_gradient(const Projected &g, const Whitened &m, VD lit, int l, Gradients<T> &out, VD *d0, VD *d1) {
+    VD across0[3], across1[3], dR[9], dr0[3], dr1[3], dq[4], total = VD{};
     cross3(g.r1, g.n, across0), cross3(g.n, g.r0, across1);  // c0 r0 - b0 r1 and a0 r1 - b0 r0
-    // With antialiasing the opacity's factor contains det0^(1/2): dL/dr = sum h Sigma^-1 r, Sigma before the dilation.
-    const double lit = args.settings.antialiased && g.det0 > DET_FLOOR ? h / g.det0 : 0;
+    const VD sx_c = m.sx * g.inverse_c;
     for (int k = 0; k < 3; ++k) {
         // sx r0 + sy r1 = sx (r0 - b/c r1)
-        const double w0 = m.sx / g.c * (DILATION * g.r0[k] + across0[k]), w1 = m.ty * g.r1[k];
-        const double dw0 = m.m00 * w0 + m.m01 * w1, dw1 = m.m01 * w0 + m.m11 * w1;
-        const double extra0 = lit * across0[k], extra1 = lit * across1[k];
+        const VD w0 = sx_c * (splat(DILATION) * g.r0[k] + across0[k]), w1 = m.ty * g.r1[k];
+        const VD dw0 = m.m00 * w0 + m.m01 * w1, dw1 = m.m01 * w0 + m.m11 * w1;
+        const VD extra0 = lit * across0[k], extra1 = lit * across1[k];
         dr0[k] = m.sx * dw0 + extra0, dr1[k] = m.sy * dw0 + m.ty * dw1 + extra1;
-        const double scale = w0 * dw0 + w1 * dw1 + g.r0[k] * extra0 + g.r1[k] * extra1;  // r0 . dr0 + r1 . dr1
-        args.grads.log_scales[3 * i + k] = T(scale);
+        const VD scale = w0 * dw0 + w1 * dw1 + g.r0[k] * extra0 + g.r1[k] * extra1;  // r0 . dr0 + r1 . dr1
+        narrowed(out.log_scale[k] + l, scale);
         total += scale;
+        dr0[k] *= g.s[k], dr1[k] *= g.s[k];
     }
     for (int k = 0; k < 3; ++k) {
-        d0[k] = d1[k] = 0;
-        for (int j = 0; j < 3; ++j) {
-            d0[k] += g.R[3 * k + j] * g.s[j] * dr0[j], d1[k] += g.R[3 * k + j] * g.s[j] * dr1[j];
-            dR[3 * k + j] = (g.t0[k] * dr0[j] + g.t1[k] * dr1[j]) * g.s[j];
-        }
+        d0[k] = dot3(g.R + 3 * k, dr0), d1[k] = dot3(g.R + 3 * k, dr1);
+        for (int j = 0; j < 3; ++j) dR[3 * k + j] = g.t0[k] * dr0[j] + g.t1[k] * dr1[j];
     }
-    double dq[4];
-    rotation_backward(g.q, dR, dq);
-    const double along = dq[0] * g.q[0] + dq[1] * g.q[1] + dq[2] * g.q[2] + dq[3] * g.q[3];
-    for (int k = 0; k < 4; ++k) args.grads.quats[4 * i + k] = T((dq[k] - along * g.q[k]) * g.inverse_q_norm);
+    rotation_backward(g.q, g.inverse_q2, dR, dq);
+    for (int k = 0; k < 4; ++k) narrowed(out.quat[k] + l, dq[k] * g.q_scale);
     return total;
 }
 
 // The same for covariances given directly: a = t0' S t0, b = t0' S t1, c = t1' S t1.
 template <class T>
-GSPLAT_INLINE double direct_gradient(const ProjectBackwardArgs<T> &args, int64_t i, const Projected &g, const Whitened &m, double h,
-                                     double *d0, double *d1) {
+GSPLAT_INLINE VD direct_gradient(const Projected &g, const Whitened &m, VD lit, int l, Gradients<T> &out, VD *d0, VD *d1) {
+    const VD half = splat(0.5);
     // Gradients of a, b (once for both entries) and c: L' N L / 2.
-    double a = m.sx * m.sx * m.m00 / 2, b = m.sx * (m.sy * m.m00 + m.ty * m.m01);
-    double c = (m.sy * (m.sy * m.m00 + 2 * m.ty * m.m01) + m.ty * m.ty * m.m11) / 2;
-    if (args.settings.antialiased && g.det0 > DET_FLOOR) a += h / 2 * g.c0 / g.det0, b -= h * g.b0 / g.det0, c += h / 2 * g.a0 / g.det0;
-    double total = 0;
+    VD a = half * m.sx * m.sx * m.m00, b = m.sx * (m.sy * m.m00 + m.ty * m.m01);
+    VD c = half * (m.sy * (m.sy * m.m00 + (m.ty + m.ty) * m.m01) + m.ty * m.ty * m.m11);
+    a += half * lit * g.c0, b -= lit * g.b0, c += half * lit * g.a0;
+    VD total = VD{};
     for (int k = 0; k < 3; ++k) {
-        d0[k] = 2 * a * g.r0[k] + b * g.r1[k];
-        d1[k] = 2 * c * g.r1[k] + b * g.r0[k];
+        d0[k] = (a + a) * g.r0[k] + b * g.r1[k];
+        d1[k] = (c + c) * g.r1[k] + b * g.r0[k];
         total += d0[k] * g.t0[k] + d1[k] * g.t1[k];
         for (int j = 0; j < 3; ++j)
-            args.grads.cov3ds[9 * i + 3 * k + j] =
-                T(a * g.t0[k] * g.t0[j] + c * g.t1[k] * g.t1[j] + b / 2 * (g.t0[k] * g.t1[j] + g.t1[k] * g.t0[j]));
+            narrowed(out.cov3d[3 * k + j] + l,
+                     a * g.t0[k] * g.t0[j] + c * g.t1[k] * g.t1[j] + half * b * (g.t0[k] * g.t1[j] + g.t1[k] * g.t0[j]));
     }
     return total;
 }
 
+// Adds up the slots of each Gaussian, in their order; a slot is 4 + 4 + 2 numbers.
+template <class T>
+GSPLAT_INLINE void sum_slots(const ProjectBackwardArgs<T> &args, const uint32_t *ids, int count, int padded, T (*sums)[CHUNK]) {
+    using V = typename Channels<T>::V;
+    static_assert(SLOT == 10);
+    for (int l = 0; l < padded; ++l) {
+        const uint32_t i = ids[l < count ? l : 0];
+        const T *in = args.slots + int64_t(SLOT) * args.slot_begin[i];
+        V low = V{}, high = V{};
+        T last[2] = {};
+        for (uint32_t k = args.pairs_of[i]; k; --k, in += SLOT) {
+            low += load<V>(in), high += load<V>(in + 4);
+            last[0] += in[8], last[1] += in[9];
+        }
+        for (int j = 0; j < 4; ++j) sums[j][l] = low[j], sums[4 + j][l] = high[j];
+        sums[8][l] = last[0], sums[9][l] = last[1];
+    }
+}
+
+// Propagates the colours' gradients to the harmonics: db[j] = dL/db_j.
+template <int DEGREE, class T>
+GSPLAT_INLINE void basis_gradient(const Scene<T> &scene, const uint32_t *ids, const Chunk<T> &in, const T (*sums)[CHUNK], Gradients<T> &out,
+                                  T (*db)[CHUNK]) {
+    for (int l = 0; l < in.padded; ++l) {
+        const int64_t i = ids[l < in.count ? l : 0];
+        T color[4], dc[4];
+        store(color, color_of<DEGREE>(scene, out.shades, l, i));
+        out.drawn[l] = is_color(color) ? T(1) : T(0);
+        for (int k = 0; k < 3; ++k) out.color[k][l] = dc[k] = color[k] > 0 ? sums[k][l] : T(0);
+        const T *sh = scene.sh_rest + 3 * int64_t(scene.rest) * i;
+#pragma GCC unroll 16
+        for (int j = 1; j < (DEGREE + 1) * (DEGREE + 1); ++j) db[j][l] = dot3(sh + 3 * (j - 1), dc);
+    }
+}
+
+// Propagates the colours' gradients to the coefficients (as `out.color` and `out.basis`) and, through the viewing direction,
+// to the mean: `dmean`, world axes.
+template <class T>
+GSPLAT_INLINE void color_gradient(const ProjectBackwardArgs<T> &args, const uint32_t *ids, const Chunk<T> &in, const T (*sums)[CHUNK],
+                                  Gradients<T> &out, T (*dmean)[CHUNK]) {
+    using V = typename Vector<T>::V;
+    const int degree = args.settings.sh_degree, used = (degree + 1) * (degree + 1);
+    alignas(64) T db[16][CHUNK];
+    shade(in, args.camera, degree, out.shades);
+    with_degree(degree, [&]<int DEGREE>() { basis_gradient<DEGREE>(args.scene, ids, in, sums, out, db); });
+    for (int l = 0; l < in.padded; l += Vector<T>::LANES) {
+        V b[16], d[3], dir[3];
+        for (int j = 1; j < used; ++j) b[j] = load<V>(db[j] + l);
+        for (int k = 0; k < 3; ++k) dir[k] = load<V>(out.shades.dir[k] + l);
+        harmonics_backward<T>(degree, dir[0], dir[1], dir[2], b, d);
+        const V along = dot3(d, dir), inverse = load<V>(out.shades.inverse_distance + l);
+        for (int k = 0; k < 3; ++k) store(dmean[k] + l, (d[k] - along * dir[k]) * inverse);
+    }
+}
+
+// Propagates the sums of WIDE Gaussians to shape, mean and opacity.
+template <class T>
+GSPLAT_INLINE void shape_gradient(const ProjectBackwardArgs<T> &args, const Chunk<T> &in, int l, const T (*sums)[CHUNK],
+                                  const T (*through_color)[CHUNK], Gradients<T> &out) {
+    const Camera &cam = args.camera;
+    const bool raw = args.scene.quats != nullptr;
+    Projected g;
+    project_shape(in, l, raw, cam, args.settings, g);
+    VD slot[SLOT], d0[3], d1[3], dp[3];
+    for (int j = 0; j < SLOT; ++j) slot[j] = widened(sums[j] + l);
+    const Whitened m = whiten<T>(cam, args.settings, g, slot);
+    const VD uv[2] = {m.sx * m.m0, m.sy * m.m0 + m.ty * m.m1};
+    const VD nx = uv[0] * splat(0.5 * cam.W), ny = uv[1] * splat(0.5 * cam.H);
+    narrowed(out.means2d_norm + l, sqrt_(nx * nx + ny * ny));
+    VD lit = VD{};
+    if (args.settings.antialiased) lit = g.det0 > splat(DET_FLOOR) ? slot[H] / g.det0 : VD{};
+    const VD total = raw ? raw_gradient(g, m, lit, l, out, d0, d1) : direct_gradient(g, m, lit, l, out, d0, d1);
+    mean_gradient(g, cam, d0, d1, total, uv, dp);
+    dp[2] += slot[DEPTH];
+    for (int k = 0; k < 3; ++k) {
+        const VD dmean = splat(cam.R[k]) * dp[0] + splat(cam.R[3 + k]) * dp[1] + splat(cam.R[6 + k]) * dp[2];
+        narrowed(out.mean[k] + l, dmean + widened(through_color[k] + l));
+    }
+    narrowed(out.opacity + l, raw ? (splat(1.0) - g.opacity) * slot[H] : slot[H] / g.opacity);
+    narrowed(out.drawn + l, g.valid ? widened(out.drawn + l) : VD{});
+}
+
+// The gradients of up to CHUNK Gaussians; `next` more follow in the list.
+template <class T>
+GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint32_t *ids, int count, int next, Gradients<T> &out) {
+    Chunk<T> in;
+    alignas(64) T sums[SLOT][CHUNK], through_color[3][CHUNK] = {};
+    gather(args.scene, ids, count, in);
+    sum_slots(args, ids, count, in.padded, sums);
+    if (args.scene.quats) {
+        color_gradient(args, ids, in, sums, out, through_color);
+    } else {
+        for (int l = 0; l < in.padded; ++l) {
+            out.drawn[l] = is_color(args.scene.colors + 3 * int64_t(ids[l < count ? l : 0])) ? T(1) : T(0);
+            for (int k = 0; k < 3; ++k) out.color[k][l] = sums[k][l];
+        }
+    }
+    const int row = 3 * args.scene.rest;
+    for (int l = 0; l < in.padded; l += WIDE) {
+        for (int k = l; k < vmin(l + WIDE, count); ++k) fetch<1>(args.grads.sh_rest + int64_t(row) * ids[k], row);
+        for (int k = l; k < vmin(l + WIDE, next); ++k) {
+            const uint32_t i = ids[count + k];
+            fetch<0>(args.scene.sh_rest + int64_t(row) * i, row);
+            fetch<0>(args.slots + int64_t(SLOT) * args.slot_begin[i], int(vmin(args.pairs_of[i], MOST_FETCHED)) * SLOT);
+        }
+        shape_gradient(args, in, l, sums, through_color, out);
+    }
+}
+
+// Writes zeros for Gaussian i.
 template <class T>
 GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
     const SceneGrads<T> &grads = args.grads;
@@ -144,43 +237,58 @@ GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
     }
 }
 
+// Writes the products basis[j] color[k] in lane l to Gaussian i.
+template <int DEGREE, class T>
+GSPLAT_INLINE void write_harmonics(const SceneGrads<T> &grads, int rest, const Gradients<T> &in, int l, int64_t i) {
+    constexpr int USED = (DEGREE + 1) * (DEGREE + 1);
+    const typename Channels<T>::V color = {in.color[0][l], in.color[1][l], in.color[2][l], T(0)};
+    for (int k = 0; k < 3; ++k) grads.sh0[3 * i + k] = in.shades.basis[0][l] * color[k];
+    if (USED == 1 && rest == 0) return;
+    T *out = grads.sh_rest + 3 * int64_t(rest) * i;
+#pragma GCC unroll 16
+    for (int j = 1; j < USED - 1; ++j)
+        store(out + 3 * (j - 1), color * in.shades.basis[j][l]);  // the next store overwrites the fourth number
+    if (USED > 1)
+        for (int k = 0; k < 3; ++k) out[3 * (USED - 2) + k] = in.shades.basis[USED - 1][l] * color[k];
+    if (USED <= rest) memset(out + 3 * (USED - 1), 0, 3 * size_t(rest + 1 - USED) * sizeof(T));
+}
+
+// Writes the gradients in lane l to Gaussian i.
 template <class T>
-void one(const ProjectBackwardArgs<T> &args, int64_t i) {
-    T sums[SLOT] = {};
-    const T *in = args.slots + int64_t(SLOT) * args.slot_begin[i];
-    for (uint32_t k = 0; k < args.pairs_of[i]; ++k, in += SLOT)
-        for (int j = 0; j < SLOT; ++j) sums[j] += in[j];
-    Projected g;
-    Shade<T> shade;
-    if (!project_shape(args.scene, args.camera, args.settings, i, g) || !project_color(args.scene, args.settings, i, g, shade))
-        return zero(args, i);
-
-    double slot[SLOT];
-    for (int j = 0; j < SLOT; ++j) slot[j] = double(sums[j]);
-    const Whitened m = whiten<T>(args.camera, args.settings, g, slot);
-    const double uv[2] = {m.sx * m.m0, m.sy * m.m0 + m.ty * m.m1};
-    const double nx = uv[0] * args.camera.W / 2, ny = uv[1] * args.camera.H / 2;
-    args.grads.means2d_norm[i] = T(sqrt_(nx * nx + ny * ny));
-
-    double d0[3], d1[3], dp[3], dmean[3];
-    const double total = args.scene.quats ? raw_gradient(args, i, g, m, slot[H], d0, d1) : direct_gradient(args, i, g, m, slot[H], d0, d1);
-    mean_gradient(g, args.camera, d0, d1, total, uv, dp);
-    dp[2] += slot[DEPTH];
-    for (int k = 0; k < 3; ++k) dmean[k] = args.camera.R[k] * dp[0] + args.camera.R[3 + k] * dp[1] + args.camera.R[6 + k] * dp[2];
-    if (args.scene.quats) {
-        color_gradient(args, i, shade, sums, dmean);
-        args.grads.logit_opacities[i] = T((1 - g.opacity) * slot[H]);
-    } else {
-        for (int k = 0; k < 3; ++k) args.grads.colors[3 * i + k] = sums[k];
-        args.grads.opacities[i] = T(slot[H] / g.opacity);
+GSPLAT_INLINE void write(const ProjectBackwardArgs<T> &args, const Gradients<T> &in, int l, int64_t i) {
+    const SceneGrads<T> &grads = args.grads;
+    if (in.drawn[l] == 0) return zero(args, i);
+    for (int k = 0; k < 3; ++k) grads.means[3 * i + k] = in.mean[k][l];
+    grads.means2d_norm[i] = in.means2d_norm[l];
+    if (!args.scene.quats) {
+        for (int k = 0; k < 9; ++k) grads.cov3ds[9 * i + k] = in.cov3d[k][l];
+        for (int k = 0; k < 3; ++k) grads.colors[3 * i + k] = in.color[k][l];
+        grads.opacities[i] = in.opacity[l];
+        return;
     }
-    for (int k = 0; k < 3; ++k) args.grads.means[3 * i + k] = T(dmean[k]);
+    for (int k = 0; k < 4; ++k) grads.quats[4 * i + k] = in.quat[k][l];
+    for (int k = 0; k < 3; ++k) grads.log_scales[3 * i + k] = in.log_scale[k][l];
+    grads.logit_opacities[i] = in.opacity[l];
+    with_degree(args.settings.sh_degree, [&]<int DEGREE>() { write_harmonics<DEGREE>(grads, args.scene.rest, in, l, i); });
 }
 
 template <class T>
 void project_backward(const ProjectBackwardArgs<T> &args, int64_t block) {
-    const int64_t end = vmin((block + 1) * BLOCK, args.scene.n);
-    for (int64_t i = block * BLOCK; i < end; ++i) args.pairs_of[i] ? one(args, i) : zero(args, i);
+    const int64_t begin = block * BLOCK, end = vmin(begin + BLOCK, args.scene.n);
+    uint32_t ids[BLOCK];
+    int drawn = 0;
+    for (int64_t i = begin; i < end; ++i) {
+        if (args.pairs_of[i])
+            ids[drawn++] = uint32_t(i);
+        else
+            zero(args, i);
+    }
+    for (int first = 0; first < drawn; first += CHUNK) {
+        const int count = vmin(CHUNK, drawn - first);
+        Gradients<T> gradients;
+        differentiate(args, ids + first, count, drawn - first - count, gradients);
+        for (int l = 0; l < count; ++l) write(args, gradients, l, ids[first + l]);
+    }
 }
 
 template void project_backward<float>(const ProjectBackwardArgs<float> &, int64_t);

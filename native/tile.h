@@ -1,8 +1,6 @@
 // Code shared by the forward and backward pass of a tile.
 #pragma once
 
-#include <type_traits>
-
 #include "gaussian_math.h"
 
 namespace gsplat {

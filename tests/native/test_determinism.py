@@ -2,9 +2,11 @@
 
 import functools
 
+import pytest
 import torch
 
 from gsplat_edu.data.synthetic import sphere_capture
+from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
@@ -43,6 +45,33 @@ def test_a_render_of_many_blocks_does_not_depend_on_threads(set_threads):
         (out.image.square().sum() + out.depth.sum()).backward()
         found = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
         results.append(found | {"image": out.image.detach(), "T": out.transmittance.detach()})
+    for other in results[1:]:
+        for name, tensor in results[0].items():
+            assert torch.equal(tensor, other[name]), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_gaussian_does_not_depend_on_its_neighbours(isa, dtype):
+    """Alone, and at any place among Gaussians outside the image or not finite, one Gaussian has the same bits."""
+    scene = random(300, (48, 32), seed=2)
+    one = scene.gaussians(dtype)
+    outside = one.means + torch.tensor(scene.camera.R[0], dtype=dtype) * 1e4
+    outside[::7] = float("nan")
+    results = []
+    for place in (None, 0, 1, 63, 64, 130, 255, 256, 299):
+        rows = torch.arange(300) if place is not None else torch.tensor([5])
+        tensors = {name: tensor[rows].clone() for name, tensor in one.tensors().items()}
+        if place is not None:
+            tensors["means"] = outside.clone()
+            for name, tensor in one.tensors().items():
+                tensors[name][place] = tensor[5]
+        gaussians = Gaussians(**tensors).trainable()
+        out = render(gaussians, scene.camera, backend="cpu")
+        assert out.num_pairs > 0
+        (out.image.square().sum() + out.depth.sum()).backward()
+        row = 0 if place is None else place
+        found = {name: tensor.grad[row] for name, tensor in gaussians.tensors().items()}
+        results.append(found | {"image": out.image.detach()})
     for other in results[1:]:
         for name, tensor in results[0].items():
             assert torch.equal(tensor, other[name]), name
