@@ -53,8 +53,9 @@ GSPLAT_INLINE void cross3(const T *a, const T *b, T *out) {
 }
 
 // R(q) of the quaternion (w, x, y, z) of any length, row-major; `inverse` is 1 / |q|².
-GSPLAT_INLINE void rotation(const VD *q, VD inverse, VD *R) {
-    const VD w = q[0], x = q[1], y = q[2], z = q[3], one = splat(1.0), k = inverse + inverse;
+template <class V>
+GSPLAT_INLINE void rotation(const V *q, V inverse, V *R) {
+    const V w = q[0], x = q[1], y = q[2], z = q[3], one = V{} + 1, k = inverse + inverse;
     R[0] = one - k * (y * y + z * z), R[1] = k * (x * y - w * z), R[2] = k * (x * z + w * y);
     R[3] = k * (x * y + w * z), R[4] = one - k * (x * x + z * z), R[5] = k * (y * z - w * x);
     R[6] = k * (x * z - w * y), R[7] = k * (y * z + w * x), R[8] = one - k * (x * x + y * y);

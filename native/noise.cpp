@@ -104,7 +104,7 @@ GSPLAT_INLINE void steps(const NoiseArgs<T> &args, const Column<T> *quats, const
         for (T &entry : q) entry *= size;
         const T unit = 1 / sqrt_(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
         for (T &entry : q) entry *= unit;
-        rotation(q, R);
+        rotation(q, T(1), R);
         for (int a = 0; a < 3; ++a)
             along[a] = exp_branchless(2 * log_scales[a][i]) * (R[a] * n[0][i] + R[3 + a] * n[1][i] + R[6 + a] * n[2][i]);
         const T opacity = 1 / (1 + exp_branchless(-logits[i])), x = k * (opacity - t);

@@ -19,7 +19,7 @@ namespace GSPLAT_ISA {
 
 constexpr int HALF = SSIM_HALF, ROWS = SSIM_BLOCK, CHANNELS = 3;
 constexpr int64_t STRIP = SSIM_STRIP, EDGE = SSIM_EDGE, MAP = STRIP + 2 * EDGE;
-constexpr int64_t CHUNK = 64;  // columns that are blurred at a time
+constexpr int64_t COLUMNS = 64;  // columns that are blurred at a time
 
 // An array of rows for each of some maps.
 template <class T, int MAPS, int64_t NUMBERS>
@@ -29,7 +29,7 @@ struct Block {
 
 // Columns that are blurred along y, with half a window on each side.
 template <class T, int MAPS>
-using Columns = Block<T, MAPS, CHUNK + 2 * EDGE>;
+using Columns = Block<T, MAPS, COLUMNS + 2 * EDGE>;
 
 template <class T>
 using Maps = Block<T, 3, MAP>;  // half of dS/dmx, dS/dv, half of dS/dc
@@ -94,11 +94,11 @@ GSPLAT_INLINE void blur_y(const T *above, const T *below, int64_t stride, V *out
 template <class T, int MAPS, class Make, class Use>
 GSPLAT_INLINE void slide(Columns<T, MAPS> &columns, int64_t count, Make make, Use use) {
     constexpr int64_t LANES = Vector<T>::LANES;
-    for (int64_t start = 0; start < count; start += CHUNK) {
+    for (int64_t start = 0; start < count; start += COLUMNS) {
         if (start)
             for (auto &map : columns.rows)
-                for (T *row : map) memcpy(row, row + CHUNK, 2 * EDGE * sizeof(T));
-        const int64_t end = vmin<int64_t>(CHUNK, count - start);
+                for (T *row : map) memcpy(row, row + COLUMNS, 2 * EDGE * sizeof(T));
+        const int64_t end = vmin<int64_t>(COLUMNS, count - start);
         for (int64_t at = start ? 2 * EDGE : 0; at < end + 2 * EDGE; at += LANES) make(start + at, at);
         for (int64_t at = 0; at < end; at += LANES) use(start + at, at + EDGE);
     }
