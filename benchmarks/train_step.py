@@ -18,6 +18,7 @@ import hardware
 import torch
 from captures import capture
 
+from gsplat_edu.buffers import reused_buffers
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import photo_loss
@@ -81,7 +82,8 @@ def main() -> None:
         dataset = load_dataset(folder)
         dataset.preload()
     scene = from_points(dataset.points, dataset.colors, TrainConfig())
-    medians = measure(scene, (*dataset.train, *dataset.test), 1 if arguments.smoke else 20)
+    with reused_buffers():  # as the trainer does
+        medians = measure(scene, (*dataset.train, *dataset.test), 1 if arguments.smoke else 20)
     hardware.report({"capture": folder.name, "medians": medians}, arguments.out)
     raster = medians["composite"] + medians["composite_backward"]
     for name, value in medians.items():

@@ -207,11 +207,8 @@ void visible(const BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
     const int64_t count = self.frame.num_visible();
     const Array ids = a.array("ids", {Kind::I64}, {count}, true), radii = a.array("radii", {KIND<T>}, {count, 2}, true);
     a.finish();
-    for (int64_t k = 0; k < count; ++k) {
-        const uint32_t id = self.frame.visible()[k];
-        ids.as<int64_t>()[k] = id;
-        for (int j = 0; j < 2; ++j) radii.as<T>()[2 * k + j] = self.frame.splats()[id].extent[j];
-    }
+    nb::gil_scoped_release release;
+    self.frame.list_visible(ids.as<int64_t>(), radii.as<T>());
 }
 
 template <class T>

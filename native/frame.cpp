@@ -70,6 +70,17 @@ void Frame<T>::sort() {
     sort_by_depth(threads_, visible_count_, keys, static_cast<uint32_t *>(sorted_.reserve(count * 4)));
 }
 
+template <class T>
+void Frame<T>::list_visible(int64_t *ids, T *radii) const {
+    const uint32_t *begin = block_begin_.as<uint32_t>(), *visible = visible_.as<uint32_t>();
+    parallel(threads_, blocks(), [&](int64_t block, int) {
+        for (uint32_t k = begin[block]; k < begin[block + 1]; ++k) {
+            const T *extent = splats()[visible[k]].extent;
+            ids[k] = visible[k], radii[2 * k] = extent[0], radii[2 * k + 1] = extent[1];
+        }
+    });
+}
+
 // Turns the counts of pairs, a row of tiles for each chunk, into the places where the chunks write theirs, and computes where
 // each tile's list begins.
 static void lay_out(int threads, int64_t tiles, int64_t chunks, uint32_t *table, uint32_t *tile_begin) {

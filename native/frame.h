@@ -30,10 +30,11 @@ class Frame {
     int64_t num_pairs() const { return pairs_count_; }
     // Wall seconds of project, sort, intersect, composite, composite_backward and project_backward.
     const std::array<double, 6> &seconds() const { return seconds_; }
-    const uint32_t *visible() const { return visible_.as<uint32_t>(); }
-    const Splat<T> *splats() const { return splats_.as<Splat<T>>(); }
+    // Writes the ids of the visible Gaussians, ascending, and the half extents of their ellipses, px.
+    void list_visible(int64_t *ids, T *radii) const;
 
   private:
+    const Splat<T> *splats() const { return splats_.as<Splat<T>>(); }
     void project(const Scene<T> &scene);
     void sort();
     void intersect();

@@ -7,7 +7,7 @@
 namespace gsplat {
 
 // Runs task(0, worker) .. task(count - 1, worker) on up to `threads` threads, including the caller, and waits for all.
-// Tasks do not throw. `worker` is below `threads`, and no two tasks run on the same worker at once.
+// Tasks do not throw; denormal numbers are zero to them. `worker` is below `threads`, and no two tasks run on the same worker at once.
 using Task = std::function<void(int64_t, int)>;
 void parallel(int threads, int64_t count, const Task &task);
 

@@ -43,6 +43,7 @@ BUILD_ON = {
     "docs/DECISIONS.md": "Conventions",
     "docs/decisions/index.md": "Decision records",
     "docs/PRECISION.md": "Precision",
+    "docs/KERNELS.md": "Kernels",
     "CONTRIBUTING.md": "Contributing",
     "CHANGELOG.md": "Changelog",
 }

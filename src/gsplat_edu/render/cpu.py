@@ -153,8 +153,9 @@ class _Rasterize(torch.autograd.Function):
         transmittance = reusable_tensor((camera.H, camera.W), means)
         depth = reusable_tensor((camera.H, camera.W) if call.settings.depth else (0,), means)
         frame.composite(_images(image, transmittance, depth if call.settings.depth else None))
-        call.visible = reusable_tensor((frame.num_visible,), means, torch.int64)
-        call.radii = reusable_tensor((frame.num_visible, 2), means)
+        # Room for all: the number of visible ones differs from view to view, and buffers of changing sizes are not reused.
+        call.visible = reusable_tensor((len(means),), means, torch.int64)[: frame.num_visible]
+        call.radii = reusable_tensor((len(means), 2), means)[: frame.num_visible]
         frame.visible(ids=native_array(call.visible), radii=native_array(call.radii))
         call.num_pairs = frame.num_pairs
         ctx.set_materialize_grads(False)
