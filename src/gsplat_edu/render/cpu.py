@@ -153,7 +153,7 @@ class _Rasterize(torch.autograd.Function):
         transmittance = reusable_tensor((camera.H, camera.W), means)
         depth = reusable_tensor((camera.H, camera.W) if call.settings.depth else (0,), means)
         frame.composite(_images(image, transmittance, depth if call.settings.depth else None))
-        # Room for all: the number of visible ones differs from view to view, and buffers of changing sizes are not reused.
+        # Room for all Gaussians: how many are visible changes from view to view, and such buffers would not be reused.
         call.visible = reusable_tensor((len(means),), means, torch.int64)[: frame.num_visible]
         call.radii = reusable_tensor((len(means), 2), means)[: frame.num_visible]
         frame.visible(ids=native_array(call.visible), radii=native_array(call.radii))
