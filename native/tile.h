@@ -157,7 +157,7 @@ struct Falloff {
     GSPLAT_METHOD void begin_splat(const Splat<T> &s, const TileBox &box, int32_t top, int32_t bottom) {
         if (GENTLY) {
             const V curve = splat(-2 * (s.sy * s.sy + s.ty * s.ty));
-            for (int32_t k = 0; k < bottom - top; k += Vector<T>::LANES) store(factors + k, exp2_(curve * (iota<T>() + splat(T(k)))));
+            for (int32_t k = 0; k <= bottom - top; k += Vector<T>::LANES) store(factors + k, exp2_(curve * (iota<T>() + splat(T(k)))));
         } else {
             for (int row = 0; row < TILE; ++row) {
                 const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;

@@ -105,7 +105,7 @@ def test_an_extended_mcmc_run_equals_one_run_with_the_same_milestones(capture, t
     """Both relocate (opacities start at 0.5) and grow until the shorter schedule ends, then only add noise."""
 
     def mcmc(out, *words):
-        numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--min-opacity", "0.45", *BASE[:-2], *words]
+        numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--min-opacity", "0.58", *BASE[:-2], *words]
         assert main(["train", str(capture), "--out", str(tmp_path / out), *numbers]) == 0
 
     short = recipe(20).flat()
