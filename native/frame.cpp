@@ -4,7 +4,6 @@
 #include <chrono>
 #include <cstring>
 #include <stdexcept>
-#include <utility>
 
 #include "dispatch.h"
 #include "scan.h"

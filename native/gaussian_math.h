@@ -9,22 +9,12 @@ namespace gsplat {
 namespace GSPLAT_ISA {
 
 // libm functions by type.
-GSPLAT_INLINE float exp_(float x) { return expf(x); }
-GSPLAT_INLINE double exp_(double x) { return exp(x); }
-GSPLAT_INLINE float log_(float x) { return logf(x); }
-GSPLAT_INLINE double log_(double x) { return log(x); }
 GSPLAT_INLINE float sqrt_(float x) { return sqrtf(x); }
 GSPLAT_INLINE double sqrt_(double x) { return sqrt(x); }
 GSPLAT_INLINE float ceil_(float x) { return ceilf(x); }
 GSPLAT_INLINE double ceil_(double x) { return ceil(x); }
 GSPLAT_INLINE float floor_(float x) { return floorf(x); }
 GSPLAT_INLINE double floor_(double x) { return floor(x); }
-
-// x - x is 0 for finite x only.
-template <class T>
-GSPLAT_INLINE bool finite(T x) {
-    return x - x == T(0);
-}
 
 // Finite, and at most COLOR_LIMIT, which no photo needs.
 template <class T>
@@ -113,10 +103,10 @@ GSPLAT_INLINE void harmonics_backward(int degree, V x, V y, V z, const V *g, V *
     d[2] += b * x * y * g[10] + c8 * y * g[11] + e3 * (splat(T(0.5)) * zz4 - xx - yy) * g[12] + c8 * x * g[13] + f * saddle * g[14];
 }
 
-// Gaussians whose numbers a kernel holds on its stack at a time, an array for each number; a multiple of every vector width.
+// Gaussians that a kernel processes at a time: an array on the stack for each of their numbers. A multiple of every vector width.
 constexpr int CHUNK = 64;
 
-// The parameters of up to CHUNK Gaussians. The arrays are filled up to a whole vector with copies of the first one.
+// The parameters of up to CHUNK Gaussians. Lanes of the last vector that have none of their own repeat the first Gaussian.
 template <class T>
 struct Chunk {
     int count, padded;

@@ -76,10 +76,11 @@ struct TileRun {
     uint32_t first, count;
 };
 
-// The runs of tiles that one Gaussian meets, top to bottom, as far as there is room: only the others are found again.
+// The runs of tiles that one Gaussian meets, top to bottom, kept between counting and writing. Where there are more than KEPT,
+// they are worked out again.
 struct TileRuns {
     static constexpr uint32_t KEPT = 3;
-    uint32_t rows;                                     // number of runs; none is kept if there are more than KEPT
+    uint32_t rows;                                     // number of runs
     TileRun runs[KEPT];
 };
 

@@ -40,6 +40,7 @@ GSPLAT_INLINE VD rounded(VD v) {
     return widened(__builtin_convertvector(v, HalfF));
 }
 
+// v - v is 0 for finite v only.
 GSPLAT_INLINE MD finite(VD v) { return v - v == VD{}; }
 
 GSPLAT_INLINE VF sqrt_(VF v) {

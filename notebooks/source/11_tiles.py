@@ -358,8 +358,8 @@ plt.show()
 # ## Where the time goes now
 #
 # The unit is an entry now, a pair of splat and tile. Its bytes: a record of nine floats; the tile's pixels stay
-# in the nearest cache. Its operations are those of its rows: in the package, where AVX-512 rounds and scales in one
-# instruction each, 18 a row, of them ten for the power of two. The rung above takes half as many again.
+# in the nearest cache. Its operations are those of its rows: 18 with AVX-512, ten of them for the power of two. The rung
+# above takes half as many again; the package about ten, since it multiplies the power of one row to get the next.
 
 # %%
 number = MOST_TIMED  # so few that no tile goes dark: every entry is drawn
@@ -377,7 +377,7 @@ print(f"evaluations that mattered, of those in a row of sixteen: {100 * did.matt
 # %% [markdown]
 # Thirty-six bytes for more than a hundred instructions: it is not the bandwidth of memory that binds. But
 # many more independent multiply-adds fit into the same time. The difference is waiting: each step of a
-# row needs the one before, and a list jumps about in memory. The package waits less; that is its lead.
+# row needs the one before, and a list jumps about in memory. The package waits and computes less; that is its lead.
 #
 # ## The next failure
 #

@@ -301,3 +301,24 @@ def test_an_exception_from_the_memory_check_ends_the_render():
     finally:
         _native.ask_before_large_blocks(available_memory)
     assert [type(error) for error in asked[:3]] == [KeyboardInterrupt, ZeroDivisionError, MemoryError]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_denormal_numbers_are_zero_in_the_kernels_and_nowhere_else(threads):
+    """The square of 1e-20 is denormal in float32; the count leaves work for both threads."""
+    count = 1 << 17
+    parameter, first, second = torch.zeros(3, count)
+    numbers = {
+        "rate": 0.1,
+        "beta1": 0.9,
+        "beta2": 0.999,
+        "eps": 1e-15,
+        "correction1": 0.1,
+        "correction2": 0.001,
+    }
+    tiny = torch.full((count,), 1e-20)
+    _native.adam_f32(
+        parameter=parameter, first=first, second=second, gradient=tiny, **numbers, threads=threads
+    )
+    assert bool((first > 0).all()) and not second.any()
+    assert np.float32(1e-30) * np.float32(1e-12) > 0 and bool((torch.full((1,), 1e-30) * 1e-12 > 0).all())
