@@ -358,8 +358,8 @@ plt.show()
 # ## Where the time goes now
 #
 # The unit is an entry now, a pair of splat and tile. Its bytes: a record of nine floats; the tile's pixels stay
-# in the nearest cache. Its operations are those of its rows: 18 with AVX-512, ten of them for the power of two. The rung
-# above takes half as many again; the package about ten, since it multiplies the power of one row to get the next.
+# in the nearest cache. Its operations are those of its rows: 18 with AVX-512, ten of them for the power of two. The
+# rung above takes half as many again; the package about ten, since it multiplies the power of one row to get the next.
 
 # %%
 number = MOST_TIMED  # so few that no tile goes dark: every entry is drawn
