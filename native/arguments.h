@@ -109,6 +109,11 @@ struct Array {
     }
     explicit operator bool() const { return given; }
     bool is(Kind kind) const { return dtype == dtype_of(kind); }
+    bool overlaps(const Array &other) const {
+        const auto begin = reinterpret_cast<uintptr_t>(data), from = reinterpret_cast<uintptr_t>(other.data);
+        return nbytes() && other.nbytes() && begin < from + other.nbytes() && from < begin + nbytes();
+    }
+    uintptr_t nbytes() const { return given ? uintptr_t(shape.size()) * dtype.bits / 8 : 0; }
 
     void describe(const void *address, int32_t device, int rank, const int64_t *extents, const int64_t *strides) {
         data = const_cast<void *>(address), here = device == nb::device::cpu::value, given = true;
@@ -180,7 +185,9 @@ class Arguments {
     }
 
     // The same, with any shape.
-    Array array_of_any_shape(const char *name, Kind kind, bool written) { return read(name, take(name), {kind}, nullptr, written); }
+    Array array_of_any_shape(const char *name, std::initializer_list<Kind> kinds, bool written) {
+        return read(name, take(name), kinds, nullptr, written);
+    }
 
     // Refuses arguments that were not taken.
     void finish() const {

@@ -110,8 +110,17 @@ struct GradientArrays : PerGaussian {
 
     template <class T>
     SceneGrads<T> as() const {
-        return {means.as<T>(),           quats.as<T>(),  log_scales.as<T>(), sh0.as<T>(),       sh_rest.as<T>(),
-                logit_opacities.as<T>(), cov3ds.as<T>(), colors.as<T>(),     opacities.as<T>(), means2d_norm.as<T>()};
+        return {means.as<T>(),
+                quats.as<T>(),
+                log_scales.as<T>(),
+                sh0.as<T>(),
+                sh_rest.as<T>(),
+                logit_opacities.as<T>(),
+                cov3ds.as<T>(),
+                colors.as<T>(),
+                opacities.as<T>(),
+                means2d_norm.as<T>(),
+                0};
     }
 };
 
@@ -126,6 +135,39 @@ struct ImageArrays {
         transmittance = a.array_or_none("transmittance", kind, size, true);
         depth = a.array_or_none("depth", kind, size, true);
         a.finish();
+    }
+
+    template <class T>
+    Outputs<T> as_outputs() const {
+        return {image.as<T>(), transmittance.as<T>(), depth.as<T>()};
+    }
+    template <class T>
+    ImageGrads<T> as_gradients() const {
+        return {image.as<T>(), transmittance.as<T>(), depth.as<T>()};
+    }
+};
+
+AdamNumbers adam_numbers(Arguments &a) {
+    return {a.number("rate"), a.number("beta1"), a.number("beta2"), a.number("eps"), a.number("correction1"), a.number("correction2")};
+}
+
+// A parameter with its moments, for a step of Adam; the gradient is the kernel's own plus `extra`, unless that is None.
+struct AdamArrays {
+    Array parameter, first, second, extra;
+    AdamNumbers numbers;
+
+    explicit AdamArrays(Arguments a) {
+        parameter = a.array_of_any_shape("parameter", {Kind::F32, Kind::F64}, true);
+        const Kind kind = parameter.is(Kind::F32) ? Kind::F32 : Kind::F64;
+        first = a.array("first", {kind}, parameter.shape, true), second = a.array("second", {kind}, parameter.shape, true);
+        extra = a.array_or_none("extra", kind, parameter.shape);
+        numbers = adam_numbers(a);
+        a.finish();
+    }
+
+    template <class T>
+    AdamArgs<T> as() const {
+        return {parameter.as<T>(), first.as<T>(), second.as<T>(), nullptr, extra.as<T>(), numbers};
     }
 };
 
@@ -149,6 +191,14 @@ struct BoundFrame {
         if (!given.image.is(KIND<T>)) a.fail(name, "is of another dtype than the frame");
         if (given.image.shape[0] != H || given.image.shape[1] != W) a.fail(name, "has another size than the frame");
         if (whole && !given.transmittance) a.fail(name, "needs transmittance");
+    }
+
+    // Before a backward pass.
+    void check_images(const Arguments &a, const ImageArrays &images, const ImageArrays &incoming) const {
+        if (!composited) a.fail("images", "are not there yet; call composite first");
+        check(a, "images", images, true), check(a, "incoming", incoming, false);
+        if (bool(images.depth) != with_depth) a.fail("images", "has to have a depth exactly where the composited ones had");
+        if (incoming.depth && !images.depth) a.fail("incoming", "has a gradient of the depth, which was not rendered");
     }
 };
 
@@ -178,7 +228,7 @@ template <class T>
 void composite(BoundFrame<T> &self, const ImageArrays &images) {
     self.check(Arguments("Frame.composite", nb::args(), nb::kwargs()), "images", images, true);
     nb::gil_scoped_release release;
-    self.frame.composite({images.image.as<T>(), images.transmittance.as<T>(), images.depth.as<T>()});
+    self.frame.composite(images.as_outputs<T>());
     self.composited = true, self.with_depth = bool(images.depth);
 }
 
@@ -190,15 +240,70 @@ void backward(BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
     const auto &incoming = struct_of<ImageArrays>(a, "incoming");
     const auto &gradients = struct_of<GradientArrays>(a, "gradients");
     a.finish();
-    if (!self.composited) a.fail("images", "are not there yet; call composite first");
     self.check(a, "scene", scene), self.check(a, "gradients", gradients);
-    self.check(a, "images", images, true), self.check(a, "incoming", incoming, false);
-    if (bool(images.depth) != self.with_depth) a.fail("images", "has to have a depth exactly where the composited ones had");
-    if (incoming.depth && !images.depth) a.fail("incoming", "has a gradient of the depth, which was not rendered");
+    self.check_images(a, images, incoming);
     nb::gil_scoped_release release;
-    self.frame.backward(scene.as<T>(), {images.image.as<T>(), images.transmittance.as<T>(), images.depth.as<T>()},
-                        {incoming.image.as<T>(), incoming.transmittance.as<T>(), incoming.depth.as<T>()}, gradients.as<T>(),
-                        gradients.background.as<T>());
+    self.frame.backward(scene.as<T>(), images.as_outputs<T>(), incoming.as_gradients<T>(), gradients.as<T>(), gradients.background.as<T>());
+}
+
+// The arguments of Frame.adam: a group for each raw parameter, and the norms of the image positions' gradients.
+struct AdamGroups {
+    const AdamArrays *groups[GROUPS];
+    Array means2d_norm;
+
+    template <class T>
+    AdamGroups(Arguments &a, const BoundFrame<T> &frame) {
+        const int64_t n = frame.n;
+        const Shape shapes[GROUPS] = {{n, 3}, {n, 4}, {n, 3}, {n, 1, 3}, {n, frame.rest, 3}, {n}};
+        for (int g = 0; g < GROUPS; ++g) {
+            groups[g] = &struct_of<AdamArrays>(a, NAMES[g]);
+            if (!groups[g]->parameter.is(KIND<T>)) a.fail(NAMES[g], "is of another dtype than the frame");
+            if (!shapes[g].allows(groups[g]->parameter.shape)) a.fail(NAMES[g], "differs in shape from the scene of the frame");
+        }
+        means2d_norm = a.array("means2d_norm", {KIND<T>}, {n}, true);
+    }
+
+    // Threads write a range of each array; memory that two of them share would make the result depend on their order.
+    void refuse_overlaps(const Arguments &a, std::initializer_list<const ImageArrays *> images) const {
+        std::vector<std::pair<const char *, const Array *>> written, read;
+        for (int g = 0; g < GROUPS; ++g) {
+            for (const Array *array : {&groups[g]->parameter, &groups[g]->first, &groups[g]->second}) written.emplace_back(NAMES[g], array);
+            read.emplace_back(NAMES[g], &groups[g]->extra);
+        }
+        written.emplace_back("means2d_norm", &means2d_norm);
+        for (const ImageArrays *each : images)
+            for (const Array *array : {&each->image, &each->transmittance, &each->depth}) read.emplace_back("images", array);
+        read.insert(read.end(), written.begin(), written.end());
+        for (const auto &[name, array] : written)
+            for (const auto &[_, other] : read)
+                if (array != other && array->overlaps(*other)) a.fail(name, "has an array that overlaps another one");
+    }
+
+    template <class T>
+    Scene<T> scene(int64_t n, int64_t rest) const {
+        const auto at = [&](int g) { return groups[g]->parameter.template as<T>(); };
+        return {n,       at(MEANS), at(QUATS), at(LOG_SCALES), at(SH0), at(SH_REST), at(LOGIT_OPACITIES), int32_t(rest),
+                nullptr, nullptr,   nullptr};
+    }
+
+    static constexpr const char *NAMES[GROUPS] = {"means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities"};
+};
+
+template <class T>
+void adam_backward(BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
+    Arguments a("Frame.adam", positional, given);
+    const auto &images = struct_of<ImageArrays>(a, "images");
+    const auto &incoming = struct_of<ImageArrays>(a, "incoming");
+    if (self.direct) a.fail("images", "are of covariances; Adam moves raw parameters");
+    const AdamGroups given_groups(a, self);
+    a.finish();
+    self.check_images(a, images, incoming);
+    given_groups.refuse_overlaps(a, {&images, &incoming});
+    AdamArgs<T> groups[GROUPS];
+    for (int g = 0; g < GROUPS; ++g) groups[g] = given_groups.groups[g]->template as<T>();
+    nb::gil_scoped_release release;
+    self.frame.adam(given_groups.template scene<T>(self.n, self.rest), images.as_outputs<T>(), incoming.as_gradients<T>(), groups,
+                    given_groups.means2d_norm.template as<T>());
 }
 
 template <class T>
@@ -218,6 +323,7 @@ void bind_frame(nb::module_ &m, const char *name) {
         .def("__init__", &make_frame<T>)
         .def("composite", &composite<T>)
         .def("backward", &backward<T>)
+        .def("adam", &adam_backward<T>)
         .def("visible", &visible<T>)
         .def_prop_ro("seconds", [](const F &self) { return self.frame.seconds(); })
         .def_prop_ro("num_visible", [](const F &self) { return self.frame.num_visible(); })
@@ -234,11 +340,10 @@ void bind_struct(nb::module_ &m, const char *name, S (*made)(Arguments)) {
 template <class T>
 void adam(nb::args positional, nb::kwargs given) {
     Arguments a("adam", positional, given);
-    const Array parameter = a.array_of_any_shape("parameter", KIND<T>, true);
+    const Array parameter = a.array_of_any_shape("parameter", {KIND<T>}, true);
     const Array first = a.array("first", {KIND<T>}, parameter.shape, true), second = a.array("second", {KIND<T>}, parameter.shape, true);
     const Array gradient = a.array("gradient", {KIND<T>}, parameter.shape);
-    AdamArgs<T> args{parameter.as<T>(), first.as<T>(),     second.as<T>(),  gradient.as<T>(),        a.number("rate"),
-                     a.number("beta1"), a.number("beta2"), a.number("eps"), a.number("correction1"), a.number("correction2")};
+    const AdamArgs<T> args{parameter.as<T>(), first.as<T>(), second.as<T>(), gradient.as<T>(), nullptr, adam_numbers(a)};
     const int threads = int(a.whole("threads", 1, MOST_THREADS));
     a.finish();
     const int64_t size = parameter.shape.size();
@@ -334,6 +439,7 @@ NB_MODULE(_native, m) {
     bind_struct<Settings>(m, "Settings", &settings_of);
     bind_struct<SceneArrays>(m, "Scene", [](Arguments a) { return SceneArrays(std::move(a)); });
     bind_struct<GradientArrays>(m, "Gradients", [](Arguments a) { return GradientArrays(std::move(a)); });
+    bind_struct<AdamArrays>(m, "AdamGroup", [](Arguments a) { return AdamArrays(std::move(a)); });
     bind_struct<ImageArrays>(m, "Images", [](Arguments a) { return ImageArrays(std::move(a)); });
     bind_frame<float>(m, "FrameF32");
     bind_frame<double>(m, "FrameF64");

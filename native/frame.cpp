@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <chrono>
 #include <cstring>
+#include <numeric>
 #include <stdexcept>
 
 #include "dispatch.h"
@@ -155,26 +156,51 @@ void Frame<T>::composite(const Outputs<T> &out) {
 }
 
 template <class T>
-void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out,
-                        T *background) {
-    Buffer slots, tile_background;
+CompositeBackwardArgs<T> Frame<T>::composite_backward(const Outputs<T> &forward, const ImageGrads<T> &in, Buffer &slots,
+                                                      Buffer &background) {
+    Timer timer(seconds_[4]);
     CompositeBackwardArgs<T> args{{splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, forward.image,
                                    forward.transmittance, forward.depth, done_.as<uint32_t>()},
                                   in.image,
                                   in.transmittance,
                                   in.depth,
                                   static_cast<T *>(slots.reserve((size_t(pairs_count_) + 1) * SLOT * sizeof(T))),
-                                  static_cast<T *>(tile_background.reserve(size_t(grid_.tiles()) * 3 * sizeof(T)))};
-    {
-        Timer timer(seconds_[4]);
-        parallel(threads_, grid_.tiles(), [&](int64_t tile, int) { kernels<T>().composite_backward(args, int32_t(tile)); });
-    }
+                                  static_cast<T *>(background.reserve(size_t(grid_.tiles()) * 3 * sizeof(T)))};
+    parallel(threads_, grid_.tiles(), [&](int64_t tile, int) { kernels<T>().composite_backward(args, int32_t(tile)); });
+    return args;
+}
+
+template <class T>
+ProjectBackwardArgs<T> Frame<T>::last_stage(const Scene<T> &scene, const T *slots) const {
+    return {scene, camera_, settings_, pairs_of_.as<uint32_t>(), slot_begin_.as<uint32_t>(), slots, {}, {}};
+}
+
+template <class T>
+void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out,
+                        T *background) {
+    Buffer slots, tile_background;
+    const CompositeBackwardArgs<T> done = composite_backward(forward, in, slots, tile_background);
     Timer timer(seconds_[5]);
     background[0] = background[1] = background[2] = 0;
     for (int32_t tile = 0; tile < grid_.tiles(); ++tile)
-        for (int k = 0; k < 3; ++k) background[k] += args.tile_background[3 * tile + k];
-    ProjectBackwardArgs<T> last{scene, camera_, settings_, pairs_of_.as<uint32_t>(), slot_begin_.as<uint32_t>(), args.slots, out};
-    parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project_backward(last, block); });
+        for (int k = 0; k < 3; ++k) background[k] += done.tile_background[3 * tile + k];
+    ProjectBackwardArgs<T> args = last_stage(scene, done.slots);
+    args.grads = out, args.written[0] = out.sh_rest;
+    parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project_backward(args, block); });
+}
+
+template <class T>
+void Frame<T>::adam(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const AdamArgs<T> *groups, T *means2d_norm) {
+    Buffer slots, tile_background, scratch;
+    const CompositeBackwardArgs<T> done = composite_backward(forward, in, slots, tile_background);
+    Timer timer(seconds_[5]);
+    AdamBackwardArgs<T> args{last_stage(scene, done.slots), {}, {3, 4, 3, 3, 3 * int64_t(scene.rest), 1}};
+    args.backward.grads.means2d_norm = means2d_norm;
+    args.backward.written[0] = groups[SH_REST].first, args.backward.written[1] = groups[SH_REST].second;
+    std::copy_n(groups, int(GROUPS), args.groups);
+    const int64_t size = BLOCK * std::accumulate(args.widths, args.widths + GROUPS, int64_t(0));
+    auto *room = static_cast<T *>(scratch.reserve(size_t(threads_ * size) * sizeof(T)));
+    parallel(threads_, blocks(), [&](int64_t block, int worker) { kernels<T>().adam_backward(args, block, room + worker * size); });
 }
 
 template class Frame<float>;

@@ -25,6 +25,8 @@ class Frame {
     void composite(const Outputs<T> &out);
     // The scene and the outputs are passed again: they may have moved between the passes.
     void backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background);
+    // The same, but every Gaussian's gradient goes into a step of Adam; `groups` has no gradients.
+    void adam(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const AdamArgs<T> *groups, T *means2d_norm);
 
     int64_t num_visible() const { return visible_count_; }
     int64_t num_pairs() const { return pairs_count_; }
@@ -38,6 +40,8 @@ class Frame {
     void project(const Scene<T> &scene);
     void sort();
     void intersect();
+    CompositeBackwardArgs<T> composite_backward(const Outputs<T> &forward, const ImageGrads<T> &in, Buffer &slots, Buffer &background);
+    ProjectBackwardArgs<T> last_stage(const Scene<T> &scene, const T *slots) const;
     int64_t blocks() const { return (n_ + BLOCK - 1) / BLOCK; }
 
     int64_t n_;

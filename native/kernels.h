@@ -43,6 +43,7 @@ template <class T>
 struct SceneGrads {
     T *means, *quats, *log_scales, *sh0, *sh_rest, *logit_opacities, *cov3ds, *colors, *opacities;
     T *means2d_norm;                                   // N, |(gu W/2, gv H/2)|
+    int64_t first;                                     // Gaussian in the first row of the arrays except means2d_norm
 };
 
 // One visible Gaussian on the screen, in base 2: alpha = 2^(log2_o - s² - t²), s = s0 + sx dx + sy dy, t = t0 + ty dy.
@@ -139,13 +140,29 @@ struct ProjectBackwardArgs {
     const uint32_t *pairs_of, *slot_begin;
     const T *slots;
     SceneGrads<T> grads;
+    const T *written[2];                               // N rest 3, arrays that are written next, to fetch; may be null
+};
+
+struct AdamNumbers {
+    double rate, beta1, beta2, eps, correction1, correction2;
 };
 
 template <class T>
 struct AdamArgs {
     T *parameter, *first, *second;
-    const T *gradient;
-    double rate, beta1, beta2, eps, correction1, correction2;
+    const T *gradient, *extra;                         // the gradient is their sum; extra may be null
+    AdamNumbers numbers;
+};
+
+// Adam's groups of a scene of raw parameters.
+enum Group { MEANS, QUATS, LOG_SCALES, SH0, SH_REST, LOGIT_OPACITIES, GROUPS };
+
+// A step of Adam in the backward pass: `backward` has no gradient arrays but means2d_norm, and `groups` no gradients.
+template <class T>
+struct AdamBackwardArgs {
+    ProjectBackwardArgs<T> backward;
+    AdamArgs<T> groups[GROUPS];
+    int64_t widths[GROUPS];                            // numbers per Gaussian
 };
 
 template <class T>
@@ -192,6 +209,7 @@ struct Kernels {
     void (*composite_backward)(const CompositeBackwardArgs<T> &, int32_t tile);
     void (*project_backward)(const ProjectBackwardArgs<T> &, int64_t block);
     void (*adam)(const AdamArgs<T> &, int64_t begin, int64_t end);
+    void (*adam_backward)(const AdamBackwardArgs<T> &, int64_t block, T *scratch);
     void (*loss)(const LossArgs<T> &, int64_t task, T *scratch);
     void (*noise)(const NoiseArgs<T> &, int64_t begin, int64_t end);
 };

@@ -207,7 +207,8 @@ GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint3
     }
     const int row = 3 * args.scene.rest;
     for (int l = 0; l < in.padded; l += WIDE) {
-        for (int k = l; k < vmin(l + WIDE, count); ++k) fetch<1>(args.grads.sh_rest + int64_t(row) * ids[k], row);
+        for (const T *written : args.written)
+            for (int k = l; written && k < vmin(l + WIDE, count); ++k) fetch<1>(written + int64_t(row) * ids[k], row);
         for (int k = l; k < vmin(l + WIDE, next); ++k) {
             const uint32_t i = ids[count + k];
             fetch<0>(args.scene.sh_rest + int64_t(row) * i, row);
@@ -221,8 +222,9 @@ GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint3
 template <class T>
 GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
     const SceneGrads<T> &grads = args.grads;
-    memset(grads.means + 3 * i, 0, 3 * sizeof(T));
     grads.means2d_norm[i] = 0;
+    i -= grads.first;
+    memset(grads.means + 3 * i, 0, 3 * sizeof(T));
     if (args.scene.quats) {
         memset(grads.quats + 4 * i, 0, 4 * sizeof(T));
         memset(grads.log_scales + 3 * i, 0, 3 * sizeof(T));
@@ -237,7 +239,7 @@ GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
     }
 }
 
-// Writes the products basis[j] color[k] in lane l to Gaussian i.
+// Writes the products basis[j] color[k] in lane l to row i.
 template <int DEGREE, class T>
 GSPLAT_INLINE void write_harmonics(const SceneGrads<T> &grads, int rest, const Gradients<T> &in, int l, int64_t i) {
     constexpr int USED = (DEGREE + 1) * (DEGREE + 1);
@@ -258,8 +260,9 @@ template <class T>
 GSPLAT_INLINE void write(const ProjectBackwardArgs<T> &args, const Gradients<T> &in, int l, int64_t i) {
     const SceneGrads<T> &grads = args.grads;
     if (in.drawn[l] == 0) return zero(args, i);
-    for (int k = 0; k < 3; ++k) grads.means[3 * i + k] = in.mean[k][l];
     grads.means2d_norm[i] = in.means2d_norm[l];
+    i -= grads.first;
+    for (int k = 0; k < 3; ++k) grads.means[3 * i + k] = in.mean[k][l];
     if (!args.scene.quats) {
         for (int k = 0; k < 9; ++k) grads.cov3ds[9 * i + k] = in.cov3d[k][l];
         for (int k = 0; k < 3; ++k) grads.colors[3 * i + k] = in.color[k][l];

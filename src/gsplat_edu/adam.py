@@ -7,32 +7,12 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsplat_edu import kernels
-
-
-class AdamNumbers(NamedTuple):
-    """The numbers of one step.
-
-    Args:
-        rate: Learning rate.
-        beta1: Decay rate of the first moment, 0 to 1.
-        beta2: Decay rate of the second moment, 0 to 1.
-        eps: Floor under the root of the second moment.
-        correction1: 1 - beta1^t, with t the number of steps including this one.
-        correction2: 1 - beta2^t.
-    """
-
-    rate: float
-    beta1: float
-    beta2: float
-    eps: float
-    correction1: float
-    correction2: float
+from gsplat_edu.moments import AdamNumbers
 
 
 AdamKernel = Callable[[Tensor, Tensor, Tensor, Tensor, AdamNumbers], None]

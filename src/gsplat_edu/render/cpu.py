@@ -10,8 +10,10 @@ Chapters: 11_tiles, 12_the_backward_pass.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,8 +26,18 @@ from gsplat_edu.constants import Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
 from gsplat_edu.kernels import SUFFIXES, kernel, native, native_array
+from gsplat_edu.moments import AdamInBackward, Moments
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+
+
+class _Waiting(NamedTuple):
+    """A backward pass that has reached the image."""
+
+    frame: Any
+    parameters: list[Tensor]
+    images: Any
+    incoming: Any
 
 
 @dataclass
@@ -40,6 +52,8 @@ class _Call:
     radii: Tensor = field(init=False)
     num_pairs: int = field(init=False)
     norms: Tensor | None = None
+    deferred: bool = False
+    waiting: _Waiting | None = None
 
 
 def render_cpu(
@@ -123,7 +137,51 @@ def _output(call: _Call, background: Tensor, *parameters: Tensor) -> RenderOutpu
         return call.norms[call.visible]
 
     depth = depth if call.settings.depth else None
-    return RenderOutput(image, transmittance, depth, call.visible, call.radii, call.num_pairs, norms)
+    defer = _defer(call, background, parameters)
+    return RenderOutput(image, transmittance, depth, call.visible, call.radii, call.num_pairs, norms, defer)
+
+
+def _defer(
+    call: _Call, background: Tensor, parameters: Sequence[Tensor]
+) -> Callable[[], AdamInBackward] | None:
+    """Return `RenderOutput.defer`: for raw parameters that a step can move in place, before a fixed background."""
+    movable = all(p.is_leaf and p.requires_grad and p.is_contiguous() for p in parameters)
+    if call.direct or background.requires_grad or not movable:
+        return None
+
+    def defer() -> AdamInBackward:
+        call.deferred = True
+        return functools.partial(_adam_in_backward, call)
+
+    return defer
+
+
+@torch.no_grad()
+def _adam_in_backward(call: _Call, moments: Mapping[str, Moments]) -> None:
+    """Finish a deferred backward pass: every Gaussian's gradient goes into its moments, and never to memory."""
+    if call.waiting is None:
+        raise ArgumentError("backward: has not reached this image, or its step has been taken")
+    if missing := [name for name in RAW if name not in moments]:
+        raise ArgumentError(f"moments: {missing[0]} is missing")
+    frame, parameters, images, incoming = call.waiting
+    norms = reusable_tensor((len(parameters[0]),), parameters[0])
+    groups = {
+        name: _group(parameter, moments[name]) for name, parameter in zip(RAW, parameters, strict=True)
+    }
+    frame.adam(images=images, incoming=incoming, means2d_norm=native_array(norms), **groups)
+    call.norms, call.waiting = norms, None
+    torch.autograd.graph.increment_version(parameters)
+
+
+def _group(parameter: Tensor, moments: Moments) -> Any:  # noqa: ANN401
+    extra = moments.extra
+    return native().AdamGroup(
+        parameter=native_array(parameter),
+        first=native_array(moments.first),
+        second=native_array(moments.second),
+        extra=None if extra is None else native_array(extra.to(parameter.dtype).contiguous()),
+        **moments.numbers._asdict(),
+    )
 
 
 class _Rasterize(torch.autograd.Function):
@@ -171,14 +229,22 @@ class _Rasterize(torch.autograd.Function):
         grad_image, grad_transmittance, grad_depth = (None if g is None else g.contiguous() for g in grads)
         if grad_image is None:
             grad_image = torch.zeros_like(image)
+        shown = depth if call.settings.depth else None
+        images = _images(image, transmittance, shown)
+        incoming = _images(grad_image, grad_transmittance, None if shown is None else grad_depth)
+        if call.deferred:
+            if call.waiting is not None or call.norms is not None:
+                raise ArgumentError("backward: passes a deferred image twice; defer works for one pass")
+            call.waiting = _Waiting(ctx.frame, kept, images, incoming)
+            return (None,) * (2 + len(kept))
         outgoing = [reusable_tensor(p.shape, p) for p in kept]
         norms = reusable_tensor((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
         # Saved tensors may have moved since the forward pass, so they are passed again.
         ctx.frame.backward(
             scene=_scene(kept, call.direct),
-            images=_images(image, transmittance, depth if call.settings.depth else None),
-            incoming=_images(grad_image, grad_transmittance, grad_depth if call.settings.depth else None),
+            images=images,
+            incoming=incoming,
             gradients=native().Gradients(
                 **_arrays(outgoing, call.direct),
                 means2d_norm=native_array(norms),

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from gsplat_edu.moments import AdamInBackward
+
 
 @dataclass(frozen=True, eq=False)
 class RenderOutput:
@@ -23,6 +25,8 @@ class RenderOutput:
         radii: (M, 2) half width and half height of that ellipse, px; 0 if a Gaussian is nowhere above 1/255.
         num_pairs: Number of composited pairs of Gaussian and tile; None on torch, which has no tiles.
         grad_norms: Returns `means2d_grad_norms`.
+        defer: Leaves the raw parameters out of the backward pass. Call it before that pass; the returned function then
+            finishes the pass once, with a step of Adam instead of gradients. None if the backend does not offer it.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -32,6 +36,7 @@ class RenderOutput:
     radii: Float[Tensor, "M 2"]
     num_pairs: int | None
     grad_norms: Callable[[], Tensor]
+    defer: Callable[[], AdamInBackward] | None = None
 
     def means2d_grad_norms(self) -> Float[Tensor, " M"]:
         """Return the signal for density control: |(gx W/2, gy H/2)|, with g = d loss / d mean in the image, px.

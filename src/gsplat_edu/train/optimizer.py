@@ -6,18 +6,23 @@ Chapter: 12_the_backward_pass.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from gsplat_edu.adam import AdamKernel, AdamNumbers, adam_step
+from gsplat_edu.adam import AdamKernel, adam_step
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.moments import AdamInBackward, AdamNumbers, Moments
 from gsplat_edu.train.saved import check_entries, check_not_negative, check_tensor_kind
 
 MOMENTS = ("first", "second")
 """Adam's state for each parameter: decaying means of its gradient and of the squared gradient."""
+
+RAW = tuple(field.name for field in fields(Gaussians))
+"""Names of the Gaussians' raw parameters."""
 
 
 @dataclass(frozen=True)
@@ -100,25 +105,34 @@ class Adam:
         self.learning_rates = {name: group.rate_at(iteration) for name, group in self.groups.items()}
 
     @torch.no_grad()
-    def step(self, parameters: Mapping[str, Tensor]) -> None:
+    def step(self, parameters: Mapping[str, Tensor], in_backward: AdamInBackward | None = None) -> None:
         """Update every parameter that has a gradient, in place, and clear the gradients.
 
         Args:
             parameters: The tensors by name: those given to the constructor, or their replacements by density surgery.
+            in_backward: Updates the raw parameters of the Gaussians as the rest of their backward pass; see
+                `RenderOutput.defer`. Their `grad` holds what did not come from the render. None if gradients are complete.
 
         Raises:
             ArgumentError: the moments of a group do not fit its parameter.
         """
         self.steps += 1
+        deferred: dict[str, Moments] = {}
         for name, group in self.groups.items():
             parameter, m, v = parameters[name], self.first[name], self.second[name]
-            if parameter.grad is None:
+            in_render = in_backward is not None and name in RAW
+            if parameter.grad is None and not in_render:
                 continue
             _check_moments(name, parameter, (m, v))
             b1, b2 = group.betas
             corrections = 1 - b1**self.steps, 1 - b2**self.steps
             numbers = AdamNumbers(self.learning_rates[name], b1, b2, group.eps, *corrections)
-            self._kernel(parameter, m, v, parameter.grad, numbers)
+            if in_render:
+                deferred[name] = Moments(m, v, parameter.grad, numbers)
+            else:
+                self._kernel(parameter, m, v, parameter.grad, numbers)
+        if in_backward is not None:
+            in_backward(deferred)
         for parameter in parameters.values():
             parameter.grad = None
 

@@ -19,6 +19,7 @@ from gsplat_edu.buffers import reused_buffers
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.moments import AdamInBackward
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.threads import one_thread
@@ -75,12 +76,15 @@ class StepParts:
         view_model: Maps a render to the image that the loss compares.
         reduce: Combines the gradients of a step's views before they are applied.
         adam: Updates one tensor by Adam's rule; by default the fastest kernel that supports it.
+        fused: Takes Adam's step for the Gaussians in the backward pass where that gives the same bits, so that their
+            gradients need no memory; see `Trainer.fuses`.
     """
 
     objective: Objective | None = None
     view_model: ViewModel = field(default_factory=Identity)
     reduce: Reduce = mean_over_views
     adam: AdamKernel = adam_step
+    fused: bool = True
 
 
 @dataclass(frozen=True)
@@ -218,10 +222,39 @@ class Trainer:
     def _step(self) -> StepEvent:
         """Take one step: gradients of the views, reduce, apply."""
         iteration, draws = self.iteration, self._draw()
-        terms = self.gradients(draws)
-        self._parts.reduce(self.parameters(), len(draws))
-        self.apply()
+        if len(draws) == 1 and self.fuses:
+            terms = self._fused_step(draws[0])
+        else:
+            terms = self.gradients(draws)
+            self._parts.reduce(self.parameters(), len(draws))
+            self.apply()
         return StepEvent(iteration, terms[PHOTO], len(self.gaussians), terms)
+
+    @property
+    def fuses(self) -> bool:
+        """Whether the Gaussians may be moved in the backward pass of a single view, with the same bits.
+
+        Not if something needs their gradients: another `reduce` or `adam`, a subclass of `Objective` (it may pass
+        backward more than once), or a density strategy without a true attribute `observes_renders_only`. Renders without
+        `RenderOutput.defer` have their gradients stored as well.
+        """
+        parts = self._parts
+        plain = parts.reduce is mean_over_views and parts.adam is adam_step and type(self._objective) is Objective
+        blind = self.density is None or getattr(self.density, "observes_renders_only", False)
+        return parts.fused and plain and blind
+
+    def _fused_step(self, draw: Draw) -> dict[str, Tensor]:
+        """Take a step with one view, moving the Gaussians in the backward pass if the backend offers it."""
+        rendered = self._rendered(draw)
+        in_backward = rendered.output.defer() if rendered.output.defer else None
+        terms = self._objective.backward(rendered)
+        if in_backward is None:
+            self._observe(rendered)
+            self.apply()
+        else:
+            self.apply(in_backward)
+            self._observe(rendered)
+        return terms
 
     def _draw(self) -> list[Draw]:
         """Return the views of the next step: one, as in the recipe. A batch would draw several here."""
@@ -240,14 +273,17 @@ class Trainer:
         for draw in draws:
             rendered = self._rendered(draw)
             found.append(self._objective.backward(rendered))
-            if self.density is not None:
-                with one_thread():
-                    self.density.observe(self.gaussians, rendered.output)
-            self.last = rendered.image.detach(), rendered.target.image, rendered.target.mask
-            self.last_name = draw.view.name
+            self._observe(rendered)
         if len(found) == 1:
             return found[0]
         return {name: sum_of_scalars([values[name] for values in found]) / len(found) for name in found[0]}
+
+    def _observe(self, rendered: Rendered) -> None:
+        if self.density is not None:
+            with one_thread():
+                self.density.observe(self.gaussians, rendered.output)
+        self.last = rendered.image.detach(), rendered.target.image, rendered.target.mask
+        self.last_name = rendered.draw.view.name
 
     def _rendered(self, draw: Draw) -> Rendered:
         """Render a view with the settings of the iteration, and apply the view model."""
@@ -266,10 +302,14 @@ class Trainer:
         image = self._parts.view_model(draw.index, output.image)
         return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 
-    def apply(self) -> None:
-        """Take an optimiser step with the stored gradients at the rates of the iteration, then clear them."""
+    def apply(self, in_backward: AdamInBackward | None = None) -> None:
+        """Take an optimiser step with the stored gradients at the rates of the iteration, then clear them.
+
+        Args:
+            in_backward: The step for the Gaussians, if their gradients are not stored; see `Adam.step`.
+        """
         self._optimizer.schedule(self.iteration)
-        self._optimizer.step(self.parameters())
+        self._optimizer.step(self.parameters(), in_backward)
         self.iteration += 1
 
     def parameters(self) -> dict[str, Tensor]:

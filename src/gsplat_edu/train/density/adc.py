@@ -43,6 +43,8 @@ class AdaptiveDensityControl:
     Source: Kerbl et al. 2023, section 5.2.
     """
 
+    observes_renders_only = True
+
     def __init__(
         self, config: TrainConfig, extent: float, generator: torch.Generator, gaussians: Gaussians
     ) -> None:

@@ -21,6 +21,9 @@ class DensityStrategy(Protocol):
 
     The trainer calls `observe` and `update` with torch on one thread, so that their results do not depend on the
     number of threads.
+
+    A strategy whose `observe` reads nothing but its `output` says so by a true attribute `observes_renders_only`. The
+    trainer may then move the Gaussians in the backward pass (`Trainer.fuses`): before `observe`, and without `grad`.
     """
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:

@@ -49,6 +49,8 @@ class MCMC:
         ArgumentError: there is no cap.
     """
 
+    observes_renders_only = True
+
     def __init__(self, config: TrainConfig, generator: torch.Generator) -> None:
         if config.max_gaussians is None:
             raise ArgumentError("max_gaussians: mcmc grows up to a cap and needs one, for example 200000")

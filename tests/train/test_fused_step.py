@@ -1,0 +1,236 @@
+"""Adam in the backward pass gives the same bits as gradients followed by Adam, wherever the trainer chooses it."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu import ArgumentError
+from gsplat_edu.adam import adam_step
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.render.api import render
+from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.objective import MeanOpacity, MeanScale, Objective, PhotoTerm
+from gsplat_edu.train.optimizer import ParameterGroup
+from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.views import View
+
+SCHEDULE = {"densify_start": 2, "densify_every": 6, "sh_every": 7, "grad_threshold": 5e-5}
+CASES = {
+    "adc": recipe(20, **SCHEDULE),
+    "adc, reset, random backgrounds": recipe(20, random_background=True, reset_every=8, **SCHEDULE),
+    "mcmc": recipe(20, strategy="mcmc", max_gaussians=80, mcmc_growth=1.1, min_opacity=0.4, **SCHEDULE),
+    "none, antialiased": recipe(10, strategy="none", antialiased=True, sh_every=2),
+    "none, degree 1": recipe(10, strategy="none", sh_degree=1, sh_every=3),
+    "none, degree 0": recipe(10, strategy="none", sh_degree=0),
+}
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return procedural_capture(24, 4, splats=60)
+
+
+class Gains:
+    """A view model: one brightness per view."""
+
+    def __init__(self, count):
+        self.gains = torch.ones(count).requires_grad_()
+
+    def parameters(self):
+        return {"gains": self.gains}
+
+    def groups(self):
+        return {"gains": ParameterGroup(0.02, eps=1e-8, per_gaussian=False)}
+
+    def __call__(self, index, image):
+        return image * self.gains[index]
+
+
+class Deferrals:
+    """The renderer of a backend that records for every render whether its step was deferred."""
+
+    def __init__(self, backend="cpu"):
+        self.backend, self.seen = backend, []
+
+    def __call__(self, gaussians, camera, *, settings):
+        output = render(gaussians, camera, settings=settings, backend=self.backend)
+        place = len(self.seen)
+        self.seen.append(False)
+        if output.defer is None:
+            return output
+        return type(output)(**output.__dict__ | {"defer": functools.partial(self.note, output.defer, place)})
+
+    def note(self, defer, place):
+        self.seen[place] = True
+        return defer()
+
+
+def trainer(capture, config, parts=None, **changes):
+    views, *cloud = capture
+    start = from_points(*cloud, config)
+    density = changes.pop("density", make_strategy(config, 2.0, start))
+    options = {"render": Deferrals(), "extent": 2.0, "density": density, "parts": parts} | changes
+    return Trainer(start, options.pop("views", views), config, **options)
+
+
+def check_same(one, other):
+    tensors, numbers = one.state()
+    assert numbers == other.state()[1]
+    for name, tensor in other.state()[0].items():
+        assert torch.equal(tensor.nan_to_num(123.0), tensors[name].nan_to_num(123.0)), name
+
+
+def pair(capture, config, make_parts=StepParts, **changes):
+    """Train both ways; return the fused trainer."""
+    fused = trainer(capture, config, make_parts(fused=True), **changes)
+    two_steps = trainer(capture, config, make_parts(fused=False), **changes)
+    assert fused.fuses and not two_steps.fuses
+    assert fused.run().losses == two_steps.run().losses
+    assert all(fused._render.seen) and len(fused._render.seen) == fused.iteration
+    assert not any(two_steps._render.seen)
+    check_same(fused, two_steps)
+    return fused
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_training_has_the_same_bits(capture, case):
+    run = pair(capture, CASES[case])
+    assert all(parameter.grad is None for parameter in run.parameters().values())
+
+
+def test_masks_depth_view_models_and_several_regularisers(capture):
+    """Other terms reach a parameter through autograd, two of them the same one; a term reads depth and transmittance."""
+    views, rng = capture[0], np.random.default_rng(0)
+    masked = []
+    for view in views:
+        image = view.read().image
+        masked.append(View(view.camera, image, mask=rng.random(image.shape[:2]) < 0.8, name=view.name))
+
+    class Depth:
+        needs_depth = True
+
+        def __call__(self, rendered):
+            return 1e-3 * (rendered.output.depth.square().mean() + rendered.output.transmittance.mean())
+
+    terms = {"photo": PhotoTerm(0.2), "opacity": MeanOpacity(0.3), "scale": MeanScale(0.2)}
+    terms |= {"more": MeanScale(0.07), "depth": Depth()}
+    terms["means"] = lambda rendered: 1e-3 * rendered.gaussians.means.sum()  # an expanded gradient
+    make = lambda fused: StepParts(objective=Objective(terms), view_model=Gains(4), fused=fused)  # noqa: E731
+    run = pair(capture, CASES["adc"], make, views=masked)
+    assert not torch.equal(run.parameters()["gains"].detach(), torch.ones(4))
+
+
+def test_poisoned_gradients_and_parameters(capture):
+    """NaN from a term, an infinite gradient, and Gaussians that are not finite at the start."""
+
+    def poison(rendered):
+        factors = torch.zeros_like(rendered.gaussians.log_scales)
+        factors[3], factors[5] = float("nan"), float("inf")
+        return (rendered.gaussians.log_scales * factors).sum()
+
+    views, points, colors = capture
+    terms = {"photo": PhotoTerm(0.2), "poison": poison}
+    make = lambda fused: StepParts(objective=Objective(terms), fused=fused)  # noqa: E731
+    config = recipe(4, strategy="none")
+
+    def run(fused):
+        start = from_points(points, colors, config)
+        start.means[7], start.means[11], start.log_scales[13] = float("nan"), 1e30, float("inf")
+        made = Trainer(start, views, config, render=Deferrals(), parts=make(fused))
+        losses = made.run().losses
+        return made, losses
+
+    (fused, losses), (two_steps, others) = run(True), run(False)
+    assert all(fused._render.seen) and np.array_equal(losses, others, equal_nan=True)
+    assert fused.gaussians.log_scales[3].isnan().all()
+    assert fused.gaussians.means[20].isfinite().all()
+    check_same(fused, two_steps)
+
+
+@pytest.mark.parametrize("case", ["adc", "mcmc"])
+def test_a_fused_run_resumes_to_the_same_bits(capture, case, tmp_path):
+    config = CASES[case]
+    whole, first, second = (trainer(capture, config) for _ in range(3))
+    whole.run()
+    first.run(stop=lambda: first.iteration == 9)
+    save_checkpoint(tmp_path / "checkpoint", first)
+    load_checkpoint(tmp_path / "checkpoint", second)
+    second.run()
+    assert all(second._render.seen)
+    check_same(whole, second)
+
+
+def test_gradients_are_stored_where_something_needs_them(capture):
+    class Watching:
+        """A strategy that reads gradients, and says nothing of what it observes."""
+
+        def __init__(self):
+            self.seen = []
+
+        def observe(self, gaussians, output):
+            self.seen.append(gaussians.means.grad.abs().sum())
+
+        def update(self, iteration, gaussians, optimizer):
+            return gaussians, []
+
+    class Twice(Objective):
+        def backward(self, rendered):
+            return super().backward(rendered)
+
+    config, strategy = recipe(2, strategy="none"), Watching()
+    for parts, changes in (
+        (StepParts(reduce=lambda parameters, count: None), {}),
+        (StepParts(adam=lambda *arguments: adam_step(*arguments)), {}),
+        (StepParts(objective=Twice({"photo": PhotoTerm(0.2)})), {}),
+        (StepParts(), {"density": strategy}),
+    ):
+        run = trainer(capture, config, parts, **changes)
+        assert not run.fuses
+        run.run()
+        assert run._render.seen == [False, False]
+    assert len(strategy.seen) == 2 and all(seen > 0 for seen in strategy.seen)
+
+
+def test_batches_and_other_backends_take_two_steps(capture, monkeypatch):
+    config = recipe(2, strategy="none", sh_degree=0)
+    dense = trainer(capture, config, render=Deferrals("torch"))
+    dense.run()
+    assert dense.fuses and dense._render.seen == [False, False]
+    batches = trainer(capture, config)
+    monkeypatch.setattr(batches, "_draw", lambda: [batches._feed.next() for _ in range(2)])
+    batches.run()
+    assert batches._render.seen == [False] * 4
+
+
+def test_a_deferred_image_takes_one_pass_and_one_step(capture):
+    views, *cloud = capture
+    gaussians = from_points(*cloud, recipe(1)).trainable()
+    output = render(gaussians, views[0].camera, backend="cpu")
+    take = output.defer()
+    with pytest.raises(ArgumentError, match="has not reached this image"):
+        take({})
+    output.image.sum().backward(retain_graph=True)
+    assert gaussians.means.grad is None
+    with pytest.raises(ArgumentError, match="has no gradient"):
+        output.means2d_grad_norms()
+    with pytest.raises(ArgumentError, match="twice"):
+        output.image.sum().backward()
+    with pytest.raises(ArgumentError, match="moments: means is missing"):
+        take({})
+
+
+def test_only_leaves_before_a_fixed_background_can_be_deferred(capture):
+    views, *cloud = capture
+    raw = from_points(*cloud, recipe(1))
+    camera, leaves = views[0].camera, raw.trainable()
+    assert render(leaves, camera, backend="cpu").defer is not None
+    assert render(raw, camera, backend="cpu").defer is None
+    assert render(leaves.map(lambda t: t * 1.0), camera, backend="cpu").defer is None
+    learned = torch.zeros(3, requires_grad=True)
+    assert render(leaves, camera, background=learned, backend="cpu").defer is None
+    strided = type(raw)(**raw.tensors() | {"means": raw.means.T.contiguous().T.requires_grad_()})
+    assert render(strided, camera, backend="cpu").defer is None
