@@ -172,7 +172,7 @@ CompositeBackwardArgs<T> Frame<T>::composite_backward(const Outputs<T> &forward,
 
 template <class T>
 ProjectBackwardArgs<T> Frame<T>::last_stage(const Scene<T> &scene, const T *slots) const {
-    return {scene, camera_, settings_, pairs_of_.as<uint32_t>(), slot_begin_.as<uint32_t>(), slots, {}, {}};
+    return {scene, camera_, settings_, pairs_of_.as<uint32_t>(), slot_begin_.as<uint32_t>(), slots, {}};
 }
 
 template <class T>
@@ -185,7 +185,7 @@ void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const 
     for (int32_t tile = 0; tile < grid_.tiles(); ++tile)
         for (int k = 0; k < 3; ++k) background[k] += done.tile_background[3 * tile + k];
     ProjectBackwardArgs<T> args = last_stage(scene, done.slots);
-    args.grads = out, args.written[0] = out.sh_rest;
+    args.grads = out;
     parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project_backward(args, block); });
 }
 
@@ -196,7 +196,6 @@ void Frame<T>::adam(const Scene<T> &scene, const Outputs<T> &forward, const Imag
     Timer timer(seconds_[5]);
     AdamBackwardArgs<T> args{last_stage(scene, done.slots), {}, {3, 4, 3, 3, 3 * int64_t(scene.rest), 1}};
     args.backward.grads.means2d_norm = means2d_norm;
-    args.backward.written[0] = groups[SH_REST].first, args.backward.written[1] = groups[SH_REST].second;
     std::copy_n(groups, int(GROUPS), args.groups);
     const int64_t size = BLOCK * std::accumulate(args.widths, args.widths + GROUPS, int64_t(0));
     auto *room = static_cast<T *>(scratch.reserve(size_t(threads_ * size) * sizeof(T)));

@@ -140,7 +140,6 @@ struct ProjectBackwardArgs {
     const uint32_t *pairs_of, *slot_begin;
     const T *slots;
     SceneGrads<T> grads;
-    const T *written[2];                               // N rest 3, arrays that are written next, to fetch; may be null
 };
 
 struct AdamNumbers {

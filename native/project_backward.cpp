@@ -207,8 +207,7 @@ GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint3
     }
     const int row = 3 * args.scene.rest;
     for (int l = 0; l < in.padded; l += WIDE) {
-        for (const T *written : args.written)
-            for (int k = l; written && k < vmin(l + WIDE, count); ++k) fetch<1>(written + int64_t(row) * ids[k], row);
+        for (int k = l; k < vmin(l + WIDE, count); ++k) fetch<1>(args.grads.sh_rest + row * (ids[k] - args.grads.first), row);
         for (int k = l; k < vmin(l + WIDE, next); ++k) {
             const uint32_t i = ids[count + k];
             fetch<0>(args.scene.sh_rest + int64_t(row) * i, row);

@@ -14,7 +14,6 @@ from torch import Tensor
 from gsplat_edu import kernels
 from gsplat_edu.moments import AdamNumbers
 
-
 AdamKernel = Callable[[Tensor, Tensor, Tensor, Tensor, AdamNumbers], None]
 """Moves a parameter and its two moments in place, given the gradient and the numbers; see `adam_step`."""
 

@@ -70,6 +70,27 @@ def adam(**changes):
     _native.adam_f32(**fields | {"threads": 2} | changes)
 
 
+def adam_group(**changes):
+    fields = {name: torch.zeros(N, 3) for name in ("parameter", "first", "second", "extra")}
+    fields |= dict.fromkeys(("rate", "beta1", "beta2", "eps", "correction1", "correction2"), 0.5)
+    return _native.AdamGroup(**fields | changes)
+
+
+def groups(dtype=torch.float32):
+    made = {}
+    for name, tensor in parameters(dtype).items():
+        moments = {part: torch.zeros_like(tensor) for part in ("first", "second")}
+        made[name] = adam_group(parameter=tensor, extra=None, **moments)
+    return made
+
+
+def adam_backward(**changes):
+    drawn, out = frame(), images()
+    drawn.composite(out)
+    fields = {"images": out, "incoming": images(), "means2d_norm": torch.empty(N)} | groups()
+    drawn.adam(**fields | changes)
+
+
 def noise(**changes):
     fields = {name: parameters()[name] for name in ("means", "quats", "log_scales", "logit_opacities")}
     fields |= {"seed": 3, "amount": 0.5, "sharpness": 100.0, "threshold": 0.005}
@@ -91,6 +112,8 @@ CALLS = {
     visible: ("ids", "radii"),
     backward: ("scene", "images", "incoming", "gradients"),
     adam: (*("parameter", "first", "second", "gradient", "rate", "beta1"), "correction2", "threads"),
+    adam_group: (*("parameter", "first", "second", "extra", "rate", "beta1"), "beta2", "eps", "correction2"),
+    adam_backward: ("images", "incoming", "means2d_norm"),
     loss: ("image", "target", "gradient", "ssim_weight", "threads"),
     noise: (
         *("means", "quats", "log_scales", "logit_opacities"),
@@ -103,8 +126,8 @@ EVERY = [(call, name) for call, names in CALLS.items() for name in names]
 @pytest.mark.parametrize("call", CALLS, ids=lambda call: call.__name__)
 def test_the_default_arguments_of_these_tests_are_accepted(call):
     call()
-    with pytest.raises(TypeError, match="does not know extra"):
-        call(extra=1)
+    with pytest.raises(TypeError, match="does not know unknown"):
+        call(unknown=1)
 
 
 @pytest.mark.parametrize(("call", "name"), EVERY, ids=lambda value: getattr(value, "__name__", value))
@@ -134,6 +157,7 @@ class Dropping:
 
 
 ARRAYS = {scene: RAW, gradients: CALLS[gradients], images: CALLS[images], adam: CALLS[adam][:4]}
+ARRAYS |= {adam_group: CALLS[adam_group][:4], adam_backward: ("means2d_norm",)}
 ARRAYS |= {loss: CALLS[loss][:3], visible: CALLS[visible], noise: CALLS[noise][:4]}
 EACH_ARRAY = [(call, name) for call, names in ARRAYS.items() for name in names]
 
@@ -144,7 +168,7 @@ def valid_array(call, name):
         return parameters()[name].clone()
     shapes = {"means2d_norm": (N,), "background": (3,), "ids": (N,), "radii": (N, 2), "depth": (H, W)}
     shapes |= {"transmittance": (H, W)}
-    if call is adam:
+    if call in (adam, adam_group):
         return torch.zeros(N, 3)
     dtype = torch.int64 if name == "ids" else torch.float32
     return torch.zeros(shapes.get(name, (H, W, 3)), dtype=dtype)
@@ -179,7 +203,7 @@ WRONG = {
 def test_an_unsuitable_array_is_refused(call, name, wrong):
     given = valid_array(call, name)
     call(**{name: given})
-    optional = call is images and name != "image" and wrong == "absent"
+    optional = wrong == "absent" and (name == "extra" or (call is images and name != "image"))
     if optional or (wrong in ("strided", "unaligned") and not given.numel()):
         return  # these arrays are valid
     # The first array sets the size. If only its size is wrong, the error names the next array.
@@ -236,6 +260,63 @@ def test_arguments_that_do_not_fit_the_frame_are_refused():
         scene(sh_rest=torch.zeros(N, 4, 3))
     with pytest.raises(TypeError, match="by name only"):
         _native.Scene(*parameters().values())
+
+
+@pytest.mark.parametrize("name", RAW)
+def test_a_step_in_the_backward_pass_needs_a_fitting_group_for_every_parameter(name):
+    drawn, out = frame(), images()
+    drawn.composite(out)
+    fields = {"images": out, "incoming": images(), "means2d_norm": torch.empty(N)} | groups()
+    drawn.adam(**fields)
+    with pytest.raises(TypeError, match=f"Frame.adam: {name} is missing$"):
+        drawn.adam(**{key: value for key, value in fields.items() if key != name})
+    for wrong in (None, torch.zeros(N, 3), scene()):
+        with pytest.raises(ValueError, match=f"Frame.adam: {name}: has to be the structure"):
+            drawn.adam(**fields | {name: wrong})
+    with pytest.raises(ValueError, match=f"Frame.adam: {name}: is of another dtype"):
+        drawn.adam(**fields | {name: groups(torch.float64)[name]})
+    for shape in ((N - 1, 3), (N, 5), (N,) if name != "logit_opacities" else (N, 1), (3, N)):
+        odd = {part: torch.zeros(shape) for part in ("parameter", "first", "second")}
+        with pytest.raises(ValueError, match=f"Frame.adam: {name}: differs in shape"):
+            drawn.adam(**fields | {name: adam_group(extra=None, **odd)})
+
+
+def test_arrays_of_a_step_in_the_backward_pass_must_not_overlap():
+    room, means, quats = torch.zeros(4 * N * 3 - 1), parameters()["means"], torch.zeros(N, 4)
+    half = room[: N * 3].view(N, 3)
+    across = room[N * 3 - 1 : 2 * N * 3 - 1].view(N, 3)
+    other = torch.zeros(N, 3)
+    norms, shared = torch.zeros(N), torch.zeros(H * W * 3)
+    inside = shared[: N * 4].view(N, 4)
+    cases = [
+        {"means": adam_group(parameter=means, first=half, second=across, extra=None)},
+        {"means": adam_group(parameter=means, first=means, second=other, extra=None)},
+        {"means": adam_group(parameter=means, first=other, second=half, extra=other)},
+        {"means": adam_group(parameter=means, first=half, second=other, extra=None)}
+        | {"log_scales": adam_group(parameter=means.clone(), first=half, second=other.clone(), extra=None)},
+        {"means2d_norm": norms}
+        | {"logit_opacities": adam_group(parameter=norms, first=norms + 1, second=norms + 2, extra=None)},
+        {"incoming": images(image=shared.view(H, W, 3))}
+        | {"quats": adam_group(parameter=quats, first=inside, second=quats + 1, extra=None)},
+    ]
+    for case in cases:
+        with pytest.raises(ValueError, match=r"Frame.adam: \w+: has an array that overlaps another one"):
+            adam_backward(**case)
+    touching = room[N * 3 : 2 * N * 3].view(N, 3)
+    adam_backward(means=adam_group(parameter=means, first=half, second=touching, extra=other))
+
+
+def test_a_step_in_the_backward_pass_needs_a_composited_frame_of_raw_parameters():
+    fields = {"images": images(), "incoming": images(), "means2d_norm": torch.empty(N)} | groups()
+    with pytest.raises(ValueError, match="call composite first"):
+        frame().adam(**fields)
+    arrays = {"means": (N, 3), "cov3ds": (N, 3, 3), "colors": (N, 3), "opacities": (N,)}
+    direct = frame(scene=_native.Scene(**{name: torch.zeros(shape) for name, shape in arrays.items()}))
+    direct.composite(fields["images"])
+    with pytest.raises(ValueError, match="Adam moves raw parameters"):
+        direct.adam(**fields)
+    with pytest.raises(ValueError, match="incoming: has another size"):
+        adam_backward(incoming=images(image=torch.empty(H, W + 1, 3), transmittance=None))
 
 
 @pytest.mark.parametrize("degree", [0, 1])

@@ -103,7 +103,7 @@ def test_a_training_has_the_same_bits(capture, case):
 
 
 def test_masks_depth_view_models_and_several_regularisers(capture):
-    """Other terms reach a parameter through autograd, two of them the same one; a term reads depth and transmittance."""
+    """Terms reach a parameter through autograd, two of them the same one; one reads depth and transmittance."""
     views, rng = capture[0], np.random.default_rng(0)
     masked = []
     for view in views:
@@ -157,8 +157,7 @@ def test_a_fused_run_resumes_to_the_same_bits(capture, case, tmp_path):
     whole, first, second = (trainer(capture, config) for _ in range(3))
     whole.run()
     first.run(stop=lambda: first.iteration == 9)
-    save_checkpoint(tmp_path / "checkpoint", first)
-    load_checkpoint(tmp_path / "checkpoint", second)
+    load_checkpoint(save_checkpoint(tmp_path, first, 1.0), second)
     second.run()
     assert all(second._render.seen)
     check_same(whole, second)
@@ -177,6 +176,12 @@ def test_gradients_are_stored_where_something_needs_them(capture):
         def update(self, iteration, gaussians, optimizer):
             return gaussians, []
 
+        def state(self):
+            return {}, {}
+
+        def load_state(self, tensors, numbers, gaussians):
+            pass
+
     class Twice(Objective):
         def backward(self, rendered):
             return super().backward(rendered)
@@ -184,7 +189,7 @@ def test_gradients_are_stored_where_something_needs_them(capture):
     config, strategy = recipe(2, strategy="none"), Watching()
     for parts, changes in (
         (StepParts(reduce=lambda parameters, count: None), {}),
-        (StepParts(adam=lambda *arguments: adam_step(*arguments)), {}),
+        (StepParts(adam=functools.partial(adam_step)), {}),
         (StepParts(objective=Twice({"photo": PhotoTerm(0.2)})), {}),
         (StepParts(), {"density": strategy}),
     ):

@@ -165,9 +165,7 @@ def _adam_in_backward(call: _Call, moments: Mapping[str, Moments]) -> None:
         raise ArgumentError(f"moments: {missing[0]} is missing")
     frame, parameters, images, incoming = call.waiting
     norms = reusable_tensor((len(parameters[0]),), parameters[0])
-    groups = {
-        name: _group(parameter, moments[name]) for name, parameter in zip(RAW, parameters, strict=True)
-    }
+    groups = {name: _group(parameter, moments[name]) for name, parameter in zip(RAW, parameters, strict=True)}
     frame.adam(images=images, incoming=incoming, means2d_norm=native_array(norms), **groups)
     call.norms, call.waiting = norms, None
     torch.autograd.graph.increment_version(parameters)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsplat_edu.buffers import reusable_tensor
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import photo_loss
@@ -159,23 +160,26 @@ class MeanScale:
 
 
 class _MeanOpacity(torch.autograd.Function):
-    """Compute weight mean(sigmoid(l)), with the gradient weight o (1 - o) / N.
+    """Compute weight mean(sigmoid(l)), with the gradient weight o (1 - o) / N, in reused buffers.
 
     The rounding of torch's sigmoid depends on the number of threads, so one thread computes it.
     """
 
     @staticmethod
     def forward(ctx: Any, logits: Tensor, weight: float) -> Tensor:  # noqa: ANN401
+        count = max(logits.numel(), 1)
         with one_thread():
-            opacities = torch.sigmoid(logits)
-            ctx.save_for_backward(weight * opacities * (1 - opacities) / max(logits.numel(), 1))
-            return weight * opacities.sum() / max(logits.numel(), 1)
+            opacities = torch.sigmoid(logits, out=reusable_tensor(logits.shape, logits))
+            value = weight * opacities.sum() / count
+            others = torch.neg(opacities, out=reusable_tensor(logits.shape, logits)).add_(1)
+            ctx.save_for_backward(opacities.mul_(weight).mul_(others).div_(count))
+            return value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        return gradient * grad, None
+        return _scaled(gradient, grad), None
 
 
 class _MeanScale(torch.autograd.Function):
@@ -184,7 +188,8 @@ class _MeanScale(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, log_scales: Tensor, weight: float) -> Tensor:  # noqa: ANN401
         with one_thread():
-            gradient = weight * torch.exp(log_scales) / max(log_scales.numel(), 1)
+            scales = torch.exp(log_scales, out=reusable_tensor(log_scales.shape, log_scales))
+            gradient = scales.mul_(weight).div_(max(log_scales.numel(), 1))
             ctx.save_for_backward(gradient)
             return gradient.sum()
 
@@ -192,4 +197,9 @@ class _MeanScale(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        return gradient * grad, None
+        return _scaled(gradient, grad), None
+
+
+def _scaled(gradient: Tensor, grad: Tensor) -> Tensor:
+    """Return gradient * grad. grad is almost always 1; a GPU is not asked, because that synchronises."""
+    return gradient if grad.device.type == "cpu" and float(grad) == 1.0 else gradient * grad

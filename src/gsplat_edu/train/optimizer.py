@@ -111,7 +111,7 @@ class Adam:
         Args:
             parameters: The tensors by name: those given to the constructor, or their replacements by density surgery.
             in_backward: Updates the raw parameters of the Gaussians as the rest of their backward pass; see
-                `RenderOutput.defer`. Their `grad` holds what did not come from the render. None if gradients are complete.
+                `RenderOutput.defer`. Their `grad` then holds only what did not come from the render.
 
         Raises:
             ArgumentError: the moments of a group do not fit its parameter.
@@ -120,16 +120,14 @@ class Adam:
         deferred: dict[str, Moments] = {}
         for name, group in self.groups.items():
             parameter, m, v = parameters[name], self.first[name], self.second[name]
-            in_render = in_backward is not None and name in RAW
-            if parameter.grad is None and not in_render:
-                continue
-            _check_moments(name, parameter, (m, v))
             b1, b2 = group.betas
             corrections = 1 - b1**self.steps, 1 - b2**self.steps
             numbers = AdamNumbers(self.learning_rates[name], b1, b2, group.eps, *corrections)
-            if in_render:
+            if in_backward is not None and name in RAW:
+                _check_moments(name, parameter, (m, v))
                 deferred[name] = Moments(m, v, parameter.grad, numbers)
-            else:
+            elif parameter.grad is not None:
+                _check_moments(name, parameter, (m, v))
                 self._kernel(parameter, m, v, parameter.grad, numbers)
         if in_backward is not None:
             in_backward(deferred)

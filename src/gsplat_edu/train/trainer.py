@@ -235,11 +235,13 @@ class Trainer:
         """Whether the Gaussians may be moved in the backward pass of a single view, with the same bits.
 
         Not if something needs their gradients: another `reduce` or `adam`, a subclass of `Objective` (it may pass
-        backward more than once), or a density strategy without a true attribute `observes_renders_only`. Renders without
-        `RenderOutput.defer` have their gradients stored as well.
+        backward more than once), or a density strategy without a true attribute `observes_renders_only`. A render
+        without `RenderOutput.defer` stores its gradients in any case.
         """
         parts = self._parts
-        plain = parts.reduce is mean_over_views and parts.adam is adam_step and type(self._objective) is Objective
+        plain = (
+            parts.reduce is mean_over_views and parts.adam is adam_step and type(self._objective) is Objective
+        )
         blind = self.density is None or getattr(self.density, "observes_renders_only", False)
         return parts.fused and plain and blind
 
