@@ -55,10 +55,11 @@ def test_moments_follow_survivors_and_start_at_zero_for_new_gaussians():
     set_gradients(gaussians, torch.Generator().manual_seed(3))
     adam.step(gaussians.tensors())
     m, v = adam.first["means"].clone(), adam.second["means"].clone()
-    adam.follow(torch.tensor([0, 3]), num_new=2)
+    new = torch.zeros(3).double()
+    adam.follow(torch.tensor([3, -1, 0, -1]))
     assert adam.steps == 1
-    torch.testing.assert_close(adam.first["means"], torch.cat([m[[0, 3]], torch.zeros(2, 3).double()]))
-    torch.testing.assert_close(adam.second["means"], torch.cat([v[[0, 3]], torch.zeros(2, 3).double()]))
+    torch.testing.assert_close(adam.first["means"], torch.stack([m[3], new, m[0], new]))
+    torch.testing.assert_close(adam.second["means"], torch.stack([v[3], new, v[0], new]))
 
 
 def test_parameters_may_be_strided_and_autograd_notices_the_step():
@@ -99,7 +100,7 @@ def test_groups_that_are_not_per_gaussian_ignore_surgery():
         tensor.grad = torch.ones_like(tensor)
     adam.step(tensors)
     adam.forget_rows(torch.tensor([0, 1]))
-    adam.follow(torch.tensor([0, 1, 4]), num_new=4)
+    adam.follow(torch.tensor([0, 1, 4, -1, -1, -1, -1]))
     assert adam.first["means"].shape == (7, 3) and (adam.first["means"][[0, 1, 3, 4, 5, 6]] == 0).all()
     assert (adam.first["means"][2] > 0).all()
     assert adam.second["exposures"].shape == (2,) and (adam.second["exposures"] > 0).all()

@@ -35,6 +35,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply_comments import comments, read_comments
 from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.morton import morton_codes
 from gsplat_edu.ply_table import Element, Header, read_elements, read_rows
 from gsplat_edu.reading import open_file
 
@@ -300,7 +301,7 @@ def _morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     if not extents.any():
         return order
     cells = np.minimum((means - low) * (1024.0 / np.where(extents > 0.0, extents, np.inf)), 1023.0)
-    codes = _spread(cells.astype(np.uint32)) @ np.array((1, 2, 4), dtype=np.uint32)
+    codes = morton_codes(cells.astype(np.uint16))
     order = np.argsort(codes, kind="stable")
     ends = np.append(np.flatnonzero(np.diff(codes[order])) + 1, len(order))
     starts = np.append(0, ends[:-1])
@@ -308,11 +309,3 @@ def _morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
         cell = order[starts[crowded] : ends[crowded]]
         cell[:] = cell[_morton_order(means[cell])]
     return order
-
-
-def _spread(values: UInt32[np.ndarray, "N 3"]) -> UInt32[np.ndarray, "N 3"]:
-    """Insert two zero bits before each of ten bits."""
-    spread = np.zeros_like(values)
-    for bit in range(10):
-        spread |= (values >> bit & 1) << 3 * bit
-    return spread

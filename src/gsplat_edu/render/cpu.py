@@ -134,7 +134,7 @@ def _output(call: _Call, background: Tensor, *parameters: Tensor) -> RenderOutpu
     def norms() -> Tensor:
         if call.norms is None:
             raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
-        return call.norms[call.visible]
+        return call.norms.index_select(0, call.visible)  # in half the time of [call.visible]
 
     depth = depth if call.settings.depth else None
     defer = _defer(call, background, parameters)

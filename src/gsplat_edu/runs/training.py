@@ -37,6 +37,7 @@ from gsplat_edu.train.checkpoint import (
     read_seconds,
     save_checkpoint,
 )
+from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.trainer import Callback, Trainer
@@ -184,7 +185,7 @@ class CaptureRun:
             folder.write_photos(photo_digests(dataset))
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
             folder.write_config(document(options) | facts | ({"start": digest} if digest else {}))
-        return gaussians
+        return sorted_in_space(gaussians)
 
     def _trainer(self, gaussians: Gaussians) -> Trainer:
         options, dataset = self.options, self.dataset

@@ -150,17 +150,19 @@ class Adam:
                     moment[indices] = 0.0
 
     @torch.no_grad()
-    def follow(self, survivors: Int64[Tensor, " S"], num_new: int) -> None:
+    def follow(self, origins: Int64[Tensor, " M"]) -> None:
         """Apply a change of the Gaussians to the moments of the per-Gaussian groups.
 
         Args:
-            survivors: (S,) indices of the remaining Gaussians, in their new order; they keep their moments.
-            num_new: Number of Gaussians appended, with zero moments.
+            origins: (M,) for each Gaussian after the change its index before it, whose moments it keeps; -1 for a new
+                one, whose moments start at zero.
         """
         for moments in (self.first, self.second):
             for name, old in moments.items():
                 if self.groups[name].per_gaussian:
-                    moments[name] = torch.cat([old[survivors], old.new_zeros(num_new, *old.shape[1:])])
+                    rows = torch.where(origins < 0, len(old), origins)
+                    padded = torch.cat([old, old.new_zeros(1, *old.shape[1:])])
+                    moments[name] = padded.index_select(0, rows)
 
     def state(self) -> tuple[dict[str, dict[str, Tensor]], int]:
         """Return the moments, as "first" and "second", and the number of steps taken."""

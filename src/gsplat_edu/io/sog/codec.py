@@ -39,12 +39,12 @@ from gsplat_edu.io.sog.meta import MOST_SPLATS, SHN, Harmonics, Meta, from_json,
 from gsplat_edu.io.sog.palette import MOST_ENTRIES, codebook, nearest_in_codebook, palette
 from gsplat_edu.io.sog.values import (
     FIRST_TAG,
-    morton_order,
     pixels_to_quats,
     positions_to_steps,
     quats_to_pixels,
     steps_to_positions,
 )
+from gsplat_edu.morton import morton_codes
 from gsplat_edu.validation import first_index
 
 PER_ROW = 64
@@ -162,7 +162,7 @@ def _packed(scene: Scene) -> dict[str, bytes]:
     """Return the files of a scene by name, meta.json first."""
     values = {name: tensor.numpy(force=True) for name, tensor in scene.gaussians.tensors().items()}
     steps, span = positions_to_steps(values["means"])
-    order = morton_order(steps)
+    order = np.argsort(morton_codes(steps), kind="stable")
     steps = steps[order]
     values = {name: array[order] for name, array in values.items()}
     scales, sh0 = codebook(values["log_scales"]), codebook(values["sh0"])

@@ -9,7 +9,7 @@ Source: PlayCanvas' specification of SOG, sections 3.1 and 3.2.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8, UInt16, UInt64
+from jaxtyping import Float32, Float64, UInt8, UInt16
 
 STEPS = 65_535
 """Steps from the lowest to the highest value of a coordinate."""
@@ -48,29 +48,6 @@ def steps_to_positions(steps: UInt16[np.ndarray, "N 3"], span: Range) -> Float32
     low, high = span
     logs = low + (high - low) * (steps / STEPS)
     return (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
-
-
-def morton_order(steps: UInt16[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Sort positions along a Morton curve, which interleaves the bits of z, y and x.
-
-    Args:
-        steps: N positions in steps.
-
-    Returns:
-        Their indices in that order; equal positions keep their order.
-    """
-    spread = steps.astype(np.uint64)
-    for shift, mask in (
-        (16, 0x0000FF0000FF),
-        (8, 0x00F00F00F00F),
-        (4, 0x0C30C30C30C3),
-        (2, 0x249249249249),
-    ):
-        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-    codes: UInt64[np.ndarray, " N"] = (
-        spread[:, 0] | spread[:, 1] << np.uint64(1) | spread[:, 2] << np.uint64(2)
-    )
-    return np.argsort(codes, kind="stable")
 
 
 def quats_to_pixels(quats: Float32[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:

@@ -59,7 +59,7 @@ class AdaptiveDensityControl:
         # Each index occurs once. To read, add and write back would take four times as long as these passes.
         visible, norms = output.visible, output.means2d_grad_norms()
         self.norm_sums.index_add_(0, visible, norms)
-        self.times_visible.index_add_(0, visible, torch.ones_like(norms))
+        self.times_visible.index_add_(0, visible, norms.new_ones(1).expand(len(visible)))
         if self.config.adc.prune_screen_size:
             largest = torch.maximum(*output.radii.unbind(dim=-1))
             self.largest_radii.scatter_reduce_(0, visible, largest, "amax")

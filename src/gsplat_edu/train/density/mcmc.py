@@ -67,7 +67,10 @@ class MCMC:
         if due and len(gaussians):
             dead = (gaussians.opacities <= config.min_opacity) | ~gaussians.finite_rows()
             num_relocated = self._relocate(gaussians, optimizer, torch.nonzero(dead)[:, 0])
-            gaussians, num_added = self._grow(gaussians, optimizer)
+            newborn = self._newborn(gaussians, optimizer)
+            keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+            gaussians = replace(gaussians, optimizer, keep, newborn)  # sorts them, also if none is added
+            num_added = len(gaussians) - len(keep)
             events.append(RelocateEvent(iteration, num_relocated, num_added, len(gaussians)))
         self._add_noise(gaussians, optimizer.learning_rates["means"])
         return gaussians, events
@@ -85,19 +88,18 @@ class MCMC:
         optimizer.forget_rows(dead)
         return len(dead)
 
-    def _grow(self, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, int]:
+    def _newborn(self, gaussians: Gaussians, optimizer: Adam) -> list[Gaussians]:
+        """Return copies of drawn Gaussians, up to the cap, and let both share their places; [] if there are none."""
         count = len(gaussians)
         num_added = max(min(self.cap, int(self.config.mcmc.growth * count)) - count, 0)
         if not num_added:
-            return gaussians, 0
+            return []
         weights = torch.where(gaussians.finite_rows(), gaussians.opacities.double(), 0.0)
         if not bool((weights > 0).any()):
-            return gaussians, 0
+            return []
         places = self._draw(weights, num_added)
         self._share(gaussians, optimizer, places)
-        newborn = gaussians.map(lambda tensor: tensor[places])
-        keep = torch.ones(count, dtype=torch.bool, device=gaussians.means.device)
-        return replace(gaussians, optimizer, keep, [newborn]), num_added
+        return [gaussians.map(lambda tensor: tensor[places])]
 
     def _draw(self, weights: Float[Tensor, " N"], count: int) -> Int64[Tensor, " count"]:
         """Draw indices with replacement, with probabilities proportional to the weights."""

@@ -1,14 +1,15 @@
-"""Add and remove Gaussians; the survivors keep their optimiser moments."""
+"""Add, remove and sort Gaussians; the survivors keep their optimiser moments."""
 
 from __future__ import annotations
 
 import math
 
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gsplat_edu.gaussians import Gaussians, quat_to_R_t
+from gsplat_edu.morton import order_in_space
 from gsplat_edu.train.optimizer import Adam
 
 
@@ -44,20 +45,38 @@ def replace(
     newborn: list[Gaussians],
     cap: int | None = None,
 ) -> Gaussians:
-    """Keep some Gaussians, append others, and drop from the end those over the cap.
+    """Keep some Gaussians, add others, drop those over the cap, and sort the rest along a Morton curve.
+
+    A tile's Gaussians are neighbours in space. Near one another in memory, they are read faster.
 
     Args:
         gaussians: The N Gaussians.
         optimizer: Its moments follow: survivors keep theirs, new Gaussians start from zero.
         keep: (N,) true for the survivors.
-        newborn: Gaussians to append, in this order.
+        newborn: Gaussians to add; the last ones are the first to be dropped.
         cap: Largest number of Gaussians afterwards; None for no cap.
 
     Returns:
         The new Gaussians, leaves that collect gradients.
     """
-    survivors: Int64[Tensor, " S"] = torch.nonzero(keep)[:cap, 0]
-    parts = [gaussians.map(lambda tensor: tensor[survivors]), *newborn]
-    replaced = Gaussians.concatenated(parts).map(lambda tensor: tensor[:cap].contiguous())
-    optimizer.follow(survivors, len(replaced) - len(survivors))
-    return replaced.map(lambda tensor: tensor.requires_grad_())
+    everyone = [part.tensors() for part in (gaussians, *newborn)]
+    survivors = torch.nonzero(keep)[:, 0]
+    added = torch.arange(len(gaussians), sum(len(part["means"]) for part in everyone), device=keep.device)
+    chosen: Int64[Tensor, " M"] = torch.cat([survivors, added])[:cap]
+    chosen = chosen[_order(torch.cat([part["means"] for part in everyone])[chosen])]
+    replaced = {
+        name: torch.cat([part[name] for part in everyone]).index_select(0, chosen) for name in everyone[0]
+    }
+    optimizer.follow(torch.where(chosen < len(gaussians), chosen, -1))
+    return Gaussians(**replaced).map(lambda tensor: tensor.requires_grad_())
+
+
+@torch.no_grad()
+def sorted_in_space(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians sorted along a Morton curve through their means."""
+    order = _order(gaussians.means)
+    return gaussians.map(lambda tensor: tensor.index_select(0, order))
+
+
+def _order(means: Float[Tensor, "N 3"]) -> Int64[Tensor, " N"]:
+    return torch.from_numpy(order_in_space(means.numpy(force=True))).to(means.device)
