@@ -18,7 +18,8 @@ struct TileState {
 template <class T, bool DEPTH, bool GENTLY>
 GSPLAT_INLINE void draw(const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i, TileState<T> &tile) {
     using V = typename Vector<T>::V;
-    Falloff<T, GENTLY> falloff;
+    FalloffRows<T> steps;
+    Falloff<T, GENTLY> falloff{steps, {}, {}, {}, {}, {}};
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {

@@ -22,7 +22,8 @@ struct TileGradient {
 template <class T, bool WITH_DEPTH, bool GENTLY>
 GSPLAT_INLINE void splat_backward(const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i, TileGradient<T> &tile, T *slot) {
     using V = typename Vector<T>::V;
-    Falloff<T, GENTLY> falloff;
+    FalloffRows<T> steps;
+    Falloff<T, GENTLY> falloff{steps, {}, {}, {}, {}, {}};
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     V sums[8] = {}, hyy = V{}, wz = V{};  // in the order of a slot

@@ -12,6 +12,8 @@ namespace gsplat {
 namespace v2 { extern const Isa table; }
 namespace v3 { extern const Isa table; }
 namespace v4 { extern const Isa table; }
+#elif defined(__aarch64__)
+namespace neon { extern const Isa table; }
 #else
 namespace baseline { extern const Isa table; }
 #endif
@@ -34,6 +36,8 @@ const Candidates &candidates() {
                                  {&v3::table, bool(__builtin_cpu_supports("x86-64-v3"))},
                                  {&v4::table, bool(__builtin_cpu_supports("x86-64-v4"))}},
                                 3};
+#elif defined(__aarch64__)
+    static const Candidates all{{{&neon::table, true}, {nullptr, false}, {nullptr, false}}, 1};
 #else
     static const Candidates all{{{&baseline::table, true}, {nullptr, false}, {nullptr, false}}, 1};
 #endif

@@ -16,12 +16,14 @@ constexpr int WIDE = Vector<double>::LANES;
 // As many floats as a vector of doubles has lanes.
 typedef float HalfF __attribute__((vector_size(WIDE * sizeof(float))));
 
-// To double. GCC 12 converts the two halves of a wider vector separately, hence the intrinsics.
+// To double. GCC 12 converts the two halves of a wider vector separately, and NEON's lanes one by one, hence the intrinsics.
 GSPLAT_INLINE VD widened(HalfF v) {
 #if GSPLAT_VECTOR_BYTES == 64
     return (VD)_mm512_cvtps_pd((__m256)v);
 #elif GSPLAT_VECTOR_BYTES == 32
     return (VD)_mm256_cvtps_pd((__m128)v);
+#elif defined(__aarch64__)
+    return (VD)vcvt_f64_f32((float32x2_t)v);
 #else
     return __builtin_convertvector(v, VD);
 #endif
@@ -50,6 +52,8 @@ GSPLAT_INLINE VF sqrt_(VF v) {
     return (VF)_mm256_sqrt_ps((__m256)v);
 #elif defined(__SSE2__)
     return (VF)_mm_sqrt_ps((__m128)v);
+#elif defined(__aarch64__)
+    return (VF)vsqrtq_f32((float32x4_t)v);
 #else
     for (int i = 0; i < Vector<float>::LANES; ++i) v[i] = sqrtf(v[i]);
     return v;
@@ -63,6 +67,8 @@ GSPLAT_INLINE VD sqrt_(VD v) {
     return (VD)_mm256_sqrt_pd((__m256d)v);
 #elif defined(__SSE2__)
     return (VD)_mm_sqrt_pd((__m128d)v);
+#elif defined(__aarch64__)
+    return (VD)vsqrtq_f64((float64x2_t)v);
 #else
     for (int i = 0; i < WIDE; ++i) v[i] = sqrt(v[i]);
     return v;

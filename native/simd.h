@@ -10,7 +10,7 @@
 #include <string.h>
 #if defined(__SSE2__)
 #include <immintrin.h>
-#elif defined(__ARM_NEON)
+#elif defined(__aarch64__)
 #include <arm_neon.h>
 #endif
 
@@ -53,6 +53,15 @@ typedef uint64_t VU __attribute__((vector_size(GSPLAT_VECTOR_BYTES)));
 GSPLAT_INLINE VF splat(float x) { return x - VF{}; }
 GSPLAT_INLINE VD splat(double x) { return x - VD{}; }
 
+// A number that a loop needs in a register. GCC loads constants that NEON cannot write as immediates in every round.
+template <class V>
+GSPLAT_INLINE V kept(V v) {
+#if defined(__aarch64__)
+    asm("" : "+w"(v));
+#endif
+    return v;
+}
+
 template <class V, class T>
 GSPLAT_INLINE V load(const T *p) {
     V v;
@@ -73,6 +82,8 @@ GSPLAT_INLINE VU multiply_low(VU a, uint32_t b) {
     return (VU)_mm256_mul_epu32((__m256i)a, _mm256_set1_epi64x(b));
 #elif defined(__SSE2__)
     return (VU)_mm_mul_epu32((__m128i)a, _mm_set1_epi64x(b));
+#elif defined(__aarch64__)
+    return (VU)vmull_u32(vmovn_u64((uint64x2_t)a), vdup_n_u32(b));
 #else
     return (a & 0xFFFFFFFFu) * b;
 #endif
@@ -88,6 +99,10 @@ inline __attribute__((always_inline)) VF load_bytes<VF>(const uint8_t *p) {
     return (VF)_mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(load<__m128i>(p)));
 #elif defined(__AVX2__)
     return (VF)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i *>(p))));
+#elif defined(__aarch64__)
+    uint32_t four;
+    memcpy(&four, p, sizeof four);
+    return (VF)vcvtq_f32_u32(vmovl_u16(vget_low_u16(vmovl_u8(vreinterpret_u8_u32(vdup_n_u32(four))))));
 #else
     Vector<float>::M v;
     for (int i = 0; i < Vector<float>::LANES; ++i) v[i] = p[i];
@@ -120,6 +135,18 @@ GSPLAT_INLINE T vmin(T a, T b) {
     return a < b ? a : b;
 }
 
+#if defined(__aarch64__)
+// One instruction instead of a comparison and a selection. Where only a is NaN, the result is b, as above.
+GSPLAT_INLINE float vmax(float a, float b) { return fmaxf(a, b); }
+GSPLAT_INLINE float vmin(float a, float b) { return fminf(a, b); }
+GSPLAT_INLINE double vmax(double a, double b) { return fmax(a, b); }
+GSPLAT_INLINE double vmin(double a, double b) { return fmin(a, b); }
+GSPLAT_INLINE VF vmax(VF a, VF b) { return (VF)vmaxnmq_f32((float32x4_t)a, (float32x4_t)b); }
+GSPLAT_INLINE VF vmin(VF a, VF b) { return (VF)vminnmq_f32((float32x4_t)a, (float32x4_t)b); }
+GSPLAT_INLINE VD vmax(VD a, VD b) { return (VD)vmaxnmq_f64((float64x2_t)a, (float64x2_t)b); }
+GSPLAT_INLINE VD vmin(VD a, VD b) { return (VD)vminnmq_f64((float64x2_t)a, (float64x2_t)b); }
+#endif
+
 // Horizontal sum by halves, always in the same order.
 GSPLAT_INLINE float sum(VF v) {
 #if GSPLAT_VECTOR_BYTES == 64
@@ -131,9 +158,13 @@ GSPLAT_INLINE float sum(VF v) {
     typedef float Q __attribute__((vector_size(16)));
     Q q = __builtin_shufflevector(v, v, 0, 1, 2, 3) + __builtin_shufflevector(v, v, 4, 5, 6, 7);
 #else
-    VF q = v;
+    const VF q = v;
 #endif
+#if defined(__aarch64__)
+    return vaddvq_f32((float32x4_t)q);
+#else
     return (q[0] + q[2]) + (q[1] + q[3]);
+#endif
 }
 
 GSPLAT_INLINE double sum(VD v) {
@@ -151,8 +182,8 @@ GSPLAT_INLINE bool any_at_least(VF v, float x) {
     return _mm256_movemask_ps((__m256)(v >= splat(x))) != 0;
 #elif defined(__SSE2__)
     return _mm_movemask_ps((__m128)(v >= splat(x))) != 0;
-#elif defined(__ARM_NEON)
-    return vmaxvq_f32((float32x4_t)v) >= x;
+#elif defined(__aarch64__)
+    return vmaxnmvq_f32((float32x4_t)v) >= x;  // where a lane is NaN, the others count
 #else
     auto mask = v >= splat(x);
     int32_t any = 0;
@@ -199,9 +230,8 @@ GSPLAT_INLINE VF exp2_between(VF p, float least, float most) {
     const __m512 n = _mm512_roundscale_ps((__m512)p, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
     return (VF)_mm512_maskz_scalef_ps(keep, (__m512)exp2_fraction(p - (VF)n), n);
 #else
-    const VF top = splat(most);
     const auto keep = p >= splat(least);
-    const VF y = exp2_(p < top ? p : top);  // garbage where p is too small, which is not kept
+    const VF y = exp2_(vmin(p, splat(most)));  // garbage where p is too small, which is not kept
     return keep ? y : VF{};
 #endif
 }
@@ -212,30 +242,30 @@ GSPLAT_INLINE VD exp2_between(VD p, double least, double most) {
 }
 
 // min(x, most), 0 where x < least.
-GSPLAT_INLINE VF between(VF x, float least, float most) {
+GSPLAT_INLINE VF between(VF x, VF least, VF most) {
 #if GSPLAT_VECTOR_BYTES == 64
-    return (VF)_mm512_maskz_min_ps(_mm512_cmp_ps_mask((__m512)x, _mm512_set1_ps(least), _CMP_GE_OQ), (__m512)x, _mm512_set1_ps(most));
+    return (VF)_mm512_maskz_min_ps(_mm512_cmp_ps_mask((__m512)x, (__m512)least, _CMP_GE_OQ), (__m512)x, (__m512)most);
 #else
-    const VF top = splat(most), y = x < top ? x : top;
-    return x >= splat(least) ? y : VF{};
+    const VF y = vmin(x, most);
+    return x >= least ? y : VF{};
 #endif
 }
 
-GSPLAT_INLINE VD between(VD x, double least, double most) {
-    const VD top = splat(most), y = x < top ? x : top;
-    return x >= splat(least) ? y : VD{};
+GSPLAT_INLINE VD between(VD x, VD least, VD most) {
+    const VD y = vmin(x, most);
+    return x >= least ? y : VD{};
 }
 
 // x where key is below the limit, otherwise 0.
-GSPLAT_INLINE VF where_below(VF key, float limit, VF x) {
+GSPLAT_INLINE VF where_below(VF key, VF limit, VF x) {
 #if GSPLAT_VECTOR_BYTES == 64
-    return (VF)_mm512_maskz_mov_ps(_mm512_cmp_ps_mask((__m512)key, _mm512_set1_ps(limit), _CMP_LT_OQ), (__m512)x);
+    return (VF)_mm512_maskz_mov_ps(_mm512_cmp_ps_mask((__m512)key, (__m512)limit, _CMP_LT_OQ), (__m512)x);
 #else
-    return key < splat(limit) ? x : VF{};
+    return key < limit ? x : VF{};
 #endif
 }
 
-GSPLAT_INLINE VD where_below(VD key, double limit, VD x) { return key < splat(limit) ? x : VD{}; }
+GSPLAT_INLINE VD where_below(VD key, VD limit, VD x) { return key < limit ? x : VD{}; }
 
 // 1 / x. AVX-512 has an estimate of 14 bits; one Newton step refines it to 2^-27 at a third of the cost of a division.
 GSPLAT_INLINE VF reciprocal(VF x) {
@@ -274,6 +304,10 @@ GSPLAT_INLINE void sum8(const VF *v, float *out) {
                __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 3, 10, 11, 6, 7, 14, 15);
     store(out, VF(__builtin_shufflevector(b[0], b[1], 0, 1, 2, 3, 8, 9, 10, 11) +
                   __builtin_shufflevector(b[0], b[1], 4, 5, 6, 7, 12, 13, 14, 15)));
+#elif defined(__aarch64__)
+    float32x4_t pairs[4];
+    for (int i = 0; i < 4; ++i) pairs[i] = vpaddq_f32((float32x4_t)v[2 * i], (float32x4_t)v[2 * i + 1]);
+    vst1q_f32(out, vpaddq_f32(pairs[0], pairs[1])), vst1q_f32(out + 4, vpaddq_f32(pairs[2], pairs[3]));
 #else
     for (int half = 0; half < 8; half += 4) {
         VF a[2];

@@ -147,21 +147,27 @@ GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t c
 //     2^p(k + 1) = 2^p(k) r(0) f(k),   r(0) = 2^(p(1) - p(0)),   f(k) = 2^(-2 k (sy² + ty²))
 //
 // Otherwise every row takes its exponential, because r and f would leave the range of a float.
+template <class T>
+struct FalloffRows {
+    T base[TILE], shift[TILE];    // of a splat that is not gentle: p = base - (across + shift)², row by row
+    alignas(64) T factors[TILE];  // f
+};
+
 template <class T, bool GENTLY>
 struct Falloff {
     using V = typename Vector<T>::V;
-    T base[TILE], shift[TILE];          // of a splat that is not gentle: p = base - (across + shift)², row by row
-    alignas(64) T factors[TILE];        // f
-    V across, value, ratio;
+    FalloffRows<T> &rows;  // outside: vectors beside an array that is indexed would not stay in registers
+    V across, value, ratio, least, most;
 
     GSPLAT_METHOD void begin_splat(const Splat<T> &s, const TileBox &box, int32_t top, int32_t bottom) {
+        least = kept(splat(T(GENTLY ? ALPHA_MIN : LOG2_ALPHA_MIN))), most = kept(splat(T(GENTLY ? ALPHA_MAX : LOG2_ALPHA_MAX)));
         if (GENTLY) {
             const V curve = splat(-2 * (s.sy * s.sy + s.ty * s.ty));
-            for (int32_t k = 0; k <= bottom - top; k += Vector<T>::LANES) store(factors + k, exp2_(curve * (iota<T>() + splat(T(k)))));
+            for (int32_t k = 0; k <= bottom - top; k += Vector<T>::LANES) store(rows.factors + k, exp2_(curve * (iota<T>() + splat(T(k)))));
         } else {
             for (int row = 0; row < TILE; ++row) {
                 const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;
-                base[row] = s.log2_o - t * t, shift[row] = s.sy * dy;
+                rows.base[row] = s.log2_o - t * t, rows.shift[row] = s.sy * dy;
             }
         }
     }
@@ -179,18 +185,18 @@ struct Falloff {
     GSPLAT_METHOD V alpha(int32_t row, V &key) const {
         if (GENTLY) {
             key = value;
-            return between(value, T(ALPHA_MIN), T(ALPHA_MAX));
+            return between(value, least, most);
         }
-        const V q = across + splat(shift[row]);
-        key = splat(base[row]) - q * q;
+        const V q = across + splat(rows.shift[row]);
+        key = splat(rows.base[row]) - q * q;
         return exp2_between(key, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
     }
 
     // x where alpha is not clamped, otherwise 0.
-    GSPLAT_METHOD static V where_open(V key, V x) { return where_below(key, GENTLY ? T(ALPHA_MAX) : T(LOG2_ALPHA_MAX), x); }
+    GSPLAT_METHOD V where_open(V key, V x) const { return where_below(key, most, x); }
 
     GSPLAT_METHOD void step(int32_t k) {
-        if (GENTLY) value *= ratio * splat(factors[k]);
+        if (GENTLY) value *= ratio * splat(rows.factors[k]);
     }
 };
 
