@@ -40,6 +40,8 @@ soak:
 	@GSPLAT_EDU_SOAK=1 $(PYTEST) -m sliced
 	@echo "== soak: damaged checkpoints and configurations under sanitizers"
 	@GSPLAT_EDU_SOAK=1 tools/sanitize.sh
+	@echo "== soak: the native tests on 64-bit ARM, emulated"
+	@tools/neon.sh
 	@echo "== soak: chapters on the full budget"
 	@$(BIN)/python tools/build_notebooks.py --out out/soak/notebooks
 
@@ -70,6 +72,7 @@ bench:
 	@$(BIN)/python benchmarks/dense.py $(BENCH) --out out/bench/dense.json
 	@$(BIN)/python benchmarks/ladder $(BENCH) --out out/bench/ladder.json
 	@$(BIN)/python benchmarks/train_step.py $(BENCH) --out out/bench/train_step.json
+	@$(BIN)/python benchmarks/serial.py $(BENCH) --out out/bench/serial.json
 
 notebooks:
 	@tools/set_up.sh dev

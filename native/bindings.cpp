@@ -8,6 +8,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <array>
 #include <chrono>
 #include <cstdlib>
@@ -316,6 +317,12 @@ void visible(const BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
     self.frame.list_visible(ids.as<int64_t>(), radii.as<T>());
 }
 
+std::array<double, 6> of_stages(const std::array<StageTime, 6> &stages, double StageTime::*part) {
+    std::array<double, 6> found;
+    std::transform(stages.begin(), stages.end(), found.begin(), [part](const StageTime &stage) { return stage.*part; });
+    return found;
+}
+
 template <class T>
 void bind_frame(nb::module_ &m, const char *name) {
     using F = BoundFrame<T>;
@@ -325,7 +332,9 @@ void bind_frame(nb::module_ &m, const char *name) {
         .def("backward", &backward<T>)
         .def("adam", &adam_backward<T>)
         .def("visible", &visible<T>)
-        .def_prop_ro("seconds", [](const F &self) { return self.frame.seconds(); })
+        .def_prop_ro("seconds", [](const F &self) { return of_stages(self.frame.stages(), &StageTime::seconds); })
+        .def_prop_ro("processor_seconds", [](const F &self) { return of_stages(self.frame.stages(), &StageTime::processor); })
+        .def_prop_ro("parallel_seconds", [](const F &self) { return of_stages(self.frame.stages(), &StageTime::parallel); })
         .def_prop_ro("num_visible", [](const F &self) { return self.frame.num_visible(); })
         .def_prop_ro("num_pairs", [](const F &self) { return self.frame.num_pairs(); });
 }
@@ -457,4 +466,5 @@ NB_MODULE(_native, m) {
     m.def("isa", [] { return std::string(isa().name); });
     m.def("choose_isa", [](const std::string &name) { choose_isa(name.c_str()); });
     m.def("fma_rate", &fma_rate);
+    m.def("parallel_time", [] { return std::array<double, 2>{parallel_time().seconds, double(parallel_time().calls)}; });
 }

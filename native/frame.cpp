@@ -14,14 +14,18 @@
 namespace gsplat {
 namespace {
 
-// Adds its lifetime to a total.
+// Adds its lifetime to a stage's times.
 class Timer {
   public:
-    explicit Timer(double &seconds) : seconds_(seconds) {}
-    ~Timer() { seconds_ += std::chrono::duration<double>(std::chrono::steady_clock::now() - start_).count(); }
+    explicit Timer(StageTime &stage) : stage_(stage) {}
+    ~Timer() {
+        stage_.seconds += std::chrono::duration<double>(std::chrono::steady_clock::now() - start_).count();
+        stage_.processor += thread_seconds() - processor_, stage_.parallel += parallel_time().seconds - parallel_;
+    }
 
   private:
-    double &seconds_;
+    StageTime &stage_;
+    double processor_ = thread_seconds(), parallel_ = parallel_time().seconds;
     std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
 };
 
@@ -39,7 +43,7 @@ Frame<T>::Frame(const Scene<T> &scene, const Camera &camera, const Settings &set
 
 template <class T>
 void Frame<T>::project(const Scene<T> &scene) {
-    Timer timer(seconds_[0]);
+    Timer timer(stages_[0]);
     const size_t n = size_t(std::max<int64_t>(n_, 1));
     ProjectArgs<T> args{scene,
                         camera_,
@@ -54,7 +58,7 @@ void Frame<T>::project(const Scene<T> &scene) {
 
 template <class T>
 void Frame<T>::sort() {
-    Timer timer(seconds_[1]);
+    Timer timer(stages_[1]);
     const size_t count = size_t(visible_count_) + 1;
     Buffer key_buffer;
     auto *keys = static_cast<DepthKey<T> *>(key_buffer.reserve(count * sizeof(DepthKey<T>)));
@@ -110,7 +114,7 @@ static void lay_out(int threads, int64_t tiles, int64_t chunks, uint32_t *table,
 // number of chunks.
 template <class T>
 void Frame<T>::intersect() {
-    Timer timer(seconds_[2]);
+    Timer timer(stages_[2]);
     const int64_t tiles = grid_.tiles();
     const int64_t chunks =
         std::clamp<int64_t>(visible_count_ / 512, 1, std::min<int64_t>(8 * int64_t(threads_), 1 + 8 * visible_count_ / tiles));
@@ -141,7 +145,7 @@ void Frame<T>::intersect() {
 
 template <class T>
 void Frame<T>::composite(const Outputs<T> &out) {
-    Timer timer(seconds_[3]);
+    Timer timer(stages_[3]);
     CompositeArgs<T> args{splats(),
                           pairs_.as<Pair>(),
                           tile_begin_.as<uint32_t>(),
@@ -158,7 +162,7 @@ void Frame<T>::composite(const Outputs<T> &out) {
 template <class T>
 CompositeBackwardArgs<T> Frame<T>::composite_backward(const Outputs<T> &forward, const ImageGrads<T> &in, Buffer &slots,
                                                       Buffer &background) {
-    Timer timer(seconds_[4]);
+    Timer timer(stages_[4]);
     CompositeBackwardArgs<T> args{{splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, forward.image,
                                    forward.transmittance, forward.depth, done_.as<uint32_t>()},
                                   in.image,
@@ -180,7 +184,7 @@ void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const 
                         T *background) {
     Buffer slots, tile_background;
     const CompositeBackwardArgs<T> done = composite_backward(forward, in, slots, tile_background);
-    Timer timer(seconds_[5]);
+    Timer timer(stages_[5]);
     background[0] = background[1] = background[2] = 0;
     for (int32_t tile = 0; tile < grid_.tiles(); ++tile)
         for (int k = 0; k < 3; ++k) background[k] += done.tile_background[3 * tile + k];
@@ -193,7 +197,7 @@ template <class T>
 void Frame<T>::adam(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const AdamArgs<T> *groups, T *means2d_norm) {
     Buffer slots, tile_background, scratch;
     const CompositeBackwardArgs<T> done = composite_backward(forward, in, slots, tile_background);
-    Timer timer(seconds_[5]);
+    Timer timer(stages_[5]);
     AdamBackwardArgs<T> args{last_stage(scene, done.slots), {}, {3, 4, 3, 3, 3 * int64_t(scene.rest), 1}};
     args.backward.grads.means2d_norm = means2d_norm;
     std::copy_n(groups, int(GROUPS), args.groups);

@@ -18,6 +18,11 @@ struct ImageGrads {
     const T *image, *transmittance, *depth;  // the last two may be null
 };
 
+// Seconds that passed during a stage, processor time of its thread, and the part of it in `parallel`.
+struct StageTime {
+    double seconds = 0, processor = 0, parallel = 0;
+};
+
 template <class T>
 class Frame {
   public:
@@ -30,8 +35,8 @@ class Frame {
 
     int64_t num_visible() const { return visible_count_; }
     int64_t num_pairs() const { return pairs_count_; }
-    // Wall seconds of project, sort, intersect, composite, composite_backward and project_backward.
-    const std::array<double, 6> &seconds() const { return seconds_; }
+    // Of project, sort, intersect, composite, composite_backward and project_backward.
+    const std::array<StageTime, 6> &stages() const { return stages_; }
     // Writes the ids of the visible Gaussians, ascending, and the half extents of their ellipses, px.
     void list_visible(int64_t *ids, T *radii) const;
 
@@ -50,7 +55,7 @@ class Frame {
     Grid grid_;
     int threads_;
     int64_t visible_count_ = 0, pairs_count_ = 0;
-    std::array<double, 6> seconds_{};
+    std::array<StageTime, 6> stages_{};
     Buffer splats_, block_ids_, block_begin_, visible_, sorted_, pairs_of_, slot_begin_, pairs_, tile_begin_, done_;
 };
 

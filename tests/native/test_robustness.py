@@ -322,3 +322,20 @@ def test_denormal_numbers_are_zero_in_the_kernels_and_nowhere_else(threads):
     )
     assert bool((first > 0).all()) and not second.any()
     assert np.float32(1e-30) * np.float32(1e-12) > 0 and bool((torch.full((1,), 1e-30) * 1e-12 > 0).all())
+
+
+def test_the_processor_time_of_stages_contains_that_of_their_tasks(set_threads):
+    """With one thread and with two, whose calls of `parallel` are as many."""
+    scene, calls = random(3000), []
+    for threads in (1, 2):
+        set_threads(threads)
+        seconds, before = _native.parallel_time()
+        out = render(scene.gaussians(torch.float32).trainable(), scene.camera, backend="cpu")
+        frame = out.image.grad_fn.frame
+        out.image.sum().backward()
+        after, count = _native.parallel_time()
+        calls.append(count - before)
+        for whole, tasks in zip(frame.processor_seconds, frame.parallel_seconds, strict=True):
+            assert 0 < tasks <= whole
+        assert sum(frame.parallel_seconds) <= after - seconds + 1e-9
+    assert calls[0] == calls[1] > 10

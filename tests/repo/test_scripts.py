@@ -20,7 +20,7 @@ SHARED = {"captures.py", "hardware.py"}
 
 MADE = {
     f"benchmarks/{name}"
-    for name in ("raster.py", "sphere.py", "dense.py", "ladder/__main__.py", "train_step.py")
+    for name in ("raster.py", "sphere.py", "dense.py", "ladder/__main__.py", "train_step.py", "serial.py")
 }
 """Benchmarks that `make bench` runs."""
 
@@ -37,6 +37,7 @@ ELSEWHERE = {
     "chapter_figures.py": "tests/repo/test_notebooks.py",
     "check_objects.py": "tools/sanitize.sh",
     "house_limits.py": "tests/repo/test_house_limits.py",
+    "neon.sh": "Makefile",
     "sanitize.sh": "Makefile",
     "set_up.sh": "Makefile",
 }
