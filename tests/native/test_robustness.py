@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import torch.utils.checkpoint
 
 from gsplat_edu import ArgumentError, Camera, _native, orbit_camera
 from gsplat_edu.gaussians import Gaussians
