@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.resizing import area_mean, premultiplied, smaller_mask, unweighted
 from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array
 
 Pixels = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
@@ -90,6 +91,24 @@ class Photo:
             flat[band] = np.round(255.0 * mixed)
         return flat
 
+    def scaled(self, W: int, H: int) -> Photo:
+        """Return the photo at a smaller size: each pixel is the mean of the area it covers, weighted by alpha.
+
+        A pixel of the mask counts if all of its area does. A float photo with alpha becomes uint8, rounded.
+
+        Args:
+            W: New width, px; at most the photo's.
+            H: New height, px; at most the photo's.
+        """
+        if self.image.shape[:2] == (H, W):
+            return self
+        mask = None if self.mask is None else smaller_mask(self.mask, W, H)
+        if self.alpha is None:
+            return Photo(area_mean(self.image, W, H), None, mask)
+        bytes_like = self.image if self.image.dtype == np.uint8 else 255.0 * self.image
+        weighted = np.asarray(bytes_like, dtype=np.float32)
+        return Photo(*unweighted(area_mean(premultiplied(weighted, self.alpha), W, H)), mask)
+
 
 @dataclass(frozen=True, eq=False, init=False)
 class View:
@@ -141,6 +160,21 @@ class View:
         view = cls.__new__(cls)
         view._set(camera, name, read, on_disk=True)
         return view
+
+    def scaled(self, factor: float) -> View:
+        """Return the view with width and height divided by a factor, and intrinsics that fit exactly.
+
+        Its photo is downscaled whenever it is read; see `Photo.scaled`.
+
+        Args:
+            factor: At least 1; a side keeps at least one pixel.
+        """
+        if factor == 1.0:
+            return self
+        intrinsics = self.camera.intrinsics
+        W, H = (max(1, round(side / factor)) for side in (intrinsics.W, intrinsics.H))
+        camera = Camera.posed(self.camera.R, self.camera.eye, intrinsics.scaled(W, H))
+        return View.stored(camera, lambda: self.read().scaled(W, H), self.name)
 
     def _set(self, camera: Camera, name: str, read: Callable[[], Photo], on_disk: bool) -> None:
         for key, value in {"camera": camera, "name": name, "read": read, "on_disk": on_disk}.items():

@@ -7,6 +7,7 @@ outside on whole runs (benchmarks/RESULTS.md). Time is fitted to the steps measu
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,12 +18,19 @@ from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.schedule import photo_factor
 
 GROWTH = (0.005, 0.08)
 """adc: Gaussians added per densification, for each pixel of a photo and for each start point. The model gives 5,700 for
 snowmiku97 and 3,000 at half size; whole trainings added 3,100 (3,000 iterations), 4,100 (7,000), 5,500 (7,000, not
 rescaled) and 3,900 (1,200, half size). For fox it gives 5,000; 3,500 were added. Scenes with much fine detail need
 several times as many."""
+
+PLANNED_SHARE = 0.14
+"""fast: planned Gaussians per pixel of a photo, for `PLANNED_VIEWS` training views; the number grows with the square
+root of the views. For snowmiku97 this is 104,000."""
+
+PLANNED_VIEWS = 85
 
 FEW_POINTS = 30_000
 """Start points beyond this number do not increase the growth."""
@@ -171,7 +179,8 @@ class Measurements:
 def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np.ndarray, " iterations"]:
     """Estimate the number of Gaussians at every iteration.
 
-    adc adds the same number at each densification (see `GROWTH`), mcmc grows by a factor; a cap limits both.
+    adc adds the same number at each densification (see `GROWTH`), mcmc grows by a factor, fast linearly to its cap; a
+    cap limits all of them.
 
     Args:
         config: The run.
@@ -180,6 +189,10 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
     """
     cap = config.max_gaussians or sys.maxsize
     counts = np.full(config.iterations, min(points, cap), dtype=np.int64)
+    if config.strategy == "fast":
+        window = max(config.fast.stop - config.densify_start, 1)
+        t = np.clip((np.arange(config.iterations) - config.densify_start) / window, 0.0, 1.0)
+        return np.rint(counts + (cap - counts) * t).astype(np.int64)
     stop = {"adc": config.adc.densify_stop, "mcmc": config.mcmc.stop}.get(config.strategy, 0)
     every = config.densify_every
     first, added = (config.densify_start // every + 1) * every, _added(points, pixels)
@@ -190,11 +203,23 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
     return counts
 
 
-def wanted_gaussians(config: TrainConfig, points: int, pixels: float) -> int:
-    """Estimate how many Gaussians the images need within the given iterations: the growth of adc without a cap.
+def pixel_share(config: TrainConfig) -> float:
+    """Return the mean over the iterations of the fraction of a photo's pixels that are rendered."""
+    factors = [photo_factor(config, iteration) for iteration in range(config.iterations)]
+    return float(np.mean(1 / np.square(factors)))
 
-    Arguments as for `expected_counts`.
+
+def wanted_gaussians(config: TrainConfig, points: int, pixels: float, views: int = PLANNED_VIEWS) -> int:
+    """Estimate how many Gaussians the images need: the plan of fast, or the growth of adc within the given iterations.
+
+    Args:
+        config: The run; its cap is ignored.
+        points: Number of start points.
+        pixels: Pixels of a view.
+        views: Number of training views.
     """
+    if config.strategy == "fast":
+        return max(round(PLANNED_SHARE * pixels * math.sqrt(views / PLANNED_VIEWS)), 1)
     window = min(config.adc.densify_stop, config.iterations) - config.densify_start
     return points + _added(points, pixels) * max(window // config.densify_every, 0)
 

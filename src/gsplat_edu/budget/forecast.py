@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import torch
 
-from gsplat_edu.budget.costs import Facts, Footprint, Measurements, expected_counts
+from gsplat_edu.budget.costs import Facts, Footprint, Measurements, expected_counts, pixel_share
 from gsplat_edu.budget.probe import probe
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.text import short_number, spelled_seconds
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.schedule import photo_factor
 
 SAVING = 4e8
 """Write speed of checkpoints, bytes per second."""
@@ -102,7 +103,12 @@ def predict(
     speed, last = measured.speed, config.iterations - 1
     missing = 1.0 - min(image_memory / max(facts.photo_bytes, 1), 1.0)
     reading_again = measured.read * missing / torch.get_num_threads()
-    each = speed.seconds(float(counts.mean()), facts.pixels) + reading_again
+    each = speed.seconds(float(counts.mean()), facts.pixels * pixel_share(config)) + reading_again
+
+    def step(iteration: int) -> float:
+        pixels = facts.pixels / photo_factor(config, iteration) ** 2
+        return speed.seconds(float(counts[iteration]), pixels) + reading_again
+
     footprint = Footprint(facts, measured.process, measured.pairs, config.sh_degree)
     evaluations, saved = (last // every if every else 0 for every in (eval_every, save_every))
     saving = saving_seconds(float(counts.mean()), config.sh_degree)
@@ -111,7 +117,7 @@ def predict(
         iterations=config.iterations,
         backend=measured.backend,
         gaussians=(int(counts[0]), int(counts[-1])),
-        steps=tuple(speed.seconds(float(counts[i]), facts.pixels) + reading_again for i in (0, -1)),  # type: ignore[arg-type]
+        steps=(step(0), step(last)),
         seconds={
             "reading": measured.read * views / facts.workers,
             "training": each * config.iterations,

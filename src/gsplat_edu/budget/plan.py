@@ -158,15 +158,17 @@ class Request:
         """
         config = self.options.config
         if "iterations" not in self.given:
-            fresh = recipe(iterations, rescale=self.rescale).flat()
+            fresh = recipe(iterations, rescale=self.rescale, strategy=config.strategy).flat()
             scaled = {name: fresh[name] for name in MILESTONES if name not in self.given}
             config = config.changed(iterations=iterations, **scaled)
         if "max_gaussians" in self.given:
             return config
         caps = [] if cap is None else [max(_rounded(cap), self.least)]
-        if config.strategy == "mcmc" or (self.by_time and config.strategy == "adc"):
-            wanted = wanted_gaussians(config, self.facts.points, self.facts.smaller(factor).pixels)
-            caps.append(wanted if config.strategy == "mcmc" else _rounded(math.ceil(GUARD * wanted)))
+        if config.strategy in ("mcmc", "fast") or (self.by_time and config.strategy == "adc"):
+            facts = self.facts.smaller(factor)
+            wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+            guarded = config.strategy == "adc"
+            caps.append(_rounded(math.ceil(GUARD * wanted)) if guarded else max(wanted, self.least))
         return dataclasses.replace(config, max_gaussians=min(caps) if caps else None)
 
 
@@ -202,7 +204,7 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
         said = f"{limits}: a resumed run keeps the values of its config.json; memory is not planned again"
         return Plan(taken_up(options, given), sentences=(said,) if limits.memory is not None else ())
     if limits.memory is None and (limits.seconds is None or "iterations" in given):
-        return Plan(options)
+        return _with_planned_count(options)
     if options.backend == "torch":
         raise ArgumentError(f"{limits}: cannot be planned for --backend torch; choose cpu or cuda")
     settings = options.data_settings
@@ -229,6 +231,21 @@ def plan(options: RunOptions, limits: Limits, given: Collection[str] = (), *, re
     probed = tuple(factor for factor in factors if factor >= first.factor)
     spent = 0.0 if limits.time is None else limits.time.spent
     return choose(dataclasses.replace(request, factors=probed), measured, spent)
+
+
+def _with_planned_count(options: RunOptions) -> Plan:
+    """Choose the number of Gaussians that the fast recipe grows to, unless it is given."""
+    config = options.config
+    if config.strategy != "fast" or config.max_gaussians is not None:
+        return Plan(options)
+    dataset = load_dataset(options.data, options.data_settings, points=options.points)
+    facts = Facts.of(dataset)
+    if options.scene is not None:
+        facts = dataclasses.replace(facts, points=len(scene_start(options.scene, config, dataset.origin)[0]))
+    request = Request(options, Limits(), frozenset({"iterations"}), True, facts)
+    config = request.config(config.iterations, 1.0, None)
+    said = f"the recipe plans {config.max_gaussians:,} Gaussians; --max-gaussians changes that"
+    return Plan(dataclasses.replace(options, config=config), sentences=(said,))
 
 
 def choose(request: Request, measured: Measurements, spent: float) -> Plan:
@@ -278,7 +295,7 @@ def _within_memory(
         facts = request.facts.smaller(factor)
         footprint = Footprint(facts, process, pairs, request.options.config.sh_degree)
         config = request.config(iterations, factor, None)
-        wanted = wanted_gaussians(config, facts.points, facts.pixels)
+        wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         if config.strategy == "none":
             wanted = facts.points
         wanted = min(wanted, config.max_gaussians or wanted)
@@ -389,7 +406,7 @@ def flags(options: RunOptions, given: Collection[str] = (), *, photos: bool = Fa
         words.append(f"--max-gaussians {config.max_gaussians}")
     if "iterations" not in given:
         words.append(f"--iterations {config.iterations}")
-        chosen, scaled = config.flat(), recipe(config.iterations).flat()
+        chosen, scaled = config.flat(), recipe(config.iterations, strategy=config.strategy).flat()
         idle = {name for key, names in ONLY_FOR.items() if key != config.strategy for name in names}
         words += [
             f"--{name.replace('_', '-')} {chosen[name]}"

@@ -182,6 +182,8 @@ def _trial(
         densify_start=PROBE_STEPS,
         densify_stop=PROBE_STEPS + 1,
         reset_every=0,
+        fast_start_factor=1.0,
+        fast_stop=PROBE_STEPS + 1,
         max_gaussians=max(len(gaussians), config.max_gaussians or 0),
     )
     placed = gaussians.to(device_of(backend))

@@ -16,10 +16,8 @@ from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.data.watch import FileWatch
 from gsplat_edu.errors import DatasetError, NotEnoughMemoryError, SplatError
 from gsplat_edu.image_files import SPELLED, UNDECODABLE, opened_image, require_room
+from gsplat_edu.resizing import area_mean, premultiplied, smaller_mask, unweighted
 from gsplat_edu.views import Photo
-
-ALL_OF_IT = 0.9999
-"""A downscaled pixel counts if at least this fraction of its sources does: all, up to float32 rounding."""
 
 AT_ONCE = 64_000_000
 """Pixels to decode at once; decoding takes about 10 bytes per pixel, and 25 more if alpha is resampled."""
@@ -118,19 +116,17 @@ def load_photo(source: PhotoFile) -> Photo:
         image, alpha = np.asarray(Photo(image, alpha).over(source.background)), None
     if not source.lens.distorts and (source.W, source.H) == (source.lens.W, source.lens.H):
         return Photo(image, alpha, mask)
-    if alpha is not None:  # premultiplied float32, since transparent pixels have no colour to interpolate
-        share = alpha[..., None].astype(np.float32) / 255.0
-        image = np.concatenate([image * share, 255.0 * share], axis=2)
+    if alpha is not None:
+        image = premultiplied(image, alpha)
     if source.lens.distorts:
         try:
             image, mask = _undistorted(image, mask, source.lens)
         except DatasetError as error:
             raise DatasetError(f"{source.path}: {error}") from None
-    if image.shape[:2] != (source.H, source.W):
-        image = cv2.resize(image, (source.W, source.H), interpolation=cv2.INTER_AREA)
+    image = area_mean(image, source.W, source.H)
     if alpha is not None:
-        image, alpha = _unweighted(image)
-    return Photo(image, alpha, None if mask is None else _smaller_mask(mask, source.W, source.H))
+        image, alpha = unweighted(image)
+    return Photo(image, alpha, None if mask is None else smaller_mask(mask, source.W, source.H))
 
 
 class ImageStore:
@@ -208,25 +204,6 @@ def _undistorted(
     if mask is not None:
         return image, counts
     return image, None if counts.all() else counts
-
-
-def _unweighted(
-    weighted: Float32[np.ndarray, "h w 4"],
-) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    """Convert premultiplied colour and alpha to 8-bit colour and alpha."""
-    color = weighted[..., :3] / np.maximum(weighted[..., 3:] / 255.0, 1e-6)
-    return (
-        np.clip(np.round(color), 0, 255).astype(np.uint8),
-        np.clip(np.round(weighted[..., 3]), 0, 255).astype(np.uint8),
-    )
-
-
-def _smaller_mask(mask: Bool[np.ndarray, "H W"], W: int, H: int) -> Bool[np.ndarray, "h w"]:
-    if mask.shape == (H, W):
-        return mask
-    shares = cv2.resize(mask.astype(np.float32), (W, H), interpolation=cv2.INTER_AREA)
-    counts: Bool[np.ndarray, "h w"] = shares >= ALL_OF_IT
-    return counts
 
 
 def _undecodable(path: Path, error: BaseException) -> SplatError:

@@ -1,10 +1,10 @@
 """The settings of a training, each with its meaning and source.
 
-The defaults are those of Kerbl et al. 2023's code ("2023" below), and of Kheradmand et al. 2024 for the strategy mcmc.
-Iterations count from 0: "at iteration i" means with or after step i + 1.
+The defaults are those of Kerbl et al. 2023's code ("2023" below), and of Kheradmand et al. 2024 for the strategy mcmc;
+those of the strategy fast are ours. Iterations count from 0: "at iteration i" means with or after step i + 1.
 
-`TrainConfig` holds the settings common to all runs; `AdcConfig` and `McmcConfig` hold those of one strategy. Options,
-config.json and docs/RECIPE.md use one flat list of them, `SETTINGS`, made from the metadata of the fields.
+`TrainConfig` holds the settings common to all runs; `AdcConfig`, `McmcConfig` and `FastConfig` hold those of one
+strategy. Options, config.json and docs/RECIPE.md use one flat list of them, `SETTINGS`, made from the fields' metadata.
 """
 
 from __future__ import annotations
@@ -23,13 +23,19 @@ RECIPE_ITERATIONS = 30_000
 SHORT_RUN = 3_000
 """Runs shorter than this do not reset opacities: there is no time to recover."""
 
-STRATEGIES = ("adc", "mcmc", "none")
+STRATEGIES = ("adc", "mcmc", "fast", "none")
 OVER_CAP = ("strongest", "cut")
 VIEW_ORDERS = ("shuffled", "random")
 
 FROM_SCENE = {"means_rate": 1.6e-5, "sh_every": 0}
 """Defaults of a run that starts from a trained scene. Its Gaussians are nearly in place, so the means' rate starts at
 the geometric mean of the recipe's initial and final rates. Its harmonics are trained, so all of them are in use."""
+
+FOR_FAST = {"sh_every": 3_000}
+"""Defaults of the strategy fast for 30,000 iterations, where they differ from those of the others."""
+
+QUALITIES = {"draft": 1_000, "standard": 3_000, "high": 10_000}
+"""Iterations of the fast recipe by the name of its quality."""
 
 Check = Callable[[str, Any], object]
 """Raises an `ArgumentError` that names the setting if a value is out of range."""
@@ -57,6 +63,10 @@ def _not_negative(name: str, value: float) -> None:
 
 def _fraction(name: str, value: float) -> None:
     in_range(name, value, 0.0, 1.0)
+
+
+def _share(name: str, value: float) -> None:
+    in_range(name, value, 0.0, 1.0, open_low=True)
 
 
 def _opacity(name: str, value: float) -> None:
@@ -184,11 +194,47 @@ class McmcConfig:
 
 @_documented
 @dataclass(frozen=True)
+class FastConfig:
+    """Settings of the fast recipe: small photos first, a planned number of Gaussians, rates that fall to the end."""
+
+    start_factor: float = _number(
+        4.0,
+        _at_least_1,
+        "Divisor of the photos' size at the start; it falls by sqrt 2 per step, each equally long, to 1.",
+        "DashGaussian",
+    )
+    full_size: int = _number(
+        18_000, _whole(0), "Iteration from which photos have their full size.", "ours", milestone=True
+    )
+    stop: int = _number(
+        18_000,
+        _whole(0),
+        "The planned number of Gaussians is reached at this iteration.",
+        "ours",
+        milestone=True,
+    )
+    decay_start: int = _number(
+        21_000,
+        _whole(0),
+        "Iteration at which all rates but the means' begin to fall.",
+        "ours",
+        milestone=True,
+    )
+    decay: float = _number(
+        0.1,
+        _share,
+        "Factor on these rates once the means' rate is final; log-linear between.",
+        "ours",
+    )
+
+
+@_documented
+@dataclass(frozen=True)
 class TrainConfig:
     """One training run; see `recipe` for runs of other lengths than 30,000 iterations.
 
-    `adc` and `mcmc` hold the settings of the two strategies; only those of `strategy` are used. A value out of range
-    raises an `ArgumentError` that names it.
+    `adc`, `mcmc` and `fast` hold the settings of the strategies; only those of `strategy` are used. A value out of
+    range raises an `ArgumentError` that names it.
     """
 
     iterations: int = _number(
@@ -267,9 +313,12 @@ class TrainConfig:
     strategy: str = _number(
         "adc",
         _one_of(STRATEGIES),
-        '"adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "none" keeps the number of Gaussians.',
+        '"adc": clone, split, prune, reset; "mcmc": relocate, grow, add noise; "fast": small photos first, split by'
+        ' score up to a planned number; "none" keeps the number of Gaussians.',
     )
-    max_gaussians: int | None = _number(None, _cap, "Cap on the number of Gaussians; mcmc requires one.")
+    max_gaussians: int | None = _number(
+        None, _cap, "Cap on the number of Gaussians; mcmc and fast require one."
+    )
     densify_start: int = _number(
         500, _whole(0), "Density control begins after this iteration.", "2023, 2024", milestone=True
     )
@@ -282,18 +331,19 @@ class TrainConfig:
     min_opacity: float = _number(
         0.005,
         _fraction,
-        "adc prunes Gaussians below this opacity, mcmc relocates them.",
+        "adc and fast prune Gaussians below this opacity, mcmc relocates them.",
         "2023, 2024",
     )
     adc: AdcConfig = AdcConfig()
     mcmc: McmcConfig = McmcConfig()
+    fast: FastConfig = FastConfig()
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         values = self.flat()
         for setting in SETTINGS:
             setting.check(setting.name, values[setting.name])
-        stop = {"adc": "densify_stop", "mcmc": "mcmc_stop"}.get(self.strategy)
+        stop = {"adc": "densify_stop", "mcmc": "mcmc_stop", "fast": "fast_stop"}.get(self.strategy)
         if stop is not None:
             whole_number(stop, values[stop], self.densify_start)
 
@@ -312,7 +362,7 @@ class TrainConfig:
         Raises:
             ArgumentError: a value is out of range, or a setting is unknown.
         """
-        parts: dict[str | None, dict[str, Any]] = {None: {}, "adc": {}, "mcmc": {}}
+        parts: dict[str | None, dict[str, Any]] = {None: {}, "adc": {}, "mcmc": {}, "fast": {}}
         by_name = {setting.name: setting for setting in SETTINGS}
         for name, value in changes.items():
             one_of("field", name, list(by_name))
@@ -321,6 +371,7 @@ class TrainConfig:
             self,
             adc=dataclasses.replace(self.adc, **parts["adc"]),
             mcmc=dataclasses.replace(self.mcmc, **parts["mcmc"]),
+            fast=dataclasses.replace(self.fast, **parts["fast"]),
             **parts[None],
         )
 
@@ -349,7 +400,7 @@ class Setting:
     """A setting, as used by the command line, config.json and docs/RECIPE.md.
 
     Args:
-        name: Flat name: the field's name, with the prefix "mcmc_" for `McmcConfig`.
+        name: Flat name: the field's name, with the prefix "mcmc_" for `McmcConfig` and "fast_" for `FastConfig`.
         field: The field's name in its class.
         strategy: The only strategy that uses it; None for the settings of `TrainConfig` itself.
         default: Its default for 30,000 iterations.
@@ -387,12 +438,13 @@ SETTINGS: tuple[Setting, ...] = (
     *_settings(TrainConfig, None),
     *_settings(AdcConfig, "adc"),
     *_settings(McmcConfig, "mcmc", "mcmc_"),
+    *_settings(FastConfig, "fast", "fast_"),
 )
 """All settings of a training."""
 
 ONLY_FOR = {
     strategy: tuple(setting.name for setting in SETTINGS if setting.strategy == strategy)
-    for strategy in ("adc", "mcmc")
+    for strategy in ("adc", "mcmc", "fast")
 }
 """Settings that only one strategy uses."""
 
@@ -415,11 +467,12 @@ def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **chang
         ArgumentError: a value is out of range, or a setting is unknown.
     """
     whole_number("iterations", iterations, 1)
-    scaled: dict[str, Any] = {}
+    scaled: dict[str, Any] = dict(FOR_FAST) if changes.get("strategy") == "fast" else {}
     if rescale:
         for setting in SETTINGS:
             if setting.milestone:
-                scaled[setting.name] = max(1, round(setting.default * iterations / RECIPE_ITERATIONS))
+                full = scaled.get(setting.name, setting.default)
+                scaled[setting.name] = max(1, round(full * iterations / RECIPE_ITERATIONS))
     if iterations < SHORT_RUN:
         scaled["reset_every"] = 0
     return TrainConfig().changed(**{"iterations": iterations, **scaled, **changes})

@@ -19,6 +19,12 @@ from gsplat_edu.views import Photo, View
 DEVICE_SHARE = 0.25
 """Fraction of the GPU memory free at the start of training that photos may use. The rest is for the Gaussians."""
 
+SMALLEST_SIDE = 32
+"""Photos are not reduced below this side, px: SSIM's window has 11."""
+
+REDUCED_ROOM = 1 << 29
+"""Bytes of photos of reduced size that are kept in memory; others are downscaled again for each use."""
+
 CPU = torch.device("cpu")
 
 Color = tuple[float, float, float]
@@ -82,15 +88,36 @@ class ViewFeed:
         device: torch.device = CPU,
         room: int | None = None,
     ) -> None:
-        self.views, self._order = tuple(views), order
+        self.views = self._full = tuple(views)
+        self._factor, self._order = 1.0, order
+        self._shortest = min(min(view.camera.W, view.camera.H) for view in self._full)
         self._background, self._device = background, device
         self._generator = np.random.default_rng(seed)
         self._queue: list[int] = []
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="photo")
         self._ahead: tuple[int, Future[Photo]] | None = None
         self._flat: dict[View, Photo] = {}
+        self._flat_room = 0
         self._kept: dict[View, Target] = {}
         self._room = _free_bytes(device) if room is None else room
+
+    def use_factor(self, factor: float) -> None:
+        """Give the views with width and height divided by a factor from now on; the order of the draws stays.
+
+        No side is reduced below `SMALLEST_SIDE`. Photos of reduced size are kept in memory up to `REDUCED_ROOM`.
+
+        Args:
+            factor: At least 1.
+        """
+        factor = max(min(factor, self._shortest / SMALLEST_SIDE), 1.0)
+        if factor == self._factor:
+            return
+        if self._ahead is not None:
+            self._ahead[1].exception()  # waits: the thread must not add to the cache any more
+        self._factor, self.views = factor, tuple(view.scaled(factor) for view in self._full)
+        self._room += sum(target.nbytes for target in self._kept.values())
+        self._ahead, self._flat, self._kept = None, {}, {}
+        self._flat_room = REDUCED_ROOM
 
     def next(self) -> Draw:
         """Draw a view, and start reading the photo of the next one. If reading fails, the view remains due."""
@@ -108,14 +135,18 @@ class ViewFeed:
         return Draw(index, view, photo)
 
     def _read(self, view: View) -> Photo:
-        """Read a photo and composite it over a fixed background; the result for a photo in memory is cached."""
-        photo = self._flat.get(view) or view.read()
-        if photo.alpha is None or self._background is None:
-            return photo
-        flat = Photo(photo.over(self._background), mask=photo.mask)
-        if not view.on_disk:
-            self._flat[view] = flat
-        return flat
+        """Read a photo and composite it over a fixed background; cache it if it was in memory or is of reduced size."""
+        if view in self._flat:
+            return self._flat[view]
+        photo = view.read()
+        if photo.alpha is not None and self._background is not None:
+            photo = Photo(photo.over(self._background), mask=photo.mask)
+            if not view.on_disk:
+                self._flat[view] = photo
+        if self._factor > 1.0 and photo.nbytes <= self._flat_room:
+            self._flat[view] = photo
+            self._flat_room -= photo.nbytes
+        return photo
 
     def target(self, draw: Draw, background: Color) -> Target:
         """Move the target of a draw to the Gaussians' device; cache it there if it is constant and fits.

@@ -14,6 +14,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.base import DensityStrategy
+from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
@@ -131,11 +132,13 @@ def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> D
         gaussians: The start Gaussians.
 
     Raises:
-        ArgumentError: the strategy is mcmc and there is no cap.
+        ArgumentError: the strategy is mcmc or fast and there is no cap.
     """
     generator = torch.Generator().manual_seed(config.seed)
     if config.strategy == "adc":
         return AdaptiveDensityControl(config, extent, generator, gaussians)
+    if config.strategy == "fast":
+        return PlannedDensity(config, generator, gaussians)
     return MCMC(config, generator) if config.strategy == "mcmc" else None
 
 

@@ -1,8 +1,9 @@
-"""Schedules: the means' learning rate and the degree of the harmonics."""
+"""Schedules: the learning rates, the degree of the harmonics and the size of the photos."""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 
 from gsplat_edu.train.config import TrainConfig
@@ -16,7 +17,10 @@ def gaussian_groups(config: TrainConfig, extent: float) -> dict[str, ParameterGr
         config: Rates, eps and the schedule of the means.
         extent: Size of the scene, world units.
     """
-    rates: dict[str, float | Callable[[int], float]] = dict(config.learning_rates)
+    rates: dict[str, float | Callable[[int], float]] = {
+        name: functools.partial(decayed_rate, config, rate) if config.strategy == "fast" else rate
+        for name, rate in config.learning_rates.items()
+    }
     rates["means"] = functools.partial(means_rate, config, extent)
     return {name: ParameterGroup(rate, eps=config.adam_eps) for name, rate in rates.items()}
 
@@ -36,6 +40,37 @@ def means_rate(config: TrainConfig, extent: float, iteration: int) -> float:
         return extent * start
     t = min(iteration / config.means_rate_iterations, 1.0)
     return float(extent * start * (end / start) ** t)
+
+
+def decayed_rate(config: TrainConfig, rate: float, iteration: int) -> float:
+    """Return a rate of the fast recipe: constant, then log-linear down to `decay` of it where the means' is final.
+
+    Args:
+        config: The run.
+        rate: The constant rate.
+        iteration: Counted from 0.
+    """
+    start = config.fast.decay_start
+    if iteration <= start:
+        return rate
+    t = (iteration - start) / max(config.means_rate_iterations - start, 1)
+    return float(rate * config.fast.decay ** min(t, 1.0))
+
+
+def photo_factor(config: TrainConfig, iteration: int) -> float:
+    """Return the divisor of the photos' width and height: above 1 only early in the fast recipe.
+
+    start_factor / sqrt(2)^k, at least 1, with k rising by 1 in each of equally long steps until `full_size`.
+
+    Args:
+        config: The run.
+        iteration: Counted from 0.
+    """
+    start, full_size = config.fast.start_factor, config.fast.full_size
+    if config.strategy != "fast" or iteration >= full_size:
+        return 1.0
+    steps = math.ceil(2 * math.log2(start) - 1e-9)  # until the factor is 1
+    return float(max(start * 0.5 ** (steps * iteration // full_size / 2), 1.0))
 
 
 def sh_degree(config: TrainConfig, iteration: int) -> int:

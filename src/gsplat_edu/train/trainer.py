@@ -30,7 +30,7 @@ from gsplat_edu.train.feed import Draw, ViewFeed
 from gsplat_edu.train.objective import PHOTO, Objective, Rendered, make_objective, sum_of_scalars
 from gsplat_edu.train.optimizer import MOMENTS, Adam
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_tensor_kind, check_whole
-from gsplat_edu.train.schedule import gaussian_groups, sh_degree
+from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
 from gsplat_edu.train.view_model import Identity, ViewModel
 from gsplat_edu.views import View
 
@@ -221,6 +221,7 @@ class Trainer:
 
     def _step(self) -> StepEvent:
         """Take one step: gradients of the views, reduce, apply."""
+        self._feed.use_factor(photo_factor(self.config, self.iteration))
         iteration, draws = self.iteration, self._draw()
         if len(draws) == 1 and self.fuses:
             terms = self._fused_step(draws[0])

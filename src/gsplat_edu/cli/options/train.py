@@ -14,6 +14,7 @@ from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.train.config import (
     FROM_SCENE,
     ONLY_FOR,
+    QUALITIES,
     RECIPE_ITERATIONS,
     SETTINGS,
     STRATEGIES,
@@ -21,6 +22,7 @@ from gsplat_edu.train.config import (
     TrainConfig,
     recipe,
 )
+from gsplat_edu.validation import one_of
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
 
@@ -28,7 +30,17 @@ FOR_POINTS = ("start_opacity", "start_scale", "mcmc_start_opacity", "mcmc_start_
 """Settings that only a start from points uses."""
 
 COMMON = (
-    *("out", "resume", "scene", "iterations", "time_limit", "max_memory", "strategy", "max_gaussians"),
+    *(
+        "out",
+        "resume",
+        "scene",
+        "iterations",
+        "time_limit",
+        "max_memory",
+        "strategy",
+        "quality",
+        "max_gaussians",
+    ),
     *("resolution", "test_every", "white_background", "antialiased", "seed", "backend", "debug"),
     *("eval_every", "save_every", "export", "view"),
 )
@@ -121,7 +133,18 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--strategy", metavar="NAME", default="adc", help=f"density control: {names} (default: adc)"
     )
-    _add_number(group, "--max-gaussians", "cap on the number of Gaussians (default: none; mcmc requires one)")
+    lengths = ", ".join(f"{name} {count:,}" for name, count in QUALITIES.items())
+    group.add_argument(
+        "--quality",
+        metavar="NAME",
+        help=f"length of --strategy fast in iterations: {lengths} (default: standard, unless --iterations or"
+        " --time-limit is given)",
+    )
+    _add_number(
+        group,
+        "--max-gaussians",
+        "cap on the number of Gaussians (default: none; mcmc requires one, fast plans one from the capture)",
+    )
 
 
 def _add_results(group: argparse._ArgumentGroup) -> None:
@@ -288,11 +311,29 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
             flag = f"--{idle[0].replace('_', '-')}"
             raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
         changes = FROM_SCENE | changes
-    iterations = RECIPE_ITERATIONS if arguments.iterations is None else arguments.iterations
+    iterations = _length(arguments)
     config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
     if config.strategy == "mcmc" and config.max_gaussians is None and not planned:
         raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
     return config
+
+
+def _length(arguments: argparse.Namespace) -> int:
+    """Return the iterations: those given, those of the quality, or the recipe's."""
+    fast, quality = arguments.strategy == "fast", arguments.quality
+    if quality is not None:
+        one_of("--quality", quality, tuple(QUALITIES))
+        if not fast:
+            raise ArgumentError(
+                "--quality: is the length of --strategy fast; leave it out or choose that strategy"
+            )
+        if arguments.iterations is not None or arguments.time_limit is not None:
+            raise ArgumentError(
+                "--quality: --iterations or --time-limit already says how long; leave one of them out"
+            )
+    if arguments.iterations is not None:
+        return int(arguments.iterations)
+    return QUALITIES[quality or "standard"] if fast else RECIPE_ITERATIONS
 
 
 def _starts_from_scene(arguments: argparse.Namespace) -> bool:

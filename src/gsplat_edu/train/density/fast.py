@@ -1,0 +1,134 @@
+"""Density control of the fast recipe: a planned number of Gaussians, splits drawn by score, no resets.
+
+The number of Gaussians follows a plan from that of the start to the cap. Each time, parents are drawn without
+replacement in proportion to their score and split along their longest axis, which leaves the image nearly unchanged.
+Gaussians that became too faint to see are removed, and the plan replaces them where the score is high.
+
+Its settings are in `gsplat_edu.train.config`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.density.base import State
+from gsplat_edu.train.density.surgery import long_axis_children, replace
+from gsplat_edu.train.events import Change, DensifyEvent
+from gsplat_edu.train.optimizer import Adam
+from gsplat_edu.train.saved import (
+    check_entries,
+    check_flag,
+    check_statistics,
+    check_torch_generator,
+    check_whole,
+)
+
+STATISTICS = ("norm_sums", "times_visible")
+"""Statistics collected for each Gaussian since the last densification."""
+
+
+class PlannedDensity:
+    """Split the Gaussians that need it most, as many as the plan asks for; prune faint ones.
+
+    score = mean over the views that show it of the gradient norm of the mean in the image
+
+    Args:
+        config: Window, interval and cap.
+        generator: Source of the draws.
+        gaussians: The start Gaussians.
+
+    Raises:
+        ArgumentError: there is no cap.
+    """
+
+    def __init__(self, config: TrainConfig, generator: torch.Generator, gaussians: Gaussians) -> None:
+        if config.max_gaussians is None:
+            raise ArgumentError(
+                "max_gaussians: the strategy fast grows to a planned number and needs it, for example 100000"
+            )
+        self.config, self.generator, self.cap = config, generator, config.max_gaussians
+        self.start_count, self.is_over = len(gaussians), False
+        self._forget(gaussians)
+
+    def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
+        """Add this view's gradient norms to the sums of the Gaussians it shows."""
+        if self.is_over:
+            return
+        norms = output.means2d_grad_norms()
+        self.norm_sums.index_add_(0, output.visible, norms)
+        self.times_visible.index_add_(0, output.visible, torch.ones_like(norms))
+
+    def planned_count(self, iteration: int) -> int:
+        """Return the planned number of Gaussians: linear from the start's at `densify_start` to the cap at `stop`."""
+        config = self.config
+        window = max(config.fast.stop - config.densify_start, 1)
+        t = min(max((iteration - config.densify_start) / window, 0.0), 1.0)
+        return round(self.start_count + (self.cap - self.start_count) * t)
+
+    @torch.no_grad()
+    def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
+        """Prune, and split up to the plan, when the schedule says so."""
+        config = self.config
+        self.is_over = iteration >= config.fast.stop
+        if iteration <= config.densify_start or iteration % config.densify_every:
+            return gaussians, []
+        keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
+        room = self.planned_count(iteration) - int(keep.sum()) if iteration <= config.fast.stop else 0
+        split = self._drawn(keep, room)
+        children = long_axis_children(gaussians.map(lambda tensor: tensor[split]))
+        replaced = replace(gaussians, optimizer, keep & ~split, children)
+        self._forget(replaced)
+        counts = 2 * len(children[0]), int((~keep).sum())
+        return replaced, [DensifyEvent(iteration, 0, *counts, num_gaussians=len(replaced))]
+
+    def _drawn(self, keep: Bool[Tensor, " N"], count: int) -> Bool[Tensor, " N"]:
+        """Draw parents without replacement, with probabilities proportional to the score.
+
+        log score - log(-log u) with u uniform is a Gumbel variable; the largest `count` are such a draw.
+        """
+        score = self._score()
+        candidates = torch.nonzero(keep & (score > 0))[:, 0]
+        uniform = torch.rand(len(keep), generator=self.generator, dtype=torch.float64)
+        uniform = uniform.clamp(min=torch.finfo(torch.float64).tiny).to(keep.device)[candidates]
+        keys = torch.log(score[candidates].double()) - torch.log(-torch.log(uniform))
+        order = torch.argsort(keys, descending=True, stable=True)
+        drawn = torch.zeros_like(keep)
+        drawn[candidates[order[: max(count, 0)]]] = True
+        return drawn
+
+    def _score(self) -> Float[Tensor, " N"]:
+        return self.norm_sums / self.times_visible.clamp(min=1)
+
+    def _forget(self, gaussians: Gaussians) -> None:
+        self.norm_sums = torch.zeros_like(gaussians.logit_opacities, requires_grad=False)
+        self.times_visible = torch.zeros_like(self.norm_sums)
+
+    def state(self) -> State:
+        """Return the statistics since the last densification, the generator and the number at the start."""
+        statistics = {name: getattr(self, name) for name in STATISTICS}
+        return statistics | {"generator": self.generator.get_state()}, {
+            "start_count": self.start_count,
+            "is_over": self.is_over,
+        }
+
+    def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any], gaussians: Gaussians) -> None:
+        """Restore what `state` returned; see `DensityStrategy.load_state`."""
+        check_entries("density", tensors, (*STATISTICS, "generator"))
+        statistics = {name: tensors[name] for name in STATISTICS}
+        check_statistics(statistics, gaussians.logit_opacities)
+        check_torch_generator("density.generator", tensors["generator"], self.generator)
+        given = check_entries("density", numbers, ("start_count", "is_over"))
+        start_count = check_whole("density: start_count", given["start_count"], self.cap)
+        self.is_over = check_flag("density: is_over", given["is_over"])
+        self.start_count = start_count
+        self.generator.set_state(tensors["generator"])
+        for name, tensor in statistics.items():
+            setattr(self, name, tensor)
