@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float32, UInt8
 ALL_OF_IT = 0.9999
 """A downscaled pixel counts if at least this fraction of its sources does: all, up to float32 rounding."""
 
-Pixels = UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"]
 
-
-def area_mean(pixels: Pixels, W: int, H: int) -> Pixels:
+def area_mean(
+    pixels: UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"], W: int, H: int
+) -> UInt8[np.ndarray, "h w c"] | Float32[np.ndarray, "h w c"]:
     """Return an image at another size, of the same dtype; each pixel is the mean of the area it covers.
 
     Args:
