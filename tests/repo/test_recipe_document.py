@@ -6,7 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from gsplat_edu.train.config import MILESTONES, ONLY_FOR, SETTINGS, AdcConfig, McmcConfig, TrainConfig
+from gsplat_edu.train.config import (
+    MILESTONES,
+    ONLY_FOR,
+    SETTINGS,
+    AdcConfig,
+    FastConfig,
+    McmcConfig,
+    TrainConfig,
+)
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs/RECIPE.md").read_text()
@@ -33,8 +41,13 @@ def test_a_changed_setting_makes_it_stale(tool, monkeypatch):
 
 def test_every_field_is_a_setting_with_a_meaning():
     """A field without metadata would have no option, no line in config.json and no row here."""
-    for kind, strategy in ((TrainConfig, None), (AdcConfig, "adc"), (McmcConfig, "mcmc")):
-        nested = {"adc", "mcmc"} if strategy is None else set()
+    for kind, strategy in (
+        (TrainConfig, None),
+        (AdcConfig, "adc"),
+        (McmcConfig, "mcmc"),
+        (FastConfig, "fast"),
+    ):
+        nested = {"adc", "mcmc", "fast"} if strategy is None else set()
         names = {field.name for field in dataclasses.fields(kind)} - nested
         found = {setting.field for setting in SETTINGS if setting.strategy == strategy}
         assert found == names and all(f"    {name}: " in kind.__doc__ for name in names)
@@ -43,9 +56,10 @@ def test_every_field_is_a_setting_with_a_meaning():
 
 
 def test_milestones_and_settings_of_one_strategy():
-    """Milestones are the settings that 2023 and 2024 give in iterations out of 30,000. Intervals are not milestones."""
+    """Milestones are the settings given in iterations out of 30,000. Intervals are not milestones."""
     assert set(MILESTONES) == {
-        *("means_rate_iterations", "sh_every", "densify_start", "densify_stop", "reset_every", "mcmc_stop")
+        *("means_rate_iterations", "sh_every", "densify_start", "densify_stop", "reset_every", "mcmc_stop"),
+        *("fast_full_size", "fast_stop", "fast_decay_start"),
     }
     assert "mcmc_growth" in ONLY_FOR["mcmc"] and "densify_stop" in ONLY_FOR["adc"]
     assert not {"densify_start", "min_opacity"} & {name for names in ONLY_FOR.values() for name in names}

@@ -80,17 +80,20 @@ def test_children_have_the_opacity_of_the_formula(logit):
 
 
 def test_a_split_changes_the_image_little():
-    """A faint ellipse keeps its light, summed over the image, to 1 %; no pixel changes by a tenth of its peak."""
+    """The light of two children is 2 o' / (sqrt(2) o) = 1.03 times their parent's at o = 0.18, less where they overlap.
+
+    The largest change is at the centre, one sigma' from each: 1 - (1 - o' e^(-1/2))^2 is 0.85 o.
+    """
     camera = orbit_camera(0.3, 0.2, 64, 80.0, 3.0)
     parent = random_ball(1, torch.Generator().manual_seed(0), torch.float64).map(torch.clone)
     parent.log_scales[0] = torch.log(torch.tensor([0.3, 0.12, 0.1]))
-    parent.logit_opacities.fill_(-3.0)
+    parent.logit_opacities.fill_(-1.5)
     before, after = (
         1 - RENDER(g, camera).transmittance
         for g in (parent, Gaussians.concatenated(long_axis_children(parent)))
     )
-    assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.01)
-    assert float((after - before).abs().max()) < 0.1 * float(before.max())
+    assert 1.0 < float(after.sum() / before.sum()) < 1.03
+    assert 0.14 < float((before - after).abs().max() / before.max()) < 0.16
 
 
 # The plan
