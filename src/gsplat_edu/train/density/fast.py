@@ -49,6 +49,8 @@ class PlannedDensity:
         ArgumentError: there is no cap.
     """
 
+    observes_renders_only = True
+
     def __init__(self, config: TrainConfig, generator: torch.Generator, gaussians: Gaussians) -> None:
         if config.max_gaussians is None:
             raise ArgumentError(
@@ -64,7 +66,7 @@ class PlannedDensity:
             return
         norms = output.means2d_grad_norms()
         self.norm_sums.index_add_(0, output.visible, norms)
-        self.times_visible.index_add_(0, output.visible, torch.ones_like(norms))
+        self.times_visible.index_add_(0, output.visible, norms.new_ones(1).expand(len(norms)))
 
     def planned_count(self, iteration: int) -> int:
         """Return the planned number of Gaussians: linear from the start's at `densify_start` to the cap at `stop`."""
