@@ -28,6 +28,7 @@ GROWING = ["--max-gaussians", "600", "--densify-start", "5", "--densify-every", 
 STRATEGIES = {
     "adc": ["--densify-stop", "150", "--grad-threshold", "1e-4", "--reset-every", "60"],
     "mcmc": ["--strategy", "mcmc", "--mcmc-stop", "150"],
+    "fast": ["--strategy", "fast", "--fast-full-size", "150", "--fast-start-factor", "1.5"],
 }
 
 

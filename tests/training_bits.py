@@ -44,8 +44,8 @@ SCHEDULE = {"densify_start": 5, "densify_every": 10, "densify_stop": 100, "mcmc_
 CAPTURE, SPHERE = functools.cache(procedural_capture), functools.cache(sphere_capture)
 
 
-def train_capture(config, events) -> tuple[Trainer, TrainResult]:
-    views, points, colors = CAPTURE(40, 6, splats=120)
+def train_capture(config, events, size=40) -> tuple[Trainer, TrainResult]:
+    views, points, colors = CAPTURE(size, 6, splats=120)
     start = from_points(points, colors, config)
     density = make_strategy(config, 2.0, start)
     watch = [lambda _, event: events.append(event)]
@@ -65,6 +65,12 @@ def train_mcmc(events):
     return train_capture(recipe(120, strategy="mcmc", **numbers, **SCHEDULE), events)
 
 
+def train_fast(events):
+    """Photos of 43, 48, 68 and 96 px, a planned number of Gaussians with pruning on the way, and rates that fall."""
+    numbers = {"max_gaussians": 200, "min_opacity": 0.05, "densify_start": 5, "densify_every": 10}
+    return train_capture(recipe(120, strategy="fast", **numbers), events, size=96)
+
+
 def train_sphere(events):
     """A shorter version of the course's run, with more frequent densification and a cap that drops Gaussians."""
     config = course_config(iterations=120, max_gaussians=400)
@@ -78,7 +84,12 @@ def train_sphere(events):
     return trainer, trainer.run()
 
 
-CASES: dict[str, Callable] = {"adc": train_adc, "mcmc": train_mcmc, "sphere": train_sphere}
+CASES: dict[str, Callable] = {
+    "adc": train_adc,
+    "mcmc": train_mcmc,
+    "fast": train_fast,
+    "sphere": train_sphere,
+}
 
 
 def took_part(name: str, events: list) -> bool:
@@ -90,6 +101,8 @@ def took_part(name: str, events: list) -> bool:
     densified = any(event.num_cloned or event.num_split_children for event in changed)
     if name == "sphere":
         return densified
+    if name == "fast":
+        return densified and any(event.num_pruned for event in changed) and changed[-1].num_gaussians > 150
     resets = sum(isinstance(event, ResetEvent) for event in events)
     return densified and resets == 2 and any(event.num_pruned for event in changed)
 

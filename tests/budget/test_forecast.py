@@ -13,6 +13,7 @@ from gsplat_edu.budget.costs import (
     Measurements,
     Speed,
     expected_counts,
+    pixel_share,
     wanted_gaussians,
 )
 from gsplat_edu.budget.forecast import forecast, predict, spelled_bytes
@@ -25,7 +26,9 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import recipe
+from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
+from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.optimizer import Adam
 
 FACTS = Facts(
@@ -99,6 +102,34 @@ def test_mcmc_is_expected_to_grow_as_it_does():
         gaussians, _ = strategy.update(iteration, gaussians, optimizer)
     assert expected_counts(config, 100, 1e4).tolist() == counts
     assert counts[-1] == 135
+
+
+def test_fast_is_expected_to_grow_as_it_plans():
+    """The plan at every densification; between two of them the forecast interpolates."""
+    config = recipe(1_000, strategy="fast", max_gaussians=500, densify_every=20)
+    counts = expected_counts(config, 100, 1e4)
+    start = random_ball(100, torch.Generator().manual_seed(0))
+    control = PlannedDensity(config, torch.Generator(), start)
+    moments = range(0, 1_000, 20)
+    assert counts[list(moments)].tolist() == [control.planned_count(moment) for moment in moments]
+    assert (counts[0], counts[-1]) == (100, 500) and (np.diff(counts) >= 0).all()
+    assert (
+        wanted_gaussians(config, 100, 734_580, 85)
+        == 102_841
+        == 2 * wanted_gaussians(config, 9, 734_580, 21.25)
+    )
+
+
+def test_small_photos_are_cheaper_in_the_forecast():
+    """Over 60 % of the run, in four equal steps, an image has 1/16, 1/8, 1/4 and 1/2 of its pixels."""
+    config = recipe(1_000, strategy="fast", max_gaussians=FACTS.points)
+    share = 0.15 * (1 / 16 + 1 / 8 + 1 / 4 + 1 / 2) + 0.4
+    assert pixel_share(config) == pytest.approx(share, rel=1e-12) and pixel_share(PLAIN) == 1.0
+    found, full = predict(FACTS, MEASURED, config), predict(FACTS, MEASURED, recipe(1_000, strategy="none"))
+    saved = (1 - share) * MEASURED.speed.per_pixel * FACTS.pixels
+    assert full.seconds["training"] - found.seconds["training"] == pytest.approx(1_000 * saved)
+    assert full.steps[0] - found.steps[0] == pytest.approx(15 / 16 * MEASURED.speed.per_pixel * FACTS.pixels)
+    assert found.steps[1] == full.steps[1]
 
 
 def test_the_time_of_a_run_is_the_sum_of_its_parts():
@@ -204,10 +235,10 @@ def test_facts_of_a_capture(capture):
     assert facts.photo_bytes == 10 * 36 * 27 * 3 and facts.points == len(full.points)
 
 
-@pytest.mark.parametrize("strategy", ["adc", "mcmc", "none"])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", "fast", "none"])
 def test_a_probe_of_a_capture_gives_numbers_and_changes_nothing(capture, strategy):
     dataset = load_dataset(capture)
-    config = recipe(500, strategy=strategy, max_gaussians=400 if strategy == "mcmc" else None)
+    config = recipe(500, strategy=strategy, max_gaussians=400 if strategy in ("mcmc", "fast") else None)
     before = dataset.points.copy()
     measured = probe(dataset, config)
     assert measured.backend == "cpu" and measured.pairs > 0 and measured.noise >= 1.0

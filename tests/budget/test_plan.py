@@ -18,7 +18,7 @@ from gsplat_edu.budget.probe import resident_bytes
 from gsplat_edu.cli.arguments import bytes_text, seconds_text
 from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from
-from gsplat_edu.data.dataset import DataSettings
+from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import ArgumentError, CheckpointError
@@ -79,7 +79,7 @@ def peak(found):
     return footprint.peak(found.max_gaussians, found.image_memory)
 
 
-@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", "fast"])
 def test_memory_holds_for_any_limit_and_more_memory_is_never_worse(strategy):
     plans = [
         chosen(limit, strategy=strategy) for limit in (560, 640, 800, 1_024, 1_500, 2_048, 4_096, 16_384)
@@ -250,6 +250,28 @@ def test_a_start_scene_is_planned_with_its_own_gaussians(strategy, limits, captu
     assert len(CaptureRun(found.options).trainer.gaussians) == 5_000
 
 
+def test_the_fast_recipe_plans_its_number_without_limits_and_a_resumed_run_keeps_it(capture, tmp_path):
+    """As many as the pixels and views ask for, at least those of a start scene; a given number stays."""
+    run = dataclasses.replace(options(capture, tmp_path / "run", 20), config=recipe(20, strategy="fast"))
+    found = plan(run, Limits())
+    dataset = load_dataset(capture)
+    views = len(dataset.train)
+    pixels = dataset.train[0].camera.W * dataset.train[0].camera.H
+    assert found.max_gaussians == round(0.14 * pixels * (views / 85) ** 0.5) and found.iterations == 20
+    assert found.sentences == (
+        f"the recipe plans {found.max_gaussians:,} Gaussians; --max-gaussians changes that",
+    )
+    trained(CaptureRun(found.options))
+    again = plan(dataclasses.replace(run, resume=True), Limits())
+    assert again.max_gaussians == found.max_gaussians and is_finished(again.options)
+    scene = tmp_path / "scene.ply"
+    save_ply(scene, random_ball(5_000, torch.Generator().manual_seed(0)))
+    other = dataclasses.replace(run, scene=scene, out=tmp_path / "other")
+    assert plan(other, Limits()).max_gaussians == 5_000
+    fixed = dataclasses.replace(other, config=recipe(20, strategy="fast", max_gaussians=7_000))
+    assert plan(fixed, Limits()).options == fixed and not plan(fixed, Limits()).sentences
+
+
 def test_a_start_scene_that_does_not_fit_is_refused(capture, tmp_path):
     """The capture's points would fit this limit, at least in part. The far larger start scene does not."""
     scene = tmp_path / "scene.ply"
@@ -376,7 +398,7 @@ def test_flags_include_milestones_that_differ_from_the_recipe():
 RUN = """
 import sys
 from pathlib import Path
-from gsplat_edu.data.dataset import DataSettings
+from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.runs.training import CaptureRun, RunOptions
 from gsplat_edu.train.config import recipe

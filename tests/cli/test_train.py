@@ -10,8 +10,11 @@ from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
+from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.identity import check_options
 from gsplat_edu.runs.training import document
-from gsplat_edu.train.config import SETTINGS, TrainConfig, recipe
+from gsplat_edu.train.config import QUALITIES, SETTINGS, TrainConfig, recipe
 
 
 def parsed(words):
@@ -55,6 +58,34 @@ def test_the_other_strategies_and_colours():
     assert late.adc.densify_stop == 28_000, "the other strategy's window is not checked"
 
 
+def test_the_quality_is_the_length_of_the_fast_recipe():
+    lengths = {name: options("--strategy", "fast", "--quality", name).config.iterations for name in QUALITIES}
+    assert lengths == QUALITIES
+    assert (
+        options("--strategy", "fast").config == options("--strategy", "fast", "--quality", "standard").config
+    )
+    config = options("--strategy", "fast", "--iterations", "500").config
+    assert (config.iterations, config.fast.full_size, config.sh_every) == (500, 300, 50)
+    for words, said in (
+        (
+            ["--strategy", "fast", "--quality", "best"],
+            "--quality: is 'best', but has to be one of draft, standard, high",
+        ),
+        (["--quality", "high"], "--quality: is the length of --strategy fast"),
+        (
+            ["--strategy", "fast", "--quality", "high", "--iterations", "9"],
+            "--quality: --iterations or --time-limit",
+        ),
+        (
+            ["--strategy", "fast", "--quality", "high", "--time-limit", "9m"],
+            "--quality: --iterations or --time-limit",
+        ),
+        (["--fast-stop", "9"], "--fast-stop: only --strategy fast uses it"),
+    ):
+        with pytest.raises(ArgumentError, match=said):
+            options(*words)
+
+
 def test_every_field_of_the_recipe_has_an_option(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help-all"])
@@ -64,7 +95,7 @@ def test_every_field_of_the_recipe_has_an_option(capsys):
     assert "example: gsplat-edu train" in said
 
 
-def test_config_json_has_the_flat_names_of_older_runs():
+def test_config_json_has_the_flat_names_of_older_runs(tmp_path):
     """An `mcmc` config as written before settings were nested. Resuming compares configurations key by key."""
     older = {
         "iterations": 700, "seed": 0, "means_rate": 0.00016, "means_rate_final": 1.6e-06, "means_rate_iterations": 700,
@@ -78,7 +109,17 @@ def test_config_json_has_the_flat_names_of_older_runs():
         "mcmc_noise": 500000.0, "mcmc_opacity_weight": 0.01, "mcmc_scale_weight": 0.01,
     }  # fmt: skip
     words = "--iterations 700 --strategy mcmc --max-gaussians 90 --mcmc-growth 1.1 --white-background"
-    assert json.loads(json.dumps(document(options(*words.split()))["train"])) == older
+    found = json.loads(json.dumps(document(options(*words.split()))))
+    newer = {name for name in found["train"] if name.startswith("fast_")}
+    assert {name: value for name, value in found["train"].items() if name not in newer} == older
+    folder = RunFolder(tmp_path)
+    folder.write_config(found | {"train": older})
+    check_options(folder, found)
+    folder.write_config(found | {"train": {**older, "grad_threshold": 0.1}})
+    check_options(folder, found)
+    folder.write_config(found | {"train": {k: v for k, v in older.items() if k != "mcmc_noise"}})
+    with pytest.raises(CheckpointError, match="was started with mcmc_noise = None, not 500000.0"):
+        check_options(folder, found)
     config = TrainConfig().changed(**older | {"background": tuple(older["background"])})
     assert config == options(*words.split()).config and config.mcmc.growth == 1.1
 

@@ -28,7 +28,7 @@ def snapshot(trainer):
 
 @pytest.mark.sliced
 @pytest.mark.usefixtures("as_shipped")
-@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", "fast"])
 def test_damaged_checkpoints(tmp_path, strategy):
     make = Maker(strategy)
     trainer = make()

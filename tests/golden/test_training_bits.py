@@ -1,4 +1,4 @@
-"""Training gives the recorded bits: adc, mcmc and the sphere, on one thread and on two.
+"""Training gives the recorded bits: adc, mcmc, fast and the sphere, on one thread and on two.
 
 The hashes were recorded before the trainer was split into groups, objective and view model. They hold for one
 combination of instruction set, compiler and arithmetic of torch and NumPy (`training_bits.arithmetic`). The tests are

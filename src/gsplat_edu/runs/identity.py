@@ -14,6 +14,7 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.train.config import ONLY_FOR
 
 SAME = ("train", "render", "data")
 """Sections of config.json that must be equal in a resumed run."""
@@ -28,6 +29,8 @@ MOVED = 1e-9
 def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     """Compare the options of a resumed run with those it was started with.
 
+    Settings of strategies that the run does not use may differ; older versions lack those of newer strategies.
+
     Raises:
         CheckpointError: an option differs, or config.json is damaged; the message names the option.
     """
@@ -40,9 +43,11 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
             f"--resume: {folder.path} was started with iterations = {length}, not {wanted}: a run can be extended,"
             " not shortened; give at least as many, or stop it earlier with --time-limit"
         )
+    used = _section(folder, old, "train").get("strategy")
+    idle = {name for strategy, names in ONLY_FOR.items() if strategy != used for name in names}
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))
-        for key in sorted({*before, *now} - set(MAY_DIFFER.get(section, ()))):
+        for key in sorted({*before, *now} - idle - set(MAY_DIFFER.get(section, ()))):
             a, b = (_plain(values.get(key)) for values in (before, now))
             if a != b:
                 problem = f"--resume: {folder.path} was started with {key} = {a}, not {b}"
