@@ -127,6 +127,9 @@ def test_small_photos_are_cheaper_in_the_forecast():
     assert full.seconds["training"] - found.seconds["training"] == pytest.approx(1_000 * saved)
     assert full.steps[0] - found.steps[0] == pytest.approx(15 / 16 * MEASURED.speed.per_pixel * FACTS.pixels)
     assert found.steps[1] == full.steps[1]
+    assert found.memory["program"] - full.memory["program"] == FACTS.photo_bytes // 2, (
+        "photos of reduced size"
+    )
 
 
 def test_the_time_of_a_run_is_the_sum_of_its_parts():

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, Speed
+from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, Speed, reduced_bytes
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Request, choose, flags, plan, taken_up
@@ -74,8 +74,9 @@ def chosen(*arguments, **options):
 
 def peak(found):
     """The model's peak memory for a plan with all the Gaussians it allows."""
-    facts = FACTS.smaller(found.resolution or 1.0)
-    footprint = Footprint(facts, MEASURED.process, MEASURED.pairs, found.options.config.sh_degree)
+    facts, config = FACTS.smaller(found.resolution or 1.0), found.options.config
+    process = MEASURED.process + reduced_bytes(config, facts.photo_bytes)
+    footprint = Footprint(facts, process, MEASURED.pairs, config.sh_degree)
     return footprint.peak(found.max_gaussians, found.image_memory)
 
 

@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.feed import REDUCED_ROOM
 from gsplat_edu.train.schedule import photo_factor
 
 GROWTH = (0.005, 0.08)
@@ -28,7 +29,7 @@ several times as many."""
 
 PLANNED_SHARE = 0.14
 """fast: planned Gaussians per pixel of a photo, for `PLANNED_VIEWS` training views; the number grows with the square
-root of the views. For snowmiku97 this is 104,000."""
+root of the views. For snowmiku97 this is 102,200."""
 
 PLANNED_VIEWS = 85
 
@@ -204,9 +205,19 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
 
 
 def pixel_share(config: TrainConfig) -> float:
-    """Return the mean over the iterations of the fraction of a photo's pixels that are rendered."""
-    factors = [photo_factor(config, iteration) for iteration in range(config.iterations)]
-    return float(np.mean(1 / np.square(factors)))
+    """Return the mean over the iterations, or over a thousand of them, of the fraction of pixels that are rendered."""
+    some = range(0, config.iterations, max(config.iterations // 1_000, 1))
+    return float(np.mean([photo_factor(config, iteration) ** -2 for iteration in some]))
+
+
+def reduced_bytes(config: TrainConfig, photo_bytes: int) -> int:
+    """Return the memory that photos of reduced size take besides those of full size: at most half of it.
+
+    Args:
+        config: The run.
+        photo_bytes: Bytes of all photos at full size.
+    """
+    return min(REDUCED_ROOM, photo_bytes // 2) if photo_factor(config, 0) > 1.0 else 0
 
 
 def wanted_gaussians(config: TrainConfig, points: int, pixels: float, views: int = PLANNED_VIEWS) -> int:

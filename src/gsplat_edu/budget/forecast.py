@@ -6,7 +6,14 @@ from dataclasses import dataclass
 
 import torch
 
-from gsplat_edu.budget.costs import Facts, Footprint, Measurements, expected_counts, pixel_share
+from gsplat_edu.budget.costs import (
+    Facts,
+    Footprint,
+    Measurements,
+    expected_counts,
+    pixel_share,
+    reduced_bytes,
+)
 from gsplat_edu.budget.probe import probe
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.runs.training import RunOptions
@@ -109,7 +116,8 @@ def predict(
         pixels = facts.pixels / photo_factor(config, iteration) ** 2
         return speed.seconds(float(counts[iteration]), pixels) + reading_again
 
-    footprint = Footprint(facts, measured.process, measured.pairs, config.sh_degree)
+    process = measured.process + reduced_bytes(config, facts.photo_bytes)
+    footprint = Footprint(facts, process, measured.pairs, config.sh_degree)
     evaluations, saved = (last // every if every else 0 for every in (eval_every, save_every))
     saving = saving_seconds(float(counts.mean()), config.sh_degree)
     views = facts.train + facts.test

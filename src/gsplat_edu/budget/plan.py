@@ -12,7 +12,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, wanted_gaussians
+from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, reduced_bytes, wanted_gaussians
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import probe, resident_bytes
@@ -277,9 +277,9 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
     options = dataclasses.replace(request.options, config=config, data_settings=settings)
     facts = request.facts.smaller(choice.factor)
     found = Plan(options, request.by_time, _predicted(request, measured, choice, config))
-    at_cap = Footprint(facts, process, pairs, config.sh_degree).peak(
-        found.max_gaussians or 0, found.image_memory
-    )
+    at_cap = Footprint(
+        facts, process + reduced_bytes(config, facts.photo_bytes), pairs, config.sh_degree
+    ).peak(found.max_gaussians or 0, found.image_memory)
     return dataclasses.replace(found, sentences=_sentences(request, found, at_cap))
 
 
@@ -293,7 +293,8 @@ def _within_memory(
     aim, least = int(MEMORY_SHARE * limit), 0
     for factor in factors:
         facts = request.facts.smaller(factor)
-        footprint = Footprint(facts, process, pairs, request.options.config.sh_degree)
+        reduced = reduced_bytes(request.options.config, facts.photo_bytes)
+        footprint = Footprint(facts, process + reduced, pairs, request.options.config.sh_degree)
         config = request.config(iterations, factor, None)
         wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         if config.strategy == "none":

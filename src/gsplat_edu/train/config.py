@@ -37,6 +37,9 @@ FOR_FAST = {"sh_every": 3_000}
 QUALITIES = {"draft": 1_000, "standard": 3_000, "high": 10_000}
 """Iterations of the fast recipe by the name of its quality."""
 
+FAST_FROM_SCENE = {"fast_start_factor": 1.0}
+"""Further default of a fast run that starts from a trained scene: small photos would undo its detail."""
+
 Check = Callable[[str, Any], object]
 """Raises an `ArgumentError` that names the setting if a value is out of range."""
 

@@ -12,6 +12,7 @@ from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.train.config import (
+    FAST_FROM_SCENE,
     FROM_SCENE,
     ONLY_FOR,
     QUALITIES,
@@ -310,7 +311,7 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         if idle := [name for name in FOR_POINTS if name in changes]:
             flag = f"--{idle[0].replace('_', '-')}"
             raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
-        changes = FROM_SCENE | changes
+        changes = FROM_SCENE | (FAST_FROM_SCENE if arguments.strategy == "fast" else {}) | changes
     iterations = _length(arguments)
     config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
     if config.strategy == "mcmc" and config.max_gaussians is None and not planned:
