@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
@@ -22,6 +21,8 @@ def area_mean(
     """
     if pixels.shape[:2] == (H, W):
         return pixels
+    import cv2  # here, because the command line's options import views, and OpenCV takes long to import
+
     return np.asarray(cv2.resize(pixels, (W, H), interpolation=cv2.INTER_AREA))
 
 
@@ -53,6 +54,8 @@ def smaller_mask(mask: Bool[np.ndarray, "H W"], W: int, H: int) -> Bool[np.ndarr
     """Return a mask at another size: a pixel counts if all of its area does."""
     if mask.shape == (H, W):
         return mask
+    import cv2
+
     shares = cv2.resize(mask.astype(np.float32), (W, H), interpolation=cv2.INTER_AREA)
     counts: Bool[np.ndarray, "h w"] = shares >= ALL_OF_IT
     return counts
