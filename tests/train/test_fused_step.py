@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gains import Gains
 from gsplat_edu import ArgumentError
 from gsplat_edu.adam import adam_step
 from gsplat_edu.data.procedural import procedural_capture
@@ -14,7 +15,6 @@ from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.objective import MeanOpacity, MeanScale, Objective, PhotoTerm
-from gsplat_edu.train.optimizer import ParameterGroup
 from gsplat_edu.train.trainer import StepParts, Trainer
 from gsplat_edu.views import View
 
@@ -32,22 +32,6 @@ CASES = {
 @pytest.fixture(scope="module")
 def capture():
     return procedural_capture(24, 4, splats=60)
-
-
-class Gains:
-    """A view model: one brightness per view."""
-
-    def __init__(self, count):
-        self.gains = torch.ones(count).requires_grad_()
-
-    def parameters(self):
-        return {"gains": self.gains}
-
-    def groups(self):
-        return {"gains": ParameterGroup(0.02, eps=1e-8, per_gaussian=False)}
-
-    def __call__(self, index, image):
-        return image * self.gains[index]
 
 
 class Deferrals:

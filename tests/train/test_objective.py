@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 
+from gains import Gains
 from gsplat_edu import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.figures import run_curve_figures
@@ -15,28 +16,11 @@ from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, make_objective
-from gsplat_edu.train.optimizer import ParameterGroup
 from gsplat_edu.train.trainer import StepParts, Trainer
 from gsplat_edu.views import View
 
 CONFIG = recipe(40, densify_start=2, densify_every=5, grad_threshold=5e-5, sh_degree=0)
 MCMC = recipe(20, strategy="mcmc", max_gaussians=60, sh_degree=0)
-
-
-class Gains:
-    """A small but real view model: one brightness per view."""
-
-    def __init__(self, count):
-        self.gains = torch.ones(count).requires_grad_()
-
-    def parameters(self):
-        return {"gains": self.gains}
-
-    def groups(self):
-        return {"gains": ParameterGroup(0.02, eps=1e-8, per_gaussian=False)}
-
-    def __call__(self, index, image):
-        return image * self.gains[index]
 
 
 @pytest.fixture(scope="module")

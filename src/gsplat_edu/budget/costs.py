@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
-from gsplat_edu.train.schedule import photo_factor
+from gsplat_edu.train.schedule import photo_factor, planned_counts
 
 GROWTH = (0.005, 0.08)
 """adc: Gaussians added per densification, for each pixel of a photo and for each start point. The model gives 5,700 for
@@ -191,9 +191,7 @@ def expected_counts(config: TrainConfig, points: int, pixels: float) -> Int64[np
     cap = config.max_gaussians or sys.maxsize
     counts = np.full(config.iterations, min(points, cap), dtype=np.int64)
     if config.strategy == "fast":
-        window = max(config.fast.stop - config.densify_start, 1)
-        t = np.clip((np.arange(config.iterations) - config.densify_start) / window, 0.0, 1.0)
-        return np.rint(counts + (cap - counts) * t).astype(np.int64)
+        return planned_counts(config, int(counts[0]), cap, np.arange(config.iterations))
     stop = {"adc": config.adc.densify_stop, "mcmc": config.mcmc.stop}.get(config.strategy, 0)
     every = config.densify_every
     first, added = (config.densify_start // every + 1) * every, _added(points, pixels)

@@ -1,10 +1,13 @@
-"""Schedules: the learning rates, the degree of the harmonics and the size of the photos."""
+"""Schedules: learning rates, degree of the harmonics, size of the photos, planned number of Gaussians."""
 
 from __future__ import annotations
 
 import functools
 import math
 from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Int64
 
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.optimizer import ParameterGroup
@@ -71,6 +74,22 @@ def photo_factor(config: TrainConfig, iteration: int) -> float:
         return 1.0
     steps = math.ceil(2 * math.log2(start) - 1e-9)  # until the factor is 1
     return float(max(start * 0.5 ** (steps * iteration // full_size / 2), 1.0))
+
+
+def planned_counts(
+    config: TrainConfig, start: int, cap: int, iterations: Int64[np.ndarray, " n"]
+) -> Int64[np.ndarray, " n"]:
+    """Return the fast recipe's planned numbers of Gaussians: linear from the start's at `densify_start` to the cap.
+
+    Args:
+        config: The run; the cap is reached at `fast.stop`.
+        start: Number of start Gaussians.
+        cap: Number at the end.
+        iterations: (n,) counted from 0.
+    """
+    window = max(config.fast.stop - config.densify_start, 1)
+    t = np.clip((iterations - config.densify_start) / window, 0.0, 1.0)
+    return np.rint(start + (cap - start) * t).astype(np.int64)
 
 
 def sh_degree(config: TrainConfig, iteration: int) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -30,6 +31,7 @@ from gsplat_edu.train.saved import (
     check_torch_generator,
     check_whole,
 )
+from gsplat_edu.train.schedule import planned_counts
 
 STATISTICS = ("norm_sums", "times_visible")
 """Statistics collected for each Gaussian since the last densification."""
@@ -68,13 +70,6 @@ class PlannedDensity:
         self.norm_sums.index_add_(0, output.visible, norms)
         self.times_visible.index_add_(0, output.visible, norms.new_ones(1).expand(len(norms)))
 
-    def planned_count(self, iteration: int) -> int:
-        """Return the planned number of Gaussians: linear from the start's at `densify_start` to the cap at `stop`."""
-        config = self.config
-        window = max(config.fast.stop - config.densify_start, 1)
-        t = min(max((iteration - config.densify_start) / window, 0.0), 1.0)
-        return round(self.start_count + (self.cap - self.start_count) * t)
-
     @torch.no_grad()
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Prune, and split up to the plan, when the schedule says so."""
@@ -83,7 +78,8 @@ class PlannedDensity:
         if iteration <= config.densify_start or iteration % config.densify_every:
             return gaussians, []
         keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
-        room = self.planned_count(iteration) - int(keep.sum()) if iteration <= config.fast.stop else 0
+        planned = int(planned_counts(config, self.start_count, self.cap, np.array([iteration]))[0])
+        room = planned - int(keep.sum()) if iteration <= config.fast.stop else 0
         split = self._drawn(keep, room)
         children = long_axis_children(gaussians.map(lambda tensor: tensor[split]))
         replaced = replace(gaussians, optimizer, keep & ~split, children)

@@ -1,0 +1,21 @@
+"""A view model for tests of the trainer."""
+
+import torch
+
+from gsplat_edu.train.optimizer import ParameterGroup
+
+
+class Gains:
+    """A small but real view model: one brightness per view."""
+
+    def __init__(self, count):
+        self.gains = torch.ones(count).requires_grad_()
+
+    def parameters(self):
+        return {"gains": self.gains}
+
+    def groups(self):
+        return {"gains": ParameterGroup(0.02, eps=1e-8, per_gaussian=False)}
+
+    def __call__(self, index, image):
+        return image * self.gains[index]
