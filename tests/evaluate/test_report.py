@@ -135,7 +135,7 @@ def test_differences_are_amplified_until_visible_and_say_by_how_much(step, times
 def test_the_final_evaluation_is_on_the_curve(tmp_path, monkeypatch):
     """The final evaluation is in the metrics, not in the log."""
     drawn = []
-    monkeypatch.setattr(report_module, "run_curve_figures", lambda log: drawn.append(log) or [])
+    monkeypatch.setattr(report_module, "run_curve_figures", lambda log, cap: drawn.append(log) or [])
     log = [{"iteration": i, "loss": 0.1} for i in (1, 2, 3)] + [{"iteration": 2, "psnr": 20.0}]
     metrics = {"test": {"psnr": 25.0, "num_images": 1}, "iterations": 3}
     for lines in (log, [*log, {"iteration": 3, "psnr": 24.0}]):
@@ -281,6 +281,24 @@ def test_every_kind_of_number_has_its_own_curve():
         "speed",
     ]
     assert [axes.lines[0].get_ydata()[0] for axes in panels] == [2.0, 21.0, 301.0, 5.0]
+
+
+def test_the_size_of_the_photos_and_the_cap_are_drawn_where_a_run_has_them():
+    log = [{"iteration": i, "num_gaussians": 100 * i, "photo_factor": 4.0 / i} for i in (1, 2)]
+    count, size = (figure.axes[0] for figure in run_curve_figures(log, cap=900))
+    assert size.get_title() == "size of the photos" and size.lines[0].get_ydata().tolist() == [4.0, 2.0]
+    assert count.lines[1].get_ydata() == [900, 900] and count.get_ylim()[1] > 900
+    constant = [line | {"photo_factor": 1.0} for line in log]
+    (alone,) = run_curve_figures(constant)
+    assert len(alone.axes[0].lines) == 1
+
+
+def test_a_report_draws_the_cap_of_its_run(tmp_path):
+    log = [{"iteration": i, "num_gaussians": 100 * i} for i in (1, 2)]
+    for name, cap in (("capped", 900), ("free", None)):
+        config = {"train": {"max_gaussians": cap}}
+        write_report(tmp_path / f"{name}.html", Report(name, {"test": summarize([])}, log, config))
+    assert len(Page(tmp_path / "capped.html").tags) > len(Page(tmp_path / "free.html").tags)
 
 
 def test_only_values_in_the_log_get_curves():

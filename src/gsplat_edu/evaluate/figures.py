@@ -40,6 +40,7 @@ RUN_CURVES = (
     ("loss", "training loss", "loss of each iteration's view"),
     ("psnr", "held-out views", "PSNR of the test views (dB)"),
     ("num_gaussians", "density control", "number of Gaussians"),
+    ("photo_factor", "size of the photos", "divisor of width and height"),
     ("ms", "speed", "ms per iteration"),
 )
 """A run's curves: key in the log, title, label."""
@@ -81,19 +82,21 @@ def curves_figure(losses: Sequence[float], counts: Sequence[int]) -> Figure:
     return figure
 
 
-def run_curve_figures(log: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """Plot a run's log: loss, PSNR of evaluations, number of Gaussians, ms per iteration, terms of the objective.
+def run_curve_figures(log: Sequence[Mapping[str, Any]], cap: int | None = None) -> list[Figure]:
+    """Plot a run's log: loss, PSNR of evaluations, Gaussians, size of the photos, ms per iteration, objective's terms.
 
     Args:
-        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, ms, terms. A key that no line has
-            gets no curve, and a single term, which is the loss, none of its own.
+        log: Lines of the log: `iteration`, and any of loss, psnr, num_gaussians, photo_factor, ms, terms. A key that no
+            line has gets no curve, a single term, which is the loss, none of its own, and photos of constant size none.
+        cap: Cap on the number of Gaussians; None for none.
 
     Returns:
         One figure for each curve; they share the range of iterations.
     """
-    curves = []
+    curves: list[tuple[str, str, str, dict[str, Float[np.ndarray, "Q 2"]]]] = []
     for key, title, label in RUN_CURVES:
-        if (points := _points(log, key)) is not None:
+        points = _points(log, key)
+        if points is not None and (key != "photo_factor" or np.ptp(points[:, 1]) > 0):
             curves.append((key, title, label, {"": points}))
     if len(terms := _terms(log)) > 1:
         curves.append(("terms", "terms of the objective", "weighted value", terms))
@@ -106,6 +109,10 @@ def run_curve_figures(log: Sequence[Mapping[str, Any]]) -> list[Figure]:
             marker = "o" if len(points) < 40 else ""
             axes.plot(*points.T, linewidth=1.0, marker=marker, markersize=3, label=name)
         values = np.concatenate([points[:, 1] for points in lines.values()])
+        if key == "num_gaussians" and cap is not None:
+            axes.axhline(cap, color="0.5", linewidth=1.0, linestyle="--", label="cap")
+            axes.legend(loc="lower right")
+            values = np.append(values, cap)
         axes.set(title=title, xlabel="iteration", ylabel=label)
         axes.set_xlim(0.0, 1.03 * last if last > 0 else 1.0)
         axes.grid(alpha=0.3)

@@ -170,6 +170,13 @@ class Report:
     machine: Mapping[str, str] = field(default_factory=machine_facts)
 
 
+def _cap(config: Mapping[str, Any]) -> int | None:
+    """Return the cap on the number of Gaussians that a config.json states; None if it states none."""
+    settings = config.get("train")
+    cap = settings.get("max_gaussians") if isinstance(settings, Mapping) else None
+    return cap if isinstance(cap, int) else None
+
+
 def write_report(path: Path, report: Report) -> None:
     """Write a report as one HTML file with images, curves and a small script inside; it loads nothing from the network.
 
@@ -180,7 +187,7 @@ def write_report(path: Path, report: Report) -> None:
     Raises:
         OSError: the file cannot be written. An existing file stays unchanged.
     """
-    figures = run_curve_figures(_with_last(report.log, report.metrics))
+    figures = run_curve_figures(_with_last(report.log, report.metrics), _cap(report.config))
     curves = "".join(svg_element(figure, str(number)) for number, figure in enumerate(figures))
     config = {key: value for key, value in report.config.items() if key != "machine"}
     sections = [

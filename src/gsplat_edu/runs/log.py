@@ -55,6 +55,7 @@ class LogWriter:
                 "loss": loss,
                 "terms": dict(zip(names, terms, strict=True)),
                 "num_gaussians": event.num_gaussians,
+                "photo_factor": event.photo_factor,
                 "ms": round(1e3 * (seconds - self._last) / count, 3),
                 "seconds": round(seconds, 3),
             }

@@ -17,12 +17,14 @@ class StepEvent:
         loss_tensor: () the objective's term "photo" before the step, on the Gaussians' device.
         num_gaussians: Gaussians that were rendered.
         terms: () every term of the objective before the step, by name, on the same device.
+        photo_factor: Divisor of the photos' width and height; see `gsplat_edu.train.schedule.photo_factor`.
     """
 
     iteration: int
     loss_tensor: Tensor
     num_gaussians: int
     terms: Mapping[str, Tensor] = field(default_factory=dict)
+    photo_factor: float = 1.0
 
     @property
     def loss(self) -> float:

@@ -221,7 +221,8 @@ class Trainer:
 
     def _step(self) -> StepEvent:
         """Take one step: gradients of the views, reduce, apply."""
-        self._feed.use_factor(photo_factor(self.config, self.iteration))
+        factor = photo_factor(self.config, self.iteration)
+        self._feed.use_factor(factor)
         iteration, draws = self.iteration, self._draw()
         if len(draws) == 1 and self.fuses:
             terms = self._fused_step(draws[0])
@@ -229,7 +230,7 @@ class Trainer:
             terms = self.gradients(draws)
             self._parts.reduce(self.parameters(), len(draws))
             self.apply()
-        return StepEvent(iteration, terms[PHOTO], len(self.gaussians), terms)
+        return StepEvent(iteration, terms[PHOTO], len(self.gaussians), terms, factor)
 
     @property
     def fuses(self) -> bool:

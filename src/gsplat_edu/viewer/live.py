@@ -306,11 +306,13 @@ class LiveView:
             total = self._trainer.config.iterations
             lines += [
                 f"iteration {self._trainer.iteration:,} of {total:,}",
-                f"{len(self._trainer.gaussians):,} Gaussians",
+                _gaussians(self._trainer),
                 f"loss {self._event.loss:.4f}",
             ]
             if self._trainer.last is not None:
                 lines.append(f"PSNR {_psnr(self._trainer):.2f} dB (last photo)")
+                height, width, _ = self._trainer.last[0].shape
+                lines.append(f"photos at {width} x {height} px" + _share(self._event.photo_factor))
         if self._failure:
             lines.append(f"`{self._failure.replace('`', '')}`")
         said = "  \n".join(lines)  # two spaces force a line break in Markdown
@@ -434,3 +436,12 @@ def _psnr(trainer: Trainer) -> float:
         return math.nan if trainer.last is None else psnr(*trainer.last)
     except SplatError:  # an image with NaN or infinity has no PSNR
         return math.nan
+
+
+def _gaussians(trainer: Trainer) -> str:
+    cap = trainer.config.max_gaussians
+    return f"{len(trainer.gaussians):,}" + (f" of at most {cap:,}" if cap is not None else "") + " Gaussians"
+
+
+def _share(factor: float) -> str:
+    return "" if factor == 1.0 else f", 1/{factor:.3g} of their size"

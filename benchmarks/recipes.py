@@ -1,0 +1,407 @@
+"""Which recipe gives the best held-out picture per minute and per Gaussian?
+
+    python benchmarks/recipes.py [CAPTURE] --out FILE.json [--recipes NAME ...] [--seeds N] [--resolution R]
+        [--length FACTOR] [--smoke]
+
+Trains one capture by several recipes, one after another in this process, and scores the held-out views twenty times
+during each run with the clock stopped: PSNR, SSIM, and at the end FLIP (Andersson et al. 2020), the perceptual score,
+since the weights of LPIPS would have to be downloaded. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data
+unless given; the word "rgba" stands for 100 photos of 800 x 800 px with alpha, traced here.
+
+Every finished run is stored in FILE.json, so that an interrupted benchmark continues where it stopped, and a further
+capture goes to a further file. Beside it, FILE.png shows the scores over time and over Gaussians.
+
+Seeds change a result by several tenths of a dB: the table shows the mean over the seeds and half their range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import flip_evaluator
+import hardware
+import numpy as np
+import torch
+from captures import capture
+from matplotlib.figure import Figure
+from traced import traced_capture
+
+from gsplat_edu.budget.plan import Limits, plan
+from gsplat_edu.cli.arguments import OneLineParser, run_command
+from gsplat_edu.cli.options import train as command
+from gsplat_edu.data.writers import write_blender
+from gsplat_edu.evaluate.figures import save_figure
+from gsplat_edu.evaluate.metrics import ImageScore, OnImage, score_views, summarize
+from gsplat_edu.files import written_aside
+from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.train.config import QUALITIES
+from gsplat_edu.train.density.fast import PlannedDensity
+from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.views import View
+
+MOMENTS = 20
+"""How often the held-out views are scored, at equal numbers of iterations."""
+
+RGBA = "rgba"
+"""Name of the traced capture."""
+
+CAP = 100_000
+"""Cap of mcmc where no run of adc has said how many Gaussians the capture takes."""
+
+
+class Uniform(PlannedDensity):
+    """The fast recipe without its score: every visible Gaussian is equally likely to be split."""
+
+    def _score(self) -> torch.Tensor:
+        return (self.times_visible > 0).to(self.norm_sums.dtype)
+
+
+class Strongest(PlannedDensity):
+    """The fast recipe without its draw: the Gaussians of the highest score are split."""
+
+    def _drawn(self, keep: torch.Tensor, count: int) -> torch.Tensor:
+        score = torch.where(keep, self._score(), 0.0)
+        order = torch.argsort(score, descending=True, stable=True)[: max(count, 0)]
+        drawn = torch.zeros_like(keep)
+        drawn[order] = score[order] > 0
+        return drawn
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A recipe to compare.
+
+    Args:
+        strategy: Density control.
+        iterations: Length of the run, before `--length`.
+        options: Further options of `gsplat-edu train`.
+        density: Replaces the density control of the fast recipe.
+    """
+
+    strategy: str
+    iterations: int
+    options: tuple[str, ...] = ()
+    density: type[PlannedDensity] | None = None
+
+
+STANDARD = QUALITIES["standard"]
+
+RECIPES = {
+    "adc-7k": Recipe("adc", 7_000),
+    "mcmc-7k": Recipe("mcmc", 7_000),
+    "adc-30k": Recipe("adc", 30_000),
+    **{f"fast-{name}": Recipe("fast", iterations) for name, iterations in QUALITIES.items()},
+    "without-small-photos": Recipe("fast", STANDARD, ("--fast-start-factor", "1")),
+    "without-late-decay": Recipe("fast", STANDARD, ("--fast-decay", "1")),
+    "without-score": Recipe("fast", STANDARD, density=Uniform),
+    "without-draw": Recipe("fast", STANDARD, density=Strongest),
+    "adc-3k": Recipe("adc", STANDARD),
+    "mcmc-3k": Recipe("mcmc", STANDARD),
+}
+"""The recipes by name: the references, the qualities of the fast recipe, and that recipe with one piece left out."""
+
+DEFAULT = ("adc-7k", "mcmc-7k", *(f"fast-{name}" for name in QUALITIES))
+
+
+@dataclass
+class Results:
+    """The finished runs, in a file that grows.
+
+    Args:
+        path: JSON file; None to keep them in memory.
+        setting: What all runs have in common. A file with another setting is refused.
+    """
+
+    path: Path | None
+    setting: dict[str, Any]
+    runs: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Read the runs of an earlier call."""
+        if self.path is None or not self.path.exists():
+            return
+        stored = json.loads(self.path.read_text())
+        if stored["setting"] != self.setting:
+            raise SystemExit(
+                f"--out: {self.path} holds runs of another setting, {stored['setting']}; give another file"
+            )
+        self.runs = stored["runs"]
+
+    def of(self, recipe: str) -> list[dict[str, Any]]:
+        """Return the runs of a recipe."""
+        return [run for run in self.runs if run["recipe"] == recipe]
+
+    def recipes(self) -> list[str]:
+        """Return the names of the recipes with at least one run, in the order of the first ones."""
+        return list(dict.fromkeys(run["recipe"] for run in self.runs))
+
+    def add(self, run: dict[str, Any]) -> None:
+        """Store one more run."""
+        self.runs.append(run)
+        if self.path is not None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            result = {"hardware": hardware.describe(), "setting": self.setting, "runs": self.runs}
+            with written_aside(self.path) as aside:
+                aside.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def trained(name: str, seed: int, arguments: argparse.Namespace, results: Results) -> dict[str, Any]:
+    """Train by one recipe; return its scores.
+
+    Args:
+        name: Name of the recipe.
+        seed: Seed of the run.
+        arguments: The benchmark's: data, resolution, length.
+        results: Earlier runs; mcmc takes its cap from those of adc.
+    """
+    recipe = RECIPES[name]
+    iterations = max(1, round(recipe.iterations * arguments.length))
+    words = [
+        "--strategy",
+        recipe.strategy,
+        "--iterations",
+        str(iterations),
+        "--seed",
+        str(seed),
+        *recipe.options,
+    ]
+    words += ["--eval-every", "0", "--save-every", "0"]
+    if arguments.resolution is not None:
+        words += ["--resolution", str(arguments.resolution)]
+    if recipe.strategy == "mcmc":
+        adc = [run["gaussians"] for run in results.of("adc-7k") or results.of("adc-3k")]
+        words += ["--max-gaussians", str(round(float(np.mean(adc))) if adc else CAP)]
+    parser = OneLineParser(prog="recipes.py")
+    command.add_arguments(parser)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = str(Path(scratch) / "run")
+        options = command.options_from(parser.parse_args([str(arguments.data), *words, "--out", folder]))
+        run = CaptureRun(plan(options, Limits()).options)
+        if recipe.density is not None:
+            config, generator = run.options.config, torch.Generator().manual_seed(seed)
+            run.trainer.density = recipe.density(config, generator, run.trainer.gaussians)
+        return {"recipe": name, "seed": seed, "options": " ".join(words), **measured(run)}
+
+
+class Clock:
+    """Wall and processor time of a training, without the time in which it is stopped."""
+
+    def __init__(self) -> None:
+        self._began = np.array([time.perf_counter(), time.process_time()])
+
+    def read(self) -> tuple[float, float]:
+        """Return the seconds so far: wall, processor."""
+        wall, processor = np.array([time.perf_counter(), time.process_time()]) - self._began
+        return float(wall), float(processor)
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Exclude the block."""
+        before = np.array([time.perf_counter(), time.process_time()])
+        yield
+        self._began += np.array([time.perf_counter(), time.process_time()]) - before
+
+
+def measured(run: CaptureRun) -> dict[str, Any]:
+    """Train, score the held-out views at `MOMENTS`, and return what was found."""
+    total = run.options.config.iterations
+    due = {math.ceil(total * k / MOMENTS) for k in range(1, MOMENTS + 1)}
+    curve: list[dict[str, float]] = []
+    clock = Clock()
+
+    def watch(trainer: Trainer, event: Event) -> None:
+        if isinstance(event, StepEvent) and trainer.iteration in due:
+            seconds, processor = clock.read()
+            with clock.stopped():
+                scores = scored(run, run.dataset.test)
+                curve.append(
+                    {"iteration": trainer.iteration, "seconds": seconds, "processor_seconds": processor}
+                    | {"gaussians": len(trainer.gaussians), "psnr": scores["psnr"], "ssim": scores["ssim"]}
+                )
+
+    run.train(callbacks=[watch])
+    train_psnr = scored(run, run.dataset.train)["psnr"]
+    return {**curve[-1], "flip": flip(run), "train_psnr": train_psnr, "curve": curve}
+
+
+def scored(run: CaptureRun, views: Sequence[View], on_image: OnImage | None = None) -> dict[str, Any]:
+    """Score the run's Gaussians on views."""
+    options = run.options
+    return summarize(
+        score_views(run.trainer.gaussians, views, options.renderer, options.config.background, on_image)
+    )
+
+
+def flip(run: CaptureRun) -> float:
+    """Return the mean FLIP of the held-out views, 0 to 1; 0 for equal images."""
+    found: list[float] = []
+
+    def one(_view: View, _score: ImageScore, image: np.ndarray, photo: np.ndarray) -> None:
+        pair = (pixels.astype(np.float32) / 255 for pixels in (photo, image))
+        found.append(float(flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)[1]))
+
+    scored(run, run.dataset.test, one)
+    return float(np.mean(found))
+
+
+def seconds_to(curve: Sequence[dict[str, float]], psnr: float) -> float | None:
+    """Return when a run's held-out PSNR first reaches a value: linear between its moments; None if it never does."""
+    before = {"seconds": 0.0, "psnr": -math.inf}
+    for point in curve:
+        if point["psnr"] >= psnr:
+            share = (
+                1.0
+                if math.isinf(before["psnr"])
+                else (psnr - before["psnr"]) / (point["psnr"] - before["psnr"])
+            )
+            return before["seconds"] + share * (point["seconds"] - before["seconds"])
+        before = point
+    return None
+
+
+def table(results: Results) -> str:
+    """Return the recipes' scores as a Markdown table: mean over the seeds and half their range."""
+    lines = [
+        "| recipe | runs | PSNR | SSIM | FLIP | train PSNR | Gaussians | seconds | processor seconds |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name in results.recipes():
+        runs = results.of(name)
+        cells = [spread(runs, key, digits) for key, digits in (("psnr", 2), ("ssim", 4), ("flip", 4))]
+        cells += [spread(runs, "train_psnr", 2)]
+        cells += [f"{mean(runs, key):,.0f}" for key in ("gaussians", "seconds", "processor_seconds")]
+        lines.append(f"| {name} | {len(runs)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def mean(runs: Sequence[dict[str, Any]], key: str) -> float:
+    """Return the mean of a figure over runs."""
+    return float(np.mean([run[key] for run in runs]))
+
+
+def spread(runs: Sequence[dict[str, Any]], key: str, digits: int) -> str:
+    """Return the mean of a figure over runs, and half its range if there are several."""
+    values = [run[key] for run in runs]
+    half = (max(values) - min(values)) / 2
+    return f"{np.mean(values):.{digits}f}" + (f" ± {half:.{digits}f}" if len(values) > 1 else "")
+
+
+def races(results: Results) -> list[str]:
+    """Say for every pair of recipes when one reaches the other's final PSNR, as a share of the other's time."""
+    said = []
+    for other in results.recipes():
+        target, whole = mean(results.of(other), "psnr"), mean(results.of(other), "seconds")
+        for name in results.recipes():
+            reached = [seconds_to(run["curve"], target) for run in results.of(name)]
+            if name != other and all(seconds is not None for seconds in reached):
+                share = float(np.mean([seconds for seconds in reached if seconds is not None])) / whole
+                said.append(f"{name} reaches {other}'s {target:.2f} dB in {share:.2f} of its time")
+    return said
+
+
+def figure(results: Results, title: str) -> Figure:
+    """Draw PSNR and SSIM during the runs and FLIP at their ends, over time and over Gaussians."""
+    drawn = Figure(figsize=(11, 11), layout="constrained")
+    drawn.suptitle(title)
+    grid = drawn.subplots(3, 2)
+    colors = {name: f"C{k}" for k, name in enumerate(results.recipes())}
+    for row, (score, label) in enumerate(
+        (
+            ("psnr", "held-out PSNR (dB)"),
+            ("ssim", "held-out SSIM"),
+            ("flip", "held-out FLIP (lower is better)"),
+        )
+    ):
+        for axes, (key, unit) in zip(
+            grid[row], (("seconds", "training time (s)"), ("gaussians", "Gaussians")), strict=True
+        ):
+            for run in results.runs:
+                color = colors[run["recipe"]]
+                if score != "flip":
+                    axes.plot(*columns(run["curve"], key, score), color=color, linewidth=0.7, alpha=0.6)
+                axes.plot(run[key], run[score], "o", color=color)
+            axes.set(xlabel=unit, ylabel=label, xscale="log")
+            axes.grid(alpha=0.3, which="both")
+    for name, color in colors.items():
+        grid[0, 0].plot([], [], "o-", color=color, label=name)
+    grid[0, 0].legend(fontsize=8)
+    return drawn
+
+
+def columns(curve: Sequence[dict[str, float]], *keys: str) -> list[list[float]]:
+    """Return columns of a run's curve."""
+    return [[point[key] for point in curve] for key in keys]
+
+
+@contextmanager
+def chosen_capture(arguments: argparse.Namespace) -> Iterator[Path]:
+    """Yield the folder of the capture that the arguments name. The traced one is kept beside the results."""
+    if str(arguments.capture) != RGBA:
+        with capture(arguments.capture, arguments.smoke) as folder:
+            yield folder
+        return
+    size, count = (24, 8) if arguments.smoke else (800, 100)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = (arguments.out.parent if arguments.out else Path(scratch)) / RGBA
+        if not (folder / "transforms_test.json").exists():  # it is written last
+            print(f"tracing {count} photos of {size} x {size} px into {folder}", flush=True)
+            write_blender(folder, *traced_capture(size, count))
+        yield folder
+
+
+def compare(arguments: argparse.Namespace) -> None:
+    """Train by every recipe and seed that has no result yet; print the table and draw the figure."""
+    with chosen_capture(arguments) as folder:
+        arguments.data = folder
+        setting = {
+            "capture": folder.name,
+            "resolution": arguments.resolution,
+            "length": arguments.length,
+            "threads": torch.get_num_threads(),
+        }
+        results = Results(arguments.out, setting)
+        for seed in range(arguments.seeds):
+            for name in arguments.recipes:
+                if any(run["seed"] == seed for run in results.of(name)):
+                    continue
+                found = trained(name, seed, arguments, results)
+                results.add(found)
+                print(
+                    f"{name}, seed {seed}: {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}, FLIP {found['flip']:.4f}, "
+                    f"{found['gaussians']} Gaussians, {found['seconds']:.0f} s",
+                    flush=True,
+                )
+    print(", ".join(f"{key}: {value}" for key, value in {**hardware.describe(), **setting}.items()))
+    print(table(results), *races(results), sep="\n")
+    if arguments.out is not None:
+        title = f"{setting['capture']}, {setting['threads']} threads; lines: during a run, dots: at its end"
+        save_figure(arguments.out.with_suffix(".png"), figure(results, title))
+
+
+def main() -> int:
+    """Read the command line and compare the recipes."""
+    parser = hardware.parser(__doc__.partition("\n")[0])
+    parser.add_argument("capture", nargs="?", type=Path, help=f'folder of a capture, or the word "{RGBA}"')
+    parser.add_argument("--recipes", nargs="+", choices=tuple(RECIPES), default=DEFAULT, metavar="NAME")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds 0 to N - 1 (default: 3)")
+    parser.add_argument("--resolution", type=int, help="divisor of the photos' size, as in train")
+    parser.add_argument("--length", type=float, default=1.0, help="factor on all numbers of iterations")
+    arguments = parser.parse_args()
+    if arguments.smoke:
+        arguments.seeds, arguments.length = 2, 0.002
+    return run_command("recipes.py", lambda: compare(arguments), debug=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
