@@ -31,6 +31,9 @@ PLANNED_SHARE = 0.14
 """fast: planned Gaussians per pixel of a photo, for `PLANNED_VIEWS` training views; the number grows with the square
 root of the views. For snowmiku97 this is 102,200."""
 
+LEAST_PLANNED = 1_000
+"""fast: smallest planned number, for thumbnails."""
+
 PLANNED_VIEWS = 85
 
 FEW_POINTS = 30_000
@@ -228,7 +231,7 @@ def wanted_gaussians(config: TrainConfig, points: int, pixels: float, views: int
         views: Number of training views.
     """
     if config.strategy == "fast":
-        return max(round(PLANNED_SHARE * pixels * math.sqrt(views / PLANNED_VIEWS)), 1)
+        return max(round(PLANNED_SHARE * pixels * math.sqrt(views / PLANNED_VIEWS)), LEAST_PLANNED)
     window = min(config.adc.densify_stop, config.iterations) - config.densify_start
     return points + _added(points, pixels) * max(window // config.densify_every, 0)
 

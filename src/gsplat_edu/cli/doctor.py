@@ -26,7 +26,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.train.config import RECIPE_ITERATIONS, TrainConfig, recipe
+from gsplat_edu.train.config import DEFAULT_QUALITY, DEFAULT_STRATEGY, QUALITIES, recipe
 
 EXIT_HOPELESS = 1
 """Exit code if training would be pointless."""
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
-    settings, config = DataSettings(resolution=arguments.resolution), recipe(arguments.iterations)
+    settings = DataSettings(resolution=arguments.resolution)
     backend = resolve_backend(arguments.backend)
     if backend == "torch" and not arguments.no_forecast:
         raise ArgumentError(
@@ -65,10 +65,15 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
         diagnosis = examine(survey, _forecast_options(arguments))
     if arguments.no_forecast or diagnosis.hopeless:
         return diagnosis, ()
+    from gsplat_edu.budget.costs import Facts, wanted_gaussians
     from gsplat_edu.budget.forecast import forecast  # it measures this machine, which takes a moment
 
     try:
-        said = forecast(load_dataset(arguments.path, settings), config, backend=backend).lines()
+        dataset = load_dataset(arguments.path, settings)
+        facts, config = Facts.of(dataset), recipe(arguments.iterations, strategy=DEFAULT_STRATEGY)
+        cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+        config = dataclasses.replace(config, max_gaussians=cap)
+        said = forecast(dataset, config, backend=backend).lines()
     except DatasetError as error:
         said = [f"none, because training would fail: {error}"]
     return diagnosis, table_lines(zip(("forecast", *[""] * len(said)), said, strict=False))
@@ -77,7 +82,7 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
 def _forecast_options(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Return the options of the training that is forecast where they are not the defaults."""
     words: tuple[str, ...] = ()
-    if arguments.iterations != RECIPE_ITERATIONS:
+    if arguments.iterations != QUALITIES[DEFAULT_QUALITY]:
         words += ("--iterations", str(arguments.iterations))
     if arguments.resolution is not None:
         words += ("--resolution", f"{arguments.resolution:g}")
@@ -120,6 +125,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         options=_options(config),
         beforehand=beforehand,
         uncompared=uncompared,
+        strategy=str(section.get("strategy", "adc")) if isinstance(section, dict) else "adc",
     )
     return examine_run(trained), view_lines(trained) if arguments.all_views else ()
 
@@ -134,7 +140,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--test-every": (data.get("test_every"),),
         "--points": (data.get("points"),),
         "--from": (data.get("scene"),),
-        "--strategy": (None if train.get("strategy") == TrainConfig.strategy else train.get("strategy"),),
+        "--strategy": (None if train.get("strategy") == DEFAULT_STRATEGY else train.get("strategy"),),
         "--max-gaussians": (train.get("max_gaussians"),),
         "--background": background if any(background) else (None,),
     }

@@ -15,7 +15,7 @@ from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.text import spelled_seconds
-from gsplat_edu.train.config import RECIPE_ITERATIONS
+from gsplat_edu.train.config import DEFAULT_QUALITY, QUALITIES, RECIPE_ITERATIONS
 
 POOR = 20.0
 """Warn when the training views' mean PSNR is below this, dB: 20 dB is an RMS error of a tenth of the range. Three
@@ -71,6 +71,7 @@ class Trained:
         options: Further training options to repeat in an advised longer run, as command-line words.
         beforehand: Findings about exposure from the photos alone.
         uncompared: Why the exposure of the photos was not compared; empty if it was.
+        strategy: The run's recipe.
     """
 
     path: Path
@@ -85,10 +86,26 @@ class Trained:
     options: tuple[str, ...] = ()
     beforehand: Sequence[Finding] = ()
     uncompared: str = ""
+    strategy: str = "adc"
+
+    @property
+    def usual(self) -> int:
+        """Iterations of the run's recipe unless told otherwise."""
+        return QUALITIES[DEFAULT_QUALITY] if self.strategy == "fast" else RECIPE_ITERATIONS
+
+    @property
+    def longest(self) -> int:
+        """Iterations of the longest run that is advised."""
+        return max(QUALITIES.values()) if self.strategy == "fast" else RECIPE_ITERATIONS
 
     @property
     def rising(self) -> bool | None:
-        """Whether the scene was still improving when training ended; None if the log does not show it."""
+        """Whether the scene was still improving when training ended; None if the log does not show it.
+
+        It never shows it for the recipe fast, whose rates fall until the end, which raises the PSNR of any run.
+        """
+        if self.strategy == "fast":
+            return None
         scores = _pairs(self.log, "psnr", self.reached)
         if self.test:
             scores = [pair for pair in scores if pair[0] < self.reached] + [(self.reached, _mean(self.test))]
@@ -137,7 +154,7 @@ def examine_run(run: Trained) -> Diagnosis:
 
 def _otherwise(run: Trained) -> tuple[str, ...]:
     """Return advice for scenes with few problems."""
-    longer = run.reached < RECIPE_ITERATIONS and run.rising is not False
+    longer = run.reached < run.longest and run.rising is not False
     return (
         f"view it: {command('render', run.path, '--orbit', '--out', 'orbit.mp4')}",
         f"a smaller file: {command('convert', run.path, 'scene.spz', '--min-opacity', str(FAINT))}",
@@ -151,21 +168,19 @@ def _what_photos_lack(run: Trained) -> str:
 
 def _train_longer(run: Trained) -> str:
     if run.capture is None:
-        return f"train for {RECIPE_ITERATIONS:,} iterations, as the recipe does"
-    name = f"{run.path.resolve().name}_{RECIPE_ITERATIONS}"
-    length = ("--iterations", str(RECIPE_ITERATIONS))
+        return f"train for {run.longest:,} iterations"
+    name = f"{run.path.resolve().name}_{run.longest}"
+    length = ("--iterations", str(run.longest))
     words = command("train", run.capture, *length, *run.options, "--out", new_run(name))
     return f"train for longer{_at_its_pace(run)}: {words}"
 
 
 def _at_its_pace(run: Trained) -> str:
-    """Estimate how long the recipe takes at the speed of the last iterations: hours on a slow computer."""
+    """Estimate how long that takes at the speed of the last iterations: hours on a slow computer."""
     late = [ms for iteration, ms in _pairs(run.log, "ms", run.reached) if iteration > 0.75 * run.reached]
     if not late:
         return ""
-    return (
-        f" ({spelled_seconds(1e-3 * RECIPE_ITERATIONS * float(np.median(late)))} or more at this run's pace)"
-    )
+    return f" ({spelled_seconds(1e-3 * run.longest * float(np.median(late)))} or more at this run's pace)"
 
 
 def view_lines(run: Trained) -> list[str]:
@@ -198,9 +213,9 @@ def _length(run: Trained) -> list[Finding]:
         what = f"the scene is that of iteration {run.reached:,} of {run.planned:,}"
         advice = "finish the training: repeat its command with --resume"
         return [Finding("unfinished", Severity.WARNING, what, advice)]
-    if run.reached >= RECIPE_ITERATIONS:
+    if run.reached >= run.usual:
         return []
-    what = f"{run.reached:,} iterations; the recipe has {RECIPE_ITERATIONS:,}"
+    what = f"{run.reached:,} iterations; the recipe has {run.usual:,}"
     if run.rising is False:
         held = "the test views' PSNR no longer rises" if run.test else "the loss no longer falls"
         advice = f"more iterations alone will not help much; better photos may{_what_photos_lack(run)}"
@@ -218,7 +233,7 @@ def _fit(run: Trained) -> list[Finding]:
     what = f"the training views reach only {_mean(run.train):.1f} dB on average: the scene does not fit even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
     advice = f"check poses and intrinsics{place}"
-    if run.reached < RECIPE_ITERATIONS and run.rising:  # too few iterations may be the only cause
+    if run.reached < run.usual and run.rising:  # too few iterations may be the only cause
         advice = f"train for longer first; if they do not improve, {advice}"
     return [Finding("poor fit", Severity.WARNING, what, advice)]
 

@@ -12,6 +12,8 @@ from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.train.config import (
+    DEFAULT_QUALITY,
+    DEFAULT_STRATEGY,
     FAST_FROM_SCENE,
     FROM_SCENE,
     ONLY_FOR,
@@ -109,7 +111,8 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
     _add_number(
         group,
         "--iterations",
-        f"number of training steps (default: {RECIPE_ITERATIONS}, or as many as fit --time-limit)",
+        f"number of training steps (default: those of --quality, or as many as fit --time-limit; {RECIPE_ITERATIONS}"
+        " for the other strategies)",
     )
     group.add_argument(
         "--no-rescale",
@@ -132,19 +135,21 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
     )
     names = ", ".join(STRATEGIES)
     group.add_argument(
-        "--strategy", metavar="NAME", default="adc", help=f"density control: {names} (default: adc)"
+        "--strategy",
+        metavar="NAME",
+        help=f"recipe of the training: {names} (default: {DEFAULT_STRATEGY}, or that of the run to resume)",
     )
     lengths = ", ".join(f"{name} {count:,}" for name, count in QUALITIES.items())
     group.add_argument(
         "--quality",
         metavar="NAME",
-        help=f"length of --strategy fast in iterations: {lengths} (default: standard, unless --iterations or"
+        help=f"length of the recipe fast in iterations: {lengths} (default: {DEFAULT_QUALITY}, unless --iterations or"
         " --time-limit is given)",
     )
     _add_number(
         group,
         "--max-gaussians",
-        "cap on the number of Gaussians (default: none; mcmc requires one, fast plans one from the capture)",
+        "cap on the number of Gaussians (default: fast plans one from the capture, mcmc requires one, adc has none)",
     )
 
 
@@ -290,7 +295,8 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
 
 
 def _config(arguments: argparse.Namespace) -> TrainConfig:
-    changes: dict[str, Any] = {}
+    strategy = _strategy(arguments)
+    changes: dict[str, Any] = {"strategy": strategy}
     for setting in SETTINGS:
         name = setting.name
         given = getattr(arguments, name, None)
@@ -298,11 +304,11 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
             changes[name] = None if name == "jacobian_limit" and given == "none" else given
     if arguments.white_background or arguments.background:
         changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
-    for strategy, names in ONLY_FOR.items():
-        if strategy != arguments.strategy and (idle := [name for name in names if name in changes]):
+    for only, names in ONLY_FOR.items():
+        if only != strategy and (idle := [name for name in names if name in changes]):
             flag = f"--{idle[0].replace('_', '-')}"
             raise ArgumentError(
-                f"{flag}: only --strategy {strategy} uses it; leave it out or choose that strategy"
+                f"{flag}: only --strategy {only} uses it; leave it out or choose that strategy"
             )
     planned = arguments.max_memory is not None or (
         arguments.time_limit is not None and arguments.iterations is None
@@ -311,17 +317,26 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         if idle := [name for name in FOR_POINTS if name in changes]:
             flag = f"--{idle[0].replace('_', '-')}"
             raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
-        changes = FROM_SCENE | (FAST_FROM_SCENE if arguments.strategy == "fast" else {}) | changes
-    iterations = _length(arguments)
+        changes = FROM_SCENE | (FAST_FROM_SCENE if strategy == "fast" else {}) | changes
+    iterations = _length(arguments, strategy)
     config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
     if config.strategy == "mcmc" and config.max_gaussians is None and not planned:
         raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
     return config
 
 
-def _length(arguments: argparse.Namespace) -> int:
+def _strategy(arguments: argparse.Namespace) -> str:
+    """Return the strategy: that given, that of the run to resume, or the default."""
+    if arguments.strategy is not None:
+        return str(arguments.strategy)
+    folder = RunFolder(arguments.out)
+    stored = folder.read_config().get("train") if arguments.resume and folder.exists() else None
+    return str(stored.get("strategy", DEFAULT_STRATEGY)) if isinstance(stored, dict) else DEFAULT_STRATEGY
+
+
+def _length(arguments: argparse.Namespace, strategy: str) -> int:
     """Return the iterations: those given, those of the quality, or the recipe's."""
-    fast, quality = arguments.strategy == "fast", arguments.quality
+    fast, quality = strategy == "fast", arguments.quality
     if quality is not None:
         one_of("--quality", quality, tuple(QUALITIES))
         if not fast:
@@ -334,7 +349,7 @@ def _length(arguments: argparse.Namespace) -> int:
             )
     if arguments.iterations is not None:
         return int(arguments.iterations)
-    return QUALITIES[quality or "standard"] if fast else RECIPE_ITERATIONS
+    return QUALITIES[quality or DEFAULT_QUALITY] if fast else RECIPE_ITERATIONS
 
 
 def _starts_from_scene(arguments: argparse.Namespace) -> bool:
