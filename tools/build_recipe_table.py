@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 from gsplat_edu.files import written_aside
-from gsplat_edu.train.config import SETTINGS, Setting
+from gsplat_edu.train.config import FOR_FAST, SETTINGS, Setting
 
 RECIPE = Path(__file__).resolve().parent.parent / "docs" / "RECIPE.md"
 
@@ -26,7 +26,10 @@ def table() -> str:
 
 def _row(setting: Setting) -> str:
     meaning = setting.meaning + (" *" if setting.milestone else "")
-    return f"| `{setting.name}` | {setting.default} | {meaning} | {setting.source or 'ours'} |\n"
+    default = f"{setting.default}" + (
+        f"; fast: {FOR_FAST[setting.name]:g}" if setting.name in FOR_FAST else ""
+    )
+    return f"| `{setting.name}` | {default} | {meaning} | {setting.source or 'ours'} |\n"
 
 
 def with_table(document: str) -> str:

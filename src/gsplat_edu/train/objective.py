@@ -96,7 +96,7 @@ def sum_of_scalars(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
 def make_objective(config: TrainConfig) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
-    (1 - k) L1 + k (1 - SSIM), and for mcmc + weight_o mean(opacity) + weight_s mean(scale)
+    (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale)
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
@@ -104,6 +104,8 @@ def make_objective(config: TrainConfig) -> Objective:
     if config.strategy == "mcmc":
         terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
         terms["scale"] = MeanScale(config.mcmc.scale_weight)
+    if config.strategy == "fast" and config.fast.opacity_weight > 0:
+        terms["opacity"] = MeanOpacity(config.fast.opacity_weight)
     return Objective(terms)
 
 

@@ -15,6 +15,7 @@ from gsplat_edu.train.config import (
     DEFAULT_QUALITY,
     DEFAULT_STRATEGY,
     FAST_FROM_SCENE,
+    FOR_FAST,
     FROM_SCENE,
     ONLY_FOR,
     QUALITIES,
@@ -218,7 +219,8 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
 def _add_setting(group: argparse._ArgumentGroup, setting: Setting) -> None:
     name, default = setting.name, setting.default
     flag = f"--{name.replace('_', '-')}"
-    text = f"{setting.meaning.replace('%', '%%')} (default: {default})"
+    fast = f"; fast: {FOR_FAST[name]:g}" if name in FOR_FAST else ""
+    text = f"{setting.meaning.replace('%', '%%')} (default: {default}{fast})"
     if isinstance(default, bool):
         group.add_argument(flag, action="store_true", default=None, help=text)
     elif isinstance(default, str):
