@@ -67,17 +67,6 @@ class Uniform(PlannedDensity):
         return (self.times_visible > 0).to(self.norm_sums.dtype)
 
 
-class Strongest(PlannedDensity):
-    """The fast recipe without its draw: the Gaussians of the highest score are split."""
-
-    def _drawn(self, keep: torch.Tensor, count: int) -> torch.Tensor:
-        score = torch.where(keep, self._score(), 0.0)
-        order = torch.argsort(score, descending=True, stable=True)[: max(count, 0)]
-        drawn = torch.zeros_like(keep)
-        drawn[order] = score[order] > 0
-        return drawn
-
-
 @dataclass(frozen=True)
 class Recipe:
     """A recipe to compare.
@@ -97,6 +86,9 @@ class Recipe:
 
 STANDARD = QUALITIES["standard"]
 
+HALF_RATES = ("--quats-rate", "1e-3", "--scales-rate", "5e-3", "--sh0-rate", "2.5e-3")
+HALF_RATES += ("--sh-rest-rate", "1.25e-4", "--opacities-rate", "5e-2")
+
 RECIPES = {
     "adc-7k": Recipe("adc", 7_000),
     "mcmc-7k": Recipe("mcmc", 7_000),
@@ -105,7 +97,9 @@ RECIPES = {
     "without-small-photos": Recipe("fast", STANDARD, ("--fast-start-factor", "1")),
     "without-late-decay": Recipe("fast", STANDARD, ("--fast-decay", "1")),
     "without-score": Recipe("fast", STANDARD, density=Uniform),
-    "without-draw": Recipe("fast", STANDARD, density=Strongest),
+    "without-opacity-term": Recipe("fast", STANDARD, ("--fast-opacity-weight", "0")),
+    "without-doubled-rates": Recipe("fast", STANDARD, HALF_RATES),
+    "without-late-means": Recipe("fast", STANDARD, ("--means-rate-final", "1.6e-6")),
     "adc-3k": Recipe("adc", STANDARD),
     "mcmc-3k": Recipe("mcmc", STANDARD),
 }
@@ -189,8 +183,7 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
         options = command.options_from(parser.parse_args([str(arguments.data), *words, "--out", folder]))
         run = CaptureRun(plan(options, Limits()).options)
         if recipe.density is not None:
-            config, generator = run.options.config, torch.Generator().manual_seed(seed)
-            run.trainer.density = recipe.density(config, generator, run.trainer.gaussians)
+            run.trainer.density = recipe.density(run.options.config, run.trainer.gaussians)
         return {"recipe": name, "seed": seed, "options": " ".join(words), **measured(run)}
 
 

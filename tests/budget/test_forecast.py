@@ -109,15 +109,17 @@ def test_fast_is_expected_to_grow_as_it_plans():
     config = recipe(1_000, strategy="fast", max_gaussians=500, densify_every=20)
     counts = expected_counts(config, 100, 1e4)
     gaussians = random_ball(100, torch.Generator().manual_seed(0)).trainable()
-    control, optimizer = PlannedDensity(config, torch.Generator(), gaussians), Adam(gaussians.tensors(), {})
+    control, optimizer = PlannedDensity(config, gaussians), Adam(gaussians.tensors(), {})
     for iteration in range(1_000):
         control.norm_sums += 1.0
         gaussians, events = control.update(iteration, gaussians, optimizer)
         if events and iteration <= config.fast.stop:  # then faint ones are only pruned
             assert len(gaussians) == counts[iteration], iteration
     assert (counts[0], counts[-1]) == (100, 500) and (np.diff(counts) >= 0).all()
-    assert wanted_gaussians(config, 100, 734_580, 85) == 102_841
-    assert wanted_gaussians(config, 9, 734_580, 340) == 205_682, "twice for four times as many views"
+    assert wanted_gaussians(config, 100, 734_580, 85) == 100_000
+    assert wanted_gaussians(config, 9, 734_580, 340) == 200_000, "twice for four times as many views"
+    assert wanted_gaussians(config, 9, 8 * 734_580, 85) == 200_000, "twice for eight times as many pixels"
+    assert wanted_gaussians(config, 9, 16, 1) == 1_000
 
 
 def test_small_photos_are_cheaper_in_the_forecast():

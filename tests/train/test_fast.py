@@ -108,7 +108,7 @@ def observed(control, norms):
 def test_the_number_follows_the_plan_and_replaces_what_was_pruned():
     gaussians = random_ball(40, torch.Generator().manual_seed(0)).map(lambda t: t + 0).trainable()
     run = config(3_000, max_gaussians=100, densify_start=100, fast_stop=600)
-    control = PlannedDensity(run, torch.Generator().manual_seed(0), gaussians)
+    control = PlannedDensity(run, gaussians)
     optimizer = Adam(gaussians.tensors(), gaussian_groups(run, 1.0))
     counts = []
     for iteration in range(1, 1_001):
@@ -126,7 +126,7 @@ def test_the_number_follows_the_plan_and_replaces_what_was_pruned():
 def test_nothing_is_added_after_the_plan_ends_but_faint_ones_still_go():
     gaussians = random_ball(40, torch.Generator().manual_seed(0)).trainable()
     run = config(max_gaussians=100, densify_start=100, fast_stop=200)
-    control = PlannedDensity(run, torch.Generator().manual_seed(0), gaussians)
+    control = PlannedDensity(run, gaussians)
     optimizer = Adam(gaussians.tensors(), gaussian_groups(run, 1.0))
     with torch.no_grad():
         gaussians.logit_opacities[:3] = -9.0
@@ -136,25 +136,25 @@ def test_nothing_is_added_after_the_plan_ends_but_faint_ones_still_go():
     assert (event.num_pruned, event.num_split_children, len(gaussians)) == (4, 0, 36)
 
 
-def test_parents_are_drawn_in_proportion_to_their_score():
-    """Of 400 draws of one of three, with probabilities 0, 1/4 and 3/4: 300 +- 4.4 sigma (sigma = 8.7)."""
-    gaussians, drawn = random_ball(3, torch.Generator().manual_seed(0)), []
-    control = PlannedDensity(config(), torch.Generator().manual_seed(0), gaussians)
-    observed(control, [0.0, 1.0, 3.0])
-    for _ in range(400):
-        chosen = control._drawn(torch.ones(3, dtype=torch.bool), 1)
-        drawn.append(int(torch.nonzero(chosen)[0, 0]))
-    assert drawn.count(0) == 0 and abs(drawn.count(2) - 300) < 38
-    assert int(control._drawn(torch.ones(3, dtype=torch.bool), 9).sum()) == 2, "never one without a score"
-    assert not control._drawn(torch.zeros(3, dtype=torch.bool), 2).any()
+def test_those_of_the_highest_score_are_split():
+    gaussians = random_ball(5, torch.Generator().manual_seed(0))
+    control = PlannedDensity(config(), gaussians)
+    observed(control, [0.0, 1.0, 3.0, 1.0, 2.0])
+    everyone = torch.ones(5, dtype=torch.bool)
+    assert control._highest(everyone, 3).tolist() == [False, True, True, False, True], (
+        "of equal ones the first"
+    )
+    assert int(control._highest(everyone, 9).sum()) == 4, "never one without a score"
+    assert not control._highest(~everyone, 2).any()
+    assert not control._highest(everyone, -2).any()
 
 
-def test_a_poisoned_score_is_never_drawn():
+def test_a_poisoned_score_is_never_split():
     gaussians = random_ball(4, torch.Generator().manual_seed(0))
-    control = PlannedDensity(config(), torch.Generator().manual_seed(0), gaussians)
+    control = PlannedDensity(config(), gaussians)
     observed(control, [np.nan, np.inf, 1.0, 0.0])
-    assert control._drawn(torch.ones(4, dtype=torch.bool), 1).tolist() == [False, True, False, False]
-    assert control._drawn(torch.ones(4, dtype=torch.bool), 4).tolist() == [False, True, True, False]
+    assert control._highest(torch.ones(4, dtype=torch.bool), 1).tolist() == [False, True, False, False]
+    assert control._highest(torch.ones(4, dtype=torch.bool), 4).tolist() == [False, True, True, False]
 
 
 def test_the_strategy_needs_a_cap():

@@ -138,7 +138,7 @@ def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> D
     if config.strategy == "adc":
         return AdaptiveDensityControl(config, extent, generator, gaussians)
     if config.strategy == "fast":
-        return PlannedDensity(config, generator, gaussians)
+        return PlannedDensity(config, gaussians)
     return MCMC(config, generator) if config.strategy == "mcmc" else None
 
 

@@ -1,8 +1,8 @@
-"""Density control of the fast recipe: a planned number of Gaussians, splits drawn by score, no resets.
+"""Density control of the fast recipe: a planned number of Gaussians, splits by score, no resets.
 
-The number of Gaussians follows a plan from that of the start to the cap. Each time, parents are drawn without
-replacement in proportion to their score and split along their longest axis, which leaves the image nearly unchanged.
-Gaussians that became too faint to see are removed, and the plan replaces them where the score is high.
+The number of Gaussians follows a plan from that of the start to the cap. Each time, the Gaussians of the highest score
+are split along their longest axis, which leaves the image nearly unchanged. Gaussians that became too faint to see are
+removed, and the plan replaces them where the score is high.
 
 Its settings are in `gsplat_edu.train.config`.
 """
@@ -28,7 +28,6 @@ from gsplat_edu.train.saved import (
     check_entries,
     check_flag,
     check_statistics,
-    check_torch_generator,
     check_whole,
 )
 from gsplat_edu.train.schedule import planned_counts
@@ -44,7 +43,6 @@ class PlannedDensity:
 
     Args:
         config: Window, interval and cap.
-        generator: Source of the draws.
         gaussians: The start Gaussians.
 
     Raises:
@@ -53,12 +51,12 @@ class PlannedDensity:
 
     observes_renders_only = True
 
-    def __init__(self, config: TrainConfig, generator: torch.Generator, gaussians: Gaussians) -> None:
+    def __init__(self, config: TrainConfig, gaussians: Gaussians) -> None:
         if config.max_gaussians is None:
             raise ArgumentError(
                 "max_gaussians: the strategy fast grows to a planned number and needs it, for example 100000"
             )
-        self.config, self.generator, self.cap = config, generator, config.max_gaussians
+        self.config, self.cap = config, config.max_gaussians
         self.start_count, self.is_over = len(gaussians), False
         self._forget(gaussians)
 
@@ -80,27 +78,21 @@ class PlannedDensity:
         keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
         planned = int(planned_counts(config, self.start_count, self.cap, np.array([iteration]))[0])
         room = planned - int(keep.sum()) if iteration <= config.fast.stop else 0
-        split = self._drawn(keep, room)
+        split = self._highest(keep, room)
         children = long_axis_children(gaussians.map(lambda tensor: tensor[split]))
         replaced = replace(gaussians, optimizer, keep & ~split, children)
         self._forget(replaced)
         counts = 2 * len(children[0]), int((~keep).sum())
         return replaced, [DensifyEvent(iteration, 0, *counts, num_gaussians=len(replaced))]
 
-    def _drawn(self, keep: Bool[Tensor, " N"], count: int) -> Bool[Tensor, " N"]:
-        """Draw parents without replacement, with probabilities proportional to the score.
-
-        log score - log(-log u) with u uniform is a Gumbel variable; the largest `count` are such a draw.
-        """
+    def _highest(self, keep: Bool[Tensor, " N"], count: int) -> Bool[Tensor, " N"]:
+        """Select the `count` Gaussians of the highest positive score, of equal ones the first."""
         score = self._score()
-        candidates = torch.nonzero(keep & (score > 0))[:, 0]
-        uniform = torch.rand(len(keep), generator=self.generator, dtype=torch.float64)
-        uniform = uniform.clamp(min=torch.finfo(torch.float64).tiny).to(keep.device)[candidates]
-        keys = torch.log(score[candidates].double()) - torch.log(-torch.log(uniform))
-        order = torch.argsort(keys, descending=True, stable=True)
-        drawn = torch.zeros_like(keep)
-        drawn[candidates[order[: max(count, 0)]]] = True
-        return drawn
+        score = torch.where(keep & (score > 0), score, 0.0)  # NaN is not above 0
+        order = torch.argsort(score, descending=True, stable=True)[: max(count, 0)]
+        chosen = torch.zeros_like(keep)
+        chosen[order] = score[order] > 0
+        return chosen
 
     def _score(self) -> Float[Tensor, " N"]:
         return self.norm_sums / self.times_visible.clamp(min=1)
@@ -110,23 +102,18 @@ class PlannedDensity:
         self.times_visible = torch.zeros_like(self.norm_sums)
 
     def state(self) -> State:
-        """Return the statistics since the last densification, the generator and the number at the start."""
+        """Return the statistics since the last densification, and the number at the start."""
         statistics = {name: getattr(self, name) for name in STATISTICS}
-        return statistics | {"generator": self.generator.get_state()}, {
-            "start_count": self.start_count,
-            "is_over": self.is_over,
-        }
+        return statistics, {"start_count": self.start_count, "is_over": self.is_over}
 
     def load_state(self, tensors: dict[str, Tensor], numbers: dict[str, Any], gaussians: Gaussians) -> None:
         """Restore what `state` returned; see `DensityStrategy.load_state`."""
-        check_entries("density", tensors, (*STATISTICS, "generator"))
+        check_entries("density", tensors, STATISTICS)
         statistics = {name: tensors[name] for name in STATISTICS}
         check_statistics(statistics, gaussians.logit_opacities)
-        check_torch_generator("density.generator", tensors["generator"], self.generator)
         given = check_entries("density", numbers, ("start_count", "is_over"))
         start_count = check_whole("density: start_count", given["start_count"], self.cap)
         self.is_over = check_flag("density: is_over", given["is_over"])
         self.start_count = start_count
-        self.generator.set_state(tensors["generator"])
         for name, tensor in statistics.items():
             setattr(self, name, tensor)
