@@ -15,7 +15,7 @@ from processes import Program
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py")) + sorted((ROOT / "benchmarks").glob("*/__main__.py"))
-SHARED = {"captures.py", "hardware.py"}
+SHARED = {"captures.py", "hardware.py", "traced.py"}
 """Modules that the benchmarks import."""
 
 MADE = {
