@@ -111,8 +111,8 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
     _add_number(
         group,
         "--iterations",
-        f"number of training steps (default: those of --quality, or as many as fit --time-limit; {RECIPE_ITERATIONS}"
-        " for the other strategies)",
+        f"number of training steps (default: those of --quality, or as many as fit --time-limit; {RECIPE_ITERATIONS:,}"
+        " for strategies other than fast)",
     )
     group.add_argument(
         "--no-rescale",
