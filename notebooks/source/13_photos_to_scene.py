@@ -396,5 +396,5 @@ shutil.rmtree(WORK)
 # - **Scenes larger than memory.** All Gaussians are held at once, in the bytes printed above.
 #
 # With photos of your own: `gsplat-edu sfm PHOTOS CAPTURE` finds the poses, `gsplat-edu doctor CAPTURE` says what is
-# wrong with them and how long a training takes, `gsplat-edu train CAPTURE --out RUN` trains by a
-# [faster recipe](../docs/RECIPE.md), `gsplat-edu view RUN` shows the scene. It began with [a point](01_points.ipynb).
+# wrong with them and how long a training takes, `gsplat-edu train CAPTURE --out RUN` trains by our
+# [fast recipe](../docs/RECIPE.md), and `gsplat-edu view RUN` shows the scene. It began with [a point](01_points.ipynb).
