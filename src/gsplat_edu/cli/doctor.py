@@ -132,12 +132,9 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
 
 
 def _strategy(section: object) -> str:
-    """Return the strategy in the section "train" of config.json; a run that does not name one is the library's."""
-    return (
-        str(section.get("strategy", TrainConfig.strategy))
-        if isinstance(section, dict)
-        else TrainConfig.strategy
-    )
+    """Return the strategy in the section "train" of config.json; a run that names none has the library's."""
+    found = section.get("strategy") if isinstance(section, dict) else None
+    return TrainConfig.strategy if found is None else str(found)
 
 
 def _options(config: dict[str, Any]) -> tuple[str, ...]:
