@@ -13,6 +13,7 @@ import websockets.sync.client
 import zstandard
 from PIL import Image
 
+from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.main import build_parser
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.runs.training import CaptureRun
@@ -26,9 +27,9 @@ CANVAS = (120, 80)
 POSE = {"wxyz": LEVEL, "position": (0.1, -0.05, -3.0), "fov": 0.8, "image_width": 120, "image_height": 80}
 GROWING = ["--max-gaussians", "600", "--densify-start", "5", "--densify-every", "10"]
 STRATEGIES = {
-    "adc": ["--densify-stop", "150", "--grad-threshold", "1e-4", "--reset-every", "60"],
+    "adc": ["--strategy", "adc", "--densify-stop", "150", "--grad-threshold", "1e-4", "--reset-every", "60"],
     "mcmc": ["--strategy", "mcmc", "--mcmc-stop", "150"],
-    "fast": ["--strategy", "fast", "--fast-full-size", "150", "--fast-start-factor", "1.5"],
+    "fast": ["--fast-full-size", "150", "--fast-start-factor", "1.5"],
 }
 
 
@@ -46,7 +47,7 @@ class Training:
 
     def __init__(self, capture, out, *words):
         parsed = build_parser(["train"]).parse_args(["train", str(capture), "--out", str(out), *words])
-        self.run = CaptureRun(options_from(parsed))
+        self.run = CaptureRun(plan(options_from(parsed), Limits()).options)
         self.stopped = threading.Event()
         self.view = LiveView(self.run, self.stopped.is_set, port=0)
         self.failure = None

@@ -277,12 +277,13 @@ for expected in ((shaken,), None):
 # %% [markdown]
 # ## The scene
 #
-# Now the recipe, from the points that were triangulated, every eighth photo held out: the loss is
-# $0.8\,L_1 + 0.2\,(1 - \mathrm{SSIM})$, where SSIM (Wang et al. 2004) is 1 if two photos agree in mean, contrast and
-# pattern around every pixel: $L_1$ alone forgives blur. Harmonics rise by degrees, splats are cloned and split. The
-# field compares the mean peak signal-to-noise ratio of held-out photos, $10 \log_{10}(1/\mathrm{MSE})$ in decibels
-# ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)): 3 dB are half the squared error. Held against
-# the guess, the first line below credits the poses with their points as well: the guess had to begin with random ones.
+# Now the recipe of Kerbl et al. 2023 (`gsplat-edu train --strategy adc`), from the points that were triangulated,
+# every eighth photo held out: the loss is $0.8\,L_1 + 0.2\,(1 - \mathrm{SSIM})$, where SSIM (Wang et al. 2004) is 1 if
+# two photos agree in mean, contrast and pattern around every pixel: $L_1$ alone forgives blur. Harmonics rise by
+# degrees, splats are cloned and split. The field compares the mean peak signal-to-noise ratio of held-out photos,
+# $10 \log_{10}(1/\mathrm{MSE})$ in decibels ([gsplat_edu.evaluate.metrics](../src/gsplat_edu/evaluate/metrics.py)):
+# 3 dB are half the squared error. Held against the guess, the first line below credits the poses with their points as
+# well: the guess had to begin with random ones.
 
 # %%
 posed = summarize(trained("capture", "small", BRIEFLY, resolution=SIDE_PX)[2].test)["psnr"]
@@ -395,5 +396,5 @@ shutil.rmtree(WORK)
 # - **Scenes larger than memory.** All Gaussians are held at once, in the bytes printed above.
 #
 # With photos of your own: `gsplat-edu sfm PHOTOS CAPTURE` finds the poses, `gsplat-edu doctor CAPTURE` says what is
-# wrong with them and how long a training takes on your machine, `gsplat-edu train CAPTURE --out RUN` trains, and
-# `gsplat-edu view RUN` shows the scene in a browser. It began with [a point](01_points.ipynb).
+# wrong with them and how long a training takes, `gsplat-edu train CAPTURE --out RUN` trains by our
+# [fast recipe](../docs/RECIPE.md), and `gsplat-edu view RUN` shows the scene. It began with [a point](01_points.ipynb).

@@ -10,7 +10,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, Speed, reduced_bytes
+from gsplat_edu.budget.costs import (
+    LATER,
+    LEAST_PLANNED,
+    PLANNED_SHARE,
+    PLANNED_VIEWS,
+    Facts,
+    Footprint,
+    Measurements,
+    Speed,
+    reduced_bytes,
+    wanted_gaussians,
+)
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import Limits, Request, choose, flags, plan, taken_up
@@ -181,7 +192,9 @@ def test_the_options_in_the_sentence_give_the_same_run():
     """The plan and the options in its sentence have the same recipe and photo size."""
     found = chosen(700, 240.0)
     words = found.sentences[0].split("chosen ")[1].split()
-    parsed = build_parser(["train"]).parse_args(["train", "capture", "--out", "run", *words])
+    parsed = build_parser(["train"]).parse_args(
+        ["train", "capture", "--out", "run", "--strategy", "adc", *words]
+    )
     again = options_from(parsed)
     assert again.config == found.options.config
     assert again.data_settings.resolution == found.resolution
@@ -255,10 +268,9 @@ def test_the_fast_recipe_plans_its_number_without_limits_and_a_resumed_run_keeps
     """As many as the pixels and views ask for, at least those of a start scene; a given number stays."""
     run = dataclasses.replace(options(capture, tmp_path / "run", 20), config=recipe(20, strategy="fast"))
     found = plan(run, Limits())
-    dataset = load_dataset(capture)
-    views = len(dataset.train)
-    pixels = dataset.train[0].camera.W * dataset.train[0].camera.H
-    assert found.max_gaussians == round(0.14 * pixels * (views / 85) ** 0.5) and found.iterations == 20
+    facts = Facts.of(load_dataset(capture))
+    assert found.max_gaussians == wanted_gaussians(run.config, facts.points, facts.pixels, facts.train)
+    assert found.max_gaussians == LEAST_PLANNED and found.iterations == 20, "the photos are thumbnails"
     assert found.sentences == (
         f"the recipe plans {found.max_gaussians:,} Gaussians; --max-gaussians changes that",
     )
@@ -271,6 +283,16 @@ def test_the_fast_recipe_plans_its_number_without_limits_and_a_resumed_run_keeps
     assert plan(other, Limits()).max_gaussians == 5_000
     fixed = dataclasses.replace(other, config=recipe(20, strategy="fast", max_gaussians=7_000))
     assert plan(fixed, Limits()).options == fixed and not plan(fixed, Limits()).sentences
+
+
+def test_the_planned_number_grows_with_pixels_and_views_from_a_least_number_on():
+    def wanted(pixels, views):
+        return wanted_gaussians(recipe(20, strategy="fast"), 200, pixels, views)
+
+    few = wanted(300_000, PLANNED_VIEWS)
+    assert few == round(PLANNED_SHARE * 300_000) > LEAST_PLANNED
+    assert wanted(600_000, PLANNED_VIEWS) == wanted(300_000, 4 * PLANNED_VIEWS) == 2 * few
+    assert wanted(64 * 48, 14) == wanted(1, 1) == LEAST_PLANNED
 
 
 def test_a_start_scene_that_does_not_fit_is_refused(capture, tmp_path):
@@ -361,7 +383,7 @@ def test_remaining_time_is_used_and_the_printed_options_repeat_the_run_exactly(c
     assert stored["iterations"] == total and stored["means_rate_iterations"] == 20, "milestones stay"
     assert f"20 iterations were planned, {total} fitted" in outcome
     words = outcome.split("to repeat the run: ")[1].split()
-    fixed = ["--save-every", "0", "--eval-every", "0"]
+    fixed = ["--strategy", "adc", "--save-every", "0", "--eval-every", "0"]
     assert main(["train", str(capture), "--out", str(tmp_path / "again"), *fixed, *words]) == 0
     scenes = [RunFolder(tmp_path / name).latest_scene()[0].read_bytes() for name in ("run", "again")]
     assert scenes[0] == scenes[1]

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 import gsplat_edu.cli.main as command_line
+from gsplat_edu.budget.costs import LEAST_PLANNED
+from gsplat_edu.budget.plan import Limits, plan
+from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap, write_transforms
@@ -60,7 +63,9 @@ def test_the_recommended_training_uses_the_given_options(doctor, capture):
     words = next(line for line in said.splitlines() if "train: " in line).partition("train: ")[2]
     assert code == 0
     assert words == f"gsplat-edu train {folder} --iterations 800 --resolution 2 --out out/capture"
-    assert "--iterations 3000" not in said
+    assert "--quality draft" not in said
+    _, said = doctor(folder, "--no-forecast")
+    assert f"gsplat-edu train {folder} --quality draft --out out/capture_draft" in said
 
 
 def test_faults_are_named_and_the_exit_code_stays_0(doctor, capture, tmp_path):
@@ -98,6 +103,7 @@ def test_bad_input_is_one_line_and_2(doctor, capture, tmp_path):
         ([tmp_path / "gone"], "does not exist; give a dataset folder or a run folder"),
         ([tmp_path / "empty"], "is not a capture"),
         ([capture[0], "--resolution", "0.5"], "resolution"),
+        ([capture[0], "--no-forecast", "--iterations", "0"], "iterations"),
         ([capture[0], "--backend", "abacus"], "abacus"),
         ([capture[0], "--backend", "torch"], "--no-forecast"),
     ):
@@ -111,6 +117,20 @@ def test_the_forecast_comes_before_the_advice(doctor, capture):
     lines = said.splitlines()
     first = next(i for i, line in enumerate(lines) if line.startswith("forecast"))
     assert "200 iterations" in said and first < lines.index("what to do:") and len(lines) <= 24
+
+
+def test_the_forecast_is_that_of_a_training_without_options(doctor, capture, tmp_path):
+    """Without --iterations it forecasts the fast recipe's standard length, with the number that `train` plans."""
+    code, said = doctor(capture[0])
+    assert code == 0
+    assert "for 3,000 iterations on cpu" in said and f"200 to {LEAST_PLANNED:,} Gaussians" in said
+    options = options_from(
+        command_line.build_parser(["train"]).parse_args(
+            ["train", str(capture[0]), "--out", str(tmp_path / "x")]
+        )
+    )
+    chosen = plan(options, Limits())
+    assert (chosen.iterations, chosen.max_gaussians) == (3_000, LEAST_PLANNED)
 
 
 @pytest.fixture(scope="module")
@@ -149,8 +169,9 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
     shutil.copytree(run.path, place / "run; one")
     config = run.read_config()
     data = config["data"] | {"path": str((place / "capture one").resolve()), "resolution": 40.0}
-    train = {"iterations": 30, "background": [1.0, 1.0, 1.0]}
-    RunFolder(place / "run; one").write_config(config | {"data": data | {"test_every": 0}, "train": train})
+    train = {"iterations": 30, "background": [1.0, 1.0, 1.0], "strategy": "fast"}
+    config |= {"data": data | {"test_every": 0}, "train": train}
+    RunFolder(place / "run; one").write_config(config)
     said = [doctor(place / "capture one", "--no-forecast")[1], doctor(place / "run; one")[1]]
     commands = [words for text in said for words in pasted(text)]
     assert {words[0] for words in commands} >= {"train", "render"} and len(commands) >= 5
@@ -162,12 +183,21 @@ def test_commands_can_be_pasted(doctor, capture, run, tmp_path, monkeypatch):
         assert "RUN" not in words and "CAPTURE" not in words
     renders = next(words for words in commands if words[0] == "render")
     assert command_line.main([*renders, "--frames", "2"]) == 0 and Path("orbit.mp4").is_file()
-    longer = next(words for words in commands if "30000" in words)
+    longer = next(words for words in commands if "10000" in words)
     assert "--strategy" not in longer, "a default"
     assert longer[longer.index("--resolution") + 1] == "40"
     assert longer[longer.index("--test-every") + 1] == "0", "0 is a value, too"
     assert longer[longer.index("--background") + 1 :][:3] == ["1", "1", "1"]
-    assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_30000").is_dir()
+    assert command_line.main([*longer, "--iterations", "2"]) == 0 and Path("out/run; one_10000").is_dir()
+    # A run of another recipe is repeated with that. The oldest runs do not name their recipe, which was adc.
+    for changes, strategy in (
+        ({"strategy": "mcmc", "max_gaussians": 300}, "mcmc"),
+        ({"strategy": None}, "adc"),
+    ):
+        changed = {key: value for key, value in (train | changes).items() if value is not None}
+        RunFolder(place / "run; one").write_config(config | {"train": changed})
+        longer = next(words for words in pasted(doctor(place / "run; one")[1]) if "30000" in words)
+        assert longer[longer.index("--strategy") + 1] == strategy
 
 
 def test_the_proposed_output_folder_does_not_exist_yet(doctor, capture, tmp_path, monkeypatch):

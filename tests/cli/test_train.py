@@ -26,10 +26,19 @@ def options(*words):
     return options_from(parsed(["train", "somewhere", "--out", "run", *words]))
 
 
-def test_without_options_the_recipe_has_its_defaults():
+def test_without_options_the_recipe_is_fast_with_3000_iterations():
     chosen = options()
-    assert chosen.config == TrainConfig() == recipe()
+    assert chosen.config == recipe(3_000, strategy="fast")
+    assert (chosen.config.strategy, chosen.config.iterations) == ("fast", 3_000)
+    assert chosen.config.max_gaussians is None, "planned from the capture"
     assert chosen.data_settings.background == (0.0, 0.0, 0.0)
+    assert options("--iterations", "500").config == recipe(500, strategy="fast")
+
+
+def test_the_other_recipes_are_those_of_their_papers():
+    assert options("--strategy", "adc").config == TrainConfig() == recipe()
+    mcmc = options("--strategy", "mcmc", "--max-gaussians", "500").config
+    assert mcmc == recipe(strategy="mcmc", max_gaussians=500) and mcmc.iterations == 30_000
 
 
 def test_options_reach_the_recipe():
@@ -55,33 +64,25 @@ def test_options_reach_the_recipe():
 def test_the_other_strategies_and_colours():
     assert options("--strategy", "none").config.strategy == "none"
     assert options("--background", "0.1", "0.2", "0.3").config.background == (0.1, 0.2, 0.3)
-    late = options("--no-rescale", "--densify-start", "26000", "--densify-stop", "28000").config
+    window = ["--no-rescale", "--densify-start", "26000", "--densify-stop", "28000"]
+    late = options("--strategy", "adc", *window).config
     assert late.adc.densify_stop == 28_000, "the other strategy's window is not checked"
 
 
 def test_the_quality_is_the_length_of_the_fast_recipe():
-    lengths = {name: options("--strategy", "fast", "--quality", name).config.iterations for name in QUALITIES}
+    lengths = {name: options("--quality", name).config.iterations for name in QUALITIES}
     assert lengths == QUALITIES
-    assert (
-        options("--strategy", "fast").config == options("--strategy", "fast", "--quality", "standard").config
-    )
-    config = options("--strategy", "fast", "--iterations", "500").config
-    assert (config.iterations, config.fast.full_size, config.sh_every) == (500, 300, 50)
+    assert options().config == options("--strategy", "fast").config == options("--quality", "standard").config
+    config, full = options("--iterations", "300").config, recipe(strategy="fast")
+    assert config.iterations == 300 and 100 * config.fast.full_size == full.fast.full_size
+    assert 100 * config.sh_every == full.sh_every
     for words, said in (
-        (
-            ["--strategy", "fast", "--quality", "best"],
-            "--quality: is 'best', but has to be one of draft, standard, high",
-        ),
-        (["--quality", "high"], "--quality: is the length of --strategy fast"),
-        (
-            ["--strategy", "fast", "--quality", "high", "--iterations", "9"],
-            "--quality: --iterations or --time-limit",
-        ),
-        (
-            ["--strategy", "fast", "--quality", "high", "--time-limit", "9m"],
-            "--quality: --iterations or --time-limit",
-        ),
-        (["--fast-stop", "9"], "--fast-stop: only --strategy fast uses it"),
+        (["--quality", "best"], "--quality: is 'best', but has to be one of draft, standard, high"),
+        (["--strategy", "adc", "--quality", "high"], "--quality: is the length of --strategy fast"),
+        (["--quality", "high", "--iterations", "9"], "--quality: --iterations or --time-limit"),
+        (["--quality", "high", "--time-limit", "9m"], "--quality: --iterations or --time-limit"),
+        (["--strategy", "adc", "--fast-stop", "9"], "--fast-stop: only --strategy fast uses it"),
+        (["--densify-stop", "9"], "--densify-stop: only --strategy adc uses it"),
     ):
         with pytest.raises(ArgumentError, match=said):
             options(*words)
@@ -159,10 +160,15 @@ def test_sizes(text, size):
         (["--test-every", "1"], "test_every"),
         (["--backend", "gpu"], "backend"),
         (["--max-gaussians", "0"], "max_gaussians"),
-        (["--densify-start", "20000"], "densify_stop"),
+        (["--densify-start", "20000"], "fast_stop"),
+        (["--strategy", "adc", "--densify-start", "20000"], "densify_stop"),
         (["--image-memory", "1e400"], "--image-memory"),
         (["--means-rate", "none"], "--means-rate"),
         (["--mcmc-noise", "1"], "--mcmc-noise"),
+        (
+            ["--grad-threshold", "1e-4"],
+            "--grad-threshold: only --strategy adc uses it; leave it out or choose",
+        ),
         (["--strategy", "none", "--reset-every", "5"], "--reset-every"),
         (["--background", "1", "1", "2", "--white-background"], "--background"),
         (["--opacities-rate", "fast"], "--opacities-rate"),

@@ -265,6 +265,42 @@ def test_a_short_training_is_not_fine(scene, reached, gain, severity, says):
     assert ("better photos" in advice) is (severity is not Severity.WARNING)
 
 
+@pytest.mark.parametrize("gain", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("reached", "is_short", "has_longer"),
+    [
+        (1_000, True, True),
+        (2_999, True, True),
+        (3_000, False, True),
+        (10_000, False, False),
+        (12_000, False, False),
+    ],
+)
+def test_a_run_of_the_fast_recipe_is_judged_by_its_lengths(scene, reached, is_short, has_longer, gain):
+    """3,000 iterations are its standard, 10,000 its longest. Its PSNR rises to the end of any run."""
+    gaussians, views = scene
+    run = trained(gaussians, views, reached=reached, planned=reached, capture=Path("a b/$c"), strategy="fast")
+    diagnosis = examine_run(replace(run, log=evaluations(reached, gain)))
+    found = [finding for finding in diagnosis.findings if finding.name == "short training"]
+    assert ("length" in diagnosis.fine) is (not found) is (not is_short)
+    if found:
+        assert found[0].severity is Severity.WARNING
+        assert found[0].sentence == f"{reached:,} iterations; the recipe has 3,000"
+    said = " ".join([*diagnosis.advice, *diagnosis.otherwise])
+    longer = "train for longer: gsplat-edu train 'a b/$c' --iterations 10000 --out out/a_10000"
+    assert (longer in said) is has_longer and ("better photos" in said) is not has_longer
+    assert "rising" not in said and "30000" not in said
+
+
+def test_the_longer_run_of_the_fast_recipe_keeps_the_mean_pace(scene):
+    """Its photos grow in proportion to its length, so the cheap iterations at the start become more, too."""
+    gaussians, views = scene
+    log = [{"iteration": i, "ms": 100.0 if i <= 1_500 else 300.0} for i in range(10, 3_001, 10)]
+    run = trained(gaussians, views, reached=3_000, planned=3_000, log=log, capture=Path("a"), strategy="fast")
+    said = " ".join(examine_run(run).otherwise)
+    assert "train for longer (about 33 min 20 s at this run's pace): gsplat-edu train a " in said
+
+
 def test_advice_to_train_for_longer_gives_the_time_at_this_runs_pace(scene):
     """After 400 iterations of 0.8 s, the command for 30,000 used to come without any hint that it takes hours."""
     gaussians, views = scene

@@ -21,12 +21,18 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, is_finished
-from gsplat_edu.train.config import TrainConfig, recipe
+from gsplat_edu.train.config import QUALITIES, TrainConfig, recipe
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import StepEvent
 
 BASE = ["--eval-every", "0", "--save-every", "5", "--densify-start", "1", "--densify-every", "4"]
-BASE += ["--grad-threshold", "5e-5"]
+ADC = ["--strategy", "adc", "--grad-threshold", "5e-5"]
+STRATEGIES = {
+    "fast": [],  # the default
+    "adc": ADC,
+    "mcmc": ["--strategy", "mcmc", "--max-gaussians", "70", "--mcmc-growth", "1.1"],
+    "none": ["--strategy", "none"],
+}
 VIEWS = 6
 
 
@@ -50,11 +56,11 @@ def capture(tmp_path_factory):
 
 
 def train(capture, out, *options):
-    return main(["train", str(capture), "--out", str(out), *BASE, *options])
+    return main(["train", str(capture), "--out", str(out), *BASE, *ADC, *options])
 
 
 def options(capture, out, *words):
-    words = ["train", str(capture), "--out", str(out), *BASE, *words]
+    words = ["train", str(capture), "--out", str(out), *BASE, *ADC, *words]
     return options_from(build_parser(words).parse_args(words))
 
 
@@ -106,7 +112,7 @@ def test_an_extended_mcmc_run_equals_one_run_with_the_same_milestones(capture, t
     """Both relocate (opacities start at 0.5) and grow until the shorter schedule ends, then only add noise."""
 
     def mcmc(out, *words):
-        numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--min-opacity", "0.58", *BASE[:-2], *words]
+        numbers = ["--strategy", "mcmc", "--max-gaussians", "60", "--min-opacity", "0.58", *BASE, *words]
         assert main(["train", str(capture), "--out", str(tmp_path / out), *numbers]) == 0
 
     short = recipe(20).flat()
@@ -119,6 +125,49 @@ def test_an_extended_mcmc_run_equals_one_run_with_the_same_milestones(capture, t
     moved = [line for line in RunFolder(tmp_path / "extended").log() if line.get("event") == "relocate"]
     assert moved[-1]["iteration"] <= 17 and any(line["num_relocated"] for line in moved)
     assert set(RunFolder(tmp_path / "extended").log()[-1]["terms"]) == {"photo", "opacity", "scale"}
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_a_run_is_resumed_with_its_own_strategy_unless_another_is_named(capture, tmp_path, capsys, strategy):
+    words, (whole, out) = STRATEGIES[strategy], (tmp_path / "whole", tmp_path / "cut")
+    other, unnamed = "none" if strategy == "fast" else "fast", words[2:]  # without "--strategy NAME"
+
+    def run(out, *words):
+        return main(["train", str(capture), "--out", str(out), *BASE, *words])
+
+    assert run(whole, "--iterations", "20", *words) == 0
+    assert run(out, "--iterations", "20", *words, "--time-limit", "0.001s") == 0
+    assert RunFolder(out).read_metrics()["iterations"] < 20
+    capsys.readouterr()
+    assert run(out, "--strategy", other, "--resume") == 2
+    error = capsys.readouterr().err
+    assert f"was started with strategy = {strategy}, not {other}" in error and error.count("\n") == 1
+    if strategy != "adc":
+        assert run(out, "--grad-threshold", "5e-5", "--resume") == 2
+        assert "--grad-threshold: only --strategy adc uses it" in capsys.readouterr().err
+    assert run(out, *unnamed, "--resume") == 0
+    assert ply(out, 20) == ply(whole, 20)
+    assert RunFolder(out).read_config()["train"] == RunFolder(whole).read_config()["train"]
+    assert RunFolder(out).read_config()["train"]["strategy"] == strategy
+
+
+def test_a_longer_quality_extends_a_run_and_a_shorter_one_is_refused(capture, tmp_path, capsys, monkeypatch):
+    """A quality is a number of iterations: the one given, not that of config.json, is the new length."""
+    for name, count in (("draft", 4), ("standard", 8), ("high", 12)):
+        monkeypatch.setitem(QUALITIES, name, count)
+
+    def run(*words):
+        return main(["train", str(capture), "--out", str(tmp_path / "run"), *BASE, *words])
+
+    assert run() == 0 and RunFolder(tmp_path / "run").read_metrics()["iterations"] == 8
+    stop = RunFolder(tmp_path / "run").read_config()["train"]["fast_stop"]
+    capsys.readouterr()
+    assert run("--quality", "draft", "--resume") == 2
+    assert "with iterations = 8, not 4: a run can be extended, not shortened" in capsys.readouterr().err
+    assert run("--quality", "high", "--resume") == 0
+    train = RunFolder(tmp_path / "run").read_config()["train"]
+    assert (train["iterations"], train["fast_stop"]) == (12, stop), "milestones stay"
+    assert RunFolder(tmp_path / "run").read_metrics()["iterations"] == 12
 
 
 def test_a_run_is_complete_once_it_is_constructed(capture, tmp_path):

@@ -22,6 +22,7 @@ FIELDS = [
     "config.json:data",
     "config.json:render",
     "config.json:train.iterations",
+    "config.json:train.strategy",
     "config.json:render.background",
     "config.json:render.sh_degree",
     "config.json:data.path",

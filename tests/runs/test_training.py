@@ -25,13 +25,14 @@ from gsplat_edu.runs.training import CaptureRun
 from processes import Program
 
 SHORT = ["--iterations", "40", "--eval-every", "20", "--save-every", "10", "--densify-start", "5"]
-SHORT += ["--densify-every", "10", "--densify-stop", "35", "--grad-threshold", "5e-5"]
+SHORT += ["--densify-every", "10"]
 
 # Long enough to be killed midway: about two seconds.
 LONG = ["--iterations", "600", "--eval-every", "150", "--save-every", "40", "--densify-start", "20"]
 LONG += ["--densify-every", "20", "--sh-every", "100"]
-ADC = ["--densify-stop", "500", "--grad-threshold", "5e-5"]
+ADC = ["--strategy", "adc", "--densify-stop", "500", "--grad-threshold", "5e-5"]
 STRATEGIES = {
+    "fast": [],  # the default
     "adc": [*ADC, "--reset-every", "100", "--max-gaussians", "1500", "--random-background"],
     "mcmc": ["--strategy", "mcmc", "--max-gaussians", "1200", "--mcmc-stop", "500"],
 }
@@ -82,7 +83,16 @@ def test_a_run_folder_has_the_expected_contents(finished):
 
 def test_the_saved_scene_renders_bit_identical_images(capture, tmp_path):
     """Compare the trained scene with the written one at every training camera."""
-    words = ["train", str(capture), "--out", str(tmp_path / "run"), *SHORT, "--antialiased"]
+    words = [
+        "train",
+        str(capture),
+        "--out",
+        str(tmp_path / "run"),
+        *SHORT,
+        "--antialiased",
+        "--max-gaussians",
+        "500",
+    ]
     parsed = build_parser(words).parse_args(words)
     run = CaptureRun(options_from(parsed))
     trainer = run.trainer
@@ -290,7 +300,6 @@ def test_a_scene_that_is_pruned_away_is_reported(capture, tmp_path, capsys):
 
 def test_nonfinite_gaussians_are_left_out(capture, tmp_path):
     words = ["train", str(capture), "--out", str(tmp_path / "run"), *SHORT, "--strategy", "none"]
-    words = [word for word in words if word not in ("--densify-stop", "35", "--grad-threshold", "5e-5")]
     said = []
     run = CaptureRun(options_from(build_parser(words).parse_args(words)), said.append)
     trainer = run.trainer
@@ -415,7 +424,10 @@ def test_a_file_in_place_of_the_run_folder_is_a_one_line_error(capture, tmp_path
     assert capsys.readouterr().err.count("\n") == 2
 
 
-@pytest.mark.parametrize(("strategy", "cap"), [("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 240)])
+@pytest.mark.parametrize(
+    ("strategy", "cap"),
+    [("fast", 200), ("fast", 500), ("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 240)],
+)
 def test_the_cap_holds_from_the_first_iteration_to_the_last(capture, tmp_path, strategy, cap):
     """The start cloud has more points than the lower cap."""
     options = [*LONG[2:], "--iterations", "150", "--strategy", strategy, "--max-gaussians", str(cap)]

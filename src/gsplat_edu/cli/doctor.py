@@ -26,7 +26,7 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.train.config import DEFAULT_QUALITY, DEFAULT_STRATEGY, QUALITIES, recipe
+from gsplat_edu.train.config import DEFAULT_QUALITY, DEFAULT_STRATEGY, QUALITIES, TrainConfig, recipe
 
 EXIT_HOPELESS = 1
 """Exit code if training would be pointless."""
@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, Sequence[str]]:
     settings = DataSettings(resolution=arguments.resolution)
+    config = recipe(arguments.iterations, strategy=DEFAULT_STRATEGY)
     backend = resolve_backend(arguments.backend)
     if backend == "torch" and not arguments.no_forecast:
         raise ArgumentError(
@@ -70,7 +71,7 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
 
     try:
         dataset = load_dataset(arguments.path, settings)
-        facts, config = Facts.of(dataset), recipe(arguments.iterations, strategy=DEFAULT_STRATEGY)
+        facts = Facts.of(dataset)
         cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         config = dataclasses.replace(config, max_gaussians=cap)
         said = forecast(dataset, config, backend=backend).lines()
@@ -125,22 +126,28 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         options=_options(config),
         beforehand=beforehand,
         uncompared=uncompared,
-        strategy=str(section.get("strategy", "adc")) if isinstance(section, dict) else "adc",
+        strategy=_strategy(section),
     )
     return examine_run(trained), view_lines(trained) if arguments.all_views else ()
 
 
+def _strategy(section: object) -> str:
+    """Return the strategy in the section "train" of config.json; a run that names none has the library's."""
+    found = section.get("strategy") if isinstance(section, dict) else None
+    return TrainConfig.strategy if found is None else str(found)
+
+
 def _options(config: dict[str, Any]) -> tuple[str, ...]:
-    """Return the options to repeat in a longer run: input, background, limits."""
+    """Return the options to repeat in a longer run: input, strategy, background, limits."""
     section, data = config.get("train"), config["data"]
-    train = section if isinstance(section, dict) else {}
+    train, strategy = section if isinstance(section, dict) else {}, _strategy(section)
     background = train.get("background") or ()
     named = {
         "--resolution": (data.get("resolution"),),
         "--test-every": (data.get("test_every"),),
         "--points": (data.get("points"),),
         "--from": (data.get("scene"),),
-        "--strategy": (None if train.get("strategy") == DEFAULT_STRATEGY else train.get("strategy"),),
+        "--strategy": (None if strategy == DEFAULT_STRATEGY else strategy,),
         "--max-gaussians": (train.get("max_gaussians"),),
         "--background": background if any(background) else (None,),
     }

@@ -158,6 +158,7 @@ def _planned(
     options = _with_poses(options_from(arguments), console, say)
     limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
+    given += ["iterations"] if arguments.quality is not None else []
     chosen = plan(options, limits, given, rescale=not arguments.no_rescale)
     for sentence in chosen.sentences:
         say(sentence)

@@ -99,7 +99,7 @@ def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:
     """Return advice for captures with few problems."""
     place = survey.path.resolve()
     name = place.name if place.is_dir() else place.parent.name  # transforms.json is in its capture's folder
-    out, short = new_run(name), new_run(f"{name}_3000")
+    out, short = new_run(name), new_run(f"{name}_draft")
     cloud = (
         ()
         if len(survey.points)
@@ -107,7 +107,7 @@ def _otherwise(survey: Survey, options: Sequence[str]) -> tuple[str, ...]:
     )
     trial = (
         "a short run shows in minutes whether the poses are right: "
-        + command("train", survey.path, "--iterations", "3000", "--out", short),
+        + command("train", survey.path, "--quality", "draft", "--out", short),
     )
     return (
         f"train: {command('train', survey.path, *options, '--out', out)}",

@@ -57,6 +57,7 @@ CONFIG: Mapping[str, Check] = {
     "train": _section,
     "render": _section,
     "train.iterations": _whole,
+    "train.strategy": _text,
     "data.path": _text,
 }
 

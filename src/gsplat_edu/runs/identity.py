@@ -47,7 +47,10 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     idle = {name for strategy, names in ONLY_FOR.items() if strategy != used for name in names}
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))
-        for key in sorted({*before, *now} - idle - set(MAY_DIFFER.get(section, ()))):
+        names = {*before, *now} - idle - set(MAY_DIFFER.get(section, ()))
+        for key in sorted(
+            names, key=lambda name: (name != "strategy", name)
+        ):  # it explains other differences
             a, b = (_plain(values.get(key)) for values in (before, now))
             if a != b:
                 problem = f"--resume: {folder.path} was started with {key} = {a}, not {b}"

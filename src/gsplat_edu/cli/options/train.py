@@ -28,7 +28,7 @@ from gsplat_edu.train.config import (
 )
 from gsplat_edu.validation import one_of
 
-EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --iterations 7000"
+EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
 
 FOR_POINTS = ("start_opacity", "start_scale", "mcmc_start_opacity", "mcmc_start_scale")
 """Settings that only a start from points uses."""
@@ -112,8 +112,8 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
     _add_number(
         group,
         "--iterations",
-        f"number of training steps (default: those of --quality, or as many as fit --time-limit; {RECIPE_ITERATIONS}"
-        " for the other strategies)",
+        f"number of training steps (default: those of --quality, or as many as fit --time-limit; {RECIPE_ITERATIONS:,}"
+        " for strategies other than fast)",
     )
     group.add_argument(
         "--no-rescale",
@@ -333,7 +333,8 @@ def _strategy(arguments: argparse.Namespace) -> str:
         return str(arguments.strategy)
     folder = RunFolder(arguments.out)
     stored = folder.read_config().get("train") if arguments.resume and folder.exists() else None
-    return str(stored.get("strategy", DEFAULT_STRATEGY)) if isinstance(stored, dict) else DEFAULT_STRATEGY
+    found = stored.get("strategy") if isinstance(stored, dict) else None
+    return DEFAULT_STRATEGY if found is None else str(found)
 
 
 def _length(arguments: argparse.Namespace, strategy: str) -> int:
