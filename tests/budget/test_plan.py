@@ -13,7 +13,8 @@ import torch
 from gsplat_edu.budget.costs import (
     LATER,
     LEAST_PLANNED,
-    PLANNED_SHARE,
+    PLANNED,
+    PLANNED_PIXELS,
     PLANNED_VIEWS,
     Facts,
     Footprint,
@@ -270,7 +271,7 @@ def test_the_fast_recipe_plans_its_number_without_limits_and_a_resumed_run_keeps
     found = plan(run, Limits())
     facts = Facts.of(load_dataset(capture))
     assert found.max_gaussians == wanted_gaussians(run.config, facts.points, facts.pixels, facts.train)
-    assert found.max_gaussians == LEAST_PLANNED and found.iterations == 20, "the photos are thumbnails"
+    assert found.max_gaussians == 64 * 48 and found.iterations == 20, "one per pixel of these thumbnails"
     assert found.sentences == (
         f"the recipe plans {found.max_gaussians:,} Gaussians; --max-gaussians changes that",
     )
@@ -289,10 +290,12 @@ def test_the_planned_number_grows_with_pixels_and_views_from_a_least_number_on()
     def wanted(pixels, views):
         return wanted_gaussians(recipe(20, strategy="fast"), 200, pixels, views)
 
-    few = wanted(300_000, PLANNED_VIEWS)
-    assert few == round(PLANNED_SHARE * 300_000) > LEAST_PLANNED
-    assert wanted(600_000, PLANNED_VIEWS) == wanted(300_000, 4 * PLANNED_VIEWS) == 2 * few
-    assert wanted(64 * 48, 14) == wanted(1, 1) == LEAST_PLANNED
+    assert wanted(PLANNED_PIXELS, PLANNED_VIEWS) == PLANNED
+    assert (
+        wanted(8 * PLANNED_PIXELS, PLANNED_VIEWS) == wanted(PLANNED_PIXELS, 4 * PLANNED_VIEWS) == 2 * PLANNED
+    )
+    assert wanted(64 * 48, 14) == 64 * 48, "never more than one per pixel"
+    assert wanted(1, 1) == LEAST_PLANNED
 
 
 def test_a_start_scene_that_does_not_fit_is_refused(capture, tmp_path):

@@ -82,7 +82,11 @@ def without_figures(results, scripts):
 
 def test_every_benchmark_has_its_results():
     results = (ROOT / "benchmarks" / "RESULTS.md").read_text()
-    scripts = {path.name for path in (ROOT / "benchmarks").glob("*.py")} - {"hardware.py", "captures.py", "traced.py"}
+    scripts = {path.name for path in (ROOT / "benchmarks").glob("*.py")} - {
+        "hardware.py",
+        "captures.py",
+        "traced.py",
+    }
     scripts |= {path.parent.name for path in (ROOT / "benchmarks").glob("*/__main__.py")}
     assert len(scripts) > 8
     assert without_figures(results, scripts) == UNMEASURED
