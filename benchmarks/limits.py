@@ -25,9 +25,7 @@ from captures import capture
 
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
-FILLING = (
-    "--iterations 300 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20 --densify-stop 250"
-)
+FILLING = "--strategy adc --iterations 300 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20 --densify-stop 250"
 FILLING += " --reset-every 0 --grad-threshold 2e-6 --eval-every 200 --save-every 100"
 """Options that grow a scene to its cap in a few hundred iterations. The scene itself is useless."""
 

@@ -26,7 +26,7 @@ import numpy as np
 
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
-OPTIONS = "--white-background --max-gaussians 2000 --no-rescale --eval-every 0"
+OPTIONS = "--strategy adc --white-background --max-gaussians 2000 --no-rescale --eval-every 0"
 """Default options of the training."""
 
 TEST_PHOTOS = 4

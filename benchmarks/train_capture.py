@@ -2,7 +2,7 @@
 
     python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--smoke] [--out FILE.json] [options of train]
 
-Trains as `gsplat-edu train CAPTURE --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data,
+Trains as `gsplat-edu train CAPTURE --strategy adc --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data,
 or else a procedural capture). Times the stages of an iteration at the start, after 1,000 and 3,000 iterations, and at
 the end: medians over 20 views. The wall time includes checkpoints and evaluations but not these measurements.
 """
@@ -19,6 +19,7 @@ import hardware
 from captures import capture
 from train_step import STAGES, measure
 
+from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
 from gsplat_edu.runs.training import CaptureRun, document
@@ -31,7 +32,7 @@ ROWS = (*STAGES, "loss", "Adam", "rest", "iteration", "pairs")
 
 def train(options: argparse.Namespace, out: Path | None) -> None:
     """Train, measure at `MOMENTS`, then print and write the results."""
-    run = CaptureRun(command.options_from(options), print)
+    run = CaptureRun(plan(command.options_from(options), Limits()).options, print)
     table: dict[int, dict[str, float]] = {}
 
     def take_apart(trainer: Trainer, event: Event) -> None:
@@ -71,10 +72,10 @@ def main() -> int:
     )
     command.add_arguments(parser)
     named = None if not theirs or theirs[0].startswith("-") else Path(theirs.pop(0))
-    iterations = "10" if mine.smoke else "7000"
+    words = ["--strategy", "adc", "--iterations", "10" if mine.smoke else "7000"]
     with tempfile.TemporaryDirectory() as scratch, capture(named, mine.smoke) as data:
         folder = str(mine.run or Path(scratch) / "run")
-        options = parser.parse_args([str(data), "--iterations", iterations, *theirs, "--out", folder])
+        options = parser.parse_args([str(data), *words, *theirs, "--out", folder])
         return run_command("train_capture.py", lambda: train(options, mine.out), debug=False)
 
 
