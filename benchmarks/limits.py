@@ -25,8 +25,8 @@ from captures import capture
 
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 
-FILLING = "--strategy adc --iterations 300 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20 --densify-stop 250"
-FILLING += " --reset-every 0 --grad-threshold 2e-6 --eval-every 200 --save-every 100"
+FILLING = "--strategy adc --iterations 300 --no-rescale --sh-every 20 --densify-start 10 --densify-every 20"
+FILLING += " --densify-stop 250 --reset-every 0 --grad-threshold 2e-6 --eval-every 200 --save-every 100"
 """Options that grow a scene to its cap in a few hundred iterations. The scene itself is useless."""
 
 UNITS = {"h": 3600.0, "min": 60.0, "s": 1.0}

@@ -2,9 +2,10 @@
 
     python benchmarks/train_capture.py [CAPTURE] [--run FOLDER] [--smoke] [--out FILE.json] [options of train]
 
-Trains as `gsplat-edu train CAPTURE --strategy adc --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data,
-or else a procedural capture). Times the stages of an iteration at the start, after 1,000 and 3,000 iterations, and at
-the end: medians over 20 views. The wall time includes checkpoints and evaluations but not these measurements.
+Trains as `gsplat-edu train CAPTURE --strategy adc --iterations 7000` does (default: snowmiku97 in $GSPLAT_EDU_DATA or
+../shared/data, or else a procedural capture). Times the stages of an iteration at the start, after 1,000 and 3,000
+iterations, and at the end: medians over 20 views. The wall time includes checkpoints and evaluations but not these
+measurements.
 """
 
 from __future__ import annotations
