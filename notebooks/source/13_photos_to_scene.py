@@ -307,18 +307,18 @@ gallery(f"{view.name}, which was held out", panels, height=3.6)
 # which fall to the end. [RECIPE.md](../docs/RECIPE.md) says where each piece comes from. A third of the steps will do:
 
 # %%
-quick, spent, judged = trained("capture", "quick", ITERATIONS // 3, "fast")
+steps = ITERATIONS if SHORT else ITERATIONS // 3
+quick, spent, judged = trained("capture", "quick", steps, "fast")
 faster, share = summarize(judged.test)["psnr"], spent["training"] / seconds["training"]
-steps, count = quick.trainer.iteration, len(quick.trainer.gaussians)
-print(f"{steps} iterations, {share:.2f} of the time: {faster:.2f} dB held out, {count} Gaussians")
+print(f"{steps} iterations, {share:.2f} of the time: {faster:.2f} dB held out,", end=" ")
+print(f"{len(quick.trainer.gaussians)} Gaussians")
 assert faster > test["psnr"] - 1
 
 # %% [markdown]
 # ## Where the time went
 #
-# Poses are paid for once, and matching grows with the square of the number of photos. Training is the stage that a
-# budget decides. `benchmarks/train_step.py` takes its iteration apart, here on the trained scene: medians over steps
-# at one photo, each row's own: on a machine that does other things they need not add up to the whole.
+# Poses are paid for once; training is what a budget decides. `benchmarks/train_step.py` takes its iteration apart, here
+# on the trained scene: each row is a median of its own, so on a busy machine they need not add up to the whole.
 
 # %%
 done = json.loads((WORK / "capture/sfm/stages.json").read_text())["stages"]
