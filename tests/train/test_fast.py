@@ -374,3 +374,11 @@ def test_the_recipe_learns_the_scene():
     assert np.mean(losses[-6:]) < full / 3
     changes = [event for event in events if isinstance(event, DensifyEvent)]
     assert max(event.num_gaussians for event in changes) == 300
+
+
+@pytest.mark.parametrize(("iterations", "every"), [(1, 1), (50, 2), (1_000, 50), (2_000, 100), (10_000, 100)])
+def test_short_runs_densify_often_enough(iterations, every):
+    assert recipe(iterations, strategy="fast").densify_every == every
+    assert recipe(iterations, strategy="fast", densify_every=70).densify_every == 70
+    assert recipe(iterations, strategy="fast", rescale=False).densify_every == 100
+    assert recipe(iterations).densify_every == 100

@@ -23,7 +23,7 @@ from gsplat_edu.runs.training import RunOptions
 from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
 
-PLANNED = ("iterations", *MILESTONES, "max_gaussians", "resolution", "image_memory")
+PLANNED = ("iterations", *MILESTONES, "densify_every", "max_gaussians", "resolution", "image_memory")
 """Settings that a plan may choose; `given` lists those that the user set."""
 
 FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
@@ -159,7 +159,7 @@ class Request:
         config = self.options.config
         if "iterations" not in self.given:
             fresh = recipe(iterations, rescale=self.rescale, strategy=config.strategy).flat()
-            scaled = {name: fresh[name] for name in MILESTONES if name not in self.given}
+            scaled = {name: fresh[name] for name in (*MILESTONES, "densify_every") if name not in self.given}
             config = config.changed(iterations=iterations, **scaled)
         if "max_gaussians" in self.given:
             return config
