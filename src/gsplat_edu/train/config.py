@@ -40,12 +40,10 @@ FOR_FAST = {
     "opacities_rate": 0.1,
     "sh_every": 3_000,
 }
-"""Defaults of the strategy fast for 30,000 iterations, where they differ from those of the others: its runs are short,
-so rates are twice as high, and the means' ends at a tenth instead of a hundredth."""
+"""What differs for the strategy fast in 30,000 iterations: its runs are short, so steps are larger."""
 
 FAST_DENSIFICATIONS = 20
-"""The recipe fast densifies at least this often in a run: a Gaussian has two children, so that few start points need
-many densifications to become as many as planned."""
+"""The recipe fast densifies at least this often: each time, a Gaussian has two children, and few points have to grow."""
 
 QUALITIES = {"draft": 1_000, "standard": 3_000, "high": 10_000}
 """Iterations of the fast recipe by the name of its quality."""
@@ -54,7 +52,7 @@ DEFAULT_STRATEGY, DEFAULT_QUALITY = "fast", "standard"
 """What `gsplat-edu train` uses unless told otherwise. `TrainConfig` defaults to adc, since fast needs a cap."""
 
 FAST_FROM_SCENE = {"fast_start_factor": 1.0}
-"""Further default of a fast run that starts from a trained scene: small photos would undo its detail."""
+"""Further default of a fast run that starts from a scene: small photos would undo its detail."""
 
 Check = Callable[[str, Any], object]
 """Raises an `ArgumentError` that names the setting if a value is out of range."""
@@ -246,10 +244,7 @@ class FastConfig:
         "as mcmc's",
     )
     decay: float = _number(
-        0.1,
-        _share,
-        "Factor on these rates once the means' rate is final; log-linear between.",
-        "ours",
+        0.1, _share, "Factor on these rates once the means' rate is final; log-linear between.", "ours"
     )
 
 
@@ -492,9 +487,8 @@ def recipe(iterations: int = RECIPE_ITERATIONS, *, rescale: bool = True, **chang
         ArgumentError: a value is out of range, or a setting is unknown.
     """
     whole_number("iterations", iterations, 1)
-    fast = changes.get("strategy") == "fast"
-    scaled: dict[str, Any] = dict(FOR_FAST) if fast else {}
-    if rescale and fast:
+    scaled: dict[str, Any] = dict(FOR_FAST) if changes.get("strategy") == "fast" else {}
+    if rescale and scaled:
         scaled["densify_every"] = min(max(iterations // FAST_DENSIFICATIONS, 1), TrainConfig.densify_every)
     if rescale:
         for setting in SETTINGS:
