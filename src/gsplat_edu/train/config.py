@@ -43,7 +43,7 @@ FOR_FAST = {
 """What differs for the strategy fast in 30,000 iterations: its runs are short, so steps are larger."""
 
 FAST_DENSIFICATIONS = 20
-"""The recipe fast densifies at least this often: each time, a Gaussian has two children, and few points have to grow."""
+"""The recipe fast densifies at least this often: a Gaussian has two children, and few points have to become many."""
 
 QUALITIES = {"draft": 1_000, "standard": 3_000, "high": 10_000}
 """Iterations of the fast recipe by the name of its quality."""
