@@ -39,6 +39,7 @@ from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
 from gsplat_edu.data.writers import write_blender
+from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.figures import save_figure
 from gsplat_edu.evaluate.metrics import ImageScore, OnImage, score_views, summarize
 from gsplat_edu.files import written_aside
@@ -47,6 +48,7 @@ from gsplat_edu.train.config import QUALITIES
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.validation import in_range, whole_number
 from gsplat_edu.views import View
 
 try:
@@ -132,7 +134,7 @@ class Results:
             return
         stored = json.loads(self.path.read_text())
         if stored["setting"] != self.setting:
-            raise SystemExit(
+            raise ArgumentError(
                 f"--out: {self.path} holds runs of another setting, {stored['setting']}; give another file"
             )
         self.runs = stored["runs"]
@@ -166,16 +168,8 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
     """
     recipe = RECIPES[name]
     iterations = max(1, round(recipe.iterations * arguments.length))
-    words = [
-        "--strategy",
-        recipe.strategy,
-        "--iterations",
-        str(iterations),
-        "--seed",
-        str(seed),
-        *recipe.options,
-    ]
-    words += ["--eval-every", "0", "--save-every", "0"]
+    words = ["--strategy", recipe.strategy, "--iterations", str(iterations), "--seed", str(seed)]
+    words += [*recipe.options, "--eval-every", "0", "--save-every", "0"]
     if arguments.resolution is not None:
         words += ["--resolution", str(arguments.resolution)]
     if recipe.strategy == "mcmc":
@@ -255,16 +249,12 @@ def flip(run: CaptureRun) -> float:
 
 def seconds_to(curve: Sequence[dict[str, float]], psnr: float) -> float | None:
     """Return when a run's held-out PSNR first reaches a value: linear between its moments; None if it never does."""
-    before = {"seconds": 0.0, "psnr": -math.inf}
-    for point in curve:
+    for before, point in zip((None, *curve), curve, strict=False):
         if point["psnr"] >= psnr:
-            share = (
-                1.0
-                if math.isinf(before["psnr"])
-                else (psnr - before["psnr"]) / (point["psnr"] - before["psnr"])
-            )
+            if before is None:
+                return point["seconds"]
+            share = (psnr - before["psnr"]) / (point["psnr"] - before["psnr"])
             return before["seconds"] + share * (point["seconds"] - before["seconds"])
-        before = point
     return None
 
 
@@ -365,6 +355,8 @@ def chosen_capture(arguments: argparse.Namespace) -> Iterator[Path]:
 
 def compare(arguments: argparse.Namespace) -> None:
     """Train by every recipe and seed that has no result yet; print the table and draw the figure."""
+    whole_number("--seeds", arguments.seeds, 1)
+    in_range("--length", arguments.length, 0.0, open_low=True)
     with chosen_capture(arguments) as folder:
         arguments.data = folder
         setting = {
