@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import gsplat_edu.cli.main as command_line
-from gsplat_edu.budget.costs import LEAST_PLANNED
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import DataSettings, load_dataset
@@ -123,14 +122,14 @@ def test_the_forecast_is_that_of_a_training_without_options(doctor, capture, tmp
     """Without --iterations it forecasts the fast recipe's standard length, with the number that `train` plans."""
     code, said = doctor(capture[0])
     assert code == 0
-    assert "for 3,000 iterations on cpu" in said and f"200 to {LEAST_PLANNED:,} Gaussians" in said
+    assert "for 3,000 iterations on cpu" in said and f"200 to {64 * 48:,} Gaussians" in said
     options = options_from(
         command_line.build_parser(["train"]).parse_args(
             ["train", str(capture[0]), "--out", str(tmp_path / "x")]
         )
     )
     chosen = plan(options, Limits())
-    assert (chosen.iterations, chosen.max_gaussians) == (3_000, LEAST_PLANNED)
+    assert (chosen.iterations, chosen.max_gaussians) == (3_000, 64 * 48)
 
 
 @pytest.fixture(scope="module")

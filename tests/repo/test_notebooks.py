@@ -314,7 +314,7 @@ def test_shipped_notebooks_match_their_source_and_were_executed(source):
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), "run from top to bottom"
     outputs = [output for cell in code for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error"]
-    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert any({"image/png", "image/jpeg"} & set(output.get("data", {})) for output in outputs)
     assert not any("(reduced)" in output.get("text", "") for output in outputs), "ships with the full budget"
 
 

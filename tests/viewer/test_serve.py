@@ -1,5 +1,6 @@
 """The page's server, tested with real sockets: it serves one page, nothing else, and only to allowed host names."""
 
+import contextlib
 import http.client
 import io
 import socket
@@ -156,7 +157,8 @@ def test_two_host_headers_are_refused(server):
     "request_", [b"", b"\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x00\xa5\x01\x00", b"GET /", b"\0" * 70_000]
 )
 def test_an_invalid_request_does_no_harm(server, capsys, request_):
-    ask_raw(server, request_)
+    with contextlib.suppress(OSError):  # the server may hang up before all of a long line is sent
+        ask_raw(server, request_)
     assert ask(server)[2] == PAGE
     assert capsys.readouterr() == ("", ""), "the terminal stays clean"
 
