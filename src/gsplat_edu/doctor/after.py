@@ -90,7 +90,7 @@ class Trained:
 
     @property
     def usual(self) -> int:
-        """Iterations of the run's recipe unless told otherwise."""
+        """The default number of iterations of the run's recipe."""
         return QUALITIES[DEFAULT_QUALITY] if self.strategy == "fast" else RECIPE_ITERATIONS
 
     @property

@@ -48,9 +48,8 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))
         names = {*before, *now} - idle - set(MAY_DIFFER.get(section, ()))
-        for key in sorted(
-            names, key=lambda name: (name != "strategy", name)
-        ):  # it explains other differences
+        # The strategy first: it explains other differences.
+        for key in sorted(names, key=lambda name: (name != "strategy", name)):
             a, b = (_plain(values.get(key)) for values in (before, now))
             if a != b:
                 problem = f"--resume: {folder.path} was started with {key} = {a}, not {b}"

@@ -49,7 +49,7 @@ QUALITIES = {"draft": 1_000, "standard": 3_000, "high": 10_000}
 """Iterations of the fast recipe by the name of its quality."""
 
 DEFAULT_STRATEGY, DEFAULT_QUALITY = "fast", "standard"
-"""What `gsplat-edu train` uses unless told otherwise. `TrainConfig` defaults to adc, since fast needs a cap."""
+"""Defaults of `gsplat-edu train`. `TrainConfig` itself defaults to adc, since fast needs a cap."""
 
 FAST_FROM_SCENE = {"fast_start_factor": 1.0}
 """Further default of a fast run that starts from a scene: small photos would undo its detail."""

@@ -444,4 +444,4 @@ def _gaussians(trainer: Trainer) -> str:
 
 
 def _share(factor: float) -> str:
-    return "" if factor == 1.0 else f", 1/{factor:.3g} of their size"
+    return "" if factor == 1.0 else f", 1/{factor:.3g} of their width"
