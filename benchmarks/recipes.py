@@ -17,6 +17,7 @@ Seeds change a result by several tenths of a dB: the table shows the mean over t
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import math
 import sys
@@ -147,6 +148,13 @@ class Results:
         """Return the names of the recipes with at least one run, in the order of the first ones."""
         return list(dict.fromkeys(run["recipe"] for run in self.runs))
 
+    def check(self, recipe: str, config: dict[str, Any]) -> None:
+        """Refuse to mix runs of a recipe before and after its constants changed."""
+        if any(run.get("config") != config for run in self.of(recipe)):
+            raise ArgumentError(
+                f"--out: {self.path} holds runs of {recipe} with other constants; give another file"
+            )
+
     def add(self, run: dict[str, Any]) -> None:
         """Store one more run."""
         self.runs.append(run)
@@ -183,7 +191,17 @@ def trained(name: str, seed: int, arguments: argparse.Namespace, results: Result
         run = CaptureRun(plan(options, Limits()).options)
         if recipe.density is not None:
             run.trainer.density = recipe.density(run.options.config, run.trainer.gaussians)
-        return {"recipe": name, "seed": seed, "options": " ".join(words), **measured(run)}
+        config = settings_of(run)
+        results.check(name, config)
+        return {"recipe": name, "seed": seed, "options": " ".join(words), "config": config, **measured(run)}
+
+
+def settings_of(run: CaptureRun) -> dict[str, Any]:
+    """Return what the runs of a recipe have in common, as JSON gives it back: all but the seed and the cap."""
+    settings = dataclasses.asdict(run.options.config)
+    settings = {key: value for key, value in settings.items() if key not in ("seed", "max_gaussians")}
+    found: dict[str, Any] = json.loads(json.dumps(settings))
+    return found
 
 
 class Clock:

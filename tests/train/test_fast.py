@@ -16,7 +16,7 @@ from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import STRATEGIES, recipe
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.surgery import long_axis_children
-from gsplat_edu.train.events import DensifyEvent
+from gsplat_edu.train.events import DensifyEvent, StepEvent
 from gsplat_edu.train.feed import REDUCED_ROOM, SMALLEST_SIDE, ViewFeed
 from gsplat_edu.train.initialize import from_points, make_strategy, random_ball
 from gsplat_edu.train.optimizer import Adam
@@ -123,17 +123,19 @@ def test_the_number_follows_the_plan_and_replaces_what_was_pruned():
     assert all(len(m) == 100 for m in optimizer.first.values())
 
 
-def test_nothing_is_added_after_the_plan_ends_but_faint_ones_still_go():
+def test_after_the_plan_nothing_is_added_and_only_what_is_never_drawn_goes():
+    """At an opacity of 0.01 a Gaussian is faint, but drawn; below 1/255 it is not."""
     gaussians = random_ball(40, torch.Generator().manual_seed(0)).trainable()
     run = config(max_gaussians=100, densify_start=100, fast_stop=200)
     control = PlannedDensity(run, gaussians)
     optimizer = Adam(gaussians.tensors(), gaussian_groups(run, 1.0))
     with torch.no_grad():
-        gaussians.logit_opacities[:3] = -9.0
+        gaussians.logit_opacities[:3] = torch.tensor([-9.0, -5.6, -4.6])
         gaussians.means[3] = torch.nan
     observed(control, np.ones(40))
     gaussians, (event,) = control.update(300, gaussians, optimizer)
-    assert (event.num_pruned, event.num_split_children, len(gaussians)) == (4, 0, 36)
+    assert (event.num_pruned, event.num_split_children, len(gaussians)) == (3, 0, 37)
+    assert float(gaussians.opacities.detach().min()) == pytest.approx(1 / (1 + np.exp(4.6)))
 
 
 def test_those_of_the_highest_score_are_split():
@@ -314,6 +316,14 @@ SHORT = {"densify_every": 10, "max_gaussians": 200}
 
 def bits(done):
     return {name: tensor.detach().numpy().tobytes() for name, tensor in done.gaussians.tensors().items()}
+
+
+def test_the_weight_on_opacity_ends_with_the_plan():
+    events = []
+    run = trainer(config(10, fast_stop=6))
+    run.run(callbacks=[lambda _, event: events.append(event)])
+    values = [float(event.terms["opacity"]) for event in events if isinstance(event, StepEvent)]
+    assert min(values[:6]) > 0 and values[6:] == [0.0] * 4
 
 
 def test_any_number_of_threads_gives_the_same_bits(set_threads):

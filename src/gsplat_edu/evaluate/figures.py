@@ -118,8 +118,8 @@ def run_curve_figures(log: Sequence[Mapping[str, Any]], cap: int | None = None) 
         axes.grid(alpha=0.3)
         if len(lines) > 1:
             axes.legend()
-        if key in ("loss", "terms") and values.min() > 0:
-            _decades(axes, values)
+        if key in ("loss", "terms") and values.min() >= 0 and values.max() > 0:
+            _decades(axes, values[values > 0])  # a term that ends leaves the axes downwards
         if key in ("num_gaussians", "ms"):
             axes.set_ylim(0, 1.05 * max(values.max(), 1.0))  # a count that hardly changes stays off the edge
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))

@@ -39,6 +39,7 @@ FOR_FAST = {
     "sh_rest_rate": 5e-3 / 20,
     "opacities_rate": 0.1,
     "sh_every": 3_000,
+    "min_opacity": 0.02,
 }
 """What differs for the strategy fast in 30,000 iterations: its runs are short, so steps are larger."""
 
@@ -224,11 +225,7 @@ class FastConfig:
         18_000, _whole(0), "Iteration from which photos have their full size.", "ours", milestone=True
     )
     stop: int = _number(
-        18_000,
-        _whole(0),
-        "The planned number of Gaussians is reached at this iteration.",
-        "ours",
-        milestone=True,
+        18_000, _whole(0), "Iteration at which the planned number is reached.", "ours", milestone=True
     )
     decay_start: int = _number(
         21_000,
@@ -238,10 +235,10 @@ class FastConfig:
         milestone=True,
     )
     opacity_weight: float = _number(
-        0.01,
+        0.002,
         _not_negative,
-        "Weight of the mean opacity in the objective: what no photo needs fades and is pruned.",
-        "as mcmc's",
+        "Weight of the mean opacity in the objective until `fast_stop`: what no photo needs fades and is pruned.",
+        "ours",
     )
     decay: float = _number(
         0.1, _share, "Factor on these rates once the means' rate is final; log-linear between.", "ours"

@@ -105,7 +105,7 @@ def make_objective(config: TrainConfig) -> Objective:
         terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
         terms["scale"] = MeanScale(config.mcmc.scale_weight)
     if config.strategy == "fast" and config.fast.opacity_weight > 0:
-        terms["opacity"] = MeanOpacity(config.fast.opacity_weight)
+        terms["opacity"] = MeanOpacity(config.fast.opacity_weight, until=config.fast.stop)
     return Objective(terms)
 
 
@@ -131,12 +131,16 @@ class MeanOpacity:
 
     Args:
         weight: lambda_o.
+        until: The term is 0 from this iteration on; None for the whole run.
     """
 
     weight: float
+    until: int | None = None
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight mean(opacity)."""
+        if self.until is not None and rendered.iteration >= self.until:
+            return rendered.gaussians.logit_opacities.new_zeros(())
         value: Tensor = _MeanOpacity.apply(  # type: ignore[no-untyped-call]
             rendered.gaussians.logit_opacities, self.weight
         )

@@ -1,8 +1,8 @@
 """Density control of the fast recipe: a planned number of Gaussians, splits by score, no resets.
 
 The number of Gaussians follows a plan from that of the start to the cap. Each time, the Gaussians of the highest score
-are split along their longest axis, which leaves the image nearly unchanged. Gaussians that became too faint to see are
-removed, and the plan replaces them where the score is high.
+are split along their longest axis, which leaves the image nearly unchanged. Until the cap is reached, Gaussians that
+have become faint are removed, and the plan replaces them where the score is high.
 
 Its settings are in `gsplat_edu.train.config`.
 """
@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
@@ -75,9 +76,12 @@ class PlannedDensity:
         self.is_over = iteration >= config.fast.stop
         if iteration <= config.densify_start or iteration % config.densify_every:
             return gaussians, []
-        keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
+        growing = iteration <= config.fast.stop
+        # Nothing replaces faint Gaussians later. Those below ALPHA_MIN are never drawn, and get no gradient.
+        least = config.min_opacity if growing else min(config.min_opacity, ALPHA_MIN)
+        keep = gaussians.finite_rows() & (gaussians.opacities >= least)
         planned = int(planned_counts(config, self.start_count, self.cap, np.array([iteration]))[0])
-        room = planned - int(keep.sum()) if iteration <= config.fast.stop else 0
+        room = planned - int(keep.sum()) if growing else 0
         split = self._highest(keep, room)
         children = long_axis_children(gaussians.map(lambda tensor: tensor[split]))
         replaced = replace(gaussians, optimizer, keep & ~split, children)
