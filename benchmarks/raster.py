@@ -57,7 +57,7 @@ def room(parameters: dict[str, torch.Tensor], size: int) -> Room:
     return Room(
         _native.Images(image=image, transmittance=transmittance, depth=None),
         _native.Images(image=gradient, transmittance=None, depth=None),
-        _native.Gradients(**out, means2d_norm=norms, background=torch.zeros(3)),
+        _native.Gradients(**out, means2d_norm=norms, background=torch.zeros(3), camera=None),
     )
 
 

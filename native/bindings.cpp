@@ -100,12 +100,13 @@ struct SceneArrays : PerGaussian {
 };
 
 struct GradientArrays : PerGaussian {
-    Array means2d_norm, background;
+    Array means2d_norm, background, camera;
 
     explicit GradientArrays(Arguments a) : PerGaussian(a, true) {
         const Kind kind = means.is(Kind::F32) ? Kind::F32 : Kind::F64;
         means2d_norm = a.array("means2d_norm", {kind}, {n}, true);
         background = a.array("background", {kind}, {3}, true);
+        camera = a.array_or_none("camera", Kind::F64, {CAMERA}, true);
         a.finish();
     }
 
@@ -244,7 +245,8 @@ void backward(BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
     self.check(a, "scene", scene), self.check(a, "gradients", gradients);
     self.check_images(a, images, incoming);
     nb::gil_scoped_release release;
-    self.frame.backward(scene.as<T>(), images.as_outputs<T>(), incoming.as_gradients<T>(), gradients.as<T>(), gradients.background.as<T>());
+    self.frame.backward(scene.as<T>(), images.as_outputs<T>(), incoming.as_gradients<T>(), gradients.as<T>(), gradients.background.as<T>(),
+                        gradients.camera.as<double>());
 }
 
 // The arguments of Frame.adam: a group for each raw parameter, and the norms of the image positions' gradients.

@@ -176,13 +176,13 @@ CompositeBackwardArgs<T> Frame<T>::composite_backward(const Outputs<T> &forward,
 
 template <class T>
 ProjectBackwardArgs<T> Frame<T>::last_stage(const Scene<T> &scene, const T *slots) const {
-    return {scene, camera_, settings_, pairs_of_.as<uint32_t>(), slot_begin_.as<uint32_t>(), slots, {}};
+    return {scene, camera_, settings_, pairs_of_.as<uint32_t>(), slot_begin_.as<uint32_t>(), slots, {}, nullptr};
 }
 
 template <class T>
-void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out,
-                        T *background) {
-    Buffer slots, tile_background;
+void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background,
+                        double *camera) {
+    Buffer slots, tile_background, camera_sums;
     const CompositeBackwardArgs<T> done = composite_backward(forward, in, slots, tile_background);
     Timer timer(stages_[5]);
     background[0] = background[1] = background[2] = 0;
@@ -190,7 +190,12 @@ void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const 
         for (int k = 0; k < 3; ++k) background[k] += done.tile_background[3 * tile + k];
     ProjectBackwardArgs<T> args = last_stage(scene, done.slots);
     args.grads = out;
+    if (camera) args.camera_sums = static_cast<double *>(camera_sums.reserve(size_t(blocks() + 1) * CAMERA * sizeof(double)));
     parallel(threads_, blocks(), [&](int64_t block, int) { kernels<T>().project_backward(args, block); });
+    if (!camera) return;
+    std::fill_n(camera, int(CAMERA), 0.0);
+    for (int64_t block = 0; block < blocks(); ++block)  // in this order for any number of threads
+        for (int k = 0; k < CAMERA; ++k) camera[k] += args.camera_sums[block * CAMERA + k];
 }
 
 template <class T>

@@ -29,7 +29,9 @@ class Frame {
     Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, int threads);
     void composite(const Outputs<T> &out);
     // The scene and the outputs are passed again: they may have moved between the passes.
-    void backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background);
+    // `camera` gets CAMERA numbers, unless it is null.
+    void backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background,
+                  double *camera);
     // The same, but every Gaussian's gradient goes into a step of Adam; `groups` has no gradients.
     void adam(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const AdamArgs<T> *groups, T *means2d_norm);
 

@@ -132,6 +132,9 @@ struct CompositeBackwardArgs {
     T *tile_background;                                // tiles x 3, sum of g T_final
 };
 
+// Numbers of a camera's gradient: R row by row, the eye, fx, fy, cx, cy.
+constexpr int CAMERA = 16;
+
 template <class T>
 struct ProjectBackwardArgs {
     Scene<T> scene;
@@ -140,6 +143,7 @@ struct ProjectBackwardArgs {
     const uint32_t *pairs_of, *slot_begin;
     const T *slots;
     SceneGrads<T> grads;
+    double *camera_sums;                               // blocks x CAMERA, gradients of the camera; null if not wanted
 };
 
 struct AdamNumbers {

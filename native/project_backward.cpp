@@ -1,6 +1,7 @@
 // project_backward: sum each Gaussian's slots in a fixed order and propagate the gradient to its raw parameters.
 //
 //     moments of h -> J W M -> (J W, quaternion, log scale) -> mean;   colour -> (coefficients, direction -> mean)
+//     all of them -> camera, if it is wanted
 //
 // Lanes are Gaussians. `differentiate` finds the gradients of a chunk, `write` stores those of one Gaussian.
 #include "gaussian_math.h"
@@ -163,10 +164,30 @@ GSPLAT_INLINE void color_gradient(const ProjectBackwardArgs<T> &args, const uint
     }
 }
 
-// Propagates the sums of WIDE Gaussians to shape, mean and opacity.
-template <class T>
+// Adds the camera's gradient of WIDE Gaussians to `sums`, lane by lane, for the lanes in `counts`. All formulas take
+// R (mean - eye), so the eye's gradient is minus that of the means, `dmean`. Rows of J W: t0 = fx/z (R0 - x/z R2). A clamped
+// x/z is a bound of the image, (constant - cx) / fx.
+GSPLAT_INLINE void camera_gradient(const Projected &g, const Camera &cam, const VD *d0, const VD *d1, const VD *uv, const VD *dp,
+                                   const VD *dmean, MD counts, VD *sums) {
+    const VD fx = splat(cam.fx) * g.iz, fy = splat(cam.fy) * g.iz;
+    VD d[CAMERA], w0 = VD{}, w1 = VD{};
+    for (int k = 0; k < 3; ++k) {
+        d[k] = dp[0] * g.offset[k] + fx * d0[k], d[3 + k] = dp[1] * g.offset[k] + fy * d1[k];
+        d[6 + k] = dp[2] * g.offset[k] - fx * g.ratio[0] * d0[k] - fy * g.ratio[1] * d1[k];
+        d[9 + k] = -dmean[k];
+        w0 += d0[k] * splat(cam.R[6 + k]), w1 += d1[k] * splat(cam.R[6 + k]);
+    }
+    w0 = g.clamped[0] ? g.iz * w0 : VD{}, w1 = g.clamped[1] ? g.iz * w1 : VD{};
+    d[12] = uv[0] * g.p[0] * g.iz + dot3(d0, g.t0) * splat(1 / cam.fx) + w0 * g.ratio[0];
+    d[13] = uv[1] * g.p[1] * g.iz + dot3(d1, g.t1) * splat(1 / cam.fy) + w1 * g.ratio[1];
+    d[14] = uv[0] + w0, d[15] = uv[1] + w1;
+    for (int k = 0; k < CAMERA; ++k) sums[k] += counts ? d[k] : VD{};
+}
+
+// Propagates the sums of WIDE Gaussians to shape, mean and opacity, and to the camera if `WITH_CAMERA`.
+template <bool WITH_CAMERA, class T>
 GSPLAT_INLINE void shape_gradient(const ProjectBackwardArgs<T> &args, const Chunk<T> &in, int l, const T (*sums)[CHUNK],
-                                  const T (*through_color)[CHUNK], Gradients<T> &out) {
+                                  const T (*through_color)[CHUNK], Gradients<T> &out, VD *camera) {
     const Camera &cam = args.camera;
     const bool raw = args.scene.quats != nullptr;
     Projected g;
@@ -182,17 +203,21 @@ GSPLAT_INLINE void shape_gradient(const ProjectBackwardArgs<T> &args, const Chun
     const VD total = raw ? raw_gradient(g, m, lit, l, out, d0, d1) : direct_gradient(g, m, lit, l, out, d0, d1);
     mean_gradient(g, cam, d0, d1, total, uv, dp);
     dp[2] += slot[DEPTH];
+    VD dmean[3];
     for (int k = 0; k < 3; ++k) {
-        const VD dmean = splat(cam.R[k]) * dp[0] + splat(cam.R[3 + k]) * dp[1] + splat(cam.R[6 + k]) * dp[2];
-        narrowed(out.mean[k] + l, dmean + widened(through_color[k] + l));
+        dmean[k] = splat(cam.R[k]) * dp[0] + splat(cam.R[3 + k]) * dp[1] + splat(cam.R[6 + k]) * dp[2];
+        dmean[k] += widened(through_color[k] + l);
+        narrowed(out.mean[k] + l, dmean[k]);
     }
     narrowed(out.opacity + l, raw ? (splat(1.0) - g.opacity) * slot[H] : slot[H] / g.opacity);
     narrowed(out.drawn + l, g.valid ? widened(out.drawn + l) : VD{});
+    if (WITH_CAMERA) camera_gradient(g, cam, d0, d1, uv, dp, dmean, widened(out.drawn + l) != VD{}, camera);
 }
 
-// The gradients of up to CHUNK Gaussians; `next` more follow in the list.
-template <class T>
-GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint32_t *ids, int count, int next, Gradients<T> &out) {
+// The gradients of up to CHUNK Gaussians; `next` more follow in the list. Adds those of the camera to `camera`.
+template <bool WITH_CAMERA, class T>
+GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint32_t *ids, int count, int next, Gradients<T> &out,
+                                 VD *camera) {
     Chunk<T> in;
     alignas(64) T sums[SLOT][CHUNK], through_color[3][CHUNK] = {};
     gather(args.scene, ids, count, in);
@@ -205,6 +230,7 @@ GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint3
             for (int k = 0; k < 3; ++k) out.color[k][l] = sums[k][l];
         }
     }
+    for (int l = count; l < in.padded; ++l) out.drawn[l] = 0;
     const int row = 3 * args.scene.rest;
     for (int l = 0; l < in.padded; l += WIDE) {
         for (int k = l; k < vmin(l + WIDE, count); ++k) fetch<1>(args.grads.sh_rest + row * (ids[k] - args.grads.first), row);
@@ -213,7 +239,7 @@ GSPLAT_INLINE void differentiate(const ProjectBackwardArgs<T> &args, const uint3
             fetch<0>(args.scene.sh_rest + int64_t(row) * i, row);
             fetch<0>(args.slots + int64_t(SLOT) * args.slot_begin[i], int(vmin(args.pairs_of[i], MOST_FETCHED)) * SLOT);
         }
-        shape_gradient(args, in, l, sums, through_color, out);
+        shape_gradient<WITH_CAMERA>(args, in, l, sums, through_color, out, camera);
     }
 }
 
@@ -274,8 +300,8 @@ GSPLAT_INLINE void write(const ProjectBackwardArgs<T> &args, const Gradients<T> 
     with_degree(args.settings.sh_degree, [&]<int DEGREE>() { write_harmonics<DEGREE>(grads, args.scene.rest, in, l, i); });
 }
 
-template <class T>
-void project_backward(const ProjectBackwardArgs<T> &args, int64_t block) {
+template <bool WITH_CAMERA, class T>
+GSPLAT_INLINE void propagate(const ProjectBackwardArgs<T> &args, int64_t block) {
     const int64_t begin = block * BLOCK, end = vmin(begin + BLOCK, args.scene.n);
     uint32_t ids[BLOCK];
     int drawn = 0;
@@ -285,12 +311,27 @@ void project_backward(const ProjectBackwardArgs<T> &args, int64_t block) {
         else
             zero(args, i);
     }
+    VD camera[CAMERA] = {};
     for (int first = 0; first < drawn; first += CHUNK) {
         const int count = vmin(CHUNK, drawn - first);
         Gradients<T> gradients;
-        differentiate(args, ids + first, count, drawn - first - count, gradients);
+        differentiate<WITH_CAMERA>(args, ids + first, count, drawn - first - count, gradients, camera);
         for (int l = 0; l < count; ++l) write(args, gradients, l, ids[first + l]);
     }
+    if (!WITH_CAMERA) return;
+    for (int k = 0; k < CAMERA; ++k) {
+        double sum = 0;
+        for (int l = 0; l < WIDE; ++l) sum += camera[k][l];
+        args.camera_sums[block * CAMERA + k] = sum;
+    }
+}
+
+template <class T>
+void project_backward(const ProjectBackwardArgs<T> &args, int64_t block) {
+    if (args.camera_sums)
+        propagate<true>(args, block);
+    else
+        propagate<false>(args, block);
 }
 
 template void project_backward<float>(const ProjectBackwardArgs<float> &, int64_t);

@@ -10,6 +10,8 @@ import torch
 from gsplat_edu import Camera, build_cov3d_batch, eval_sh, project_cov3d, quat_to_R_batch, render_gaussians
 from gsplat_edu.gaussian_math import opacity_compensation
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
 
 BACKGROUND = (0.2, 0.5, 0.9)
 
@@ -73,6 +75,33 @@ def random(n: int, size: tuple[int, int] = (41, 35), seed: int = 0, **changes: n
         "logits": rng.normal(size=n) * 1.5,
     }
     return Scene(camera(*size), **parts | changes)
+
+
+def smooth_scene(seed: int, n: int = 5) -> Scene:
+    """Return a few Gaussians, each wider than the image, so that alpha is far above the floor at every pixel."""
+    rng = np.random.default_rng(seed)
+    sh = rng.normal(size=(n, 16, 3)) * 0.05
+    sh[:, 0] += 0.5
+    return Scene(
+        camera(11, 9),
+        means=np.stack([*rng.uniform(-0.3, 0.3, (2, n)), np.linspace(-0.5, 0.5, n)], axis=1),
+        quats=rng.normal(size=(n, 4)),
+        log_scales=rng.uniform(-0.6, 0.2, (n, 3)),
+        sh=sh,
+        logits=rng.uniform(-0.5, 1.0, n),
+    )
+
+
+def assert_smooth(scene: Scene, settings: RenderSettings) -> None:
+    gaussians = scene.gaussians()
+    depths = np.sort(scene.camera.world_to_cam(scene.means)[:, 2])
+    assert np.diff(depths).min() > 1e-3, "no depths swap"
+    for i in range(len(gaussians)):
+        alone = gaussians.map(lambda t, i=i: t[i : i + 1])
+        alpha = 1 - render(alone, scene.camera, settings=settings, backend="cpu").transmittance
+        assert alpha.min() > 1.5 / 255 and alpha.max() < 0.95, "alphas stay away from the floor and the clamp"
+        assert render(alone, scene.camera, settings=RenderSettings(), backend="cpu").image.min() > 0.0
+    assert len(render(gaussians, scene.camera, backend="cpu").visible) == len(gaussians)
 
 
 def _spread(n: int) -> np.ndarray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, SupportsFloat, SupportsIndex, runtime_checkable
+from typing import Any, Protocol, SupportsFloat, SupportsIndex, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -62,6 +62,18 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Floa
         raise ArgumentError("up: is zero or parallel to the viewing direction; give another up direction")
     right = right / sine
     return np.stack([right, np.cross(forward, right), forward])
+
+
+def jacobian_bound(size: int, middle: Any, focal: Any, limit: float) -> Any:  # noqa: ANN401
+    """Return one bound of x/z for the projection's Jacobian; see `Camera.jacobian_bounds`.
+
+    Args:
+        size: Width of the image, px.
+        middle: cx, px, a number or a tensor without axes.
+        focal: fx, px, of the same kind.
+        limit: Signed factor on the distance between the image's centre and its edge.
+    """
+    return (0.5 * (size - 1) + 0.5 * limit * size - middle) / focal
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -177,7 +189,7 @@ class Camera:
         if limit is None:
             return (-np.inf, np.inf), (-np.inf, np.inf)
         edges = [
-            [(0.5 * (size - 1) + side * 0.5 * limit * size - middle) / focal for side in (-1, 1)]
+            [jacobian_bound(size, middle, focal, side * limit) for side in (-1, 1)]
             for size, middle, focal in ((self.W, self.cx, self.fx), (self.H, self.cy, self.fy))
         ]
         (x_low, x_high), (y_low, y_high) = edges

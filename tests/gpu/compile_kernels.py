@@ -62,7 +62,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     shape = {"DEGREE": 3 * MOST, "REST": 15 * MOST, "ANTIALIASED": MOST}
     stage(project.project_kernel, **shape, BLOCK=128)
-    stage(project.project_backward_kernel, 2, **shape, BLOCK=64)
+    stage(project.project_backward_kernel, 2, **shape, WITH_CAMERA=MOST, BLOCK=64)
     stage(intersect.count_kernel, BLOCK=128)
     stage(intersect.emit_kernel, BLOCK=128)
     stage(composite.composite_kernel, WITH_DEPTH=MOST, BATCH=16, PRECISION="ieee")

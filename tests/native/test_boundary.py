@@ -41,7 +41,7 @@ def images(**changes):
 
 
 def gradients(**changes):
-    extra = {"means2d_norm": torch.empty(N), "background": torch.empty(3)}
+    extra = {"means2d_norm": torch.empty(N), "background": torch.empty(3), "camera": None}
     return _native.Gradients(**parameters() | extra | changes)
 
 

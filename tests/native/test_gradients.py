@@ -10,43 +10,15 @@ R / (1 - alpha) is about eps |R0| / (1 - alpha) (native/composite_backward.cpp),
 
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
 
 from gsplat_edu.render.api import render
 from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.settings import RenderSettings
-from native_scenes import BACKGROUND, SCENES, Scene, camera
+from native_scenes import BACKGROUND, SCENES, assert_smooth, camera, smooth_scene
 
 PARAMETERS = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
-
-
-def smooth_scene(seed: int, n: int = 5) -> Scene:
-    """Return a few Gaussians, each wider than the image, so that alpha is far above the floor at every pixel."""
-    rng = np.random.default_rng(seed)
-    sh = rng.normal(size=(n, 16, 3)) * 0.05
-    sh[:, 0] += 0.5
-    return Scene(
-        camera(11, 9),
-        means=np.stack([*rng.uniform(-0.3, 0.3, (2, n)), np.linspace(-0.5, 0.5, n)], axis=1),
-        quats=rng.normal(size=(n, 4)),
-        log_scales=rng.uniform(-0.6, 0.2, (n, 3)),
-        sh=sh,
-        logits=rng.uniform(-0.5, 1.0, n),
-    )
-
-
-def assert_smooth(scene: Scene, settings: RenderSettings) -> None:
-    gaussians = scene.gaussians()
-    depths = np.sort(scene.camera.world_to_cam(scene.means)[:, 2])
-    assert np.diff(depths).min() > 1e-3, "no depths swap"
-    for i in range(len(gaussians)):
-        alone = gaussians.map(lambda t, i=i: t[i : i + 1])
-        alpha = 1 - render(alone, scene.camera, settings=settings, backend="cpu").transmittance
-        assert alpha.min() > 1.5 / 255 and alpha.max() < 0.95, "alphas stay away from the floor and the clamp"
-        assert render(alone, scene.camera, settings=RenderSettings(), backend="cpu").image.min() > 0.0
-    assert len(render(gaussians, scene.camera, backend="cpu").visible) == len(gaussians)
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

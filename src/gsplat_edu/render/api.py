@@ -15,6 +15,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
 from gsplat_edu.headroom import require_memory
 from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput, RenderStack
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_dense
@@ -27,7 +28,7 @@ copies as bytes or its gradient."""
 @overload
 def render(
     gaussians: Gaussians,
-    camera: CameraLike,
+    camera: CameraLike | CameraTensors,
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
@@ -38,7 +39,7 @@ def render(
 @overload
 def render(
     gaussians: Gaussians,
-    camera: Sequence[CameraLike],
+    camera: Sequence[CameraLike | CameraTensors],
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
@@ -48,7 +49,7 @@ def render(
 
 def render(
     gaussians: Gaussians,
-    camera: CameraLike | Sequence[CameraLike],
+    camera: CameraLike | CameraTensors | Sequence[CameraLike | CameraTensors],
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
@@ -58,8 +59,8 @@ def render(
 
     Args:
         gaussians: N Gaussians, raw parameters, float32 or float64 (cuda: float32).
-        camera: A `Camera` or any object with its members (`gsplat_edu.CameraLike`); or a sequence of cameras of equal
-            image size.
+        camera: A `Camera` or any object with its members (`gsplat_edu.CameraLike`); `CameraTensors` for gradients of
+            its pose and intrinsics; or a sequence of cameras of equal image size.
         settings: Background, SH degree, antialiasing, depth; None uses the defaults.
         background: (3,) background as a tensor, for differentiation; None uses the settings' background.
         backend: "auto" for the fastest one on the Gaussians' device, or a backend by name (see
@@ -75,7 +76,7 @@ def render(
         ArgumentError: on the backend torch, a parameter is NaN or infinite, or a quaternion has zero length. The
             kernels skip such a Gaussian, with zero gradient and no effect on others.
 
-    Differentiable in: every raw parameter of the Gaussians, and the background. Not in: the camera.
+    Differentiable in: every raw parameter of the Gaussians, the background, and a camera of tensors.
     """
     settings = settings or RenderSettings()
     name = resolve_backend(backend, gaussians.means.device)
@@ -85,8 +86,8 @@ def render(
         check_tensor("background", background, (3,), {})
         background = background.to(gaussians.means)
     if not isinstance(camera, Sequence):
-        return _render_one(name, gaussians, as_camera("camera", camera), settings, background)
-    cameras = [as_camera(f"camera[{k}]", one) for k, one in enumerate(camera)]
+        return _render_one(name, gaussians, _checked("camera", camera), settings, background)
+    cameras = [_checked(f"camera[{k}]", one) for k, one in enumerate(camera)]
     if len({(c.H, c.W) for c in cameras}) != 1:
         raise ArgumentError(
             "camera: is an empty sequence or has different image sizes; render the cameras one by one"
@@ -99,6 +100,10 @@ def render(
         torch.stack(depths) if depths else None,
         views,
     )
+
+
+def _checked(name: str, camera: CameraLike | CameraTensors) -> Camera | CameraTensors:
+    return camera if isinstance(camera, CameraTensors) else as_camera(name, camera)
 
 
 def _background(color: tuple[float, float, float], dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -115,7 +120,11 @@ def _sent(color: tuple[float, float, float], dtype: torch.dtype, device: torch.d
 
 
 def _render_one(
-    name: str, gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Float[Tensor, "3"]
+    name: str,
+    gaussians: Gaussians,
+    camera: Camera | CameraTensors,
+    settings: RenderSettings,
+    background: Float[Tensor, "3"],
 ) -> RenderOutput:
     if gaussians.means.device.type == "cpu":
         require_memory(

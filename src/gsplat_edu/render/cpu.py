@@ -27,6 +27,13 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
 from gsplat_edu.kernels import SUFFIXES, kernel, native, native_array
 from gsplat_edu.moments import AdamInBackward, Moments
+from gsplat_edu.render.camera_tensors import (
+    GRADIENT_NUMBERS,
+    CameraTensors,
+    Pose,
+    camera_gradients,
+    split_camera,
+)
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 
@@ -57,7 +64,7 @@ class _Call:
 
 
 def render_cpu(
-    gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Tensor
+    gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, background: Tensor
 ) -> RenderOutput:
     """Render raw parameters; `gsplat_edu.render.api.render` validates the arguments.
 
@@ -68,11 +75,12 @@ def render_cpu(
         background: (3,) colour behind everything, of the Gaussians' dtype.
 
     Returns:
-        The view. Differentiable in every raw parameter and the background.
+        The view. Differentiable in every raw parameter, the background and a camera of tensors.
     """
-    call = _Call(camera, settings, min(settings.sh_degree, gaussians.sh_degree), direct=False)
+    value, pose = split_camera(camera)
+    call = _Call(value, settings, min(settings.sh_degree, gaussians.sh_degree), direct=False)
     tensors = gaussians.tensors()
-    return _output(call, background, *(tensors[name] for name in RAW))
+    return _output(call, background, pose, *(tensors[name] for name in RAW))
 
 
 def render_covariances(
@@ -80,7 +88,7 @@ def render_covariances(
     cov3ds: Tensor,
     colors: Tensor,
     opacities: Tensor,
-    camera: CameraLike,
+    camera: CameraLike | CameraTensors,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
 ) -> RenderOutput:
@@ -91,7 +99,7 @@ def render_covariances(
         cov3ds: (N, 3, 3) covariances, world units squared; symmetry is not checked.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
-        camera: A `Camera` or any object with its members.
+        camera: A `Camera` or any object with its members; `CameraTensors` for gradients of its pose and intrinsics.
         settings: Background, antialiasing and depth; None uses the defaults.
         background: (3,) background as a tensor, for differentiation; None uses the settings' background.
 
@@ -103,7 +111,7 @@ def render_covariances(
         ArgumentError: a value is NaN or infinite, the dtypes are not all float32 or all float64, or `camera` is
             invalid.
 
-    Differentiable in: means, cov3ds, colors, opacities, background. Not in: the camera.
+    Differentiable in: means, cov3ds, colors, opacities, background, and a camera of tensors.
     """
     settings = settings or RenderSettings()
     sizes: dict[str, int] = {}
@@ -114,8 +122,9 @@ def render_covariances(
     if background is None:
         background = torch.tensor(settings.background, dtype=means.dtype)
     check_tensor("background", background, (3,), {})
-    call = _Call(as_camera("camera", camera), settings, 0, direct=True)
-    return _output(call, background, means, cov3ds, colors, opacities)
+    value, pose = split_camera(camera if isinstance(camera, CameraTensors) else as_camera("camera", camera))
+    call = _Call(value, settings, 0, direct=True)
+    return _output(call, background, pose, means, cov3ds, colors, opacities)
 
 
 RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
@@ -125,11 +134,11 @@ DIRECT = ("means", "cov3ds", "colors", "opacities")
 """Arguments of `render_covariances`, in order."""
 
 
-def _output(call: _Call, background: Tensor, *parameters: Tensor) -> RenderOutput:
+def _output(call: _Call, background: Tensor, pose: Pose, *parameters: Tensor) -> RenderOutput:
     dtype = parameters[0].dtype
     if dtype not in SUFFIXES or any(p.dtype != dtype or p.device.type != "cpu" for p in parameters):
         raise ArgumentError("means: the backend cpu needs tensors on the CPU, all float32 or all float64")
-    image, transmittance, depth = _Rasterize.apply(call, background, *parameters)  # type: ignore[no-untyped-call]
+    image, transmittance, depth = _Rasterize.apply(call, background, *pose, *parameters)  # type: ignore[no-untyped-call]
 
     def norms() -> Tensor:
         if call.norms is None:
@@ -137,7 +146,8 @@ def _output(call: _Call, background: Tensor, *parameters: Tensor) -> RenderOutpu
         return call.norms.index_select(0, call.visible)  # in half the time of [call.visible]
 
     depth = depth if call.settings.depth else None
-    defer = _defer(call, background, parameters)
+    needs_pose = any(tensor is not None and tensor.requires_grad for tensor in pose)
+    defer = None if needs_pose else _defer(call, background, parameters)
     return RenderOutput(image, transmittance, depth, call.visible, call.radii, call.num_pairs, norms, defer)
 
 
@@ -190,6 +200,9 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         call: _Call,
         background: Tensor,
+        R: Tensor | None,
+        eye: Tensor | None,
+        intrinsics: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         camera, means = call.camera, parameters[0]
@@ -234,10 +247,13 @@ class _Rasterize(torch.autograd.Function):
             if call.waiting is not None or call.norms is not None:
                 raise ArgumentError("backward: passes a deferred image twice; defer works for one pass")
             call.waiting = _Waiting(ctx.frame, kept, images, incoming)
-            return (None,) * (2 + len(kept))
+            return (None,) * (5 + len(kept))
         outgoing = [reusable_tensor(p.shape, p) for p in kept]
         norms = reusable_tensor((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
+        camera = (
+            torch.empty(GRADIENT_NUMBERS, dtype=torch.float64) if any(ctx.needs_input_grad[2:5]) else None
+        )
         # Saved tensors may have moved since the forward pass, so they are passed again.
         ctx.frame.backward(
             scene=_scene(kept, call.direct),
@@ -247,10 +263,11 @@ class _Rasterize(torch.autograd.Function):
                 **_arrays(outgoing, call.direct),
                 means2d_norm=native_array(norms),
                 background=native_array(background),
+                camera=None if camera is None else native_array(camera),
             ),
         )
         call.norms = norms if call.norms is None else call.norms + norms
-        return None, background, *outgoing
+        return None, background, *camera_gradients(camera), *outgoing
 
 
 def _arrays(parameters: list[Tensor], direct: bool) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
@@ -18,6 +19,7 @@ from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, DILATION, SH_OFFSET, Z_NEAR
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.gaussians import Gaussians, check_tensor, quat_to_R_t
+from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.sh import basis_terms, num_coefficients
@@ -126,7 +128,10 @@ def render_t(
 
 
 def render_dense(
-    gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Float[Tensor, "3"]
+    gaussians: Gaussians,
+    camera: Camera | CameraTensors,
+    settings: RenderSettings,
+    background: Float[Tensor, "3"],
 ) -> RenderOutput:
     """Render raw parameters: the backend torch of `gsplat_edu.render.api.render`.
 
@@ -137,7 +142,7 @@ def render_dense(
         background: (3,) colour behind everything.
 
     Returns:
-        The view. Differentiable in every raw parameter and the background.
+        The view. Differentiable in every raw parameter, the background and a camera of tensors.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite, or a quaternion has zero length.
@@ -186,7 +191,7 @@ def _composite(
     screen: _Screen,
     colors: Float[Tensor, "M C"],
     opacities: Float[Tensor, " M"],
-    cam: Camera,
+    cam: Camera | CameraTensors,
     alpha_min: float,
     chunk: int,
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
@@ -206,12 +211,19 @@ def _composite(
     return image, T
 
 
-def _viewing_directions(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 3"]:
+def _viewing_directions(means: Float[Tensor, "N 3"], camera: Camera | CameraTensors) -> Float[Tensor, "N 3"]:
     """Return directions from the camera to the means; a mean at the camera, which is culled, gets the zero vector."""
-    offset = means - torch.tensor(camera.eye, dtype=means.dtype, device=means.device)
+    offset = means - _like(means, camera.eye)
     squared = (offset * offset).sum(dim=-1, keepdim=True)
     # where() twice keeps the square root's infinite slope at 0 out of the chain rule.
     return torch.where(squared > 0, offset / torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
+
+
+def _like(tensor: Tensor, values: Tensor | np.ndarray | float) -> Tensor:
+    """Return a camera's numbers with the dtype and on the device of a tensor."""
+    if isinstance(values, Tensor):
+        return values.to(tensor)
+    return torch.tensor(values, dtype=tensor.dtype, device=tensor.device)
 
 
 def _check(
@@ -232,21 +244,22 @@ def _check(
 def _project(
     means: Float[Tensor, "N 3"],
     shapes: Float[Tensor, "N 3 3"],
-    cam: Camera,
+    cam: Camera | CameraTensors,
     jacobian_limit: float | None = None,
     *,
     factors: tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]] | None = None,
 ) -> _Screen:
     """Project; `shapes` are covariances, or M = R S if the factors are given, which keeps the digits of thin ones."""
-    R = torch.tensor(cam.R, dtype=means.dtype, device=means.device)
-    means_cam = (means - torch.tensor(cam.eye, dtype=means.dtype, device=means.device)) @ R.T
+    R = _like(means, cam.R)
+    means_cam = (means - _like(means, cam.eye)) @ R.T
     visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]
     visible = visible[torch.argsort(means_cam[visible, 2], stable=True)]
     x, y, z = means_cam[visible].unbind(-1)
     means2d = torch.stack([cam.fx * x / z + cam.cx, cam.fy * y / z + cam.cy], dim=-1)
     zero = torch.zeros_like(z)
     (x_low, x_high), (y_low, y_high) = cam.jacobian_bounds(jacobian_limit)
-    x_z, y_z = (x / z).clamp(x_low, x_high), (y / z).clamp(y_low, y_high)
+    x_z = (x / z).clamp(_like(z, x_low), _like(z, x_high))
+    y_z = (y / z).clamp(_like(z, y_low), _like(z, y_high))
     rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
     JW = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2) @ R
     if factors is not None:
@@ -273,7 +286,7 @@ def _alpha(
     means2d: Float[Tensor, "k 2"],
     ellipses: Float[Tensor, "k 3"],
     opacities: Float[Tensor, " k"],
-    cam: Camera,
+    cam: Camera | CameraTensors,
     alpha_min: float,
 ) -> Float[Tensor, "k H W"]:
     u, v = (axis[:, None, None] for axis in means2d.unbind(-1))

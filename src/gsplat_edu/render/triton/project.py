@@ -16,10 +16,12 @@ import triton
 import triton.language as tl
 
 from gsplat_edu import constants
+from gsplat_edu.render.camera_tensors import GRADIENT_NUMBERS
 from gsplat_edu.render.triton.gaussian import (
     C0,
     DET_FLOOR,
     DILATION,
+    EYE_AT,
     FOCAL_AT,
     MIDDLE_AT,
     NEAR_AT,
@@ -42,6 +44,9 @@ RECORD = tl.constexpr(16)
 
 SLOT = tl.constexpr(16)
 """Values per slot: sums of w g (3), of w times the depth's gradient, and six moments of h."""
+
+CAMERA_NUMBERS = tl.constexpr(GRADIENT_NUMBERS)
+"""Numbers of a camera's gradient, at the offsets of the camera's row."""
 
 ALPHA_MIN = tl.constexpr(constants.ALPHA_MIN)
 COLOR_LIMIT = tl.constexpr(constants.COLOR_LIMIT)
@@ -222,12 +227,50 @@ def _store_if(pointer, stride: tl.constexpr, place: tl.constexpr, i, value, touc
 
 @triton.jit
 @no_type_check
+def _store_shape(grad_quats, grad_log_scales, turn, R, s, t, p, f, g, i, touched, mask):
+    """Store the gradients of scales and quaternion, from those of the rows of J W M (f, g)."""
+    G = (
+        (t[0] * f[0] + p[0] * g[0]) * s[0], (t[0] * f[1] + p[0] * g[1]) * s[1], (t[0] * f[2] + p[0] * g[2]) * s[2],
+        (t[1] * f[0] + p[1] * g[0]) * s[0], (t[1] * f[1] + p[1] * g[1]) * s[1], (t[1] * f[2] + p[1] * g[2]) * s[2],
+        (t[2] * f[0] + p[2] * g[0]) * s[0], (t[2] * f[1] + p[2] * g[1]) * s[1], (t[2] * f[2] + p[2] * g[2]) * s[2],
+    )  # fmt: skip
+    for k in tl.static_range(3):
+        along = dot3(R[k], R[3 + k], R[6 + k], G[k], G[3 + k], G[6 + k])
+        _store_if(grad_log_scales, 3, k, i, along, touched, mask)
+    w, x, y, z, length = turn
+    found = _turn_gradient(w, x, y, z, G)
+    for k in tl.static_range(4):
+        _store_if(grad_quats, 4, k, i, found[k] / length, touched, mask)
+
+
+@triton.jit
+@no_type_check
+def _store_means(
+    grad_means, camera, camera_sums, g, w, direction, distance, i, touched, mask, WITH_CAMERA: tl.constexpr
+):
+    """Store the means' gradient, from that in camera axes (g) and that of the viewing direction (w), and the eye's."""
+    along = dot3(w[0], w[1], w[2], direction[0], direction[1], direction[2])
+    for k in tl.static_range(3):
+        column = (tl.load(camera + k), tl.load(camera + 3 + k), tl.load(camera + 6 + k))
+        mean = dot3(column[0], column[1], column[2], g[0], g[1], g[2])
+        mean += (w[k] - along * direction[k]) / distance
+        _store_if(grad_means, 3, k, i, mean, touched, mask)
+        if WITH_CAMERA:  # all formulas depend on mean - eye
+            _store_sum(camera_sums, EYE_AT + k, -mean, touched)
+
+
+@triton.jit
+@no_type_check
 def project_backward_kernel(
     means, quats, log_scales, sh0, sh_rest, logits, camera, slots, slot_begin, pairs_of,
-    grad_means, grad_quats, grad_log_scales, grad_sh0, grad_sh_rest, grad_logits, norms, n,
-    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+    grad_means, grad_quats, grad_log_scales, grad_sh0, grad_sh_rest, grad_logits, norms, camera_sums, n,
+    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, WITH_CAMERA: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Add slots and propagate to raw parameters: conic -> Sigma2d -> (J W, M); colour -> (coefficients, direction)."""
+    """Add slots and propagate to raw parameters: conic -> Sigma2d -> (J W, M); colour -> (coefficients, direction).
+
+    With `WITH_CAMERA`, each program writes its sums of the camera's gradient: R row by row, the eye, fx, fy, cx, cy.
+    """
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
     sums = _sums(slots, slot_begin, pairs_of, i, mask, BLOCK)
@@ -254,22 +297,13 @@ def project_backward_kernel(
     # From Sigma2d to r and q, the rows of J W M; then to M's rotation and scales, and to J W.
     f0, f1, f2 = 2 * da * r[0] + db * q[0], 2 * da * r[1] + db * q[1], 2 * da * r[2] + db * q[2]
     g0, g1, g2 = 2 * dc * q[0] + db * r[0], 2 * dc * q[1] + db * r[1], 2 * dc * q[2] + db * r[2]
-    G = (
-        (t0 * f0 + p0 * g0) * s0, (t0 * f1 + p0 * g1) * s1, (t0 * f2 + p0 * g2) * s2,
-        (t1 * f0 + p1 * g0) * s0, (t1 * f1 + p1 * g1) * s1, (t1 * f2 + p1 * g2) * s2,
-        (t2 * f0 + p2 * g0) * s0, (t2 * f1 + p2 * g1) * s1, (t2 * f2 + p2 * g2) * s2,
+    _store_shape(
+        grad_quats, grad_log_scales, (qw, qx, qy, qz, length), R, (s0, s1, s2), (t0, t1, t2), (p0, p1, p2),
+        (f0, f1, f2), (g0, g1, g2), i, touched, mask,
     )  # fmt: skip
-    _store_if(grad_log_scales, 3, 0, i, dot3(R[0], R[3], R[6], G[0], G[3], G[6]), touched, mask)
-    _store_if(grad_log_scales, 3, 1, i, dot3(R[1], R[4], R[7], G[1], G[4], G[7]), touched, mask)
-    _store_if(grad_log_scales, 3, 2, i, dot3(R[2], R[5], R[8], G[2], G[5], G[8]), touched, mask)
-    turn = _turn_gradient(qw, qx, qy, qz, G)
-    for k in tl.static_range(4):
-        _store_if(grad_quats, 4, k, i, turn[k] / length, touched, mask)
     d = _along_rows(R, s0 * f0, s1 * f1, s2 * f2)
     e = _along_rows(R, s0 * g0, s1 * g1, s2 * g2)
-    m0, m1, m2 = _mean_gradient(
-        camera, x, y, z, ratio_x, ratio_y, (t0, t1, t2), (p0, p1, p2), d, e, gu, gv, sums[3]
-    )
+    g = _mean_gradient(camera, x, y, z, ratio_x, ratio_y, (t0, t1, t2), (p0, p1, p2), d, e, gu, gv, sums[3])
 
     distance = tl.sqrt(dot3(o0, o1, o2, o0, o1, o2))
     direction = (o0 / distance, o1 / distance, o2 / distance)
@@ -277,10 +311,45 @@ def project_backward_kernel(
     w0, w1, w2 = _color_gradient(
         sh0, sh_rest, grad_sh0, grad_sh_rest, i, direction, colors, sums, mask, touched, DEGREE, REST
     )
-    along = dot3(w0, w1, w2, direction[0], direction[1], direction[2])
-    _store_if(grad_means, 3, 0, i, m0 + (w0 - along * direction[0]) / distance, touched, mask)
-    _store_if(grad_means, 3, 1, i, m1 + (w1 - along * direction[1]) / distance, touched, mask)
-    _store_if(grad_means, 3, 2, i, m2 + (w2 - along * direction[2]) / distance, touched, mask)
+    _store_means(
+        grad_means, camera, camera_sums, g, (w0, w1, w2), direction, distance, i, touched, mask, WITH_CAMERA
+    )
+    if WITH_CAMERA:
+        _camera_gradient(
+            camera, camera_sums, (o0, o1, o2), (x, y, z), (ratio_x, ratio_y), (t0, t1, t2), (p0, p1, p2), d, e,
+            gu, gv, g, touched,
+        )  # fmt: skip
+
+
+@triton.jit
+@no_type_check
+def _store_sum(camera_sums, place: tl.constexpr, value, touched):
+    """Store a block's sum of a number of the camera's gradient; Gaussians that were not drawn have none."""
+    tl.store(
+        camera_sums + tl.program_id(0) * CAMERA_NUMBERS + place, tl.sum(tl.where(touched, value, 0.0), 0)
+    )
+
+
+@triton.jit
+@no_type_check
+def _camera_gradient(camera, camera_sums, offset, at, ratio, t, p, d, e, gu, gv, g, touched):
+    """Store the sums for R and the intrinsics. A clamped x/z is a bound of the image, (constant - cx) / fx."""
+    fx, fy = tl.load(camera + FOCAL_AT), tl.load(camera + FOCAL_AT + 1)
+    x, y, z = at
+    r6, r7, r8 = tl.load(camera + 6), tl.load(camera + 7), tl.load(camera + 8)
+    w0 = tl.where(ratio[0] == x / z, 0.0, dot3(d[0], d[1], d[2], r6, r7, r8) / z)
+    w1 = tl.where(ratio[1] == y / z, 0.0, dot3(e[0], e[1], e[2], r6, r7, r8) / z)
+    for k in tl.static_range(3):
+        along0, along1 = fx / z * d[k], fy / z * e[k]
+        _store_sum(camera_sums, k, g[0] * offset[k] + along0, touched)
+        _store_sum(camera_sums, 3 + k, g[1] * offset[k] + along1, touched)
+        _store_sum(camera_sums, 6 + k, g[2] * offset[k] - ratio[0] * along0 - ratio[1] * along1, touched)
+    focal0 = gu * x / z + dot3(d[0], d[1], d[2], t[0], t[1], t[2]) / fx + w0 * ratio[0]
+    focal1 = gv * y / z + dot3(e[0], e[1], e[2], p[0], p[1], p[2]) / fy + w1 * ratio[1]
+    _store_sum(camera_sums, FOCAL_AT, focal0, touched)
+    _store_sum(camera_sums, FOCAL_AT + 1, focal1, touched)
+    _store_sum(camera_sums, MIDDLE_AT, gu + w0, touched)
+    _store_sum(camera_sums, MIDDLE_AT + 1, gv + w1, touched)
 
 
 @triton.jit
@@ -297,7 +366,7 @@ def _along_rows(R, v0, v1, v2):
 @triton.jit
 @no_type_check
 def _mean_gradient(camera, x, y, z, ratio_x, ratio_y, t, p, d, e, gu, gv, deep):
-    """Return the mean's gradient, world axes, from those of the rows of J W (d, e), image position and depth."""
+    """Return the mean's gradient, camera axes, from those of the rows of J W (d, e), image position and depth."""
     u, v = x / z, y / z
     r6, r7, r8 = tl.load(camera + 6), tl.load(camera + 7), tl.load(camera + 8)
     # J W = f/z (W_row - x/z W_2): d/dx gives -f/z² W_2; d/dz gives -(J W)/z + f x/z³ W_2. A clamped x/z is constant.
@@ -306,8 +375,4 @@ def _mean_gradient(camera, x, y, z, ratio_x, ratio_y, t, p, d, e, gu, gv, deep):
     along = dot3(d[0], d[1], d[2], t[0], t[1], t[2]) + dot3(e[0], e[1], e[2], p[0], p[1], p[2])
     fx, fy = tl.load(camera + FOCAL_AT) / z, tl.load(camera + FOCAL_AT + 1) / z
     gx, gy = fx * gu - fx / z * w0, fy * gv - fy / z * w1
-    gz = deep - u * fx * gu - v * fy * gv - along / z + (fx * u * w0 + fy * v * w1) / z
-    m0 = dot3(tl.load(camera), tl.load(camera + 3), r6, gx, gy, gz)
-    m1 = dot3(tl.load(camera + 1), tl.load(camera + 4), r7, gx, gy, gz)
-    m2 = dot3(tl.load(camera + 2), tl.load(camera + 5), r8, gx, gy, gz)
-    return m0, m1, m2
+    return gx, gy, deep - u * fx * gu - v * fy * gv - along / z + (fx * u * w0 + fy * v * w1) / z

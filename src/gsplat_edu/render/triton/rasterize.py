@@ -4,7 +4,8 @@
 
 Every sum has a fixed order: pairs write to their own slots and Gaussians add theirs in order, without atomics, so two
 runs give the same bits. All launches are on torch's current stream. The host synchronises once per render, for the
-numbers of pairs and of visible Gaussians. With TRITON_INTERPRET=1 the same kernels run on CPU tensors.
+numbers of pairs and of visible Gaussians, and once per gradient of a camera. With TRITON_INTERPRET=1 the same kernels
+run on CPU tensors.
 """
 
 from __future__ import annotations
@@ -22,11 +23,18 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.constants import TILE, Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.triton.composite import composite_backward_kernel, composite_kernel
 from gsplat_edu.render.triton.intersect import count_kernel, emit_kernel
-from gsplat_edu.render.triton.project import RECORD, SLOT, project_backward_kernel, project_kernel
+from gsplat_edu.render.triton.project import (
+    CAMERA_NUMBERS,
+    RECORD,
+    SLOT,
+    project_backward_kernel,
+    project_kernel,
+)
 
 BLOCK = 128
 """Gaussians per program of project, count and emit."""
@@ -75,7 +83,7 @@ class _Lists:
 
 
 def render_triton(
-    gaussians: Gaussians, camera: Camera, settings: RenderSettings, background: Tensor
+    gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, background: Tensor
 ) -> RenderOutput:
     """Render raw parameters; `gsplat_edu.render.api.render` validates the arguments.
 
@@ -86,17 +94,19 @@ def render_triton(
         background: (3,) colour behind everything, of the Gaussians' dtype and device.
 
     Returns:
-        The view. Differentiable in every raw parameter and the background.
+        The view. Differentiable in every raw parameter, the background and a camera of tensors.
 
     Raises:
         ArgumentError: the Gaussians are not float32.
     """
     if gaussians.means.dtype != torch.float32:
         raise ArgumentError(f"means: are {gaussians.means.dtype}, but the backend cuda needs float32")
-    call = _Call(camera, settings, min(settings.sh_degree, gaussians.sh_degree))
+    value, pose = split_camera(camera)
+    call = _Call(value, settings, min(settings.sh_degree, gaussians.sh_degree))
     tensors = gaussians.tensors()
+    parameters = [tensors[name] for name in RAW]
     with torch.cuda.device_of(gaussians.means):  # type: ignore[no-untyped-call]
-        image, transmittance, depth = _Rasterize.apply(call, background, *(tensors[name] for name in RAW))  # type: ignore[no-untyped-call]
+        image, transmittance, depth = _Rasterize.apply(call, background, *pose, *parameters)  # type: ignore[no-untyped-call]
 
     def norms() -> Tensor:
         if call.norms is None:
@@ -115,6 +125,9 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         call: _Call,
         background: Tensor,
+        R: Tensor | None,
+        eye: Tensor | None,
+        intrinsics: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         camera, settings = call.camera, call.settings
@@ -154,17 +167,20 @@ class _Rasterize(torch.autograd.Function):
         outgoing = [torch.empty_like(p) for p in kept]  # fully overwritten
         count = len(kept[0])
         norms = kept[0].new_zeros(count)
+        blocks, with_camera = -(-count // BACKWARD_BLOCK), any(ctx.needs_input_grad[2:5])
+        camera_sums = kept[0].new_empty(blocks if with_camera else 0, CAMERA_NUMBERS.value)
         if count:
-            project_backward_kernel[(-(-count // BACKWARD_BLOCK),)](
+            project_backward_kernel[(blocks,)](
                 *kept, _camera_row(call, image.device), slots, lists.slot_begin, lists.pairs_of, *outgoing, norms,
-                count,
+                camera_sums, count,
                 DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
-                BLOCK=BACKWARD_BLOCK, num_warps=PROJECT_BACKWARD_WARPS,
+                WITH_CAMERA=with_camera, BLOCK=BACKWARD_BLOCK, num_warps=PROJECT_BACKWARD_WARPS,
             )  # fmt: skip
         call.norms = norms if call.norms is None else call.norms + norms
         wanted = ctx.needs_input_grad[1]
         background = (grad_image * transmittance[..., None]).sum(dim=(0, 1)) if wanted else None
-        return None, background, *outgoing
+        pose = camera_gradients(camera_sums.double().sum(dim=0).cpu() if with_camera else None)
+        return None, background, *pose, *outgoing
 
 
 def _project(call: _Call, kept: list[Tensor]) -> Tensor:
