@@ -41,9 +41,9 @@ def phone(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def done(colmap, phone, tmp_path_factory):
-    """The capture made from the phone's photos, with the messages (said) and the progress of the run."""
+    """The capture that one thread makes from the phone's photos, with the run's messages (said) and progress."""
     out = tmp_path_factory.mktemp("done") / "capture"
     said, progress = [], []
-    options = SfmOptions(phone.folder, out, max_features=LIMIT)
+    options = SfmOptions(phone.folder, out, max_features=LIMIT, threads=1)
     assert reconstruct(options, said.append, lambda *step: progress.append(step)) == out
     return SimpleNamespace(out=out, said=said, progress=progress, options=options, truth=phone.truth)
