@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from gsplat_edu import _native
-from gsplat_edu.constants import Z_NEAR
+from gsplat_edu.constants import ALPHA_MAX, Z_NEAR
 
 SIZE, FOCAL, SIGMA, ROUNDS = 1024, 1000.0, 2.0, 7
 STAGES = ("project", "sort", "intersect", "composite", "composite_backward", "project_backward")
@@ -55,9 +55,9 @@ def room(parameters: dict[str, torch.Tensor], size: int) -> Room:
     norms = torch.zeros(len(parameters["means"]))
     image, transmittance = torch.zeros(size, size, 3), torch.zeros(size, size)
     return Room(
-        _native.Images(image=image, transmittance=transmittance, depth=None),
-        _native.Images(image=gradient, transmittance=None, depth=None),
-        _native.Gradients(**out, means2d_norm=norms, background=torch.zeros(3), camera=None),
+        _native.Images(image=image, transmittance=transmittance, depth=None, features=None, median=None),
+        _native.Images(image=gradient, transmittance=None, depth=None, features=None, median=None),
+        _native.Gradients(**out, means2d_norm=norms, background=torch.zeros(3), camera=None, features=None),
     )
 
 
@@ -81,11 +81,20 @@ def frame_seconds(
             H=size,
             W=size,
         ),
-        settings=_native.Settings(z_near=Z_NEAR, background=[0.0] * 3, sh_degree=0, antialiased=False),
+        settings=_native.Settings(
+            z_near=Z_NEAR, background=[0.0] * 3, sh_degree=0, antialiased=False, alpha_max=ALPHA_MAX
+        ),
         threads=threads,
     )
-    frame.composite(to.images)
-    frame.backward(scene=scene, images=to.images, incoming=to.incoming, gradients=to.gradients)
+    frame.composite(images=to.images, features=None)
+    frame.backward(
+        scene=scene,
+        images=to.images,
+        incoming=to.incoming,
+        gradients=to.gradients,
+        features=None,
+        collected=None,
+    )
     return frame.seconds, frame.num_pairs
 
 

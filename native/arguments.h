@@ -142,6 +142,13 @@ class Arguments {
         return value;
     }
 
+    // Whether an argument is None, which is then taken.
+    bool is_none(const char *name) {
+        const bool none = take(name).is_none();
+        if (!none) --count_;
+        return none;
+    }
+
     double number(const char *name) {
         const double value = real(name, take(name));
         if (!std::isfinite(value)) fail(name, "has to be finite");

@@ -1,8 +1,7 @@
-// The module gsplat_edu._native. Only this file and arguments.h know Python.
+// The module gsplat_edu._native. Only this file, structures.h and arguments.h know Python.
 //
 // Every call takes its arguments by name. The dtype, shape, layout, alignment and device of every array are checked here,
 // before a kernel gets its address. Kernels check nothing.
-#include "arguments.h"
 
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/string.h>
@@ -17,167 +16,20 @@
 
 #include "buffers.h"
 #include "dispatch.h"
-#include "frame.h"
 #include "loss.h"
+#include "structures.h"
 #include "threads.h"
 
 using namespace gsplat;
 
 namespace {
 
-constexpr int64_t MOST = std::numeric_limits<int32_t>::max();
-constexpr int64_t MOST_THREADS = 65536;
-
-Camera camera_of(Arguments a) {
-    Camera cam{};
-    const Array R = a.array("R", {Kind::F64}, {3, 3}), eye = a.array("eye", {Kind::F64}, {3});
-    std::copy_n(R.as<double>(), 9, cam.R);
-    std::copy_n(eye.as<double>(), 3, cam.eye);
-    cam.fx = a.number("fx"), cam.fy = a.number("fy"), cam.cx = a.number("cx"), cam.cy = a.number("cy");
-    std::array<double, 2> x, y;
-    a.numbers("x_bounds", x.data(), 2), a.numbers("y_bounds", y.data(), 2);
-    cam.x_low = x[0], cam.x_high = x[1], cam.y_low = y[0], cam.y_high = y[1];
-    cam.H = int32_t(a.whole("H", 1, MOST)), cam.W = int32_t(a.whole("W", 1, MOST));
-    const int64_t tiles = ((int64_t(cam.H) + TILE - 1) / TILE) * ((int64_t(cam.W) + TILE - 1) / TILE);
-    if (tiles > MOST) a.fail("H", "times W is more pixels than can be rendered");
-    a.finish();
-    return cam;
-}
-
-Settings settings_of(Arguments a) {
-    Settings set{};
-    set.z_near = a.number("z_near");
-    a.numbers("background", set.background, 3);
-    set.sh_degree = int32_t(a.whole("sh_degree", 0, 3));
-    set.antialiased = a.flag("antialiased");
-    a.finish();
-    return set;
-}
-
-// Arrays with one entry per Gaussian: raw parameters, or covariances, colours and opacities.
-struct PerGaussian {
-    Array means, quats, log_scales, sh0, sh_rest, logit_opacities, cov3ds, colors, opacities;
-    bool direct = false;
-    int64_t n = 0, rest = 0;
-
-    PerGaussian(Arguments &a, bool written) : direct(a.has("cov3ds")) {
-        means = a.array("means", {Kind::F32, Kind::F64}, {ANY, 3}, written);
-        const Kind kind = means.is(Kind::F32) ? Kind::F32 : Kind::F64;
-        n = means.shape[0];
-        if (direct) {
-            cov3ds = a.array("cov3ds", {kind}, {n, 3, 3}, written);
-            colors = a.array("colors", {kind}, {n, 3}, written);
-            opacities = a.array("opacities", {kind}, {n}, written);
-            return;
-        }
-        quats = a.array("quats", {kind}, {n, 4}, written);
-        log_scales = a.array("log_scales", {kind}, {n, 3}, written);
-        sh0 = a.array("sh0", {kind}, {n, 1, 3}, written);
-        sh_rest = a.array("sh_rest", {kind}, {n, ANY, 3}, written);
-        logit_opacities = a.array("logit_opacities", {kind}, {n}, written);
-        rest = sh_rest.shape[1];
-        if (rest != 0 && rest != 3 && rest != 8 && rest != 15) a.fail("sh_rest", "has to hold 0, 3, 8 or 15 coefficients per channel");
-    }
-};
-
-struct SceneArrays : PerGaussian {
-    explicit SceneArrays(Arguments a) : PerGaussian(a, false) { a.finish(); }
-
-    template <class T>
-    Scene<T> as() const {
-        return {n,
-                means.as<T>(),
-                quats.as<T>(),
-                log_scales.as<T>(),
-                sh0.as<T>(),
-                sh_rest.as<T>(),
-                logit_opacities.as<T>(),
-                int32_t(rest),
-                cov3ds.as<T>(),
-                colors.as<T>(),
-                opacities.as<T>()};
-    }
-};
-
-struct GradientArrays : PerGaussian {
-    Array means2d_norm, background, camera;
-
-    explicit GradientArrays(Arguments a) : PerGaussian(a, true) {
-        const Kind kind = means.is(Kind::F32) ? Kind::F32 : Kind::F64;
-        means2d_norm = a.array("means2d_norm", {kind}, {n}, true);
-        background = a.array("background", {kind}, {3}, true);
-        camera = a.array_or_none("camera", Kind::F64, {CAMERA}, true);
-        a.finish();
-    }
-
-    template <class T>
-    SceneGrads<T> as() const {
-        return {means.as<T>(),
-                quats.as<T>(),
-                log_scales.as<T>(),
-                sh0.as<T>(),
-                sh_rest.as<T>(),
-                logit_opacities.as<T>(),
-                cov3ds.as<T>(),
-                colors.as<T>(),
-                opacities.as<T>(),
-                means2d_norm.as<T>(),
-                0};
-    }
-};
-
-// The images that a frame draws, or the loss's gradients of them. None means not wanted, or zero.
-struct ImageArrays {
-    Array image, transmittance, depth;
-
-    explicit ImageArrays(Arguments a) {
-        image = a.array("image", {Kind::F32, Kind::F64}, {ANY, ANY, 3}, true);
-        const Kind kind = image.is(Kind::F32) ? Kind::F32 : Kind::F64;
-        const Shape size{image.shape[0], image.shape[1]};
-        transmittance = a.array_or_none("transmittance", kind, size, true);
-        depth = a.array_or_none("depth", kind, size, true);
-        a.finish();
-    }
-
-    template <class T>
-    Outputs<T> as_outputs() const {
-        return {image.as<T>(), transmittance.as<T>(), depth.as<T>()};
-    }
-    template <class T>
-    ImageGrads<T> as_gradients() const {
-        return {image.as<T>(), transmittance.as<T>(), depth.as<T>()};
-    }
-};
-
-AdamNumbers adam_numbers(Arguments &a) {
-    return {a.number("rate"), a.number("beta1"), a.number("beta2"), a.number("eps"), a.number("correction1"), a.number("correction2")};
-}
-
-// A parameter with its moments, for a step of Adam; the gradient is the kernel's own plus `extra`, unless that is None.
-struct AdamArrays {
-    Array parameter, first, second, extra;
-    AdamNumbers numbers;
-
-    explicit AdamArrays(Arguments a) {
-        parameter = a.array_of_any_shape("parameter", {Kind::F32, Kind::F64}, true);
-        const Kind kind = parameter.is(Kind::F32) ? Kind::F32 : Kind::F64;
-        first = a.array("first", {kind}, parameter.shape, true), second = a.array("second", {kind}, parameter.shape, true);
-        extra = a.array_or_none("extra", kind, parameter.shape);
-        numbers = adam_numbers(a);
-        a.finish();
-    }
-
-    template <class T>
-    AdamArgs<T> as() const {
-        return {parameter.as<T>(), first.as<T>(), second.as<T>(), nullptr, extra.as<T>(), numbers};
-    }
-};
-
 // The scene and image sizes of a frame, against which the arguments of its later calls are checked.
 template <class T>
 struct BoundFrame {
     int64_t n, rest;
     bool direct, composited = false, with_depth = false;
+    int64_t channels = 0;
     int32_t H, W;
     Frame<T> frame;
 
@@ -195,13 +47,25 @@ struct BoundFrame {
         if (whole && !given.transmittance) a.fail(name, "needs transmittance");
     }
 
+    // Features of the frame's Gaussians for images that have them.
+    Array features_of(Arguments &a, const ImageArrays &images) const {
+        const Array features = a.array_or_none("features", KIND<T>, {n, images.features ? images.channels() : ANY});
+        if (bool(features) != bool(images.features)) a.fail("features", "has to be given exactly where the images have features");
+        return features;
+    }
+
     // Before a backward pass.
     void check_images(const Arguments &a, const ImageArrays &images, const ImageArrays &incoming) const {
         if (!composited) a.fail("images", "are not there yet; call composite first");
         check(a, "images", images, true), check(a, "incoming", incoming, false);
         if (bool(images.depth) != with_depth) a.fail("images", "has to have a depth exactly where the composited ones had");
+        if (images.channels() != channels) a.fail("images", "has to have as many channels of features as the composited ones");
         if (incoming.depth && !images.depth) a.fail("incoming", "has a gradient of the depth, which was not rendered");
+        if (incoming.median) a.fail("incoming", "has a gradient of the median depth, which has none");
+        if (incoming.features && incoming.channels() != channels) a.fail("incoming", "has another number of channels than the images");
     }
+
+    const StatisticArrays *collected_of(Arguments &a) const;
 };
 
 template <class S>
@@ -209,6 +73,23 @@ const S &struct_of(Arguments &a, const char *name) {
     const S *found = nullptr;
     if (!nb::try_cast(a.take(name), found, false) || !found) a.fail(name, "has to be the structure of that name");
     return *found;
+}
+
+// Statistics to collect, or null for None.
+template <class T>
+const StatisticArrays *BoundFrame<T>::collected_of(Arguments &a) const {
+    if (a.is_none("collected")) return nullptr;
+    const auto &given = struct_of<StatisticArrays>(a, "collected");
+    if (!given.values.is(KIND<T>)) a.fail("collected", "is of another dtype than the frame");
+    if (given.values.shape[0] != n) a.fail("collected", "has another number of Gaussians than the frame");
+    if (given.errors && (given.errors.shape[0] != H || given.errors.shape[1] != W))
+        a.fail("collected", "has errors of another size than the frame");
+    return &given;
+}
+
+template <class T>
+Collected<T> collected_as(const StatisticArrays *given) {
+    return given ? Collected<T>{given->values.as<T>(), given->errors.as<T>()} : Collected<T>{nullptr, nullptr};
 }
 
 template <class T>
@@ -227,11 +108,15 @@ void make_frame(BoundFrame<T> *self, nb::args positional, nb::kwargs given) {
 }
 
 template <class T>
-void composite(BoundFrame<T> &self, const ImageArrays &images) {
-    self.check(Arguments("Frame.composite", nb::args(), nb::kwargs()), "images", images, true);
+void composite(BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
+    Arguments a("Frame.composite", positional, given);
+    const auto &images = struct_of<ImageArrays>(a, "images");
+    self.check(a, "images", images, true);
+    const Array features = self.features_of(a, images);
+    a.finish();
     nb::gil_scoped_release release;
-    self.frame.composite(images.as_outputs<T>());
-    self.composited = true, self.with_depth = bool(images.depth);
+    self.frame.composite(images.as_outputs<T>(), features.as<T>());
+    self.composited = true, self.with_depth = bool(images.depth), self.channels = images.channels();
 }
 
 template <class T>
@@ -241,12 +126,16 @@ void backward(BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
     const auto &images = struct_of<ImageArrays>(a, "images");
     const auto &incoming = struct_of<ImageArrays>(a, "incoming");
     const auto &gradients = struct_of<GradientArrays>(a, "gradients");
+    const Array features = self.features_of(a, images);
+    const StatisticArrays *collected = self.collected_of(a);
     a.finish();
     self.check(a, "scene", scene), self.check(a, "gradients", gradients);
     self.check_images(a, images, incoming);
+    if (incoming.features && (!gradients.features || gradients.features.shape[1] != self.channels))
+        a.fail("gradients", "needs features, with as many channels as the images");
     nb::gil_scoped_release release;
-    self.frame.backward(scene.as<T>(), images.as_outputs<T>(), incoming.as_gradients<T>(), gradients.as<T>(), gradients.background.as<T>(),
-                        gradients.camera.as<double>());
+    self.frame.backward(scene.as<T>(), {images.as_outputs<T>(), features.as<T>(), collected_as<T>(collected)}, incoming.as_gradients<T>(),
+                        gradients.as<T>(), gradients.background.as<T>(), gradients.camera.as<double>());
 }
 
 // The arguments of Frame.adam: a group for each raw parameter, and the norms of the image positions' gradients.
@@ -267,15 +156,17 @@ struct AdamGroups {
     }
 
     // Threads write a range of each array; memory that two of them share would make the result depend on their order.
-    void refuse_overlaps(const Arguments &a, std::initializer_list<const ImageArrays *> images) const {
+    void refuse_overlaps(const Arguments &a, std::initializer_list<const ImageArrays *> images, const StatisticArrays *collected) const {
         std::vector<std::pair<const char *, const Array *>> written, read;
         for (int g = 0; g < GROUPS; ++g) {
             for (const Array *array : {&groups[g]->parameter, &groups[g]->first, &groups[g]->second}) written.emplace_back(NAMES[g], array);
             read.emplace_back(NAMES[g], &groups[g]->extra);
         }
         written.emplace_back("means2d_norm", &means2d_norm);
+        if (collected) written.emplace_back("collected", &collected->values), read.emplace_back("collected", &collected->errors);
         for (const ImageArrays *each : images)
-            for (const Array *array : {&each->image, &each->transmittance, &each->depth}) read.emplace_back("images", array);
+            for (const Array *array : {&each->image, &each->transmittance, &each->depth, &each->features})
+                read.emplace_back("images", array);
         read.insert(read.end(), written.begin(), written.end());
         for (const auto &[name, array] : written)
             for (const auto &[_, other] : read)
@@ -299,14 +190,16 @@ void adam_backward(BoundFrame<T> &self, nb::args positional, nb::kwargs given) {
     const auto &incoming = struct_of<ImageArrays>(a, "incoming");
     if (self.direct) a.fail("images", "are of covariances; Adam moves raw parameters");
     const AdamGroups given_groups(a, self);
+    const StatisticArrays *collected = self.collected_of(a);
     a.finish();
     self.check_images(a, images, incoming);
-    given_groups.refuse_overlaps(a, {&images, &incoming});
+    if (images.features) a.fail("images", "have features, which Adam does not move");
+    given_groups.refuse_overlaps(a, {&images, &incoming}, collected);
     AdamArgs<T> groups[GROUPS];
     for (int g = 0; g < GROUPS; ++g) groups[g] = given_groups.groups[g]->template as<T>();
     nb::gil_scoped_release release;
-    self.frame.adam(given_groups.template scene<T>(self.n, self.rest), images.as_outputs<T>(), incoming.as_gradients<T>(), groups,
-                    given_groups.means2d_norm.template as<T>());
+    self.frame.adam(given_groups.template scene<T>(self.n, self.rest), {images.as_outputs<T>(), nullptr, collected_as<T>(collected)},
+                    incoming.as_gradients<T>(), groups, given_groups.means2d_norm.template as<T>());
 }
 
 template <class T>
@@ -452,6 +345,7 @@ NB_MODULE(_native, m) {
     bind_struct<GradientArrays>(m, "Gradients", [](Arguments a) { return GradientArrays(std::move(a)); });
     bind_struct<AdamArrays>(m, "AdamGroup", [](Arguments a) { return AdamArrays(std::move(a)); });
     bind_struct<ImageArrays>(m, "Images", [](Arguments a) { return ImageArrays(std::move(a)); });
+    bind_struct<StatisticArrays>(m, "Statistics", [](Arguments a) { return StatisticArrays(std::move(a)); });
     bind_frame<float>(m, "FrameF32");
     bind_frame<double>(m, "FrameF64");
     m.def("adam_f32", &adam<float>);

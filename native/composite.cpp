@@ -2,24 +2,31 @@
 //
 //     p = log2_o - s² - t²;   alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 //
-// A tile stops once the transmittance of every pixel is below 1e-4.
+// A tile stops once the transmittance of every pixel is below 1e-4. Depth and features are composited as colours are. The
+// median depth is that of the splat where T falls below one half, 0 if it never does.
 #include "isa.h"
 #include "tile.h"
 
 namespace gsplat {
 namespace GSPLAT_ISA {
 
-template <class T>
+template <class T, int MODE>
 struct TileState {
     Plane<T> transmittance, red, green, blue, depth;
 };
 
-// Draws one splat.
-template <class T, bool DEPTH, bool GENTLY>
-GSPLAT_INLINE void draw(const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i, TileState<T> &tile) {
+template <class T>
+struct TileState<T, WITH_ALL> : TileState<T, WITH_DEPTH> {
+    Plane<T> median, features[MOST_CHANNELS];
+};
+
+// Draws one splat; `features` are its own.
+template <class T, int MODE, bool GENTLY>
+GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const T *features, const TileBox &box, const Rows<T> &rows,
+                        uint32_t i, TileState<T, MODE> &tile) {
     using V = typename Vector<T>::V;
     FalloffRows<T> steps;
-    Falloff<T, GENTLY> falloff{steps, {}, {}, {}, {}, {}};
+    Falloff<T, GENTLY> falloff{steps, args.settings};
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
@@ -33,8 +40,16 @@ GSPLAT_INLINE void draw(const Splat<T> &s, const TileBox &box, const Rows<T> &ro
             store(tile.red.values + at, load<V>(tile.red.values + at) + w * red);
             store(tile.green.values + at, load<V>(tile.green.values + at) + w * green);
             store(tile.blue.values + at, load<V>(tile.blue.values + at) + w * blue);
-            if (DEPTH) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
+            if (MODE != COLORS) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
             store(tile.transmittance.values + at, t - w);
+            if constexpr (MODE == WITH_ALL) {
+                const V half = splat(T(0.5)), median = load<V>(tile.median.values + at);
+                store(tile.median.values + at, (t >= half) & (t - w < half) ? splat(s.depth) : median);
+                for (int32_t k = 0; k < args.out.channels; ++k) {
+                    T *to = tile.features[k].values + at;
+                    store(to, load<V>(to) + w * splat(features[k]));
+                }
+            }
             falloff.step(row - first);
         }
     }
@@ -42,35 +57,43 @@ GSPLAT_INLINE void draw(const Splat<T> &s, const TileBox &box, const Rows<T> &ro
 
 // Whether any pixel still has a transmittance of T_STOP or more. Looks first where one had it the last time.
 template <class T>
-GSPLAT_INLINE bool lets_light_through(const TileState<T> &tile, int &where) {
+GSPLAT_INLINE bool lets_light_through(const Plane<T> &transmittance, int &where) {
     using V = typename Vector<T>::V;
-    if (any_at_least(load<V>(tile.transmittance.values + where), T(T_STOP))) return true;
+    if (any_at_least(load<V>(transmittance.values + where), T(T_STOP))) return true;
     for (where = 0; where < TILE * TILE; where += Vector<T>::LANES)
-        if (any_at_least(load<V>(tile.transmittance.values + where), T(T_STOP))) return true;
+        if (any_at_least(load<V>(transmittance.values + where), T(T_STOP))) return true;
     where = 0;
     return false;
 }
 
 // Writes the pixels of a tile, over the background.
-template <class T, bool DEPTH>
-GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box, const TileState<T> &tile) {
+template <class T, int MODE>
+GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box, const TileState<T, MODE> &tile) {
     using Q = typename Four<T>::V;
+    const Images<T> &out = args.out;
     const double *bg = args.settings.background;
     for_each_four<T>(box, args.camera.W, [&](int from, int64_t pixel, int count) {
         const Q t = load<Q>(tile.transmittance.values + from);
         const Q rgb[3] = {load<Q>(tile.red.values + from) + t * T(bg[0]), load<Q>(tile.green.values + from) + t * T(bg[1]),
                           load<Q>(tile.blue.values + from) + t * T(bg[2])};
-        store_colors<T>(args.image + 3 * pixel, count, rgb);
-        memcpy(args.transmittance + pixel, &t, size_t(count) * sizeof(T));
-        if (DEPTH) memcpy(args.depth + pixel, tile.depth.values + from, size_t(count) * sizeof(T));
+        const size_t bytes = size_t(count) * sizeof(T);
+        store_colors<T>(out.image + 3 * pixel, count, rgb);
+        memcpy(out.transmittance + pixel, &t, bytes);
+        if (MODE != COLORS && out.depth) memcpy(out.depth + pixel, tile.depth.values + from, bytes);
+        if constexpr (MODE == WITH_ALL) {
+            if (out.median) memcpy(out.median + pixel, tile.median.values + from, bytes);
+            for (int i = 0; i < count; ++i)
+                for (int32_t k = 0; k < out.channels; ++k) out.features[(pixel + i) * out.channels + k] = tile.features[k].values[from + i];
+        }
     });
 }
 
-template <class T, bool DEPTH>
+template <class T, int MODE>
 void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     const TileBox box = tile_box(args.grid, args.camera, index);
-    TileState<T> tile;
-    memset(&tile, 0, sizeof tile);
+    TileState<T, MODE> tile;
+    memset(&tile, 0, sizeof(TileState<T, COLORS>));
+    if constexpr (MODE == WITH_ALL) memset(&tile.median, 0, sizeof(Plane<T>) * size_t(1 + args.out.channels));  // and the first features
     for (int y = 0; y < box.height; ++y)
         for (int x = 0; x < box.width; ++x) tile.transmittance.values[y * TILE + x] = 1;
 
@@ -85,20 +108,24 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
             rows_of(args.splats, args.pairs + k, vmin(BATCH, end - k), box, rows);
         }
         if (rows.top[i] > rows.bottom[i]) continue;
-        const Splat<T> &s = args.splats[args.pairs[k].gaussian];
-        rows.gentle[i] ? draw<T, DEPTH, true>(s, box, rows, i, tile) : draw<T, DEPTH, false>(s, box, rows, i, tile);
-        if (!lets_light_through(tile, bright)) {
+        const uint32_t id = args.pairs[k].gaussian;
+        const T *features = MODE == WITH_ALL ? args.features + int64_t(args.out.channels) * id : nullptr;
+        const Splat<T> &s = args.splats[id];
+        rows.gentle[i] ? draw<T, MODE, true>(args, s, features, box, rows, i, tile)
+                       : draw<T, MODE, false>(args, s, features, box, rows, i, tile);
+        if (!lets_light_through(tile.transmittance, bright)) {
             ++k;
             break;
         }
     }
     args.done[index] = k - begin;
-    finish_tile<T, DEPTH>(args, box, tile);
+    finish_tile<T, MODE>(args, box, tile);
 }
 
 template <class T>
 void composite(const CompositeArgs<T> &args, int32_t tile) {
-    args.depth ? composite_tile<T, true>(args, tile) : composite_tile<T, false>(args, tile);
+    if (args.out.median || args.out.features) return composite_tile<T, WITH_ALL>(args, tile);
+    args.out.depth ? composite_tile<T, WITH_DEPTH>(args, tile) : composite_tile<T, COLORS>(args, tile);
 }
 
 template void composite<float>(const CompositeArgs<float> &, int32_t);

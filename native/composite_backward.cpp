@@ -6,24 +6,88 @@
 //     h = alpha dL/dalpha, 0 where alpha was clamped
 //
 // Every pair writes its sums over the tile's pixels, w g and the moments of h about the splat's reference point, to its own
-// slot.
+// slot; those of features and statistics to slots of their own.
 #include "isa.h"
 #include "tile.h"
 
 namespace gsplat {
 namespace GSPLAT_ISA {
 
-template <class T>
+template <class T, int MODE>
 struct TileGradient {
     Plane<T> transmittance, rest, red, green, blue, depth;
 };
 
-// Writes one splat's sums over the tile to `slot`.
-template <class T, bool WITH_DEPTH, bool GENTLY>
-GSPLAT_INLINE void splat_backward(const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i, TileGradient<T> &tile, T *slot) {
+template <class T>
+struct TileGradient<T, WITH_ALL> : TileGradient<T, WITH_DEPTH> {
+    int32_t channels;  // 0 if features have no gradient
+    Plane<T> errors, features[MOST_CHANNELS];
+};
+
+// A pair, and where its sums go.
+template <class T>
+struct PairSlots {
+    const Splat<T> &s;
+    T *slot;
+    const T *features;  // of the Gaussian
+    T *feature_slot, *statistic_slot;
+};
+
+// The sums of one splat over the tile that only WITH_ALL has.
+template <class T, int MODE>
+struct MoreSums {};
+
+template <class T>
+struct MoreSums<T, WITH_ALL> {
     using V = typename Vector<T>::V;
+    V features[MOST_CHANNELS], statistics[STATISTICS] = {};
+
+    GSPLAT_METHOD explicit MoreSums(int32_t channels) {
+        for (int32_t k = 0; k < channels; ++k) features[k] = V{};
+    }
+
+    // Adds a row with the weights w; returns the sum of the features times their gradients.
+    GSPLAT_METHOD V add_features(const TileGradient<T, WITH_ALL> &tile, const T *own, int at, V w) {
+        V dot = V{};
+        for (int32_t k = 0; k < tile.channels; ++k) {
+            const V gradient = load<V>(tile.features[k].values + at);
+            dot += gradient * splat(own[k]);
+            features[k] += w * gradient;
+        }
+        return dot;
+    }
+
+    // p = log2_o - s² - t², so that dL/du = 2 ln 2 sx (h s) and dL/dv = 2 ln 2 (sy (h s) + ty (h t)); the factors follow in `write`.
+    GSPLAT_METHOD void add_statistics(const TileGradient<T, WITH_ALL> &tile, const Splat<T> &of, int at, V w, V h, V across, V t) {
+        statistics[ABS_U] += absolute(h * across), statistics[ABS_V] += absolute(h * (splat(of.sy) * across + splat(of.ty) * t));
+        statistics[WEIGHT] += w, statistics[PIXELS] += w > V{} ? splat(T(1)) : V{};
+        statistics[WEIGHTED_ERROR] += w * load<V>(tile.errors.values + at);
+        statistics[WEIGHT_MAX] = w > statistics[WEIGHT_MAX] ? w : statistics[WEIGHT_MAX];
+    }
+
+    GSPLAT_METHOD void write(const PairSlots<T> &pair, int32_t channels) const {
+        for (int32_t k = 0; k < channels; ++k) pair.feature_slot[k] = sum(features[k]);
+        if (!pair.statistic_slot) return;
+        for (int k = 0; k < WEIGHT_MAX; ++k) pair.statistic_slot[k] = sum(statistics[k]);
+        const T two_ln2 = T(2 * 0.69314718055994531);
+        pair.statistic_slot[ABS_U] *= two_ln2 * absolute(pair.s.sx), pair.statistic_slot[ABS_V] *= two_ln2;
+        T most = 0;
+        for (int l = 0; l < Vector<T>::LANES; ++l) most = vmax(most, statistics[WEIGHT_MAX][l]);
+        pair.statistic_slot[WEIGHT_MAX] = most;
+    }
+
+    static GSPLAT_METHOD V absolute(V v) { return v < V{} ? -v : v; }
+    static GSPLAT_METHOD T absolute(T v) { return v < 0 ? -v : v; }
+};
+
+// Writes one splat's sums over the tile to its slots.
+template <class T, int MODE, bool GENTLY>
+GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlots<T> &pair, const TileBox &box, const Rows<T> &rows,
+                                  uint32_t i, TileGradient<T, MODE> &tile, MoreSums<T, MODE> &more) {
+    using V = typename Vector<T>::V;
+    const Splat<T> &s = pair.s;
     FalloffRows<T> steps;
-    Falloff<T, GENTLY> falloff{steps, {}, {}, {}, {}, {}};
+    Falloff<T, GENTLY> falloff{steps, forward.settings};
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     V sums[8] = {}, hyy = V{}, wz = V{};  // in the order of a slot
@@ -42,11 +106,12 @@ GSPLAT_INLINE void splat_backward(const Splat<T> &s, const TileBox &box, const R
             const V r = load<V>(tile.red.values + at), g = load<V>(tile.green.values + at), b = load<V>(tile.blue.values + at);
             V cg = r * red + g * green + b * blue;
             const V t = load<V>(tile.transmittance.values + at), w = t * alpha;
-            if (WITH_DEPTH) {
+            if (MODE != COLORS) {
                 const V z = load<V>(tile.depth.values + at);
                 cg += z * splat(s.depth);
                 wz += w * z;
             }
+            if constexpr (MODE == WITH_ALL) cg += more.add_features(tile, pair.features, at, w);
             const V rest = load<V>(tile.rest.values + at) - w * cg;
             const V h = falloff.where_open(key, alpha * (t * cg - rest * reciprocal(splat(T(1)) - alpha)));
             store(tile.rest.values + at, rest);
@@ -54,6 +119,9 @@ GSPLAT_INLINE void splat_backward(const Splat<T> &s, const TileBox &box, const R
             wr += w * r, wg += w * g, wb += w * b;
             const V hdy = h * dy;
             sum0 += h, sum1 += hdy, sum2 += hdy * dy;
+            if constexpr (MODE == WITH_ALL)
+                if (pair.statistic_slot)
+                    more.add_statistics(tile, s, at, w, h, falloff.across + splat(s.sy) * dy, splat(s.t0) + splat(s.ty) * dy);
             falloff.step(row - first);
         }
         const V hdx = sum0 * dx;
@@ -61,28 +129,42 @@ GSPLAT_INLINE void splat_backward(const Splat<T> &s, const TileBox &box, const R
         sums[H] += sum0, sums[HX] += hdx, sums[HXX] += hdx * dx, sums[HY] += sum1, sums[HXY] += sum1 * dx;
         hyy += sum2;
     }
-    sum8(sums, slot);
-    slot[HYY] = sum(hyy), slot[DEPTH] = WITH_DEPTH ? sum(wz) : T(0);
+    sum8(sums, pair.slot);
+    pair.slot[HYY] = sum(hyy), pair.slot[DEPTH] = MODE != COLORS ? sum(wz) : T(0);
 }
 
 // Loads the inputs of a tile's pixels; returns the sum of g T_final through `background`.
-template <class T, bool WITH_DEPTH>
-GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBox &box, TileGradient<T> &tile, T *background) {
+template <class T, int MODE>
+GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBox &box, TileGradient<T, MODE> &tile, T *background) {
     using Q = typename Four<T>::V;
-    const CompositeArgs<T> &forward = args.forward;
-    memset(&tile, 0, sizeof tile);
+    const Images<T> &out = args.forward.out;
+    const ImageGrads<T> &in = args.in;
+    memset(&tile, 0, sizeof(TileGradient<T, COLORS>));
+    if constexpr (MODE == WITH_ALL) {
+        tile.channels = in.features ? out.channels : 0;
+        memset(&tile.errors, 0, sizeof(Plane<T>) * size_t(1 + tile.channels));  // and the first features
+    }
     Q sums[3] = {};
-    for_each_four<T>(box, forward.camera.W, [&](int to, int64_t pixel, int count) {
+    for_each_four<T>(box, args.forward.camera.W, [&](int to, int64_t pixel, int count) {
         Q g[3], drawn[3];
-        load_colors(args.grad_image + 3 * pixel, count, g);
-        load_colors(forward.image + 3 * pixel, count, drawn);
-        const Q t = load_some(forward.transmittance + pixel, count);
+        load_colors(in.image + 3 * pixel, count, g);
+        load_colors(out.image + 3 * pixel, count, drawn);
+        const Q t = load_some(out.transmittance + pixel, count);
         Q rest = g[0] * drawn[0] + g[1] * drawn[1] + g[2] * drawn[2];
-        if (args.grad_transmittance) rest += load_some(args.grad_transmittance + pixel, count) * t;
-        if (WITH_DEPTH) {
-            const Q gz = load_some(args.grad_depth + pixel, count);
+        if (in.transmittance) rest += load_some(in.transmittance + pixel, count) * t;
+        if (MODE != COLORS && in.depth) {
+            const Q gz = load_some(in.depth + pixel, count);
             store(tile.depth.values + to, gz);
-            rest += gz * load_some(forward.depth + pixel, count);
+            rest += gz * load_some(out.depth + pixel, count);
+        }
+        if constexpr (MODE == WITH_ALL) {
+            if (args.errors) store(tile.errors.values + to, load_some(args.errors + pixel, count));
+            for (int i = 0; i < count; ++i)
+                for (int32_t k = 0; k < tile.channels; ++k) {
+                    const int64_t at = (pixel + i) * tile.channels + k;
+                    tile.features[k].values[to + i] = in.features[at];
+                    rest[i] += in.features[at] * out.features[at];
+                }
         }
         store(tile.rest.values + to, rest);
         store(tile.red.values + to, g[0]), store(tile.green.values + to, g[1]), store(tile.blue.values + to, g[2]);
@@ -92,17 +174,33 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
     for (int k = 0; k < 3; ++k) background[k] = (sums[k][0] + sums[k][2]) + (sums[k][1] + sums[k][3]);
 }
 
-template <class T, bool WITH_DEPTH>
+template <class T>
+GSPLAT_INLINE PairSlots<T> slots_of(const CompositeBackwardArgs<T> &args, const Pair &pair) {
+    const int64_t slot = pair.slot, channels = args.forward.out.channels;
+    return {args.forward.splats[pair.gaussian], args.slots + SLOT * slot,
+            args.forward.features ? args.forward.features + channels * pair.gaussian : nullptr,
+            args.feature_slots ? args.feature_slots + channels * slot : nullptr,
+            args.statistic_slots ? args.statistic_slots + STATISTICS * slot : nullptr};
+}
+
+template <class T>
+GSPLAT_INLINE void write_zeros(const PairSlots<T> &to, int32_t channels) {
+    for (int j = 0; j < SLOT; ++j) to.slot[j] = 0;
+    if (to.feature_slot) memset(to.feature_slot, 0, size_t(channels) * sizeof(T));
+    if (to.statistic_slot) memset(to.statistic_slot, 0, STATISTICS * sizeof(T));
+}
+
+template <class T, int MODE>
 void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     const CompositeArgs<T> &forward = args.forward;
     const TileBox box = tile_box(forward.grid, forward.camera, index);
-    TileGradient<T> tile;
-    begin_tile<T, WITH_DEPTH>(args, box, tile, args.tile_background + 3 * index);
+    TileGradient<T, MODE> tile;
+    begin_tile<T, MODE>(args, box, tile, args.tile_background + 3 * index);
     const uint32_t begin = forward.tile_begin[index], end = forward.tile_begin[index + 1];
     const uint32_t stop = begin + forward.done[index];
     Rows<T> rows;
     for (uint32_t k = begin; k < end; ++k) {
-        T *slot = args.slots + int64_t(SLOT) * forward.pairs[k].slot;
+        const PairSlots<T> pair = slots_of(args, forward.pairs[k]);
         const uint32_t i = (k - begin) % BATCH;
         if (k + 4 < end) __builtin_prefetch(args.slots + int64_t(SLOT) * forward.pairs[k + 4].slot, 1);
         if (i == 0 && k < stop) {
@@ -110,18 +208,26 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
             rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
         }
         if (k >= stop || rows.top[i] > rows.bottom[i]) {
-            for (int j = 0; j < SLOT; ++j) slot[j] = 0;
+            write_zeros(pair, forward.out.channels);
             continue;
         }
-        const Splat<T> &s = forward.splats[forward.pairs[k].gaussian];
-        rows.gentle[i] ? splat_backward<T, WITH_DEPTH, true>(s, box, rows, i, tile, slot)
-                       : splat_backward<T, WITH_DEPTH, false>(s, box, rows, i, tile, slot);
+        if constexpr (MODE == WITH_ALL) {
+            MoreSums<T, MODE> more(tile.channels);
+            rows.gentle[i] ? splat_backward<T, MODE, true>(forward, pair, box, rows, i, tile, more)
+                           : splat_backward<T, MODE, false>(forward, pair, box, rows, i, tile, more);
+            more.write(pair, tile.channels);
+        } else {
+            MoreSums<T, MODE> none;
+            rows.gentle[i] ? splat_backward<T, MODE, true>(forward, pair, box, rows, i, tile, none)
+                           : splat_backward<T, MODE, false>(forward, pair, box, rows, i, tile, none);
+        }
     }
 }
 
 template <class T>
 void composite_backward(const CompositeBackwardArgs<T> &args, int32_t tile) {
-    args.grad_depth ? tile_backward<T, true>(args, tile) : tile_backward<T, false>(args, tile);
+    if (args.feature_slots || args.statistic_slots) return tile_backward<T, WITH_ALL>(args, tile);
+    args.in.depth ? tile_backward<T, WITH_DEPTH>(args, tile) : tile_backward<T, COLORS>(args, tile);
 }
 
 template void composite_backward<float>(const CompositeBackwardArgs<float> &, int32_t);

@@ -144,34 +144,61 @@ void Frame<T>::intersect() {
 }
 
 template <class T>
-void Frame<T>::composite(const Outputs<T> &out) {
+CompositeArgs<T> Frame<T>::composite_args(const Images<T> &out, const T *features) const {
+    return {splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, out, features, done_.as<uint32_t>()};
+}
+
+template <class T>
+void Frame<T>::composite(const Images<T> &out, const T *features) {
     Timer timer(stages_[3]);
-    CompositeArgs<T> args{splats(),
-                          pairs_.as<Pair>(),
-                          tile_begin_.as<uint32_t>(),
-                          grid_,
-                          camera_,
-                          settings_,
-                          out.image,
-                          out.transmittance,
-                          out.depth,
-                          static_cast<uint32_t *>(done_.reserve(size_t(grid_.tiles()) * 4))};
+    done_.reserve(size_t(grid_.tiles()) * 4);
+    const CompositeArgs<T> args = composite_args(out, features);
     parallel(threads_, grid_.tiles(), [&](int64_t tile, int) { kernels<T>().composite(args, int32_t(tile)); });
 }
 
 template <class T>
-CompositeBackwardArgs<T> Frame<T>::composite_backward(const Outputs<T> &forward, const ImageGrads<T> &in, Buffer &slots,
-                                                      Buffer &background) {
+CompositeBackwardArgs<T> Frame<T>::composite_backward(const Drawn<T> &drawn, const ImageGrads<T> &in, SlotBuffers &to) {
     Timer timer(stages_[4]);
-    CompositeBackwardArgs<T> args{{splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, forward.image,
-                                   forward.transmittance, forward.depth, done_.as<uint32_t>()},
-                                  in.image,
-                                  in.transmittance,
-                                  in.depth,
-                                  static_cast<T *>(slots.reserve((size_t(pairs_count_) + 1) * SLOT * sizeof(T))),
-                                  static_cast<T *>(background.reserve(size_t(grid_.tiles()) * 3 * sizeof(T)))};
+    const size_t pairs = size_t(pairs_count_) + 1;
+    auto room = [](Buffer &buffer, size_t count) { return static_cast<T *>(buffer.reserve(count * sizeof(T))); };
+    CompositeBackwardArgs<T> args{composite_args(drawn.images, drawn.features),
+                                  in,
+                                  room(to.slots, pairs * SLOT),
+                                  room(to.tile_background, size_t(grid_.tiles()) * 3),
+                                  in.features ? room(to.features, pairs * size_t(drawn.images.channels)) : nullptr,
+                                  drawn.collected.values ? room(to.statistics, pairs * STATISTICS) : nullptr,
+                                  drawn.collected.errors};
     parallel(threads_, grid_.tiles(), [&](int64_t tile, int) { kernels<T>().composite_backward(args, int32_t(tile)); });
+    if (args.statistic_slots) sum_statistics(args.statistic_slots, drawn.collected.values);
     return args;
+}
+
+template <class T>
+void Frame<T>::sum_features(const T *slots, int32_t channels, T *to) const {
+    const uint32_t *pairs_of = pairs_of_.as<uint32_t>(), *begin = slot_begin_.as<uint32_t>();
+    parallel(threads_, blocks(), [&](int64_t block, int) {
+        for (int64_t i = block * BLOCK; i < std::min((block + 1) * BLOCK, n_); ++i) {
+            T *sums = to + i * channels;
+            std::fill_n(sums, channels, T(0));
+            for (const T *slot = slots + int64_t(begin[i]) * channels, *end = slot + int64_t(pairs_of[i]) * channels; slot < end;
+                 slot += channels)
+                for (int32_t k = 0; k < channels; ++k) sums[k] += slot[k];
+        }
+    });
+}
+
+template <class T>
+void Frame<T>::sum_statistics(const T *slots, T *to) const {
+    sum_features(slots, STATISTICS, to);
+    const uint32_t *pairs_of = pairs_of_.as<uint32_t>(), *begin = slot_begin_.as<uint32_t>();
+    parallel(threads_, blocks(), [&](int64_t block, int) {
+        for (int64_t i = block * BLOCK; i < std::min((block + 1) * BLOCK, n_); ++i) {
+            T most = 0;
+            for (int64_t slot = begin[i]; slot < int64_t(begin[i]) + pairs_of[i]; ++slot)
+                most = std::max(most, slots[STATISTICS * slot + WEIGHT_MAX]);
+            to[STATISTICS * i + WEIGHT_MAX] = most;
+        }
+    });
 }
 
 template <class T>
@@ -180,11 +207,13 @@ ProjectBackwardArgs<T> Frame<T>::last_stage(const Scene<T> &scene, const T *slot
 }
 
 template <class T>
-void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background,
+void Frame<T>::backward(const Scene<T> &scene, const Drawn<T> &drawn, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background,
                         double *camera) {
-    Buffer slots, tile_background, camera_sums;
-    const CompositeBackwardArgs<T> done = composite_backward(forward, in, slots, tile_background);
+    SlotBuffers slots;
+    Buffer camera_sums;
+    const CompositeBackwardArgs<T> done = composite_backward(drawn, in, slots);
     Timer timer(stages_[5]);
+    if (done.feature_slots) sum_features(done.feature_slots, drawn.images.channels, out.features);
     background[0] = background[1] = background[2] = 0;
     for (int32_t tile = 0; tile < grid_.tiles(); ++tile)
         for (int k = 0; k < 3; ++k) background[k] += done.tile_background[3 * tile + k];
@@ -199,9 +228,10 @@ void Frame<T>::backward(const Scene<T> &scene, const Outputs<T> &forward, const 
 }
 
 template <class T>
-void Frame<T>::adam(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const AdamArgs<T> *groups, T *means2d_norm) {
-    Buffer slots, tile_background, scratch;
-    const CompositeBackwardArgs<T> done = composite_backward(forward, in, slots, tile_background);
+void Frame<T>::adam(const Scene<T> &scene, const Drawn<T> &drawn, const ImageGrads<T> &in, const AdamArgs<T> *groups, T *means2d_norm) {
+    SlotBuffers slots;
+    Buffer scratch;
+    const CompositeBackwardArgs<T> done = composite_backward(drawn, in, slots);
     Timer timer(stages_[5]);
     AdamBackwardArgs<T> args{last_stage(scene, done.slots), {}, {3, 4, 3, 3, 3 * int64_t(scene.rest), 1}};
     args.backward.grads.means2d_norm = means2d_norm;

@@ -8,14 +8,19 @@
 
 namespace gsplat {
 
+// Statistics of every Gaussian, in the order of `Statistic`, and the error of every pixel that one of them weighs.
 template <class T>
-struct Outputs {
-    T *image, *transmittance, *depth;  // depth may be null
+struct Collected {
+    T *values;        // N STATISTICS; null if not wanted
+    const T *errors;  // H W, or null
 };
 
+// What a frame has drawn, and what its backward pass collects on the way.
 template <class T>
-struct ImageGrads {
-    const T *image, *transmittance, *depth;  // the last two may be null
+struct Drawn {
+    Images<T> images;
+    const T *features;  // N channels; null if images.features is
+    Collected<T> collected;
 };
 
 // Seconds that passed during a stage, processor time of its thread, and the part of it in `parallel`.
@@ -23,17 +28,21 @@ struct StageTime {
     double seconds = 0, processor = 0, parallel = 0;
 };
 
+struct SlotBuffers {
+    Buffer slots, tile_background, features, statistics;
+};
+
 template <class T>
 class Frame {
   public:
     Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, int threads);
-    void composite(const Outputs<T> &out);
-    // The scene and the outputs are passed again: they may have moved between the passes.
+    void composite(const Images<T> &out, const T *features);
+    // The scene, the images and the features are passed again: they may have moved between the passes.
     // `camera` gets CAMERA numbers, unless it is null.
-    void backward(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background,
+    void backward(const Scene<T> &scene, const Drawn<T> &drawn, const ImageGrads<T> &in, const SceneGrads<T> &out, T *background,
                   double *camera);
     // The same, but every Gaussian's gradient goes into a step of Adam; `groups` has no gradients.
-    void adam(const Scene<T> &scene, const Outputs<T> &forward, const ImageGrads<T> &in, const AdamArgs<T> *groups, T *means2d_norm);
+    void adam(const Scene<T> &scene, const Drawn<T> &drawn, const ImageGrads<T> &in, const AdamArgs<T> *groups, T *means2d_norm);
 
     int64_t num_visible() const { return visible_count_; }
     int64_t num_pairs() const { return pairs_count_; }
@@ -47,7 +56,11 @@ class Frame {
     void project(const Scene<T> &scene);
     void sort();
     void intersect();
-    CompositeBackwardArgs<T> composite_backward(const Outputs<T> &forward, const ImageGrads<T> &in, Buffer &slots, Buffer &background);
+    CompositeArgs<T> composite_args(const Images<T> &out, const T *features) const;
+    CompositeBackwardArgs<T> composite_backward(const Drawn<T> &drawn, const ImageGrads<T> &in, SlotBuffers &to);
+    // Sums the slots of each Gaussian, first to last.
+    void sum_features(const T *slots, int32_t channels, T *to) const;
+    void sum_statistics(const T *slots, T *to) const;
     ProjectBackwardArgs<T> last_stage(const Scene<T> &scene, const T *slots) const;
     int64_t blocks() const { return (n_ + BLOCK - 1) / BLOCK; }
 

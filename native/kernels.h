@@ -25,7 +25,23 @@ struct Settings {
     double background[3];
     int32_t sh_degree;
     int32_t antialiased;
+    double alpha_max, log2_alpha_max;                  // clamp of alpha, below 1
 };
+
+// The images of one render; the last three may be null. 1 to MOST_CHANNELS channels of features.
+template <class T>
+struct Images {
+    T *image, *transmittance, *depth, *median, *features;  // H W 3, H W, H W, H W, H W channels
+    int32_t channels;
+};
+
+// The loss's gradients of the images; all but the first may be null, which means zero.
+template <class T>
+struct ImageGrads {
+    const T *image, *transmittance, *depth, *features;
+};
+
+constexpr int MOST_CHANNELS = 32;
 
 // N Gaussians: raw parameters if quats is not null, otherwise covariances, colours and opacities.
 template <class T>
@@ -42,6 +58,7 @@ struct Scene {
 template <class T>
 struct SceneGrads {
     T *means, *quats, *log_scales, *sh0, *sh_rest, *logit_opacities, *cov3ds, *colors, *opacities;
+    T *features;                                       // N channels; null if there are none
     T *means2d_norm;                                   // N, |(gu W/2, gv H/2)|
     int64_t first;                                     // Gaussian in the first row of the arrays except means2d_norm
 };
@@ -120,16 +137,24 @@ struct CompositeArgs {
     Grid grid;
     Camera camera;
     Settings settings;
-    T *image, *transmittance, *depth;                  // H W 3, H W, H W (depth may be null)
+    Images<T> out;
+    const T *features;                                 // N channels; null if out.features is
     uint32_t *done;                                    // tiles, pairs composited before the tile ended
 };
+
+// What one pair contributes besides gradients: sums over its pixels of |dL/du|, |dL/dv|, w, [w > 0] and w times the error of
+// the pixel, and the largest w.
+enum Statistic { ABS_U, ABS_V, WEIGHT, PIXELS, WEIGHTED_ERROR, WEIGHT_MAX, STATISTICS };
 
 template <class T>
 struct CompositeBackwardArgs {
     CompositeArgs<T> forward;
-    const T *grad_image, *grad_transmittance, *grad_depth;  // H W 3; the others may be null
+    ImageGrads<T> in;
     T *slots;                                          // pairs x SLOT
     T *tile_background;                                // tiles x 3, sum of g T_final
+    T *feature_slots;                                  // pairs x channels, sums of w times in.features, which may be null with it
+    T *statistic_slots;                                // pairs x STATISTICS; null if not wanted
+    const T *errors;                                   // H W; null for zero
 };
 
 // Numbers of a camera's gradient: R row by row, the eye, fx, fy, cx, cy.

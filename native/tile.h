@@ -6,6 +6,9 @@
 namespace gsplat {
 namespace GSPLAT_ISA {
 
+// What is composited: colours; depth as well; or also features, median depth and statistics, as far as they are asked for.
+enum Mode { COLORS, WITH_DEPTH, WITH_ALL };
+
 // Pixels of one tile inside the image.
 struct TileBox {
     int32_t x0, y0, width, height;
@@ -157,10 +160,14 @@ template <class T, bool GENTLY>
 struct Falloff {
     using V = typename Vector<T>::V;
     FalloffRows<T> &rows;  // outside: vectors beside an array that is indexed would not stay in registers
+    T highest;             // alpha's clamp, or its logarithm
     V across, value, ratio, least, most;
 
+    GSPLAT_METHOD Falloff(FalloffRows<T> &steps, const Settings &settings)
+        : rows(steps), highest(T(GENTLY ? settings.alpha_max : settings.log2_alpha_max)), across{}, value{}, ratio{}, least{}, most{} {}
+
     GSPLAT_METHOD void begin_splat(const Splat<T> &s, const TileBox &box, int32_t top, int32_t bottom) {
-        least = kept(splat(T(GENTLY ? ALPHA_MIN : LOG2_ALPHA_MIN))), most = kept(splat(T(GENTLY ? ALPHA_MAX : LOG2_ALPHA_MAX)));
+        least = kept(splat(T(GENTLY ? ALPHA_MIN : LOG2_ALPHA_MIN))), most = kept(splat(highest));
         if (GENTLY) {
             const V curve = splat(-2 * (s.sy * s.sy + s.ty * s.ty));
             for (int32_t k = 0; k <= bottom - top; k += Vector<T>::LANES) store(rows.factors + k, exp2_(curve * (iota<T>() + splat(T(k)))));
@@ -189,7 +196,7 @@ struct Falloff {
         }
         const V q = across + splat(rows.shift[row]);
         key = splat(rows.base[row]) - q * q;
-        return exp2_between(key, T(LOG2_ALPHA_MIN), T(LOG2_ALPHA_MAX));
+        return exp2_between(key, T(LOG2_ALPHA_MIN), highest);
     }
 
     // x where alpha is not clamped, otherwise 0.

@@ -20,7 +20,13 @@ class Camera:
 
 class Settings:
     def __init__(
-        self, *, z_near: float, background: Sequence[float], sh_degree: int, antialiased: bool
+        self,
+        *,
+        z_near: float,
+        background: Sequence[float],
+        sh_degree: int,
+        antialiased: bool,
+        alpha_max: float,
     ) -> None: ...
 
 class Scene:
@@ -30,7 +36,12 @@ class Gradients:
     def __init__(self, *, means2d_norm: object, background: object, **arrays: object) -> None: ...
 
 class Images:
-    def __init__(self, *, image: object, transmittance: object, depth: object) -> None: ...
+    def __init__(
+        self, *, image: object, transmittance: object, depth: object, features: object, median: object
+    ) -> None: ...
+
+class Statistics:
+    def __init__(self, *, values: object, errors: object) -> None: ...
 
 class FrameF32:
     num_visible: int
@@ -39,8 +50,17 @@ class FrameF32:
     processor_seconds: tuple[float, ...]
     parallel_seconds: tuple[float, ...]
     def __init__(self, *, scene: Scene, camera: Camera, settings: Settings, threads: int) -> None: ...
-    def composite(self, images: Images) -> None: ...
-    def backward(self, *, scene: Scene, images: Images, incoming: Images, gradients: Gradients) -> None: ...
+    def composite(self, *, images: Images, features: object) -> None: ...
+    def backward(
+        self,
+        *,
+        scene: Scene,
+        images: Images,
+        incoming: Images,
+        gradients: Gradients,
+        features: object,
+        collected: Statistics | None,
+    ) -> None: ...
     def visible(self, *, ids: object, radii: object) -> None: ...
 
 class FrameF64(FrameF32): ...

@@ -27,7 +27,13 @@ def camera(**changes):
 
 
 def settings(**changes):
-    fields = {"z_near": 0.05, "background": [0.0, 0.0, 0.0], "sh_degree": 0, "antialiased": False}
+    fields = {
+        "z_near": 0.05,
+        "background": [0.0, 0.0, 0.0],
+        "sh_degree": 0,
+        "antialiased": False,
+        "alpha_max": 0.99,
+    }
     return _native.Settings(**fields | changes)
 
 
@@ -37,12 +43,17 @@ def scene(**changes):
 
 def images(**changes):
     fields = {"image": torch.empty(H, W, 3), "transmittance": torch.empty(H, W), "depth": None}
+    fields |= {"features": None, "median": None}
     return _native.Images(**fields | changes)
 
 
 def gradients(**changes):
-    extra = {"means2d_norm": torch.empty(N), "background": torch.empty(3), "camera": None}
+    extra = {"means2d_norm": torch.empty(N), "background": torch.empty(3), "camera": None, "features": None}
     return _native.Gradients(**parameters() | extra | changes)
+
+
+def statistics(**changes):
+    return _native.Statistics(**{"values": torch.empty(N, 6), "errors": None} | changes)
 
 
 def frame(**changes):
@@ -59,8 +70,9 @@ def visible(**changes):
 
 def backward(**changes):
     drawn, out = frame(), images()
-    drawn.composite(out)
+    drawn.composite(images=out, features=None)
     fields = {"scene": scene(), "images": out, "incoming": images(), "gradients": gradients()}
+    fields |= {"features": None, "collected": None}
     drawn.backward(**fields | changes)
 
 
@@ -86,8 +98,13 @@ def groups(dtype=torch.float32):
 
 def adam_backward(**changes):
     drawn, out = frame(), images()
-    drawn.composite(out)
-    fields = {"images": out, "incoming": images(), "means2d_norm": torch.empty(N)} | groups()
+    drawn.composite(images=out, features=None)
+    fields = {
+        "images": out,
+        "incoming": images(),
+        "means2d_norm": torch.empty(N),
+        "collected": None,
+    } | groups()
     drawn.adam(**fields | changes)
 
 
@@ -104,16 +121,17 @@ def loss(**changes):
 
 CALLS = {
     camera: ("R", "eye", "fx", "fy", "cx", "cy", "x_bounds", "y_bounds", "H", "W"),
-    settings: ("z_near", "background", "sh_degree", "antialiased"),
+    settings: ("z_near", "background", "sh_degree", "antialiased", "alpha_max"),
     scene: RAW,
-    images: ("image", "transmittance", "depth"),
-    gradients: (*RAW, "means2d_norm", "background"),
+    images: ("image", "transmittance", "depth", "features", "median"),
+    gradients: (*RAW, "means2d_norm", "background", "camera", "features"),
+    statistics: ("values", "errors"),
     frame: ("scene", "camera", "settings", "threads"),
     visible: ("ids", "radii"),
-    backward: ("scene", "images", "incoming", "gradients"),
+    backward: ("scene", "images", "incoming", "gradients", "features", "collected"),
     adam: (*("parameter", "first", "second", "gradient", "rate", "beta1"), "correction2", "threads"),
     adam_group: (*("parameter", "first", "second", "extra", "rate", "beta1"), "beta2", "eps", "correction2"),
-    adam_backward: ("images", "incoming", "means2d_norm"),
+    adam_backward: ("images", "incoming", "means2d_norm", "collected"),
     loss: ("image", "target", "gradient", "ssim_weight", "threads"),
     noise: (
         *("means", "quats", "log_scales", "logit_opacities"),
@@ -157,7 +175,7 @@ class Dropping:
 
 
 ARRAYS = {scene: RAW, gradients: CALLS[gradients], images: CALLS[images], adam: CALLS[adam][:4]}
-ARRAYS |= {adam_group: CALLS[adam_group][:4], adam_backward: ("means2d_norm",)}
+ARRAYS |= {statistics: CALLS[statistics], adam_group: CALLS[adam_group][:4], adam_backward: ("means2d_norm",)}
 ARRAYS |= {loss: CALLS[loss][:3], visible: CALLS[visible], noise: CALLS[noise][:4]}
 EACH_ARRAY = [(call, name) for call, names in ARRAYS.items() for name in names]
 
@@ -167,10 +185,12 @@ def valid_array(call, name):
     if call in (scene, gradients, noise) and name in RAW:
         return parameters()[name].clone()
     shapes = {"means2d_norm": (N,), "background": (3,), "ids": (N,), "radii": (N, 2), "depth": (H, W)}
-    shapes |= {"transmittance": (H, W)}
+    shapes |= {"transmittance": (H, W), "median": (H, W), "errors": (H, W), "values": (N, 6), "camera": (16,)}
+    if call is gradients and name == "features":
+        return torch.zeros(N, 2)
     if call in (adam, adam_group):
         return torch.zeros(N, 3)
-    dtype = torch.int64 if name == "ids" else torch.float32
+    dtype = {"ids": torch.int64, "camera": torch.float64}.get(name, torch.float32)
     return torch.zeros(shapes.get(name, (H, W, 3)), dtype=dtype)
 
 
@@ -203,7 +223,14 @@ WRONG = {
 def test_an_unsuitable_array_is_refused(call, name, wrong):
     given = valid_array(call, name)
     call(**{name: given})
-    optional = wrong == "absent" and (name == "extra" or (call is images and name != "image"))
+    optional = wrong == "absent" and (
+        name in ("extra", "errors")
+        or (call is images and name != "image")
+        or (call is gradients and name in ("camera", "features"))
+    )
+    if call in (images, gradients, statistics) and name in ("features", "errors", "values"):
+        # Their sizes may be any, or set those of other arrays; a frame checks them.
+        optional |= wrong in ("empty", "one more", "flat") and (call is not gradients or wrong == "flat")
     if optional or (wrong in ("strided", "unaligned") and not given.numel()):
         return  # these arrays are valid
     # The first array sets the size. If only its size is wrong, the error names the next array.
@@ -238,17 +265,20 @@ def test_arguments_that_do_not_fit_the_frame_are_refused():
         ("images", images(transmittance=None), "needs transmittance"),
         ("images", images(depth=torch.empty(H, W)), "depth exactly where"),
         ("incoming", images(depth=torch.empty(H, W)), "not rendered"),
-        (
-            "incoming",
-            _native.Images(image=torch.empty(H, W, 3).double(), transmittance=None, depth=None),
-            "dtype",
-        ),
+        ("incoming", images(image=torch.empty(H, W, 3).double(), transmittance=None), "dtype"),
+        ("incoming", images(median=torch.empty(H, W)), "median depth, which has none"),
+        ("features", torch.empty(N, 2), "exactly where the images have"),
+        ("incoming", images(features=torch.empty(H, W, 2)), "another number of channels"),
+        ("collected", statistics(values=torch.empty(N + 1, 6)), "another number of Gaussians"),
+        ("collected", statistics(values=torch.empty(N, 6).double()), "another dtype"),
+        ("collected", statistics(errors=torch.empty(H + 1, W)), "errors of another size"),
     )
     for name, value, words in cases:
         with pytest.raises(ValueError, match=f"{name}: .*{words}"):
             backward(**{name: value})
+    fields = {"scene": scene(), "images": images(), "incoming": images(), "gradients": gradients()}
     with pytest.raises(ValueError, match="call composite first"):
-        frame().backward(scene=scene(), images=images(), incoming=images(), gradients=gradients())
+        frame().backward(**fields, features=None, collected=None)
     with pytest.raises(ValueError, match="sh_degree is above"):
         frame(settings=settings(sh_degree=1))
     with pytest.raises(ValueError, match="H: times W"):
@@ -265,8 +295,13 @@ def test_arguments_that_do_not_fit_the_frame_are_refused():
 @pytest.mark.parametrize("name", RAW)
 def test_a_step_in_the_backward_pass_needs_a_fitting_group_for_every_parameter(name):
     drawn, out = frame(), images()
-    drawn.composite(out)
-    fields = {"images": out, "incoming": images(), "means2d_norm": torch.empty(N)} | groups()
+    drawn.composite(images=out, features=None)
+    fields = {
+        "images": out,
+        "incoming": images(),
+        "means2d_norm": torch.empty(N),
+        "collected": None,
+    } | groups()
     drawn.adam(**fields)
     with pytest.raises(TypeError, match=f"Frame.adam: {name} is missing$"):
         drawn.adam(**{key: value for key, value in fields.items() if key != name})
@@ -296,6 +331,10 @@ def test_arrays_of_a_step_in_the_backward_pass_must_not_overlap():
         | {"log_scales": adam_group(parameter=means.clone(), first=half, second=other.clone(), extra=None)},
         {"means2d_norm": norms}
         | {"logit_opacities": adam_group(parameter=norms, first=norms + 1, second=norms + 2, extra=None)},
+        {"means2d_norm": norms, "collected": statistics(errors=None, values=torch.zeros(N, 6))}
+        | {"logit_opacities": adam_group(parameter=norms + 3, first=norms, second=norms + 2, extra=None)},
+        {"collected": statistics(values=room[: N * 6].view(N, 6))}
+        | {"means": adam_group(parameter=means, first=half, second=other, extra=None)},
         {"incoming": images(image=shared.view(H, W, 3))}
         | {"quats": adam_group(parameter=quats, first=inside, second=quats + 1, extra=None)},
     ]
@@ -306,13 +345,44 @@ def test_arrays_of_a_step_in_the_backward_pass_must_not_overlap():
     adam_backward(means=adam_group(parameter=means, first=half, second=touching, extra=other))
 
 
+def test_features_have_the_frame_s_rows_and_at_most_32_channels():
+    given = torch.ones(N, 2)
+    drawn, out = frame(), images(features=torch.empty(H, W, 2))
+    drawn.composite(images=out, features=given)
+    fields = {"scene": scene(), "images": out, "incoming": images(features=torch.ones(H, W, 2))}
+    fields |= {"features": given, "collected": None}
+    drawn.backward(**fields, gradients=gradients(features=torch.empty(N, 2)))
+    for wrong in (None, torch.empty(N, 3)):
+        with pytest.raises(ValueError, match="gradients: needs features"):
+            drawn.backward(**fields, gradients=gradients(features=wrong))
+    for wrong in (torch.ones(N + 1, 2), torch.ones(N, 3), None):
+        with pytest.raises(ValueError, match="features: has to be"):
+            drawn.composite(images=out, features=wrong)
+    for channels in (0, 33):
+        with pytest.raises(ValueError, match="features: has to have 1 to 32 channels"):
+            images(features=torch.empty(H, W, channels))
+    with pytest.raises(ValueError, match="images: have features, which Adam does not move"):
+        drawn.adam(images=out, incoming=images(), means2d_norm=torch.empty(N), collected=None, **groups())
+
+
+@pytest.mark.parametrize("clamp", [0.003, 1.0, float("nan")])
+def test_the_clamp_of_alpha_is_below_one_and_above_the_cut(clamp):
+    with pytest.raises(ValueError, match="Settings: alpha_max: has to be"):
+        settings(alpha_max=clamp)
+
+
 def test_a_step_in_the_backward_pass_needs_a_composited_frame_of_raw_parameters():
-    fields = {"images": images(), "incoming": images(), "means2d_norm": torch.empty(N)} | groups()
+    fields = {
+        "images": images(),
+        "incoming": images(),
+        "means2d_norm": torch.empty(N),
+        "collected": None,
+    } | groups()
     with pytest.raises(ValueError, match="call composite first"):
         frame().adam(**fields)
     arrays = {"means": (N, 3), "cov3ds": (N, 3, 3), "colors": (N, 3), "opacities": (N,)}
     direct = frame(scene=_native.Scene(**{name: torch.zeros(shape) for name, shape in arrays.items()}))
-    direct.composite(fields["images"])
+    direct.composite(images=fields["images"], features=None)
     with pytest.raises(ValueError, match="Adam moves raw parameters"):
         direct.adam(**fields)
     with pytest.raises(ValueError, match="incoming: has another size"):

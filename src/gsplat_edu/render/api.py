@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import overload
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.camera import Camera, CameraLike, as_camera
@@ -16,13 +15,16 @@ from gsplat_edu.gaussians import Gaussians, check_tensor
 from gsplat_edu.headroom import require_memory
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.render.output import RenderOutput, RenderStack
+from gsplat_edu.render.output import Extra, RenderOutput, RenderStack, check_features
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_dense
 
 BYTES_PER_PIXEL = 40
 """Memory for creating and using an image: 20 bytes as float32 with transmittance and depth, and as much again for its
 copies as bytes or its gradient."""
+
+BYTES_PER_CHANNEL = 8
+"""The same for each channel of features."""
 
 
 @overload
@@ -32,6 +34,7 @@ def render(
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
+    features: Tensor | None = None,
     backend: str = "auto",
 ) -> RenderOutput: ...
 
@@ -43,6 +46,7 @@ def render(
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
+    features: Tensor | None = None,
     backend: str = "auto",
 ) -> RenderStack: ...
 
@@ -53,6 +57,7 @@ def render(
     *,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
+    features: Tensor | None = None,
     backend: str = "auto",
 ) -> RenderOutput | RenderStack:
     """Render Gaussians from one camera, or from several of equal image size.
@@ -61,8 +66,10 @@ def render(
         gaussians: N Gaussians, raw parameters, float32 or float64 (cuda: float32).
         camera: A `Camera` or any object with its members (`gsplat_edu.CameraLike`); `CameraTensors` for gradients of
             its pose and intrinsics; or a sequence of cameras of equal image size.
-        settings: Background, SH degree, antialiasing, depth; None uses the defaults.
+        settings: Background, SH degree, antialiasing, depths; None uses the defaults.
         background: (3,) background as a tensor, for differentiation; None uses the settings' background.
+        features: (N, C) numbers to composite beside the colours, of the Gaussians' dtype and device, 1 <= C <= 32;
+            None for none.
         backend: "auto" for the fastest one on the Gaussians' device, or a backend by name (see
             `gsplat_edu.render.backends`).
 
@@ -71,12 +78,12 @@ def render(
 
     Raises:
         BackendUnavailableError: the backend cannot run here.
-        ShapeError: the background is not of shape (3,), or cameras have different sizes.
+        ShapeError: the background is not of shape (3,), features have another shape, or cameras have different sizes.
         NotEnoughMemoryError: the image alone needs more memory than is free.
-        ArgumentError: on the backend torch, a parameter is NaN or infinite, or a quaternion has zero length. The
+        ArgumentError: a feature is NaN or infinite; or on the backend torch, a parameter is NaN or infinite, or a quaternion has zero length. The
             kernels skip such a Gaussian, with zero gradient and no effect on others.
 
-    Differentiable in: every raw parameter of the Gaussians, the background, and a camera of tensors.
+    Differentiable in: every raw parameter of the Gaussians, the background, the features, and a camera of tensors.
     """
     settings = settings or RenderSettings()
     name = resolve_backend(backend, gaussians.means.device)
@@ -85,21 +92,30 @@ def render(
     else:
         check_tensor("background", background, (3,), {})
         background = background.to(gaussians.means)
+    if features is not None:
+        check_features(features, len(gaussians))
+    extra = Extra(background, features)
     if not isinstance(camera, Sequence):
-        return _render_one(name, gaussians, _checked("camera", camera), settings, background)
+        return _render_one(name, gaussians, _checked("camera", camera), settings, extra)
     cameras = [_checked(f"camera[{k}]", one) for k, one in enumerate(camera)]
     if len({(c.H, c.W) for c in cameras}) != 1:
         raise ArgumentError(
             "camera: is an empty sequence or has different image sizes; render the cameras one by one"
         )
-    views = tuple(_render_one(name, gaussians, c, settings, background) for c in cameras)
-    depths = [view.depth for view in views if view.depth is not None]
+    views = tuple(_render_one(name, gaussians, c, settings, extra) for c in cameras)
     return RenderStack(
         torch.stack([view.image for view in views]),
         torch.stack([view.transmittance for view in views]),
-        torch.stack(depths) if depths else None,
+        _stacked([view.depth for view in views]),
         views,
+        _stacked([view.features for view in views]),
+        _stacked([view.median_depth for view in views]),
     )
+
+
+def _stacked(images: Sequence[Tensor | None]) -> Tensor | None:
+    drawn = [image for image in images if image is not None]
+    return torch.stack(drawn) if drawn else None
 
 
 def _checked(name: str, camera: CameraLike | CameraTensors) -> Camera | CameraTensors:
@@ -124,20 +140,21 @@ def _render_one(
     gaussians: Gaussians,
     camera: Camera | CameraTensors,
     settings: RenderSettings,
-    background: Float[Tensor, "3"],
+    extra: Extra,
 ) -> RenderOutput:
+    channels = 0 if extra.features is None else extra.features.shape[1]
     if gaussians.means.device.type == "cpu":
         require_memory(
             f"an image of {camera.W}x{camera.H} px",
-            BYTES_PER_PIXEL * int(camera.W) * int(camera.H),
+            (BYTES_PER_PIXEL + BYTES_PER_CHANNEL * channels) * int(camera.W) * int(camera.H),
             "close other programs, or render fewer pixels (--size)",
         )
     if name == "cpu":
         from gsplat_edu.render.cpu import render_cpu  # backends.py has checked the native module
 
-        return render_cpu(gaussians, camera, settings, background)
+        return render_cpu(gaussians, camera, settings, extra)
     if name == "cuda":
         from gsplat_edu.render.triton.rasterize import render_triton  # and Triton
 
-        return render_triton(gaussians, camera, settings, background)
-    return render_dense(gaussians, camera, settings, background)
+        return render_triton(gaussians, camera, settings, extra)
+    return render_dense(gaussians, camera, settings, extra)

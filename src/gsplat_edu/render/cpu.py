@@ -22,7 +22,6 @@ from torch.autograd.function import once_differentiable
 
 from gsplat_edu.buffers import reusable_tensor
 from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.constants import Z_NEAR
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
 from gsplat_edu.kernels import SUFFIXES, kernel, native, native_array
@@ -34,7 +33,7 @@ from gsplat_edu.render.camera_tensors import (
     camera_gradients,
     split_camera,
 )
-from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.output import STATISTICS, Extra, RenderOutput, check_features
 from gsplat_edu.render.settings import RenderSettings
 
 
@@ -61,10 +60,13 @@ class _Call:
     norms: Tensor | None = None
     deferred: bool = False
     waiting: _Waiting | None = None
+    collecting: bool = False
+    errors: Tensor | None = None
+    statistics: Tensor | None = None
 
 
 def render_cpu(
-    gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, background: Tensor
+    gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, extra: Extra
 ) -> RenderOutput:
     """Render raw parameters; `gsplat_edu.render.api.render` validates the arguments.
 
@@ -72,15 +74,15 @@ def render_cpu(
         gaussians: N Gaussians, float32 or float64, on the CPU.
         camera: The camera.
         settings: The settings.
-        background: (3,) colour behind everything, of the Gaussians' dtype.
+        extra: Background and features, of the Gaussians' dtype.
 
     Returns:
-        The view. Differentiable in every raw parameter, the background and a camera of tensors.
+        The view. Differentiable in every raw parameter, background, features and a camera of tensors.
     """
     value, pose = split_camera(camera)
     call = _Call(value, settings, min(settings.sh_degree, gaussians.sh_degree), direct=False)
     tensors = gaussians.tensors()
-    return _output(call, background, pose, *(tensors[name] for name in RAW))
+    return _output(call, extra, pose, *(tensors[name] for name in RAW))
 
 
 def render_covariances(
@@ -91,6 +93,7 @@ def render_covariances(
     camera: CameraLike | CameraTensors,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
+    features: Tensor | None = None,
 ) -> RenderOutput:
     """Render Gaussians given as covariances and colours, the inputs of the chapter's dense `render_t`.
 
@@ -102,6 +105,7 @@ def render_covariances(
         camera: A `Camera` or any object with its members; `CameraTensors` for gradients of its pose and intrinsics.
         settings: Background, antialiasing and depth; None uses the defaults.
         background: (3,) background as a tensor, for differentiation; None uses the settings' background.
+        features: (N, C) features to composite beside the colours, 1 <= C <= 32; None for none.
 
     Returns:
         The view.
@@ -111,7 +115,7 @@ def render_covariances(
         ArgumentError: a value is NaN or infinite, the dtypes are not all float32 or all float64, or `camera` is
             invalid.
 
-    Differentiable in: means, cov3ds, colors, opacities, background, and a camera of tensors.
+    Differentiable in: means, cov3ds, colors, opacities, background, features, and a camera of tensors.
     """
     settings = settings or RenderSettings()
     sizes: dict[str, int] = {}
@@ -122,9 +126,11 @@ def render_covariances(
     if background is None:
         background = torch.tensor(settings.background, dtype=means.dtype)
     check_tensor("background", background, (3,), {})
+    if features is not None:
+        check_features(features, len(means))
     value, pose = split_camera(camera if isinstance(camera, CameraTensors) else as_camera("camera", camera))
     call = _Call(value, settings, 0, direct=True)
-    return _output(call, background, pose, means, cov3ds, colors, opacities)
+    return _output(call, Extra(background, features), pose, means, cov3ds, colors, opacities)
 
 
 RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
@@ -134,21 +140,58 @@ DIRECT = ("means", "cov3ds", "colors", "opacities")
 """Arguments of `render_covariances`, in order."""
 
 
-def _output(call: _Call, background: Tensor, pose: Pose, *parameters: Tensor) -> RenderOutput:
-    dtype = parameters[0].dtype
-    if dtype not in SUFFIXES or any(p.dtype != dtype or p.device.type != "cpu" for p in parameters):
+def _output(call: _Call, extra: Extra, pose: Pose, *parameters: Tensor) -> RenderOutput:
+    dtype, features = parameters[0].dtype, extra.features
+    tensors = parameters if features is None else (*parameters, features)
+    if dtype not in SUFFIXES or any(p.dtype != dtype or p.device.type != "cpu" for p in tensors):
         raise ArgumentError("means: the backend cpu needs tensors on the CPU, all float32 or all float64")
-    image, transmittance, depth = _Rasterize.apply(call, background, *pose, *parameters)  # type: ignore[no-untyped-call]
+    image, transmittance, depth, mixed, median = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        call, extra.background, *pose, features, *parameters
+    )
 
     def norms() -> Tensor:
         if call.norms is None:
             raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
         return call.norms.index_select(0, call.visible)  # in half the time of [call.visible]
 
-    depth = depth if call.settings.depth else None
-    needs_pose = any(tensor is not None and tensor.requires_grad for tensor in pose)
-    defer = None if needs_pose else _defer(call, background, parameters)
-    return RenderOutput(image, transmittance, depth, call.visible, call.radii, call.num_pairs, norms, defer)
+    needs_more = any(tensor is not None and tensor.requires_grad for tensor in (*pose, features))
+    return RenderOutput(
+        image,
+        transmittance,
+        depth if call.settings.depth else None,
+        call.visible,
+        call.radii,
+        call.num_pairs,
+        norms,
+        defer=None if needs_more or features is not None else _defer(call, extra.background, parameters),
+        features=None if features is None else mixed,
+        median_depth=median if call.settings.median_depth else None,
+        collector=functools.partial(_collect, call, parameters[0]),
+    )
+
+
+def _collect(call: _Call, means: Tensor, errors: Tensor | None) -> Callable[[], Tensor]:
+    """Ask for statistics of the next backward pass; return a function that gives those of the visible Gaussians."""
+    if errors is not None:
+        check_tensor("errors", errors, (call.camera.H, call.camera.W), {})
+        errors = errors.detach().to(means).contiguous()
+    call.collecting, call.errors = True, errors
+
+    def found() -> Tensor:
+        if call.statistics is None:
+            raise ArgumentError("collect: there is nothing yet; call backward on a loss of this image first")
+        return call.statistics.index_select(0, call.visible)
+
+    return found
+
+
+def _collected(call: _Call, means: Tensor) -> Any:  # noqa: ANN401
+    """Return where a backward pass writes the statistics that were asked for; None if none were."""
+    if not call.collecting:
+        return None
+    call.statistics = reusable_tensor((len(means), len(STATISTICS)), means)
+    errors = None if call.errors is None else native_array(call.errors)
+    return native().Statistics(values=native_array(call.statistics), errors=errors)
 
 
 def _defer(
@@ -176,7 +219,10 @@ def _adam_in_backward(call: _Call, moments: Mapping[str, Moments]) -> None:
     frame, parameters, images, incoming = call.waiting
     norms = reusable_tensor((len(parameters[0]),), parameters[0])
     groups = {name: _group(parameter, moments[name]) for name, parameter in zip(RAW, parameters, strict=True)}
-    frame.adam(images=images, incoming=incoming, means2d_norm=native_array(norms), **groups)
+    collected = _collected(call, parameters[0])
+    frame.adam(
+        images=images, incoming=incoming, means2d_norm=native_array(norms), collected=collected, **groups
+    )
     call.norms, call.waiting = norms, None
     torch.autograd.graph.increment_version(parameters)
 
@@ -203,52 +249,67 @@ class _Rasterize(torch.autograd.Function):
         R: Tensor | None,
         eye: Tensor | None,
         intrinsics: Tensor | None,
+        features: Tensor | None,
         *parameters: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        camera, means = call.camera, parameters[0]
+    ) -> tuple[Tensor, ...]:
+        camera, means, settings = call.camera, parameters[0], call.settings
         kept = [p.detach().contiguous() for p in parameters]
+        given = None if features is None else features.detach().contiguous()
         frame = kernel("FrameF", means.dtype)(
             scene=_scene(kept, call.direct),
-            camera=_camera(camera, call.settings),
+            camera=_camera(camera, settings),
             settings=native().Settings(
-                z_near=Z_NEAR,
+                z_near=settings.z_near,
                 background=background.tolist(),
                 sh_degree=call.sh_degree,
-                antialiased=call.settings.antialiased,
+                antialiased=settings.antialiased,
+                alpha_max=settings.alpha_max,
             ),
             threads=torch.get_num_threads(),
         )
-        image = reusable_tensor((camera.H, camera.W, 3), means)
-        transmittance = reusable_tensor((camera.H, camera.W), means)
-        depth = reusable_tensor((camera.H, camera.W) if call.settings.depth else (0,), means)
-        frame.composite(_images(image, transmittance, depth if call.settings.depth else None))
+        size = (camera.H, camera.W)
+        shapes = (
+            (*size, 3),
+            size,
+            size if settings.depth else (0,),
+            (0,),
+            size if settings.median_depth else (0,),
+        )
+        if given is not None:
+            shapes = (*shapes[:3], (*size, given.shape[1]), shapes[4])
+        images = [reusable_tensor(shape, means) for shape in shapes]
+        frame.composite(images=_images(*map(_wanted, images)), features=_array(given))
         # Room for all Gaussians: how many are visible changes from view to view, and such buffers would not be reused.
         call.visible = reusable_tensor((len(means),), means, torch.int64)[: frame.num_visible]
         call.radii = reusable_tensor((len(means), 2), means)[: frame.num_visible]
         frame.visible(ids=native_array(call.visible), radii=native_array(call.radii))
         call.num_pairs = frame.num_pairs
         ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(images[4])
         ctx.call, ctx.frame = call, frame
-        ctx.save_for_backward(*kept, image, transmittance, depth)
-        return image, transmittance, depth
+        ctx.save_for_backward(given, *images, *kept)
+        return tuple(images)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        *kept, image, transmittance, depth = ctx.saved_tensors
+        features, *saved = ctx.saved_tensors
+        drawn, kept = saved[:5], saved[5:]
         call: _Call = ctx.call
-        grad_image, grad_transmittance, grad_depth = (None if g is None else g.contiguous() for g in grads)
-        if grad_image is None:
-            grad_image = torch.zeros_like(image)
-        shown = depth if call.settings.depth else None
-        images = _images(image, transmittance, shown)
-        incoming = _images(grad_image, grad_transmittance, None if shown is None else grad_depth)
+        asked = [
+            None if g is None or not im.numel() else g.contiguous()
+            for g, im in zip(grads, drawn, strict=True)
+        ]
+        asked[0] = torch.zeros_like(drawn[0]) if asked[0] is None else asked[0]
+        images = _images(*map(_wanted, drawn))
+        incoming = _images(*asked[:4], None)
         if call.deferred:
             if call.waiting is not None or call.norms is not None:
                 raise ArgumentError("backward: passes a deferred image twice; defer works for one pass")
             call.waiting = _Waiting(ctx.frame, kept, images, incoming)
-            return (None,) * (5 + len(kept))
+            return (None,) * (6 + len(kept))
         outgoing = [reusable_tensor(p.shape, p) for p in kept]
+        to_features = None if asked[3] is None else reusable_tensor(features.shape, features)
         norms = reusable_tensor((len(kept[0]),), kept[0])
         background = kept[0].new_empty(3)
         camera = (
@@ -263,11 +324,23 @@ class _Rasterize(torch.autograd.Function):
                 **_arrays(outgoing, call.direct),
                 means2d_norm=native_array(norms),
                 background=native_array(background),
-                camera=None if camera is None else native_array(camera),
+                camera=_array(camera),
+                features=_array(to_features),
             ),
+            features=_array(features),
+            collected=_collected(call, kept[0]),
         )
         call.norms = norms if call.norms is None else call.norms + norms
-        return None, background, *camera_gradients(camera), *outgoing
+        return None, background, *camera_gradients(camera), to_features, *outgoing
+
+
+def _wanted(image: Tensor) -> Tensor | None:
+    """Return an image, or None for an empty one, which stands for one that was not asked for."""
+    return image if image.numel() else None
+
+
+def _array(tensor: Tensor | None) -> Any:  # noqa: ANN401
+    return None if tensor is None else native_array(tensor)
 
 
 def _arrays(parameters: list[Tensor], direct: bool) -> dict[str, Any]:
@@ -279,12 +352,9 @@ def _scene(parameters: list[Tensor], direct: bool) -> Any:  # noqa: ANN401
     return native().Scene(**_arrays(parameters, direct))
 
 
-def _images(image: Tensor, transmittance: Tensor | None, depth: Tensor | None) -> Any:  # noqa: ANN401
-    return native().Images(
-        image=native_array(image),
-        transmittance=None if transmittance is None else native_array(transmittance),
-        depth=None if depth is None else native_array(depth),
-    )
+def _images(*tensors: Tensor | None) -> Any:  # noqa: ANN401
+    names = ("image", "transmittance", "depth", "features", "median")
+    return native().Images(**dict(zip(names, map(_array, tensors), strict=True)))
 
 
 def _camera(camera: Camera, settings: RenderSettings) -> Any:  # noqa: ANN401

@@ -4,11 +4,55 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.gaussians import check_tensor
 from gsplat_edu.moments import AdamInBackward
+
+MOST_CHANNELS = 32
+"""Largest number of channels of features in one render."""
+
+STATISTICS = ("abs_u", "abs_v", "weight_sum", "pixels", "error_sum", "weight_max")
+"""Columns of the kernels' statistics, in order."""
+
+COLLECTED = {
+    "absgrad": ("abs_u", "abs_v"),
+    "weight_sum": ("weight_sum",),
+    "weight_max": ("weight_max",),
+    "pixels": ("pixels",),
+    "error_sum": ("error_sum",),
+}
+"""What `RenderOutput.collect` collects, by name, and its columns."""
+
+
+class Extra(NamedTuple):
+    """Optional inputs of a render.
+
+    Args:
+        background: (3,) colour behind everything, of the Gaussians' dtype.
+        features: (N, C) features to composite, 1 to 32 channels, or None.
+    """
+
+    background: Tensor
+    features: Tensor | None = None
+
+
+def check_features(features: Tensor, count: int) -> int:
+    """Check features of `count` Gaussians; return their number of channels.
+
+    Raises:
+        ShapeError: the features are not of shape (count, 1 to 32).
+        ArgumentError: a value is NaN or infinite.
+    """
+    sizes = {"N": count}
+    check_tensor("features", features, ("N", "C"), sizes)
+    if not 1 <= sizes["C"] <= MOST_CHANNELS:
+        raise ShapeError(f"features: have {sizes['C']} channels, but need 1 to {MOST_CHANNELS}")
+    return sizes["C"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +69,10 @@ class RenderOutput:
         radii: (M, 2) half width and half height of that ellipse, px; 0 if a Gaussian is nowhere above 1/255.
         num_pairs: Number of composited pairs of Gaussian and tile; None on torch, which has no tiles.
         grad_norms: Returns `means2d_grad_norms`.
+        features: (H, W, C) sum of w f for the features f that were given, over zero; None if there were none.
+        median_depth: (H, W) depth of the Gaussian at which the transmittance falls below one half, world units; 0 where
+            it does not. It has no gradient. None if `RenderSettings.median_depth` is off.
+        collector: What `collect` uses; None if the backend does not collect.
         defer: Leaves the raw parameters out of the backward pass. Call it before that pass; the returned function then
             finishes the pass once, with a step of Adam instead of gradients. None if the backend does not offer it.
     """
@@ -37,6 +85,61 @@ class RenderOutput:
     num_pairs: int | None
     grad_norms: Callable[[], Tensor]
     defer: Callable[[], AdamInBackward] | None = None
+    features: Float[Tensor, "H W C"] | None = None
+    median_depth: Float[Tensor, "H W"] | None = None
+    collector: Callable[[Tensor | None], Callable[[], Tensor]] | None = None
+
+    @property
+    def alpha(self) -> Float[Tensor, "H W"]:
+        """Accumulated alpha: 1 - transmittance. Differentiable."""
+        return 1.0 - self.transmittance
+
+    @property
+    def mean_depth(self) -> Float[Tensor, "H W"]:
+        """Depth divided by alpha, world units; 0 where nothing was drawn. Differentiable.
+
+        Raises:
+            ArgumentError: `RenderSettings.depth` is off.
+        """
+        if self.depth is None:
+            raise ArgumentError("depth: was not rendered; set RenderSettings(depth=True)")
+        drawn = self.alpha > 0
+        # where() twice keeps the division by 0 out of the chain rule.
+        return (self.depth / self.alpha.where(drawn, 1.0)).where(drawn, 0.0)
+
+    def collect(self, *names: str, errors: Tensor | None = None) -> Callable[[], dict[str, Tensor]]:
+        """Ask the backward pass for statistics of the visible Gaussians. Call it before that pass.
+
+        Each statistic is a sum or maximum over the pixels of this image, with w = T alpha. They have the same bits for
+        any number of threads. After several passes they are those of the last one.
+
+        Args:
+            names: "absgrad": (M, 2) sums of |d loss / d mean in the image|, each pixel's by itself (AbsGS); per px.
+                "weight_sum", "weight_max": (M,) sum and maximum of w. "pixels": (M,) number of pixels with w > 0.
+                "error_sum": (M,) sum of w times the pixel's error.
+            errors: (H, W) error of each pixel, for "error_sum".
+
+        Returns:
+            A function that returns the statistics by name, after the backward pass.
+
+        Raises:
+            ArgumentError: a name is unknown, "error_sum" has no errors, or the backend does not collect statistics.
+            ShapeError: the errors have another size than the image.
+        """
+        if unknown := [name for name in names if name not in COLLECTED]:
+            raise ArgumentError(f"collect: does not know {unknown[0]!r}; use {', '.join(COLLECTED)}")
+        if not names or ("error_sum" in names) != (errors is not None):
+            raise ArgumentError("collect: give at least one name, and errors exactly with error_sum")
+        if self.collector is None:
+            raise ArgumentError("collect: only the backend cpu collects statistics")
+        found = self.collector(errors)
+
+        def statistics() -> dict[str, Tensor]:
+            table = found()
+            columns = {name: [STATISTICS.index(column) for column in COLLECTED[name]] for name in names}
+            return {name: table[:, at].squeeze(-1) for name, at in columns.items()}
+
+        return statistics
 
     def means2d_grad_norms(self) -> Float[Tensor, " M"]:
         """Return the signal for density control: |(gx W/2, gy H/2)|, with g = d loss / d mean in the image, px.
@@ -60,9 +163,13 @@ class RenderStack:
         transmittance: (B, H, W).
         depth: (B, H, W), or None if not requested.
         views: The B individual outputs.
+        features: (B, H, W, C), or None if none were given.
+        median_depth: (B, H, W), or None if not requested.
     """
 
     image: Float[Tensor, "B H W 3"]
     transmittance: Float[Tensor, "B H W"]
     depth: Float[Tensor, "B H W"] | None
     views: tuple[RenderOutput, ...]
+    features: Float[Tensor, "B H W C"] | None = None
+    median_depth: Float[Tensor, "B H W"] | None = None

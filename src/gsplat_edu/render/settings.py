@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, SH_MAX_DEGREE, Z_NEAR
 from gsplat_edu.errors import BackendUnavailableError
 from gsplat_edu.validation import float64_array, in_range, whole_number
 
@@ -38,8 +38,11 @@ class RenderSettings:
         antialiased: Lower each opacity to compensate for the dilation (Mip-Splatting), see
             `gsplat_edu.gaussian_math.opacity_compensation`.
         depth: Also render expected depth. Training without a depth loss is faster without it.
+        median_depth: Also render median depth.
         jacobian_limit: Clamp x/z and y/z inside the projection's Jacobian to this multiple of half the field of view
             (`Camera.jacobian_bounds`); 1.3 for captures, as in Kerbl et al.'s code; None disables clamping.
+        alpha_max: Clamp of a splat's alpha in a pixel, 1/255 to 0.9999; gsplat uses 0.999.
+        z_near: Gaussians whose means are at this camera depth or nearer are not drawn, world units.
         dense_chunk: Number of splats that the dense torch backend evaluates at once. It affects speed, not the image
             (except for rounding); 16 keeps a chunk in a core's cache at 128 px (benchmarks/RESULTS.md).
 
@@ -52,7 +55,10 @@ class RenderSettings:
     sh_degree: int = SH_MAX_DEGREE
     antialiased: bool = False
     depth: bool = True
+    median_depth: bool = False
     jacobian_limit: float | None = None
+    alpha_max: float = ALPHA_MAX
+    z_near: float = Z_NEAR
     dense_chunk: int = 16
 
     def __post_init__(self) -> None:
@@ -63,7 +69,10 @@ class RenderSettings:
             "sh_degree": whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE),
             "antialiased": bool(self.antialiased),
             "depth": bool(self.depth),
+            "median_depth": bool(self.median_depth),
             "jacobian_limit": None if limit is None else in_range("jacobian_limit", limit, 1.0),
+            "alpha_max": in_range("alpha_max", self.alpha_max, ALPHA_MIN, 0.9999),
+            "z_near": in_range("z_near", self.z_near, 0.0),
             "dense_chunk": whole_number("dense_chunk", self.dense_chunk, 1),
         }
         for name, value in plain.items():

@@ -16,11 +16,11 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, DILATION, SH_OFFSET, Z_NEAR
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, DILATION, SH_OFFSET
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.gaussians import Gaussians, check_tensor, quat_to_R_t
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.sh import basis_terms, num_coefficients
 from gsplat_edu.validation import first_index, in_range, whole_number
@@ -33,6 +33,13 @@ class DenseRender(NamedTuple):
     transmittance: Float[Tensor, "H W"]
     means2d: Float[Tensor, "M 2"]  # px, near to far; retains its gradient on request
     visible: Int64[Tensor, " M"]  # index of the Gaussian for each row of means2d
+
+
+class _Thresholds(NamedTuple):
+    """Alpha below the smallest is zero; alpha above the largest is the largest."""
+
+    smallest: float
+    largest: float
 
 
 class _Screen(NamedTuple):
@@ -123,7 +130,7 @@ def render_t(
     if track_means2d and screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     colors, opacities = colors[screen.visible], opacities[screen.visible]
-    image, T = _composite(screen, colors, opacities, cam, alpha_min, chunk)
+    image, T = _composite(screen, colors, opacities, cam, _Thresholds(alpha_min, ALPHA_MAX), chunk)
     return DenseRender(image, T, screen.means2d, screen.visible)
 
 
@@ -131,7 +138,7 @@ def render_dense(
     gaussians: Gaussians,
     camera: Camera | CameraTensors,
     settings: RenderSettings,
-    background: Float[Tensor, "3"],
+    extra: Extra,
 ) -> RenderOutput:
     """Render raw parameters: the backend torch of `gsplat_edu.render.api.render`.
 
@@ -139,10 +146,10 @@ def render_dense(
         gaussians: N Gaussians.
         camera: The camera.
         settings: The settings.
-        background: (3,) colour behind everything.
+        extra: Background and features.
 
     Returns:
-        The view. Differentiable in every raw parameter, the background and a camera of tensors.
+        The view. Differentiable in every raw parameter, background, features and a camera of tensors.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite, or a quaternion has zero length.
@@ -151,17 +158,23 @@ def render_dense(
     degree = min(settings.sh_degree, gaussians.sh_degree)
     colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
     R, scales = quat_to_R_t(gaussians.quats), torch.exp(gaussians.log_scales)
-    screen = _project(
-        gaussians.means, R * scales[:, None, :], camera, settings.jacobian_limit, factors=(R, scales)
-    )
+    screen = _project(gaussians.means, R * scales[:, None, :], camera, settings, factors=(R, scales))
     if screen.means2d.requires_grad:
         screen.means2d.retain_grad()
     opacities = gaussians.opacities[screen.visible]
     if settings.antialiased:
         opacities = opacities * screen.compensation
     channels = [colors[screen.visible]] + ([screen.depths[:, None]] if settings.depth else [])
+    if extra.features is not None:
+        channels.append(extra.features[screen.visible])
+    thresholds = _Thresholds(ALPHA_MIN, settings.alpha_max)
     mixed, T = _composite(
-        screen, torch.cat(channels, dim=1), opacities, camera, ALPHA_MIN, settings.dense_chunk
+        screen, torch.cat(channels, dim=1), opacities, camera, thresholds, settings.dense_chunk
+    )
+    median = (
+        _median(screen, opacities, camera, thresholds, settings.dense_chunk)
+        if settings.median_depth
+        else None
     )
     level = 2.0 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1.0))
     radii = torch.sqrt(level[:, None] * screen.variances.detach())
@@ -177,13 +190,15 @@ def render_dense(
         return length
 
     return RenderOutput(
-        image=mixed[..., :3] + T[..., None] * background,
+        image=mixed[..., :3] + T[..., None] * extra.background,
         transmittance=T,
         depth=mixed[..., 3] if settings.depth else None,
         visible=screen.visible,
         radii=radii,
         num_pairs=None,
         grad_norms=norms,
+        features=None if extra.features is None else mixed[..., 3 + settings.depth :],
+        median_depth=median,
     )
 
 
@@ -192,7 +207,7 @@ def _composite(
     colors: Float[Tensor, "M C"],
     opacities: Float[Tensor, " M"],
     cam: Camera | CameraTensors,
-    alpha_min: float,
+    thresholds: _Thresholds,
     chunk: int,
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
     """Composite C channels over zero, near to far; return them and the final transmittance."""
@@ -203,12 +218,38 @@ def _composite(
     T = torch.ones(cam.H, cam.W, dtype=dtype, device=device)
     for start in range(0, len(screen.visible), chunk):
         part = slice(start, start + chunk)
-        alpha = _alpha(screen.means2d[part], screen.ellipses[part], opacities[part], cam, alpha_min)
-        T_after = T * torch.cumprod(1.0 - alpha, dim=0)
-        T_before = torch.cat([T[None], T_after[:-1]], dim=0)
+        alpha = _alpha(screen.means2d[part], screen.ellipses[part], opacities[part], cam, thresholds)
+        T_before, T_after = _transmittances(T, alpha)
         image = image + torch.einsum("nyx,nc->yxc", T_before * alpha, colors[part])
         T = T_after[-1]
     return image, T
+
+
+def _transmittances(T: Float[Tensor, "H W"], alpha: Float[Tensor, "k H W"]) -> tuple[Tensor, Tensor]:
+    """Return the transmittance before and after each of k splats."""
+    T_after = T * torch.cumprod(1.0 - alpha, dim=0)
+    return torch.cat([T[None], T_after[:-1]], dim=0), T_after
+
+
+@torch.no_grad()
+def _median(
+    screen: _Screen,
+    opacities: Float[Tensor, " M"],
+    cam: Camera | CameraTensors,
+    thresholds: _Thresholds,
+    chunk: int,
+) -> Float[Tensor, "H W"]:
+    """Return the depth of the splat at which the transmittance falls below one half; 0 where it does not."""
+    T = screen.depths.new_ones(cam.H, cam.W)
+    found = torch.zeros_like(T)
+    for start in range(0, len(screen.visible), chunk):
+        part = slice(start, start + chunk)
+        alpha = _alpha(screen.means2d[part], screen.ellipses[part], opacities[part], cam, thresholds)
+        T_before, T_after = _transmittances(T, alpha)
+        crosses = (T_before >= 0.5) & (T_after < 0.5)
+        found += torch.einsum("nyx,n->yx", crosses.to(T), screen.depths[part])
+        T = T_after[-1]
+    return found
 
 
 def _viewing_directions(means: Float[Tensor, "N 3"], camera: Camera | CameraTensors) -> Float[Tensor, "N 3"]:
@@ -245,19 +286,20 @@ def _project(
     means: Float[Tensor, "N 3"],
     shapes: Float[Tensor, "N 3 3"],
     cam: Camera | CameraTensors,
-    jacobian_limit: float | None = None,
+    settings: RenderSettings | None = None,
     *,
     factors: tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]] | None = None,
 ) -> _Screen:
     """Project; `shapes` are covariances, or M = R S if the factors are given, which keeps the digits of thin ones."""
+    settings = settings or RenderSettings()
     R = _like(means, cam.R)
     means_cam = (means - _like(means, cam.eye)) @ R.T
-    visible = torch.nonzero(means_cam[:, 2] > Z_NEAR)[:, 0]
+    visible = torch.nonzero(means_cam[:, 2] > settings.z_near)[:, 0]
     visible = visible[torch.argsort(means_cam[visible, 2], stable=True)]
     x, y, z = means_cam[visible].unbind(-1)
     means2d = torch.stack([cam.fx * x / z + cam.cx, cam.fy * y / z + cam.cy], dim=-1)
     zero = torch.zeros_like(z)
-    (x_low, x_high), (y_low, y_high) = cam.jacobian_bounds(jacobian_limit)
+    (x_low, x_high), (y_low, y_high) = cam.jacobian_bounds(settings.jacobian_limit)
     x_z = (x / z).clamp(_like(z, x_low), _like(z, x_high))
     y_z = (y / z).clamp(_like(z, y_low), _like(z, y_high))
     rows = [[cam.fx / z, zero, -cam.fx * x_z / z], [zero, cam.fy / z, -cam.fy * y_z / z]]
@@ -287,12 +329,12 @@ def _alpha(
     ellipses: Float[Tensor, "k 3"],
     opacities: Float[Tensor, " k"],
     cam: Camera | CameraTensors,
-    alpha_min: float,
+    thresholds: _Thresholds,
 ) -> Float[Tensor, "k H W"]:
     u, v = (axis[:, None, None] for axis in means2d.unbind(-1))
     A, m, C = (axis[:, None, None] for axis in ellipses.unbind(-1))
     dx = torch.arange(cam.W, dtype=means2d.dtype, device=means2d.device) - u
     dy = torch.arange(cam.H, dtype=means2d.dtype, device=means2d.device)[:, None] - v
     power = -0.5 * A * (dx - m * dy) ** 2 - 0.5 * C * dy * dy
-    alpha = (opacities[:, None, None] * torch.exp(power)).clamp(max=ALPHA_MAX)
-    return alpha * (alpha >= alpha_min)
+    alpha = (opacities[:, None, None] * torch.exp(power)).clamp(max=thresholds.largest)
+    return alpha * (alpha >= thresholds.smallest)
