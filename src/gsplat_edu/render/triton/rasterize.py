@@ -156,7 +156,9 @@ class _Rasterize(torch.autograd.Function):
         settings = call.settings
         kept = [p.detach().contiguous() for p in parameters]
         lists = _intersect(call, _project(call, kept))
-        shown = _composite(call, lists, background.detach().contiguous(), settings.depth, settings.median_depth)
+        shown = _composite(
+            call, lists, background.detach().contiguous(), settings.depth, settings.median_depth
+        )
         image, transmittance, depth, median = shown
         mixed, given = background.new_empty(0), None
         if features is not None:
