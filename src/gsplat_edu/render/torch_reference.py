@@ -8,6 +8,7 @@ Chapter: 09_train_in_3d.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -176,30 +177,36 @@ def render_dense(
         if settings.median_depth
         else None
     )
-    level = 2.0 * torch.log((opacities.detach() / ALPHA_MIN).clamp(min=1.0))
-    radii = torch.sqrt(level[:, None] * screen.variances.detach())
-
-    def norms() -> Tensor:
-        gradient = screen.means2d.grad
-        if gradient is None:
-            if len(screen.visible):
-                raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
-            gradient = torch.zeros_like(screen.means2d)
-        half_size = torch.tensor([camera.W / 2, camera.H / 2], dtype=gradient.dtype, device=gradient.device)
-        length: Tensor = torch.linalg.vector_norm(gradient * half_size, dim=-1)
-        return length
-
     return RenderOutput(
         image=mixed[..., :3] + T[..., None] * extra.background,
         transmittance=T,
         depth=mixed[..., 3] if settings.depth else None,
         visible=screen.visible,
-        radii=radii,
+        radii=_radii(screen, opacities),
         num_pairs=None,
-        grad_norms=norms,
+        grad_norms=functools.partial(_grad_norms, screen, camera),
         features=None if extra.features is None else mixed[..., 3 + settings.depth :],
         median_depth=median,
     )
+
+
+@torch.no_grad()
+def _radii(screen: _Screen, opacities: Float[Tensor, " M"]) -> Float[Tensor, "M 2"]:
+    """Return the half extents of the ellipses alpha >= 1/255, px."""
+    level = 2.0 * torch.log((opacities / ALPHA_MIN).clamp(min=1.0))
+    return torch.sqrt(level[:, None] * screen.variances)
+
+
+def _grad_norms(screen: _Screen, camera: Camera | CameraTensors) -> Float[Tensor, " M"]:
+    """Return the norms of the gradients of the image positions; see `RenderOutput.means2d_grad_norms`."""
+    gradient = screen.means2d.grad
+    if gradient is None:
+        if len(screen.visible):
+            raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
+        gradient = torch.zeros_like(screen.means2d)
+    half_size = torch.tensor([camera.W / 2, camera.H / 2], dtype=gradient.dtype, device=gradient.device)
+    length: Tensor = torch.linalg.vector_norm(gradient * half_size, dim=-1)
+    return length
 
 
 def _composite(
