@@ -4,8 +4,8 @@
 //
 // A tile stops once the transmittance of every pixel is below 1e-4. Depth and features are composited as colours are. The
 // median depth is that of the splat where T falls below one half, 0 if it never does.
+#include "features.h"
 #include "isa.h"
-#include "tile.h"
 
 namespace gsplat {
 namespace GSPLAT_ISA {
@@ -18,6 +18,7 @@ struct TileState {
 template <class T>
 struct TileState<T, WITH_FEATURES> : TileState<T, WITH_DEPTH> {
     FeaturePlanes<T> features;
+    FeatureGroup<T> group;
 };
 
 template <class T>
@@ -25,16 +26,15 @@ struct TileState<T, WITH_ALL> : TileState<T, WITH_FEATURES> {
     Plane<T> median;
 };
 
-// Draws one splat; `features` are its own.
+// Draws one splat; `weights` gets T alpha by pixel if there are features.
 template <class T, int MODE, bool GENTLY>
-GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const T *features, const TileBox &box, const Rows<T> &rows,
-                        uint32_t i, TileState<T, MODE> &tile) {
+GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i,
+                        TileState<T, MODE> &tile, [[maybe_unused]] T *weights) {
     using V = typename Vector<T>::V;
     FalloffRows<T> steps;
     Falloff<T, GENTLY> falloff{steps, args.settings};
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
-    const int32_t channels = args.out.channels;
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
         const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
         if (first > last) continue;
@@ -48,11 +48,7 @@ GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const T
             store(tile.blue.values + at, load<V>(tile.blue.values + at) + w * blue);
             if (MODE != COLORS) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
             store(tile.transmittance.values + at, t - w);
-            if constexpr (MODE >= WITH_FEATURES) {
-                T *to = tile.features.at(at);
-#pragma GCC unroll 4
-                for (int32_t k = 0; k < channels; ++k, to += Vector<T>::LANES) store(to, load<V>(to) + w * splat(features[k]));
-            }
+            if constexpr (MODE >= WITH_FEATURES) store(weights + at, w);
             if constexpr (MODE == WITH_ALL) {
                 const V half = splat(T(0.5)), median = load<V>(tile.median.values + at);
                 store(tile.median.values + at, (t >= half) & (t - w < half) ? splat(s.depth) : median);
@@ -119,15 +115,19 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
         }
         if (rows.top[i] > rows.bottom[i]) continue;
         const uint32_t id = args.pairs[k].gaussian;
-        const T *features = MODE >= WITH_FEATURES ? args.features + int64_t(args.out.channels) * id : nullptr;
-        const Splat<T> &s = args.splats[id];
-        rows.gentle[i] ? draw<T, MODE, true>(args, s, features, box, rows, i, tile)
-                       : draw<T, MODE, false>(args, s, features, box, rows, i, tile);
+        T *weights = nullptr;
+        if constexpr (MODE >= WITH_FEATURES)
+            weights = tile.group.take(args.features + int64_t(args.out.channels) * id, rows.top[i], rows.bottom[i]);
+        rows.gentle[i] ? draw<T, MODE, true>(args, args.splats[id], box, rows, i, tile, weights)
+                       : draw<T, MODE, false>(args, args.splats[id], box, rows, i, tile, weights);
+        if constexpr (MODE >= WITH_FEATURES)
+            if (tile.group.count == tile.group.SIZE) tile.group.add_to(tile.features);
         if (!lets_light_through(tile.transmittance, bright)) {
             ++k;
             break;
         }
     }
+    if constexpr (MODE >= WITH_FEATURES) tile.group.add_to(tile.features);
     args.done[index] = k - begin;
     finish_tile<T, MODE>(args, box, tile);
 }

@@ -7,8 +7,8 @@
 //
 // Every pair writes its sums over the tile's pixels, w g and the moments of h about the splat's reference point, to its own
 // slot; those of features and statistics to slots of their own.
+#include "features.h"
 #include "isa.h"
-#include "tile.h"
 
 namespace gsplat {
 namespace GSPLAT_ISA {
@@ -20,7 +20,8 @@ struct TileGradient {
 
 template <class T>
 struct TileGradient<T, WITH_FEATURES> : TileGradient<T, WITH_DEPTH> {
-    FeaturePlanes<T> features;
+    FeaturePlanes<T> features;  // their gradients; no channels if there are none
+    FeatureGroupBackward<T> group;
 };
 
 template <class T>
@@ -33,52 +34,9 @@ template <class T>
 struct PairSlots {
     const Splat<T> &s;
     T *slot;
-    const T *features;  // of the Gaussian
     T *feature_slot, *statistic_slot;
     int32_t channels;   // 0 if features have no gradient
 };
-
-// The sums over a tile of one splat's weights times the gradients of the features.
-template <class T, int MODE>
-struct FeatureSums {};
-
-template <class T>
-struct FeatureSums<T, WITH_FEATURES> {
-    using V = typename Vector<T>::V;
-    V sums[MOST_CHANNELS];
-
-    GSPLAT_METHOD void clear(int32_t channels) {
-        for (int32_t k = 0; k < vmin(channels + 7, MOST_CHANNELS); ++k) sums[k] = V{};  // `write` adds eight at a time
-    }
-
-    // Adds a vector of pixels with the weights w; returns the sum of the features times their gradients, of which four parts are
-    // added side by side because each addition waits for the one before.
-    GSPLAT_METHOD V add(const T *gradients, const T *own, int32_t channels, V w) {
-        V parts[4] = {};
-        int32_t k = 0;
-        for (; k + 4 <= channels; k += 4)
-            for (int j = 0; j < 4; ++j) parts[j] += one(gradients, own, k + j, w);
-        for (; k < channels; ++k) parts[0] += one(gradients, own, k, w);
-        return (parts[0] + parts[1]) + (parts[2] + parts[3]);
-    }
-
-    GSPLAT_METHOD V one(const T *gradients, const T *own, int32_t k, V w) {
-        const V g = load<V>(gradients + k * Vector<T>::LANES);
-        sums[k] += w * g;
-        return g * splat(own[k]);
-    }
-
-    GSPLAT_METHOD void write(int32_t channels, T *slot) const {
-        for (int32_t k = 0; k < channels; k += 8) {
-            T eight[8];
-            sum8(sums + k, eight);
-            memcpy(slot + k, eight, size_t(vmin(channels - k, 8)) * sizeof(T));
-        }
-    }
-};
-
-template <class T>
-struct FeatureSums<T, WITH_ALL> : FeatureSums<T, WITH_FEATURES> {};
 
 template <class V>
 GSPLAT_INLINE V absolute(V v) {
@@ -95,10 +53,11 @@ GSPLAT_INLINE void write_statistics(const Splat<T> &s, const typename Vector<T>:
     for (int l = 0; l < Vector<T>::LANES; ++l) slot[WEIGHT_MAX] = vmax(slot[WEIGHT_MAX], T(sums[WEIGHT_MAX][l]));
 }
 
-// Writes one splat's sums over the tile to its slots.
+// Writes one splat's sums over the tile to its slot, and its weights to its place in the group of features.
 template <class T, int MODE, bool GENTLY>
 GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlots<T> &pair, const TileBox &box, const Rows<T> &rows,
                                   uint32_t i, TileGradient<T, MODE> &tile) {
+    [[maybe_unused]] const uint32_t member = i % FeatureGroup<T>::SIZE;
     using V = typename Vector<T>::V;
     const Splat<T> &s = pair.s;
     FalloffRows<T> steps;
@@ -107,9 +66,6 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     V sums[8] = {}, hyy = V{}, wz = V{};  // in the order of a slot
     V statistics[STATISTICS] = {};
-    FeatureSums<T, MODE> features;
-    const int32_t channels = pair.channels;
-    if constexpr (MODE >= WITH_FEATURES) features.clear(channels);
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
         const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
         if (first > last) continue;
@@ -130,7 +86,11 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
                 cg += z * splat(s.depth);
                 wz += w * z;
             }
-            if constexpr (MODE >= WITH_FEATURES) cg += features.add(tile.features.at(at), pair.features, channels, w);
+            if constexpr (MODE >= WITH_FEATURES)
+                if (pair.channels) {
+                    cg += load<V>(tile.group.dots[member].values + at);
+                    store(tile.group.weights[member].values + at, w);
+                }
             const V rest = load<V>(tile.rest.values + at) - w * cg;
             const V h = falloff.where_open(key, alpha * (t * cg - rest * reciprocal(splat(T(1)) - alpha)));
             store(tile.rest.values + at, rest);
@@ -154,7 +114,6 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
     }
     sum8(sums, pair.slot);
     pair.slot[HYY] = sum(hyy), pair.slot[DEPTH] = MODE != COLORS ? sum(wz) : T(0);
-    if constexpr (MODE >= WITH_FEATURES) features.write(channels, pair.feature_slot);
     if constexpr (MODE == WITH_ALL) write_statistics(s, statistics, pair.statistic_slot);
 }
 
@@ -203,12 +162,9 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
 template <class T>
 GSPLAT_INLINE PairSlots<T> slots_of(const CompositeBackwardArgs<T> &args, const Pair &pair) {
     const int64_t slot = pair.slot, channels = args.forward.out.channels;
-    return {args.forward.splats[pair.gaussian],
-            args.slots + SLOT * slot,
-            args.forward.features ? args.forward.features + channels * pair.gaussian : nullptr,
+    return {args.forward.splats[pair.gaussian], args.slots + SLOT * slot,
             args.feature_slots ? args.feature_slots + channels * slot : nullptr,
-            args.statistic_slots ? args.statistic_slots + STATISTICS * slot : nullptr,
-            args.feature_slots ? int32_t(channels) : 0};
+            args.statistic_slots ? args.statistic_slots + STATISTICS * slot : nullptr, args.feature_slots ? int32_t(channels) : 0};
 }
 
 template <class T>
@@ -216,6 +172,27 @@ GSPLAT_INLINE void write_zeros(const PairSlots<T> &to) {
     for (int j = 0; j < SLOT; ++j) to.slot[j] = 0;
     if (to.feature_slot) memset(to.feature_slot, 0, size_t(to.channels) * sizeof(T));
     if (to.statistic_slot) memset(to.statistic_slot, 0, STATISTICS * sizeof(T));
+}
+
+// Takes the pairs from k on, which are those from i on in the batch, as far as they are of one group.
+template <class T, int MODE>
+GSPLAT_INLINE void begin_group(const CompositeBackwardArgs<T> &args, uint32_t k, uint32_t stop, const Rows<T> &rows, uint32_t i,
+                               TileGradient<T, MODE> &tile) {
+    const CompositeArgs<T> &forward = args.forward;
+    for (uint32_t end = vmin(k + FeatureGroup<T>::SIZE, stop); k < end; ++k, ++i)
+        tile.group.take(forward.features + int64_t(forward.out.channels) * forward.pairs[k].gaussian, rows.top[i], rows.bottom[i]);
+    tile.group.fill();
+    tile.group.multiply(tile.features);
+}
+
+// Writes the features' sums of the pairs [k, end).
+template <class T, int MODE>
+GSPLAT_INLINE void end_group(const CompositeBackwardArgs<T> &args, uint32_t k, uint32_t end, TileGradient<T, MODE> &tile) {
+    T *slots[FeatureGroup<T>::SIZE];
+    const int members = int(end - k);
+    for (int j = 0; j < members; ++j)
+        slots[j] = args.feature_slots + int64_t(tile.features.channels) * args.forward.pairs[k + uint32_t(j)].slot;
+    tile.group.write(tile.features, slots, members);
 }
 
 template <class T, int MODE>
@@ -235,12 +212,16 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
             fetch_next(forward.splats, forward.pairs + k, stop - k);
             rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
         }
-        if (k >= stop || rows.top[i] > rows.bottom[i]) {
+        if constexpr (MODE >= WITH_FEATURES)
+            if (k < stop && pair.channels && i % FeatureGroup<T>::SIZE == 0) begin_group(args, k, stop, rows, i, tile);
+        if (k >= stop || rows.top[i] > rows.bottom[i])
             write_zeros(pair);
-            continue;
-        }
-        rows.gentle[i] ? splat_backward<T, MODE, true>(forward, pair, box, rows, i, tile)
-                       : splat_backward<T, MODE, false>(forward, pair, box, rows, i, tile);
+        else
+            rows.gentle[i] ? splat_backward<T, MODE, true>(forward, pair, box, rows, i, tile)
+                           : splat_backward<T, MODE, false>(forward, pair, box, rows, i, tile);
+        if constexpr (MODE >= WITH_FEATURES)
+            if (k < stop && pair.channels && (i % FeatureGroup<T>::SIZE == FeatureGroup<T>::SIZE - 1 || k + 1 == stop))
+                end_group(args, k - i % FeatureGroup<T>::SIZE, k + 1, tile);
     }
 }
 
