@@ -21,8 +21,8 @@ from gsplat_edu.constants import ALPHA_MIN, DET_FLOOR
 from gsplat_edu.gaussians import quat_to_R_t
 
 MARGIN = 0.15
-"""gsplat clamps x/z and y/z inside the Jacobian at the edge of the image, moved outwards by this fraction of its size. It
-is our `RenderSettings(jacobian_limit=1.3)`."""
+"""gsplat clamps x/z and y/z inside the Jacobian at the edge of the image, moved outwards by this fraction of its size.
+It is our `RenderSettings(jacobian_limit=1.3)`."""
 
 EXTENT = 3.33
 """Largest half extent of a Gaussian, standard deviations. Alpha reaches 1/255 at 3.329 of them if the opacity is 1."""
@@ -158,7 +158,7 @@ def _radii(
     means2d: Float[Tensor, "B C N 2"],
     variances: Float[Tensor, "B C N 2"],
     drawable: Bool[Tensor, "B C N"],
-    opacities: Float[Tensor, "B C N"] | None,
+    opacities: Float[Tensor, "B #C N"] | None,
     lens: Lens,
 ) -> Int32[Tensor, "B C N 2"]:
     """Return the half sizes of the boxes, px, rounded up; 0 for Gaussians that are not drawn."""
