@@ -2,8 +2,8 @@
 
     from gsplat_edu.compat.gsplat import rasterization      # instead of: from gsplat import rasterization
 
-gsplat's `DefaultStrategy` runs on it as it is; its `MCMCStrategy` calls CUDA kernels of its own. docs/GSPLAT.md compares
-the arguments one by one and lists the differences.
+gsplat's `DefaultStrategy` runs on it as it is; its `MCMCStrategy` calls CUDA kernels of its own. docs/GSPLAT.md
+compares the arguments one by one and lists the differences.
 
 Design. gsplat has three stages, each differentiable: projection and harmonics, then compositing of what they return.
 Its strategies call `meta["means2d"].retain_grad()` before the backward pass and read `.grad` and `.absgrad` after it.

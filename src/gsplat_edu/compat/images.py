@@ -30,7 +30,7 @@ from gsplat_edu.render.settings import RenderSettings
 SETTINGS = RenderSettings(alpha_max=0.999, z_near=0.0, depth=False, stop="pixel")
 """gsplat's clamp of alpha, and its rule for the end of a pixel."""
 
-COLORS = 3
+COLOR_CHANNELS = 3
 """Channels that the kernels composite as the colour; the others are features."""
 
 
@@ -65,9 +65,9 @@ def composite(
     parts: list[Tensor] = []
     transmittance: Tensor | None = None
     # The depth is a feature, never a colour, because the kernels skip Gaussians whose colours exceed COLOR_LIMIT.
-    pieces = torch.split(colors, COLORS + MOST_CHANNELS - 1, dim=1)
+    pieces = torch.split(colors, COLOR_CHANNELS + MOST_CHANNELS - 1, dim=1)
     for k, piece in enumerate(pieces):
-        front, features = piece[:, :COLORS], piece[:, COLORS:]
+        front, features = piece[:, :COLOR_CHANNELS], piece[:, COLOR_CHANNELS:]
         if k == 0 and splats.depths is not None:
             features = torch.cat([features, splats.depths[:, None]], dim=1)
         view = _render(splats, front, features, lens, absgrad)
@@ -106,7 +106,7 @@ def _render(
     view = render_covariances(
         means,
         cov3ds,
-        torch.nn.functional.pad(front, (0, COLORS - front.shape[1])),
+        torch.nn.functional.pad(front, (0, COLOR_CHANNELS - front.shape[1])),
         splats.opacities,
         Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 0.0, 0.0, lens.height, lens.width),
         SETTINGS,

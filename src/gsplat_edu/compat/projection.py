@@ -158,7 +158,7 @@ def _radii(
     means2d: Float[Tensor, "B C N 2"],
     variances: Float[Tensor, "B C N 2"],
     drawable: Bool[Tensor, "B C N"],
-    opacities: Float[Tensor, "B #C N"] | None,
+    opacities: Float[Tensor, "B _ N"] | None,
     lens: Lens,
 ) -> Int32[Tensor, "B C N 2"]:
     """Return the half sizes of the boxes, px, rounded up; 0 for Gaussians that are not drawn."""
