@@ -1,4 +1,5 @@
 import dataclasses
+import json
 import signal
 import time
 
@@ -12,6 +13,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.render.api import render
+from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from processes import Program
@@ -170,3 +172,63 @@ def test_an_interrupted_render_leaves_no_temporary_file(made, cli, tmp_path, num
     else:
         assert code == 130 and said.count("\n") == 1, said
     assert left == set()
+
+
+def test_maps_are_written_beside_the_images(made, cli, capsys, tmp_path):
+    """The TIFF has the values, the PNG has them with the scale of maps.json, and a preview shows something."""
+    _, capture, bare, views = made
+    words = [
+        "--dataset",
+        str(capture),
+        "--out",
+        str(tmp_path / "seen"),
+        "--maps",
+        "depth, normal,alpha,depth",
+    ]
+    assert cli(["render", str(bare), *words]) == 0
+    assert "6 images and their maps (depth, normal, alpha) of " in capsys.readouterr().out
+    listed = json.loads((tmp_path / "seen" / "maps.json").read_text())
+    assert len(listed) == 18 and len(list((tmp_path / "seen").iterdir())) == 6 * (1 + 3 * 3) + 1
+    settings = RenderSettings(background=BLUE)
+    maps, _ = render_maps(load_ply(bare), views[2].camera, ["depth", "normal", "alpha"], settings)
+    for name, tensor in maps.items():
+        stem, truth = tmp_path / "seen" / f"view_002.{name}", tensor.numpy()
+        values = cv2.imread(f"{stem}.tiff", cv2.IMREAD_UNCHANGED)
+        stored = cv2.imread(f"{stem}.png", cv2.IMREAD_UNCHANGED)
+        assert values.dtype == np.float32 and stored.dtype == np.uint16
+        if name == "normal":
+            values, stored = values[..., ::-1], stored[..., ::-1]
+        np.testing.assert_array_equal(values, truth)
+        scale = listed[f"view_002.{name}.png"]
+        # Half a step, and the rounding of float32 in the product.
+        np.testing.assert_allclose(
+            scale["scale"] * stored + scale["offset"], truth, rtol=0, atol=0.51 * scale["scale"]
+        )
+        shown = pixels(f"{stem}.preview.png")
+        assert shown.shape == (24, 32, 3) and shown.std() > 10
+
+
+def test_an_orbit_with_maps_is_a_folder(made, cli, tmp_path):
+    _, _, bare, _ = made
+    assert cli(["render", str(bare), "--maps", "median-depth", "--frames", "2", "--size", "20"]) == 0
+    names = sorted(path.name for path in (tmp_path / "out" / "bare_orbit").iterdir())
+    frame = [
+        "frame_0000.median-depth.png",
+        "frame_0000.median-depth.preview.png",
+        "frame_0000.median-depth.tiff",
+    ]
+    assert names[:4] == [*frame, "frame_0000.png"] and "maps.json" in names
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--maps", "depth,height"], "--maps: does not know 'height'; use alpha, depth, expected-depth"),
+        (["--maps", ""], "--maps: does not know ''; use alpha"),
+        (["--maps", "depth", "--out", "x.mp4"], "--maps: x.mp4 is a video; give a folder with --out DIR"),
+    ],
+)
+def test_maps_that_cannot_be_written_are_refused(made, cli, capsys, words, message):
+    _, _, bare, _ = made
+    assert cli(["render", str(bare), *words]) == 2
+    assert message in capsys.readouterr().err

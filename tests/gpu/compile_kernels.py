@@ -55,6 +55,7 @@ def build(kernel, kinds, constants=None, warps=4) -> None:
 
 def stage(kernel, warps=4, **constants) -> None:
     kinds = {name: "i32" if name in INTEGERS else KINDS.get(name, FLOATS) for name in kernel.arg_names}
+    kinds |= {"most": "fp32"} if "most" in kinds else {}
     build(kernel, kinds, constants, warps)
 
 
@@ -65,7 +66,7 @@ def main() -> None:
     stage(project.project_backward_kernel, 2, **shape, WITH_CAMERA=MOST, BLOCK=64)
     stage(intersect.count_kernel, BLOCK=128)
     stage(intersect.emit_kernel, BLOCK=128)
-    stage(composite.composite_kernel, WITH_DEPTH=MOST, BATCH=16, PRECISION="ieee")
+    stage(composite.composite_kernel, WITH_DEPTH=MOST, WITH_MEDIAN=MOST, BATCH=16, PRECISION="ieee")
     stage(composite.composite_backward_kernel, 8, WITH_DEPTH=MOST, WITH_T=MOST, BATCH=16)
     image = {"image": FLOATS, "target": "*u8", "planes": FLOATS}
     sums = {"sums": FLOATS, "size": SIZE}

@@ -223,3 +223,45 @@ def test_a_camera_is_uploaded_once(device):
         render(gaussians, other, backend="cuda")
         rows.append(next(iter(_camera_rows[other].values())))
     assert len(_camera_rows) == before + 1 and rows[0] is rows[1]
+
+
+@pytest.mark.sliced(2)
+@pytest.mark.parametrize("channels", [1, 3, 7, 32])
+def test_features_and_median_depth_match_the_native_kernels(device, channels):
+    """The bounds are those of colours, of which features are more: 3e-4 of the largest gradient.
+
+    The median depth may differ where the transmittance is within float32 rounding of one half.
+    """
+    scene = random(24, (20, 17), seed=channels)
+    settings = RenderSettings(median_depth=True, alpha_max=0.97, z_near=0.2)
+    found = []
+    for backend, dtype, where in (("cuda", torch.float32, device), ("cpu", torch.float64, "cpu")):
+        gaussians = scene.gaussians(dtype).to(torch.device(where)).trainable()
+        generator = torch.Generator().manual_seed(channels)
+        features = torch.randn(24, channels, generator=generator, dtype=torch.float64)
+        features = features.to(gaussians.means).requires_grad_()
+        out = render(gaussians, scene.camera, settings=settings, features=features, backend=backend)
+        draw = torch.randn(out.features.shape, generator=generator, dtype=torch.float64).to(out.features)
+        ((out.features * draw).sum() + out.image.sum() + out.mean_depth.sum()).backward()
+        values = {"features": out.features, "image": out.image, "median": out.median_depth}
+        gradients = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
+        gradients["of features"] = features.grad
+        found.append([{k: t.detach().double().cpu() for k, t in d.items()} for d in (values, gradients)])
+    (values, gradients), (truths, expected) = found
+    for key in ("features", "image"):
+        assert (values[key] - truths[key]).abs().max() < 1.1 * max(1.0, truths[key].abs().max()) / 255
+        assert (values[key] - truths[key]).abs().median() < 1e-5
+    assert ((values["median"] - truths["median"]).abs() > 1e-5).sum() <= 2 and truths["median"].max() > 2
+    for key, truth in expected.items():
+        assert (gradients[key] - truth).abs().max() <= 3e-4 * truth.abs().max(), key
+
+
+def test_features_of_another_dtype_are_refused(device):
+    gaussians = random(3, (16, 16)).gaussians(torch.float32).to(torch.device(device))
+    with pytest.raises(ArgumentError, match="^features: are torch.float64"):
+        render(
+            gaussians,
+            random(3).camera,
+            features=torch.zeros(3, 2, dtype=torch.float64, device=device),
+            backend="cuda",
+        )

@@ -20,13 +20,14 @@ from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.following import path_along
-from gsplat_edu.evaluate.images import check_output, write_frames
+from gsplat_edu.evaluate.images import VIDEO_SUFFIX, check_output, write_frames
+from gsplat_edu.evaluate.map_files import write_list, write_maps
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import SOG_META, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
-from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
+from gsplat_edu.render.maps import MAPS, render_maps
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
@@ -44,6 +45,7 @@ class Shot:
         names: File names of the images in a folder; None numbers them.
         settings: Render settings.
         path: The kind of camera path and the reason for it; "" for the dataset's cameras.
+        maps: Names of the maps to write beside the images.
     """
 
     gaussians: Gaussians
@@ -51,6 +53,7 @@ class Shot:
     names: Sequence[str] | None
     settings: RenderSettings
     path: str = ""
+    maps: Sequence[str] = ()
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -62,14 +65,16 @@ def run(arguments: argparse.Namespace) -> None:
         whole_number("--size", arguments.size, 1)
     if arguments.out is not None:
         check_output(arguments.out)
+    maps = _chosen_maps(arguments)
+    name = "orbit" if maps else "orbit.mp4"
     folder = RunFolder(arguments.source)
     orbit = arguments.orbit or arguments.dataset is None
     if folder.exists():
         shot = _run_shot(arguments, folder, orbit)
-        out = arguments.out or folder.renders / ("orbit.mp4" if orbit else "views")
+        out = arguments.out or folder.renders / (name if orbit else "views")
     elif arguments.source.is_file() or (arguments.source / SOG_META).is_file():
         shot = _file_shot(arguments, orbit)
-        out = arguments.out or Path("out") / f"{arguments.source.stem}_{'orbit.mp4' if orbit else 'views'}"
+        out = arguments.out or Path("out") / f"{arguments.source.stem}_{name if orbit else 'views'}"
     elif arguments.source.exists():
         raise ArgumentError(
             f"{arguments.source}: is not a run (config.json is missing); give a run folder or a scene file"
@@ -80,8 +85,9 @@ def run(arguments: argparse.Namespace) -> None:
     if shot.path:
         console.print(shot.path, soft_wrap=True)
     started = time.perf_counter()
+    shot = replace(shot, gaussians=shot.gaussians.to(device_of(backend)), maps=maps)
     frames = track(
-        _frames(replace(shot, gaussians=shot.gaussians.to(device_of(backend))), backend),
+        _frames(shot, backend, out),
         "rendering",
         total=len(shot.cameras),
         console=console,
@@ -91,7 +97,9 @@ def run(arguments: argparse.Namespace) -> None:
     written = write_frames(out, frames, fps=arguments.fps, names=shot.names)
     each = 1e3 * (time.perf_counter() - started) / len(shot.cameras)
     first = shot.cameras[0]
-    what = f"{len(shot.cameras)} images of {len(shot.gaussians):,} Gaussians, {first.W}x{first.H}, {each:.0f} ms each"
+    also = f" and their maps ({', '.join(maps)})" if maps else ""
+    what = f"{len(shot.cameras)} images{also} of {len(shot.gaussians):,} Gaussians"
+    what += f", {first.W}x{first.H}, {each:.0f} ms each"
     console.print(f"wrote {out}{'' if written == [out] else '/'}: {what}", soft_wrap=True)
 
 
@@ -170,8 +178,28 @@ def _depth(gaussians: Gaussians, camera: Camera) -> float:
     return float(np.median(ahead)) if ahead.size else 1.0
 
 
-def _frames(shot: Shot, backend: str) -> Iterator[Float[np.ndarray, "H W 3"]]:
-    for camera in shot.cameras:
+def _chosen_maps(arguments: argparse.Namespace) -> list[str]:
+    """Return the maps that --maps names, after checking that they can be written."""
+    if arguments.maps is None:
+        return []
+    names = [name.strip() for name in arguments.maps.split(",")]
+    if unknown := [name for name in names if name not in MAPS]:
+        raise ArgumentError(f"--maps: does not know {unknown[0]!r}; use {', '.join(MAPS)}")
+    if arguments.out is not None and arguments.out.suffix.lower() == VIDEO_SUFFIX:
+        raise ArgumentError(f"--maps: {arguments.out} is a video; give a folder with --out DIR")
+    return list(dict.fromkeys(names))
+
+
+def _frames(shot: Shot, backend: str, out: Path) -> Iterator[Float[np.ndarray, "H W 3"]]:
+    """Yield the images; write the maps of each beside them."""
+    scales: dict[str, dict[str, float]] = {}
+    for index, camera in enumerate(shot.cameras):
         with torch.no_grad():
-            output = render(shot.gaussians, camera, settings=shot.settings, backend=backend)
-        yield output.image.numpy(force=True)
+            maps, view = render_maps(shot.gaussians, camera, shot.maps, shot.settings, backend)
+        if shot.maps:
+            stem = f"frame_{index:04d}" if shot.names is None else Path(shot.names[index]).stem
+            arrays = {name: tensor.numpy(force=True) for name, tensor in maps.items()}
+            scales |= write_maps(out, stem, arrays)
+        yield view.image.numpy(force=True)
+    if shot.maps:
+        write_list(out, scales)

@@ -80,8 +80,8 @@ def render(
         BackendUnavailableError: the backend cannot run here.
         ShapeError: the background is not of shape (3,), features have another shape, or cameras have different sizes.
         NotEnoughMemoryError: the image alone needs more memory than is free.
-        ArgumentError: a feature is NaN or infinite; or on the backend torch, a parameter is NaN or infinite, or a quaternion has zero length. The
-            kernels skip such a Gaussian, with zero gradient and no effect on others.
+        ArgumentError: a feature is NaN or infinite; or on the backend torch, a parameter is, or a quaternion has zero
+            length. The kernels skip such a Gaussian, with zero gradient and no effect on others.
 
     Differentiable in: every raw parameter of the Gaussians, the background, the features, and a camera of tensors.
     """

@@ -268,16 +268,14 @@ class _Rasterize(torch.autograd.Function):
             ),
             threads=torch.get_num_threads(),
         )
-        size = (camera.H, camera.W)
-        shapes = (
+        size: tuple[int, ...] = (camera.H, camera.W)
+        shapes: tuple[tuple[int, ...], ...] = (
             (*size, 3),
             size,
             size if settings.depth else (0,),
-            (0,),
+            (0,) if given is None else (*size, given.shape[1]),
             size if settings.median_depth else (0,),
         )
-        if given is not None:
-            shapes = (*shapes[:3], (*size, given.shape[1]), shapes[4])
         images = [reusable_tensor(shape, means) for shape in shapes]
         frame.composite(images=_images(*map(_wanted, images)), features=_array(given))
         # Room for all Gaussians: how many are visible changes from view to view, and such buffers would not be reused.

@@ -24,7 +24,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 
 IMAGE_BOUND = 1.1 * ALPHA_MIN
@@ -82,7 +82,8 @@ def kernel_error(device: torch.device) -> str | None:
     from gsplat_edu.render.triton.rasterize import render_triton
 
     image, gradients = _differentiated(
-        check_scene(torch.float32).to(device), lambda g, bg: render_triton(g, CHECK_CAMERA, SETTINGS, bg)
+        check_scene(torch.float32).to(device),
+        lambda g, bg: render_triton(g, CHECK_CAMERA, SETTINGS, Extra(bg)),
     )
     truth, expected = _differentiated(check_scene(torch.float64), _exact)
     bright = max(1.0, float(truth.abs().max()))
@@ -131,10 +132,10 @@ def _exact(gaussians: Gaussians, background: Tensor) -> RenderOutput:
     if kernels.REASON is None:
         from gsplat_edu.render.cpu import render_cpu
 
-        return render_cpu(gaussians, CHECK_CAMERA, SETTINGS, background)
+        return render_cpu(gaussians, CHECK_CAMERA, SETTINGS, Extra(background))
     from gsplat_edu.render.torch_reference import render_dense
 
-    return render_dense(gaussians, CHECK_CAMERA, SETTINGS, background)
+    return render_dense(gaussians, CHECK_CAMERA, SETTINGS, Extra(background))
 
 
 def _differentiated(

@@ -68,8 +68,8 @@ def reconstruct(
     """Find the poses of photos, and write a capture in COLMAP's layout: undistorted photos and a model of pinholes.
 
     Features, matches and the order of all random draws are the same in every run. The mappers' order of summation
-    depends on their threads, so poses of different runs agree to a fraction of a pixel but not to the bit. With one thread
-    they agree to the bit.
+    depends on their threads, so poses of different runs agree to a fraction of a pixel but not to the bit. With one
+    thread they agree to the bit.
 
     Args:
         options: The options.

@@ -12,6 +12,9 @@ EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush
 SCENE_SIZE = 512
 """px: size of the images of a scene file that comes without cameras."""
 
+MAPS = ("alpha", "depth", "expected-depth", "median-depth", "normal")
+"""The maps by name, as in `gsplat_edu.render.maps`, whose import takes torch along."""
+
 RUNS_CAMERAS = ""
 """Value of --dataset without a path."""
 
@@ -48,6 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="DIR|X.mp4",
         help="folder for PNGs, or a video (VP9 in MP4) (default: renders/ in the run, out/ for a scene file)",
+    )
+    parser.add_argument(
+        "--maps",
+        metavar="NAMES",
+        help=f"also write maps, separated by commas: {', '.join(MAPS)}; each as float32 TIFF, 16-bit PNG (maps.json has"
+        " the scales) and coloured preview; needs a folder for --out",
     )
     parser.add_argument(
         "--white-background", action="store_true", help="render over white (default: the run's background)"

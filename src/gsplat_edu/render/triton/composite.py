@@ -24,7 +24,6 @@ TILE = tl.constexpr(constants.TILE)
 PIXELS = tl.constexpr(constants.TILE * constants.TILE)
 T_STOP = tl.constexpr(constants.T_STOP)
 LOG2_ALPHA_MIN = tl.constexpr(math.log2(constants.ALPHA_MIN))
-LOG2_ALPHA_MAX = tl.constexpr(math.log2(constants.ALPHA_MAX))
 CHANNELS = tl.constexpr(16)
 """Columns of the channel matrices: red, green, blue, depth, and zero padding, the minimum for matrix units."""
 
@@ -41,8 +40,8 @@ def _pixels(tile, tiles_x, W, H):
 
 @triton.jit
 @no_type_check
-def _alphas(records, ids, mask, x, y):
-    """Return p and alpha for every pair of pixel and Gaussian."""
+def _alphas(records, ids, mask, x, y, most):
+    """Return p and alpha for every pair of pixel and Gaussian; `most` is the logarithm of alpha's clamp."""
     row = records + ids.to(tl.int64) * RECORD
     dx = x[:, None].to(tl.float32) - tl.load(row, mask=mask, other=0.0)[None, :]
     dy = y[:, None].to(tl.float32) - tl.load(row + 1, mask=mask, other=0.0)[None, :]
@@ -50,7 +49,7 @@ def _alphas(records, ids, mask, x, y):
     ty, log2_o = tl.load(row + 4, mask=mask, other=0.0), tl.load(row + 5, mask=mask, other=-1000.0)
     s, t = sx[None, :] * dx + sy[None, :] * dy, ty[None, :] * dy
     p = log2_o[None, :] - s * s - t * t
-    return p, tl.where(p >= LOG2_ALPHA_MIN, tl.exp2(tl.minimum(p, LOG2_ALPHA_MAX)), 0.0)
+    return p, tl.where(p >= LOG2_ALPHA_MIN, tl.exp2(tl.minimum(p, most)), 0.0)
 
 
 @triton.jit
@@ -78,8 +77,8 @@ def _channels(records, ids, mask):
 @triton.jit
 @no_type_check
 def composite_kernel(
-    records, gaussians, tile_begin, background, image, transmittance, depth, W, H, tiles_x,
-    WITH_DEPTH: tl.constexpr, BATCH: tl.constexpr, PRECISION: tl.constexpr,
+    records, gaussians, tile_begin, background, image, transmittance, depth, median, W, H, tiles_x, most,
+    WITH_DEPTH: tl.constexpr, WITH_MEDIAN: tl.constexpr, BATCH: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Composite one tile."""
     tile = tl.program_id(0)
@@ -87,12 +86,17 @@ def composite_kernel(
     k, end = tl.load(tile_begin + tile), tl.load(tile_begin + tile + 1)
     T = tl.where(inside, 1.0, 0.0)
     mixed = tl.zeros([PIXELS, CHANNELS], tl.float32)
+    middle = tl.zeros([PIXELS], tl.float32)
     while (k < end) & (tl.max(T, axis=0) >= T_STOP):
         lane = k + tl.arange(0, BATCH)
         mask = lane < end
         ids = tl.load(gaussians + lane, mask=mask, other=0)
-        _, alpha = _alphas(records, ids, mask, x, y)
+        _, alpha = _alphas(records, ids, mask, x, y, most)
         before, alpha, T = _weights(alpha, T)
+        if WITH_MEDIAN:
+            deep = tl.load(records + ids.to(tl.int64) * RECORD + 9, mask=mask, other=0.0)
+            crosses = (before >= 0.5) & (before * (1 - alpha) < 0.5)
+            middle += tl.sum(tl.where(crosses, deep[None, :], 0.0), axis=1)
         mixed += tl.dot(before * alpha, _channels(records, ids, mask), input_precision=PRECISION)
         k += BATCH
     column = tl.arange(0, CHANNELS)[None, :]
@@ -104,6 +108,8 @@ def composite_kernel(
     if WITH_DEPTH:
         deep = tl.sum(tl.where(column == 3, mixed, 0.0), axis=1)
         tl.store(depth + pixel, deep, mask=inside)
+    if WITH_MEDIAN:
+        tl.store(median + pixel, middle, mask=inside)
 
 
 @triton.jit
@@ -139,7 +145,7 @@ def _gradients(
 @no_type_check
 def composite_backward_kernel(
     records, gaussians, perm, tile_begin, image, transmittance, depth,
-    grad_image, grad_transmittance, grad_depth, slots, W, H, tiles_x,
+    grad_image, grad_transmittance, grad_depth, slots, W, H, tiles_x, most,
     WITH_T: tl.constexpr, WITH_DEPTH: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
     """Write every pair's sums over one tile to its own slot; slots of pairs that were not drawn stay unchanged.
@@ -174,7 +180,7 @@ def composite_backward_kernel(
         lane = k + tl.arange(0, BATCH)
         mask = lane < end
         ids = tl.load(gaussians + lane, mask=mask, other=0)
-        p, alpha = _alphas(records, ids, mask, x, y)
+        p, alpha = _alphas(records, ids, mask, x, y, most)
         before, alpha, T = _weights(alpha, T)
         w = before * alpha
         row = records + ids.to(tl.int64) * RECORD
@@ -185,7 +191,7 @@ def composite_backward_kernel(
             cg += g3[:, None] * tl.load(row + 9, mask=mask, other=0.0)[None, :]
         left = rest[:, None] - tl.cumsum(w * cg, axis=1)
         rest -= tl.sum(w * cg, axis=1)
-        h = tl.where(p >= LOG2_ALPHA_MAX, 0.0, alpha * (before * cg - left / (1 - alpha)))
+        h = tl.where(p >= most, 0.0, alpha * (before * cg - left / (1 - alpha)))
         out = slots + tl.load(perm + lane, mask=mask, other=0) * SLOT
         tl.store(out, tl.sum(w * g0[:, None], axis=0), mask=mask)
         tl.store(out + 1, tl.sum(w * g1[:, None], axis=0), mask=mask)

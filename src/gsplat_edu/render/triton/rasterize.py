@@ -6,11 +6,14 @@ Every sum has a fixed order: pairs write to their own slots and Gaussians add th
 runs give the same bits. All launches are on torch's current stream. The host synchronises once per render, for the
 numbers of pairs and of visible Gaussians, and once per gradient of a camera. With TRITON_INTERPRET=1 the same kernels
 run on CPU tensors.
+
+Features are composited by the same kernels, in place of colours and depth, four channels per pass.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -20,11 +23,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsplat_edu.camera import Camera
-from gsplat_edu.constants import TILE, Z_NEAR
+from gsplat_edu.constants import TILE
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
-from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.triton.composite import composite_backward_kernel, composite_kernel
 from gsplat_edu.render.triton.intersect import count_kernel, emit_kernel
@@ -54,7 +57,10 @@ COMPOSITE_BACKWARD_WARPS, PROJECT_BACKWARD_WARPS = 8, 2
 RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 """Raw parameters in the kernels' argument order."""
 
-_camera_rows: WeakKeyDictionary[Camera, dict[tuple[str, float | None], Tensor]] = WeakKeyDictionary()
+GROUP = 4
+"""Features per pass: composite has room for three colours and a depth."""
+
+_camera_rows: WeakKeyDictionary[Camera, dict[tuple[str, float | None, float], Tensor]] = WeakKeyDictionary()
 
 
 @dataclass
@@ -83,7 +89,7 @@ class _Lists:
 
 
 def render_triton(
-    gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, background: Tensor
+    gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, extra: Extra
 ) -> RenderOutput:
     """Render raw parameters; `gsplat_edu.render.api.render` validates the arguments.
 
@@ -91,30 +97,46 @@ def render_triton(
         gaussians: N Gaussians, float32, on the GPU; on the CPU under Triton's interpreter.
         camera: The camera.
         settings: The settings.
-        background: (3,) colour behind everything, of the Gaussians' dtype and device.
+        extra: Background and features, of the Gaussians' dtype and device.
 
     Returns:
-        The view. Differentiable in every raw parameter, the background and a camera of tensors.
+        The view. Differentiable in every raw parameter, background, features and a camera of tensors.
 
     Raises:
-        ArgumentError: the Gaussians are not float32.
+        ArgumentError: the Gaussians or the features are not float32, or are on different devices.
     """
-    if gaussians.means.dtype != torch.float32:
-        raise ArgumentError(f"means: are {gaussians.means.dtype}, but the backend cuda needs float32")
+    features, means = extra.features, gaussians.means
+    if means.dtype != torch.float32:
+        raise ArgumentError(f"means: are {means.dtype}, but the backend cuda needs float32")
+    if features is not None and (features.dtype, features.device) != (means.dtype, means.device):
+        raise ArgumentError(
+            f"features: are {features.dtype} on {features.device}, but the Gaussians are float32 on {means.device}"
+        )
     value, pose = split_camera(camera)
     call = _Call(value, settings, min(settings.sh_degree, gaussians.sh_degree))
     tensors = gaussians.tensors()
     parameters = [tensors[name] for name in RAW]
     with torch.cuda.device_of(gaussians.means):  # type: ignore[no-untyped-call]
-        image, transmittance, depth = _Rasterize.apply(call, background, *pose, *parameters)  # type: ignore[no-untyped-call]
+        image, transmittance, depth, mixed, median = _Rasterize.apply(  # type: ignore[no-untyped-call]
+            call, extra.background, *pose, features, *parameters
+        )
 
     def norms() -> Tensor:
         if call.norms is None:
             raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
         return call.norms[call.visible]
 
-    depth = depth if settings.depth else None
-    return RenderOutput(image, transmittance, depth, call.visible, call.radii, call.num_pairs, norms)
+    return RenderOutput(
+        image,
+        transmittance,
+        depth if settings.depth else None,
+        call.visible,
+        call.radii,
+        call.num_pairs,
+        norms,
+        features=None if features is None else mixed,
+        median_depth=median if settings.median_depth else None,
+    )
 
 
 class _Rasterize(torch.autograd.Function):
@@ -128,42 +150,41 @@ class _Rasterize(torch.autograd.Function):
         R: Tensor | None,
         eye: Tensor | None,
         intrinsics: Tensor | None,
+        features: Tensor | None,
         *parameters: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        camera, settings = call.camera, call.settings
+    ) -> tuple[Tensor, ...]:
+        settings = call.settings
         kept = [p.detach().contiguous() for p in parameters]
         lists = _intersect(call, _project(call, kept))
-        image = background.new_empty(camera.H, camera.W, 3)
-        transmittance = background.new_empty(camera.H, camera.W)
-        depth = background.new_empty((camera.H, camera.W) if settings.depth else 0)
-        tiles_x, tiles = _grid(camera)
-        composite_kernel[(tiles,)](
-            lists.records, lists.gaussians, lists.tile_begin, background.detach().contiguous(),
-            image, transmittance, depth, camera.W, camera.H, tiles_x, WITH_DEPTH=settings.depth, BATCH=BATCH,
-            PRECISION=PRECISION,
-        )  # fmt: skip
+        shown = _composite(
+            call, lists, background.detach().contiguous(), settings.depth, settings.median_depth
+        )
+        image, transmittance, depth, median = shown
+        mixed, given = background.new_empty(0), None
+        if features is not None:
+            given = features.detach()
+            mixed = _composite_features(call, lists, given)
         ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(median)
         ctx.call, ctx.lists = call, lists
-        ctx.save_for_backward(*kept, image, transmittance, depth)
-        return image, transmittance, depth
+        ctx.save_for_backward(given, mixed, image, transmittance, depth, *kept)
+        return image, transmittance, depth, mixed, median
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        *kept, image, transmittance, depth = ctx.saved_tensors
+        features, mixed, image, transmittance, depth, *kept = ctx.saved_tensors
         call: _Call = ctx.call
         lists: _Lists = ctx.lists
-        grad_image, grad_T, grad_depth = (None if g is None else g.contiguous() for g in grads)
+        grad_image, grad_T, grad_depth, grad_mixed, _ = (None if g is None else g.contiguous() for g in grads)
         grad_image = torch.zeros_like(image) if grad_image is None else grad_image
-        slots = image.new_zeros(max(len(lists.gaussians), 1), SLOT.value)
-        tiles_x, tiles = _grid(call.camera)
-        composite_backward_kernel[(tiles,)](
-            lists.records, lists.gaussians, lists.slots, lists.tile_begin, image, transmittance, depth,
-            grad_image, image if grad_T is None else grad_T, image if grad_depth is None else grad_depth, slots,
-            call.camera.W, call.camera.H, tiles_x,
-            WITH_T=grad_T is not None, WITH_DEPTH=grad_depth is not None and call.settings.depth, BATCH=BATCH,
-            num_warps=COMPOSITE_BACKWARD_WARPS,
-        )  # fmt: skip
+        grad_depth = grad_depth if call.settings.depth else None
+        slots = _composite_backward(
+            call, lists, (image, transmittance, depth), (grad_image, grad_T, grad_depth)
+        )
+        to_features = None
+        if grad_mixed is not None and features is not None:
+            to_features = _features_backward(call, lists, (features, mixed, transmittance), grad_mixed, slots)
         outgoing = [torch.empty_like(p) for p in kept]  # fully overwritten
         count = len(kept[0])
         norms = kept[0].new_zeros(count)
@@ -180,7 +201,94 @@ class _Rasterize(torch.autograd.Function):
         wanted = ctx.needs_input_grad[1]
         background = (grad_image * transmittance[..., None]).sum(dim=(0, 1)) if wanted else None
         pose = camera_gradients(camera_sums.double().sum(dim=0).cpu() if with_camera else None)
-        return None, background, *pose, *outgoing
+        return None, background, *pose, to_features, *outgoing
+
+
+def _composite(
+    call: _Call, lists: _Lists, background: Tensor, with_depth: bool, with_median: bool
+) -> tuple[Tensor, ...]:
+    """Return image, transmittance, depth and median depth; those that are not wanted are empty."""
+    camera, (tiles_x, tiles) = call.camera, _grid(call.camera)
+    size = (camera.H, camera.W)
+    shapes = (*size, 3), size, size if with_depth else (0,), size if with_median else (0,)
+    images = tuple(background.new_empty(shape) for shape in shapes)
+    composite_kernel[(tiles,)](
+        lists.records, lists.gaussians, lists.tile_begin, background, *images, camera.W, camera.H, tiles_x,
+        math.log2(call.settings.alpha_max),
+        WITH_DEPTH=with_depth, WITH_MEDIAN=with_median, BATCH=BATCH, PRECISION=PRECISION,
+    )  # fmt: skip
+    return images
+
+
+def _composite_backward(
+    call: _Call, lists: _Lists, images: tuple[Tensor, ...], grads: tuple[Tensor, Tensor | None, Tensor | None]
+) -> Tensor:
+    """Return the slots of all pairs. Images and gradients: image, transmittance, depth."""
+    image, (grad_image, grad_T, grad_depth) = images[0], grads
+    slots = image.new_zeros(max(len(lists.gaussians), 1), SLOT.value)
+    tiles_x, tiles = _grid(call.camera)
+    composite_backward_kernel[(tiles,)](
+        lists.records, lists.gaussians, lists.slots, lists.tile_begin, *images,
+        grad_image, image if grad_T is None else grad_T, image if grad_depth is None else grad_depth, slots,
+        call.camera.W, call.camera.H, tiles_x, math.log2(call.settings.alpha_max),
+        WITH_T=grad_T is not None, WITH_DEPTH=grad_depth is not None, BATCH=BATCH,
+        num_warps=COMPOSITE_BACKWARD_WARPS,
+    )  # fmt: skip
+    return slots
+
+
+def _with_group(lists: _Lists, features: Tensor, first: int) -> _Lists:
+    """Return the lists with a group of features in place of colours and depth; missing ones are 0."""
+    records = lists.records.clone()
+    group = features[:, first : first + GROUP]
+    records[:, 6:10] = torch.nn.functional.pad(group, (0, GROUP - group.shape[1]))
+    return replace(lists, records=records)
+
+
+def _composite_features(call: _Call, lists: _Lists, features: Tensor) -> Tensor:
+    """Composite features over zero, a group at a time."""
+    black = features.new_zeros(3)
+    groups = []
+    for first in range(0, features.shape[1], GROUP):
+        image, _, depth, _ = _composite(call, _with_group(lists, features, first), black, True, False)
+        groups.append(torch.cat([image, depth[..., None]], dim=2))
+    return torch.cat(groups, dim=2)[..., : features.shape[1]].contiguous()
+
+
+def _features_backward(
+    call: _Call, lists: _Lists, drawn: tuple[Tensor, Tensor, Tensor], gradient: Tensor, slots: Tensor
+) -> Tensor:
+    """Return the gradient of the features, and add their share of the moments to the slots of all pairs.
+
+    Args:
+        call: The render.
+        lists: Its lists.
+        drawn: Features, their image, and the transmittance.
+        gradient: (H, W, C) gradient of that image.
+        slots: Slots of all pairs.
+    """
+    features, mixed, transmittance = drawn
+    channels = features.shape[1]
+    sums = []
+    for first in range(0, channels, GROUP):
+        padding = (0, first + GROUP - channels if first + GROUP > channels else 0)
+        image, incoming = (
+            torch.nn.functional.pad(each[..., first : first + GROUP], padding) for each in (mixed, gradient)
+        )
+        images = (image[..., :3].contiguous(), transmittance, image[..., 3].contiguous())
+        grads = (incoming[..., :3].contiguous(), None, incoming[..., 3].contiguous())
+        own = _composite_backward(call, _with_group(lists, features, first), images, grads)
+        slots[:, GROUP:] += own[:, GROUP:]
+        sums.append(own[:, :GROUP])
+    pairs = torch.cat(sums, dim=1)[: len(lists.gaussians), :channels].contiguous()
+    found = torch.zeros_like(features)
+    if len(pairs):
+        # The slots of a Gaussian are neighbours, and `segment_reduce` adds them one after another.
+        by_slot = torch.sort(lists.slot_begin, stable=True).indices
+        by_slot = by_slot[lists.pairs_of[by_slot] > 0]
+        lengths = lists.pairs_of[by_slot].to(torch.int64)
+        found[by_slot] = torch.segment_reduce(pairs, "sum", lengths=lengths, axis=0)
+    return found
 
 
 def _project(call: _Call, kept: list[Tensor]) -> Tensor:
@@ -244,7 +352,7 @@ def _camera_row(call: _Call, device: torch.device) -> Tensor:
 
     They are cached with the camera, so that later renders copy nothing.
     """
-    camera, key = call.camera, (str(device), call.settings.jacobian_limit)
+    camera, key = call.camera, (str(device), call.settings.jacobian_limit, call.settings.z_near)
     rows = _camera_rows.setdefault(camera, {})
     if key not in rows:
         x_bounds, y_bounds = camera.jacobian_bounds(call.settings.jacobian_limit)
@@ -260,6 +368,6 @@ def _camera_row(call: _Call, device: torch.device) -> Tensor:
         ]
         rest = camera.eye - camera.eye.astype(np.float32)  # rounding error of float32
         rows[key] = torch.tensor(
-            [*numbers, *x_bounds, *y_bounds, Z_NEAR, *rest], dtype=torch.float32, device=device
+            [*numbers, *x_bounds, *y_bounds, call.settings.z_near, *rest], dtype=torch.float32, device=device
         )
     return rows[key]
