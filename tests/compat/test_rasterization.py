@@ -1,5 +1,8 @@
 """`rasterization` against gsplat's own functions, the NumPy reference and finite differences."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -291,3 +294,49 @@ def test_float32_agrees_with_float64():
     wanted, found = render(exact, **options)[0], render(single, **options)[0]
     assert found.dtype == torch.float32
     assert float((found - wanted).abs().max()) < 1.2e-4 * float(wanted.abs().max())
+
+
+def test_absgrad_of_an_empty_view_is_zero():
+    tensors = gsplat_witness.scene(count=3)
+    tensors["means"] = torch.tensor([[0.0, 0.0, -5.0]], dtype=torch.float64).repeat(3, 1).requires_grad_()
+    images, _, meta = render(tensors, sh_degree=0, absgrad=True, packed=False)
+    images.sum().backward()
+    assert torch.equal(meta["means2d"].absgrad, torch.zeros(2, 3, 2, dtype=torch.float64))
+
+
+def test_absgrad_adds_up_as_grad_does():
+    images, _, meta = render(gsplat_witness.scene(), sh_degree=0, absgrad=True)
+    meta["means2d"].retain_grad()
+    found = []
+    for _ in range(2):
+        images.square().sum().backward(retain_graph=True)
+        found.append((meta["means2d"].grad.clone(), meta["means2d"].absgrad.clone()))
+    for once, twice in zip(*found, strict=True):
+        assert float(once.abs().max()) > 0
+        assert_close(twice, 2 * once)
+
+
+def test_no_reference_keeps_an_image_alive():
+    """The hook of absgrad is part of the graph; a circle through it would hold every image until the collector runs."""
+    gc.disable()
+    try:
+        images, alphas, meta = render(gsplat_witness.scene(), sh_degree=0, absgrad=True)
+        meta["means2d"].retain_grad()
+        images.sum().backward()
+        watched = [weakref.ref(images), weakref.ref(alphas), weakref.ref(meta["means2d"])]
+        del images, alphas, meta
+        assert [ref() is None for ref in watched] == [True] * 3
+    finally:
+        gc.enable()
+
+
+def test_the_same_bits_with_any_number_of_threads():
+    tensors = {name: t.detach() for name, t in gsplat_witness.scene(count=3000, dtype=torch.float32).items()}
+    found, before = [], torch.get_num_threads()
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            found.append(render(tensors, sh_degree=3, render_mode="RGB+ED")[:2])
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
