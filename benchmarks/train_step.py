@@ -5,8 +5,7 @@
 CAPTURE is anything that `gsplat-edu train` accepts (default: snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data, or else
 a procedural capture). Gaussians start at its points, as in the recipe. One iteration: render at full size, 0.8 L1
 + 0.2 (1 - SSIM) against the uint8 photo, backward, Adam. Medians over 20 views: first with stored gradients, so that
-every stage has its own time, then with Adam in the backward pass, as the trainer does it, and last with stored
-gradients and that of the camera.
+every stage has its own time, then with Adam in the backward pass, as the trainer does it.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import photo_loss
 from gsplat_edu.render.api import render
-from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.initialize import from_points
@@ -38,12 +36,11 @@ WARM_UP = 3
 
 
 def measure(
-    scene: Gaussians, views: Sequence[View], rounds: int = 20, fused: bool = False, posed: bool = False
+    scene: Gaussians, views: Sequence[View], rounds: int = 20, fused: bool = False
 ) -> dict[str, float]:
     """Time iterations at some of the views; return the median milliseconds of every stage, and the pairs.
 
-    The scene is not changed. If `fused`, Adam is part of project_backward, and "Adam" is what remains outside. If
-    `posed`, the backward pass includes the camera's gradient.
+    The scene is not changed. If `fused`, Adam is part of project_backward, and "Adam" is what remains outside.
     """
     config, gaussians = TrainConfig(), scene.trainable()
     optimizer = Adam(gaussians.tensors(), gaussian_groups(config, 1.0) | {"means": ParameterGroup(0.0)})
@@ -54,11 +51,8 @@ def measure(
     for k in range(rounds + WARM_UP):
         view = views[k * len(views) // (rounds + WARM_UP)]
         photo = view.read()
-        camera = CameraTensors.of(view.camera)
-        for tensor in camera.tensors():
-            tensor.requires_grad_()
         t0 = time.perf_counter()
-        output = render(gaussians, camera if posed else view.camera, settings=settings, backend="cpu")
+        output = render(gaussians, view.camera, settings=settings, backend="cpu")
         frame, t1 = output.image.grad_fn.frame, time.perf_counter()
         in_backward = output.defer() if fused else None
         loss = photo_loss(output.image, torch.from_numpy(photo.image), photo.mask, config.ssim_weight)
@@ -95,12 +89,8 @@ def main() -> None:
     scene = from_points(dataset.points, dataset.colors, TrainConfig())
     with reused_buffers():  # as the trainer does
         views, rounds = (*dataset.train, *dataset.test), 1 if arguments.smoke else 20
-        medians = measure(scene, views, rounds)
-        fused = measure(scene, views, rounds, fused=True)
-        posed = measure(scene, views, rounds, posed=True)
-    hardware.report(
-        {"capture": folder.name, "medians": medians, "fused": fused, "camera": posed}, arguments.out
-    )
+        medians, fused = (measure(scene, views, rounds, way) for way in (False, True))
+    hardware.report({"capture": folder.name, "medians": medians, "fused": fused}, arguments.out)
     raster = medians["composite"] + medians["composite_backward"]
     for name, value in medians.items():
         print(
@@ -109,10 +99,6 @@ def main() -> None:
         )
     for name in ("project_backward", "iteration"):
         print(f"{name + ', fused':26} {fused[name]:6.2f} ms")
-    for name in ("project_backward", "iteration"):
-        print(
-            f"{name + ', camera':26} {posed[name]:6.2f} ms, {posed[name] / medians[name]:.3f} of that without"
-        )
     print(f"outside composite and composite_backward: {100 * (1 - raster / medians['iteration']):.1f} %")
 
 

@@ -16,8 +16,13 @@ struct TileState {
 };
 
 template <class T>
-struct TileState<T, WITH_ALL> : TileState<T, WITH_DEPTH> {
-    Plane<T> median, features[MOST_CHANNELS];
+struct TileState<T, WITH_FEATURES> : TileState<T, WITH_DEPTH> {
+    FeaturePlanes<T> features;
+};
+
+template <class T>
+struct TileState<T, WITH_ALL> : TileState<T, WITH_FEATURES> {
+    Plane<T> median;
 };
 
 // Draws one splat; `features` are its own.
@@ -29,6 +34,7 @@ GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const T
     Falloff<T, GENTLY> falloff{steps, args.settings};
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
+    const int32_t channels = args.out.channels;
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
         const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
         if (first > last) continue;
@@ -37,7 +43,7 @@ GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const T
             const int at = row * TILE + column;
             V key;
             V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at);
-            if constexpr (MODE == WITH_ALL)
+            if constexpr (MODE >= WITH_FEATURES)
                 if (args.settings.pixel_stop) end_pixels<T>(t, alpha);
             const V w = t * alpha;
             store(tile.red.values + at, load<V>(tile.red.values + at) + w * red);
@@ -45,13 +51,14 @@ GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const T
             store(tile.blue.values + at, load<V>(tile.blue.values + at) + w * blue);
             if (MODE != COLORS) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
             store(tile.transmittance.values + at, t - w);
+            if constexpr (MODE >= WITH_FEATURES) {
+                T *to = tile.features.at(at);
+#pragma GCC unroll 4
+                for (int32_t k = 0; k < channels; ++k, to += Vector<T>::LANES) store(to, load<V>(to) + w * splat(features[k]));
+            }
             if constexpr (MODE == WITH_ALL) {
                 const V half = splat(T(0.5)), median = load<V>(tile.median.values + at);
                 store(tile.median.values + at, (t >= half) & (t - w < half) ? splat(s.depth) : median);
-                for (int32_t k = 0; k < args.out.channels; ++k) {
-                    T *to = tile.features[k].values + at;
-                    store(to, load<V>(to) + w * splat(features[k]));
-                }
             }
             falloff.step(row - first);
         }
@@ -71,24 +78,26 @@ GSPLAT_INLINE bool lets_light_through(const Plane<T> &transmittance, int &where)
 
 // Writes the pixels of a tile, over the background.
 template <class T, int MODE>
-GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box, const TileState<T, MODE> &tile) {
+GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box, TileState<T, MODE> &tile) {
     using Q = typename Four<T>::V;
     const Images<T> &out = args.out;
     const double *bg = args.settings.background;
     for_each_four<T>(box, args.camera.W, [&](int from, int64_t pixel, int count) {
         Q t = load<Q>(tile.transmittance.values + from);
-        if (MODE == WITH_ALL) t = t < Q{} ? -t : t;
+        if (MODE >= WITH_FEATURES) t = t < Q{} ? -t : t;
         const Q rgb[3] = {load<Q>(tile.red.values + from) + t * T(bg[0]), load<Q>(tile.green.values + from) + t * T(bg[1]),
                           load<Q>(tile.blue.values + from) + t * T(bg[2])};
         const size_t bytes = size_t(count) * sizeof(T);
         store_colors<T>(out.image + 3 * pixel, count, rgb);
         memcpy(out.transmittance + pixel, &t, bytes);
         if (MODE != COLORS && out.depth) memcpy(out.depth + pixel, tile.depth.values + from, bytes);
-        if constexpr (MODE == WITH_ALL) {
-            if (out.median) memcpy(out.median + pixel, tile.median.values + from, bytes);
-            for (int i = 0; i < count; ++i)
-                for (int32_t k = 0; k < out.channels; ++k) out.features[(pixel + i) * out.channels + k] = tile.features[k].values[from + i];
-        }
+        if constexpr (MODE == WITH_ALL) memcpy(out.median + pixel, tile.median.values + from, bytes);
+        if constexpr (MODE >= WITH_FEATURES)
+            for (int32_t k = 0; k < out.channels; k += 4) {
+                Q m[4] = {};
+                for (int j = 0; j < vmin(out.channels - k, 4); ++j) m[j] = tile.features.load_four(from, k + j);
+                store_channels(out.features + pixel * out.channels, out.channels, k, count, m);
+            }
     });
 }
 
@@ -97,7 +106,8 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     const TileBox box = tile_box(args.grid, args.camera, index);
     TileState<T, MODE> tile;
     memset(&tile, 0, sizeof(TileState<T, COLORS>));
-    if constexpr (MODE == WITH_ALL) memset(&tile.median, 0, sizeof(Plane<T>) * size_t(1 + args.out.channels));  // and the first features
+    if constexpr (MODE >= WITH_FEATURES) tile.features.clear(args.out.channels);
+    if constexpr (MODE == WITH_ALL) memset(&tile.median, 0, sizeof tile.median);
     for (int y = 0; y < box.height; ++y)
         for (int x = 0; x < box.width; ++x) tile.transmittance.values[y * TILE + x] = 1;
 
@@ -113,7 +123,7 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
         }
         if (rows.top[i] > rows.bottom[i]) continue;
         const uint32_t id = args.pairs[k].gaussian;
-        const T *features = MODE == WITH_ALL ? args.features + int64_t(args.out.channels) * id : nullptr;
+        const T *features = MODE >= WITH_FEATURES ? args.features + int64_t(args.out.channels) * id : nullptr;
         const Splat<T> &s = args.splats[id];
         rows.gentle[i] ? draw<T, MODE, true>(args, s, features, box, rows, i, tile)
                        : draw<T, MODE, false>(args, s, features, box, rows, i, tile);
@@ -128,7 +138,8 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
 
 template <class T>
 void composite(const CompositeArgs<T> &args, int32_t tile) {
-    if (args.out.median || args.out.features || args.settings.pixel_stop) return composite_tile<T, WITH_ALL>(args, tile);
+    if (args.out.median) return composite_tile<T, WITH_ALL>(args, tile);
+    if (args.out.features || args.settings.pixel_stop) return composite_tile<T, WITH_FEATURES>(args, tile);
     args.out.depth ? composite_tile<T, WITH_DEPTH>(args, tile) : composite_tile<T, COLORS>(args, tile);
 }
 

@@ -19,9 +19,13 @@ struct TileGradient {
 };
 
 template <class T>
-struct TileGradient<T, WITH_ALL> : TileGradient<T, WITH_DEPTH> {
-    int32_t channels;  // 0 if features have no gradient
-    Plane<T> errors, features[MOST_CHANNELS];
+struct TileGradient<T, WITH_FEATURES> : TileGradient<T, WITH_DEPTH> {
+    FeaturePlanes<T> features;
+};
+
+template <class T>
+struct TileGradient<T, WITH_ALL> : TileGradient<T, WITH_FEATURES> {
+    Plane<T> errors;
 };
 
 // A pair, and where its sums go.
@@ -31,59 +35,70 @@ struct PairSlots {
     T *slot;
     const T *features;  // of the Gaussian
     T *feature_slot, *statistic_slot;
+    int32_t channels;   // 0 if features have no gradient
 };
 
-// The sums of one splat over the tile that only WITH_ALL has.
+// The sums over a tile of one splat's weights times the gradients of the features.
 template <class T, int MODE>
-struct MoreSums {};
+struct FeatureSums {};
 
 template <class T>
-struct MoreSums<T, WITH_ALL> {
+struct FeatureSums<T, WITH_FEATURES> {
     using V = typename Vector<T>::V;
-    V features[MOST_CHANNELS], statistics[STATISTICS] = {};
+    V sums[MOST_CHANNELS];
 
-    GSPLAT_METHOD explicit MoreSums(int32_t channels) {
-        for (int32_t k = 0; k < channels; ++k) features[k] = V{};
+    GSPLAT_METHOD void clear(int32_t channels) {
+        for (int32_t k = 0; k < vmin(channels + 7, MOST_CHANNELS); ++k) sums[k] = V{};  // `write` adds eight at a time
     }
 
-    // Adds a row with the weights w; returns the sum of the features times their gradients.
-    GSPLAT_METHOD V add_features(const TileGradient<T, WITH_ALL> &tile, const T *own, int at, V w) {
-        V dot = V{};
-        for (int32_t k = 0; k < tile.channels; ++k) {
-            const V gradient = load<V>(tile.features[k].values + at);
-            dot += gradient * splat(own[k]);
-            features[k] += w * gradient;
+    // Adds a vector of pixels with the weights w; returns the sum of the features times their gradients, of which four parts are
+    // added side by side because each addition waits for the one before.
+    GSPLAT_METHOD V add(const T *gradients, const T *own, int32_t channels, V w) {
+        V parts[4] = {};
+        int32_t k = 0;
+        for (; k + 4 <= channels; k += 4)
+            for (int j = 0; j < 4; ++j) parts[j] += one(gradients, own, k + j, w);
+        for (; k < channels; ++k) parts[0] += one(gradients, own, k, w);
+        return (parts[0] + parts[1]) + (parts[2] + parts[3]);
+    }
+
+    GSPLAT_METHOD V one(const T *gradients, const T *own, int32_t k, V w) {
+        const V g = load<V>(gradients + k * Vector<T>::LANES);
+        sums[k] += w * g;
+        return g * splat(own[k]);
+    }
+
+    GSPLAT_METHOD void write(int32_t channels, T *slot) const {
+        for (int32_t k = 0; k < channels; k += 8) {
+            T eight[8];
+            sum8(sums + k, eight);
+            memcpy(slot + k, eight, size_t(vmin(channels - k, 8)) * sizeof(T));
         }
-        return dot;
     }
-
-    // p = log2_o - s² - t², so that dL/du = 2 ln 2 sx (h s) and dL/dv = 2 ln 2 (sy (h s) + ty (h t)); the factors follow in `write`.
-    GSPLAT_METHOD void add_statistics(const TileGradient<T, WITH_ALL> &tile, const Splat<T> &of, int at, V w, V h, V across, V t) {
-        statistics[ABS_U] += absolute(h * across), statistics[ABS_V] += absolute(h * (splat(of.sy) * across + splat(of.ty) * t));
-        statistics[WEIGHT] += w, statistics[PIXELS] += w > V{} ? splat(T(1)) : V{};
-        statistics[WEIGHTED_ERROR] += w * load<V>(tile.errors.values + at);
-        statistics[WEIGHT_MAX] = w > statistics[WEIGHT_MAX] ? w : statistics[WEIGHT_MAX];
-    }
-
-    GSPLAT_METHOD void write(const PairSlots<T> &pair, int32_t channels) const {
-        for (int32_t k = 0; k < channels; ++k) pair.feature_slot[k] = sum(features[k]);
-        if (!pair.statistic_slot) return;
-        for (int k = 0; k < WEIGHT_MAX; ++k) pair.statistic_slot[k] = sum(statistics[k]);
-        const T two_ln2 = T(2 * 0.69314718055994531);
-        pair.statistic_slot[ABS_U] *= two_ln2 * absolute(pair.s.sx), pair.statistic_slot[ABS_V] *= two_ln2;
-        T most = 0;
-        for (int l = 0; l < Vector<T>::LANES; ++l) most = vmax(most, statistics[WEIGHT_MAX][l]);
-        pair.statistic_slot[WEIGHT_MAX] = most;
-    }
-
-    static GSPLAT_METHOD V absolute(V v) { return v < V{} ? -v : v; }
-    static GSPLAT_METHOD T absolute(T v) { return v < 0 ? -v : v; }
 };
+
+template <class T>
+struct FeatureSums<T, WITH_ALL> : FeatureSums<T, WITH_FEATURES> {};
+
+template <class V>
+GSPLAT_INLINE V absolute(V v) {
+    return v < V{} ? -v : v;
+}
+
+// Writes the sums of one splat's statistics; p = log2_o - s² - t², so that dL/du = 2 ln 2 sx (h s), dL/dv = 2 ln 2 (sy (h s) + ty (h t)).
+template <class T>
+GSPLAT_INLINE void write_statistics(const Splat<T> &s, const typename Vector<T>::V *sums, T *slot) {
+    const T two_ln2 = T(2 * 0.69314718055994531);
+    for (int k = 0; k < WEIGHT_MAX; ++k) slot[k] = sum(sums[k]);
+    slot[ABS_U] *= two_ln2 * (s.sx < 0 ? -s.sx : s.sx), slot[ABS_V] *= two_ln2;
+    slot[WEIGHT_MAX] = 0;
+    for (int l = 0; l < Vector<T>::LANES; ++l) slot[WEIGHT_MAX] = vmax(slot[WEIGHT_MAX], T(sums[WEIGHT_MAX][l]));
+}
 
 // Writes one splat's sums over the tile to its slots.
 template <class T, int MODE, bool GENTLY>
 GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlots<T> &pair, const TileBox &box, const Rows<T> &rows,
-                                  uint32_t i, TileGradient<T, MODE> &tile, MoreSums<T, MODE> &more) {
+                                  uint32_t i, TileGradient<T, MODE> &tile) {
     using V = typename Vector<T>::V;
     const Splat<T> &s = pair.s;
     FalloffRows<T> steps;
@@ -91,6 +106,10 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     V sums[8] = {}, hyy = V{}, wz = V{};  // in the order of a slot
+    V statistics[STATISTICS] = {};
+    FeatureSums<T, MODE> features;
+    const int32_t channels = pair.channels;
+    if constexpr (MODE >= WITH_FEATURES) features.clear(channels);
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
         const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
         if (first > last) continue;
@@ -103,7 +122,7 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
             const int at = row * TILE + column;
             V key;
             V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at);
-            if constexpr (MODE == WITH_ALL)
+            if constexpr (MODE >= WITH_FEATURES)
                 if (forward.settings.pixel_stop) end_pixels<T>(t, alpha);
             const V r = load<V>(tile.red.values + at), g = load<V>(tile.green.values + at), b = load<V>(tile.blue.values + at);
             V cg = r * red + g * green + b * blue;
@@ -113,7 +132,7 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
                 cg += z * splat(s.depth);
                 wz += w * z;
             }
-            if constexpr (MODE == WITH_ALL) cg += more.add_features(tile, pair.features, at, w);
+            if constexpr (MODE >= WITH_FEATURES) cg += features.add(tile.features.at(at), pair.features, channels, w);
             const V rest = load<V>(tile.rest.values + at) - w * cg;
             const V h = falloff.where_open(key, alpha * (t * cg - rest * reciprocal(splat(T(1)) - alpha)));
             store(tile.rest.values + at, rest);
@@ -121,9 +140,13 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
             wr += w * r, wg += w * g, wb += w * b;
             const V hdy = h * dy;
             sum0 += h, sum1 += hdy, sum2 += hdy * dy;
-            if constexpr (MODE == WITH_ALL)
-                if (pair.statistic_slot)
-                    more.add_statistics(tile, s, at, w, h, falloff.across + splat(s.sy) * dy, splat(s.t0) + splat(s.ty) * dy);
+            if constexpr (MODE == WITH_ALL) {
+                const V across = falloff.across + splat(s.sy) * dy, along = splat(s.t0) + splat(s.ty) * dy;
+                statistics[ABS_U] += absolute(h * across), statistics[ABS_V] += absolute(h * (splat(s.sy) * across + splat(s.ty) * along));
+                statistics[WEIGHT] += w, statistics[PIXELS] += w > V{} ? splat(T(1)) : V{};
+                statistics[WEIGHTED_ERROR] += w * load<V>(tile.errors.values + at);
+                statistics[WEIGHT_MAX] = w > statistics[WEIGHT_MAX] ? w : statistics[WEIGHT_MAX];
+            }
             falloff.step(row - first);
         }
         const V hdx = sum0 * dx;
@@ -133,6 +156,8 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
     }
     sum8(sums, pair.slot);
     pair.slot[HYY] = sum(hyy), pair.slot[DEPTH] = MODE != COLORS ? sum(wz) : T(0);
+    if constexpr (MODE >= WITH_FEATURES) features.write(channels, pair.feature_slot);
+    if constexpr (MODE == WITH_ALL) write_statistics(s, statistics, pair.statistic_slot);
 }
 
 // Loads the inputs of a tile's pixels; returns the sum of g T_final through `background`.
@@ -142,10 +167,8 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
     const Images<T> &out = args.forward.out;
     const ImageGrads<T> &in = args.in;
     memset(&tile, 0, sizeof(TileGradient<T, COLORS>));
-    if constexpr (MODE == WITH_ALL) {
-        tile.channels = in.features ? out.channels : 0;
-        memset(&tile.errors, 0, sizeof(Plane<T>) * size_t(1 + tile.channels));  // and the first features
-    }
+    if constexpr (MODE >= WITH_FEATURES) tile.features.clear(in.features ? out.channels : 0);
+    if constexpr (MODE == WITH_ALL) memset(&tile.errors, 0, sizeof tile.errors);
     Q sums[3] = {};
     for_each_four<T>(box, args.forward.camera.W, [&](int to, int64_t pixel, int count) {
         Q g[3], drawn[3];
@@ -159,15 +182,18 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
             store(tile.depth.values + to, gz);
             rest += gz * load_some(out.depth + pixel, count);
         }
-        if constexpr (MODE == WITH_ALL) {
+        if constexpr (MODE == WITH_ALL)
             if (args.errors) store(tile.errors.values + to, load_some(args.errors + pixel, count));
-            for (int i = 0; i < count; ++i)
-                for (int32_t k = 0; k < tile.channels; ++k) {
-                    const int64_t at = (pixel + i) * tile.channels + k;
-                    tile.features[k].values[to + i] = in.features[at];
-                    rest[i] += in.features[at] * out.features[at];
+        if constexpr (MODE >= WITH_FEATURES)
+            for (int32_t k = 0, channels = tile.features.channels; k < channels; k += 4) {
+                Q g4[4], drawn4[4];
+                load_channels(in.features + pixel * channels, channels, k, count, g4);
+                load_channels(out.features + pixel * channels, channels, k, count, drawn4);
+                for (int j = 0; j < vmin(channels - k, 4); ++j) {
+                    tile.features.store_four(to, k + j, g4[j]);
+                    rest += g4[j] * drawn4[j];
                 }
-        }
+            }
         store(tile.rest.values + to, rest);
         store(tile.red.values + to, g[0]), store(tile.green.values + to, g[1]), store(tile.blue.values + to, g[2]);
         for (int i = 0; i < count; ++i) tile.transmittance.values[to + i] = 1;
@@ -179,16 +205,18 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
 template <class T>
 GSPLAT_INLINE PairSlots<T> slots_of(const CompositeBackwardArgs<T> &args, const Pair &pair) {
     const int64_t slot = pair.slot, channels = args.forward.out.channels;
-    return {args.forward.splats[pair.gaussian], args.slots + SLOT * slot,
+    return {args.forward.splats[pair.gaussian],
+            args.slots + SLOT * slot,
             args.forward.features ? args.forward.features + channels * pair.gaussian : nullptr,
             args.feature_slots ? args.feature_slots + channels * slot : nullptr,
-            args.statistic_slots ? args.statistic_slots + STATISTICS * slot : nullptr};
+            args.statistic_slots ? args.statistic_slots + STATISTICS * slot : nullptr,
+            args.feature_slots ? int32_t(channels) : 0};
 }
 
 template <class T>
-GSPLAT_INLINE void write_zeros(const PairSlots<T> &to, int32_t channels) {
+GSPLAT_INLINE void write_zeros(const PairSlots<T> &to) {
     for (int j = 0; j < SLOT; ++j) to.slot[j] = 0;
-    if (to.feature_slot) memset(to.feature_slot, 0, size_t(channels) * sizeof(T));
+    if (to.feature_slot) memset(to.feature_slot, 0, size_t(to.channels) * sizeof(T));
     if (to.statistic_slot) memset(to.statistic_slot, 0, STATISTICS * sizeof(T));
 }
 
@@ -210,25 +238,18 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
             rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
         }
         if (k >= stop || rows.top[i] > rows.bottom[i]) {
-            write_zeros(pair, forward.out.channels);
+            write_zeros(pair);
             continue;
         }
-        if constexpr (MODE == WITH_ALL) {
-            MoreSums<T, MODE> more(tile.channels);
-            rows.gentle[i] ? splat_backward<T, MODE, true>(forward, pair, box, rows, i, tile, more)
-                           : splat_backward<T, MODE, false>(forward, pair, box, rows, i, tile, more);
-            more.write(pair, tile.channels);
-        } else {
-            MoreSums<T, MODE> none;
-            rows.gentle[i] ? splat_backward<T, MODE, true>(forward, pair, box, rows, i, tile, none)
-                           : splat_backward<T, MODE, false>(forward, pair, box, rows, i, tile, none);
-        }
+        rows.gentle[i] ? splat_backward<T, MODE, true>(forward, pair, box, rows, i, tile)
+                       : splat_backward<T, MODE, false>(forward, pair, box, rows, i, tile);
     }
 }
 
 template <class T>
 void composite_backward(const CompositeBackwardArgs<T> &args, int32_t tile) {
-    if (args.feature_slots || args.statistic_slots || args.forward.settings.pixel_stop) return tile_backward<T, WITH_ALL>(args, tile);
+    if (args.statistic_slots) return tile_backward<T, WITH_ALL>(args, tile);
+    if (args.feature_slots || args.forward.settings.pixel_stop) return tile_backward<T, WITH_FEATURES>(args, tile);
     args.in.depth ? tile_backward<T, WITH_DEPTH>(args, tile) : tile_backward<T, COLORS>(args, tile);
 }
 

@@ -6,8 +6,8 @@
 namespace gsplat {
 namespace GSPLAT_ISA {
 
-// What is composited: colours; depth as well; or also features, median depth and statistics, as far as they are asked for.
-enum Mode { COLORS, WITH_DEPTH, WITH_ALL };
+// What is composited: colours; depth as well; features as well; or also median depth or statistics. The last three do what is asked for.
+enum Mode { COLORS, WITH_DEPTH, WITH_FEATURES, WITH_ALL };
 
 // With Settings::pixel_stop a pixel ends before the first splat that would take its transmittance to T_STOP or below, and keeps the
 // transmittance that it has. The planes mark a pixel that has ended by a negative transmittance. Sets alpha to 0 where the pixel has
@@ -76,6 +76,58 @@ GSPLAT_INLINE typename Four<T>::V load_some(const T *from, int count) {
     Q v{};
     for (int i = 0; i < count; ++i) v[i] = from[i];
     return v;
+}
+
+// Features of a tile's pixels: all channels of a vector of pixels are neighbours, because a splat adds to all of them at once.
+template <class T>
+struct FeaturePlanes {
+    using V = typename Vector<T>::V;
+    using Q = typename Four<T>::V;
+    static constexpr int LANES = Vector<T>::LANES;
+    int32_t channels;
+    alignas(64) T values[TILE * TILE * MOST_CHANNELS];
+
+    GSPLAT_METHOD void clear(int32_t count) {
+        channels = count;
+        memset(values, 0, size_t(TILE * TILE) * size_t(count) * sizeof(T));
+    }
+
+    // The vectors of all channels at a place in a plane, where a vector begins.
+    GSPLAT_METHOD T *at(int place) { return values + place * channels; }
+
+    // One channel of four neighbouring pixels.
+    GSPLAT_METHOD T *four(int place, int32_t k) { return values + place / LANES * LANES * channels + k * LANES + place % LANES; }
+    GSPLAT_METHOD Q load_four(int place, int32_t k) {
+        if (LANES >= 4) return load<Q>(four(place, k));
+        return Q{*four(place, k), *four(place + 1, k), *four(place + 2, k), *four(place + 3, k)};
+    }
+    GSPLAT_METHOD void store_four(int place, int32_t k, Q q) {
+        if (LANES >= 4) return store(four(place, k), q);
+        for (int i = 0; i < 4; ++i) *four(place + i, k) = q[i];
+    }
+};
+
+// Turns rows into columns: four pixels of four channels into four channels of four pixels, and back.
+template <class Q>
+GSPLAT_INLINE void transpose(Q *m) {
+    const Q a = __builtin_shufflevector(m[0], m[1], 0, 4, 1, 5), b = __builtin_shufflevector(m[0], m[1], 2, 6, 3, 7);
+    const Q c = __builtin_shufflevector(m[2], m[3], 0, 4, 1, 5), d = __builtin_shufflevector(m[2], m[3], 2, 6, 3, 7);
+    m[0] = __builtin_shufflevector(a, c, 0, 1, 4, 5), m[1] = __builtin_shufflevector(a, c, 2, 3, 6, 7);
+    m[2] = __builtin_shufflevector(b, d, 0, 1, 4, 5), m[3] = __builtin_shufflevector(b, d, 2, 3, 6, 7);
+}
+
+// Reads channels k to k + 3 of `count` pixels of an interleaved image, at most four; others are 0.
+template <class T>
+GSPLAT_INLINE void load_channels(const T *from, int32_t channels, int32_t k, int count, typename Four<T>::V *m) {
+    for (int i = 0; i < 4; ++i) m[i] = i < count ? load_some(from + i * channels + k, vmin(channels - k, 4)) : typename Four<T>::V{};
+    transpose(m);
+}
+
+// Writes them.
+template <class T>
+GSPLAT_INLINE void store_channels(T *to, int32_t channels, int32_t k, int count, typename Four<T>::V *m) {
+    transpose(m);
+    for (int i = 0; i < count; ++i) memcpy(to + i * channels + k, m + i, size_t(vmin(channels - k, 4)) * sizeof(T));
 }
 
 // Calls visit(index in a plane, index in the image, count) for every run of at most four pixels of the tile.

@@ -45,6 +45,8 @@ BUILD_ON = {
     "docs/decisions/index.md": "Decision records",
     "docs/PRECISION.md": "Precision",
     "docs/KERNELS.md": "Kernels",
+    "conformance/README.md": "Conformance kit",
+    "conformance/SPECIFICATION.md": "Specification of a renderer",
     "CONTRIBUTING.md": "Contributing",
     "CHANGELOG.md": "Changelog",
 }

@@ -153,14 +153,14 @@ def test_a_module_named_in_another_folder_counts_as_missing():
     assert undescribed(tree, map(Path, others)) == others
 
 
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("conformance/*.md")])
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_that_documents_name_exist(path):
     text = path.read_text()
     linked = re.findall(r"\]\(([^)#]+)\)", text)
-    named = re.findall(r"`((?:src|docs|tools|tests|benchmarks|notebooks|train)/[\w./-]+)`", text)
+    named = re.findall(r"`((?:src|docs|tools|tests|benchmarks|notebooks|train|conformance)/[\w./-]+)`", text)
     for target in linked:
         assert (path.parent / target).exists(), target
     for target in named:

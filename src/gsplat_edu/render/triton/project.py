@@ -164,20 +164,36 @@ def _sums(slots, slot_begin, pairs_of, i, mask, BLOCK: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def _shape_gradient(a, b, c, det0, det, a0, c0, h, hxx, hxy, hyy, ANTIALIASED: tl.constexpr):
+def _shape_gradient(a, b, c, det, h, hxx, hxy, hyy, ANTIALIASED: tl.constexpr):
     """Return Sigma2d's gradient from the moments of h, with antialiasing: -K G K, K = Sigma2d^-1, G = dL/dK."""
     A, B, C = c / det, -b / det, a / det
     gA, gB, gC = -hxx / 2, -hxy / 2, -hyy / 2
     m00, m01, m10, m11 = gA * A + gB * B, gA * B + gB * C, gB * A + gC * B, gB * B + gC * C
     da, db, dc = -(A * m00 + B * m10), -2 * (A * m01 + B * m11), -(B * m01 + C * m11)
-    if ANTIALIASED:
-        half = h / 2
-        floored = det0 <= DET_FLOOR
-        over = tl.where(floored, 0.0, half / tl.where(floored, 1.0, det0))
-        da += over * c0 - half * A
-        db += -2 * over * b - 2 * half * B
-        dc += over * a0 - half * C
+    if ANTIALIASED:  # of the root of det(Sigma2d); `_area_gradient` has that of the root of det0
+        da, db, dc = da - h / 2 * A, db - h * B, dc - h / 2 * C
     return da, db, dc
+
+
+@triton.jit
+@no_type_check
+def _area_gradient(r, q, det0, h, f, g):
+    """Add h/2 times the gradient of log det0 to those of r and q: det0 = |n|², n = r x q, so h/det0 (q x n, n x r).
+
+    Through the entries of Sigma2d, where det0 is a0 c0 - b², the gradients of needles would lose their digits.
+    """
+    n = (r[1] * q[2] - r[2] * q[1], r[2] * q[0] - r[0] * q[2], r[0] * q[1] - r[1] * q[0])
+    floored = det0 <= DET_FLOOR
+    over = tl.where(floored, 0.0, h / tl.where(floored, 1.0, det0))
+    return (
+        f[0] + over * (q[1] * n[2] - q[2] * n[1]),
+        f[1] + over * (q[2] * n[0] - q[0] * n[2]),
+        f[2] + over * (q[0] * n[1] - q[1] * n[0]),
+    ), (
+        g[0] + over * (n[1] * r[2] - n[2] * r[1]),
+        g[1] + over * (n[2] * r[0] - n[0] * r[2]),
+        g[2] + over * (n[0] * r[1] - n[1] * r[0]),
+    )
 
 
 @triton.jit
@@ -292,18 +308,20 @@ def project_backward_kernel(
     gu, gv = A * sums[5] + B * sums[6], B * sums[5] + C * sums[6]
     nu, nv = gu * tl.load(camera + SIZE_AT) / 2, gv * tl.load(camera + SIZE_AT + 1) / 2
     _store_if(norms, 1, 0, i, tl.sqrt(nu * nu + nv * nv), touched, mask)
-    da, db, dc = _shape_gradient(a, b, c, det0, det, a0, c0, sums[4], sums[7], sums[8], sums[9], ANTIALIASED)
+    da, db, dc = _shape_gradient(a, b, c, det, sums[4], sums[7], sums[8], sums[9], ANTIALIASED)
 
     # From Sigma2d to r and q, the rows of J W M; then to M's rotation and scales, and to J W.
-    f0, f1, f2 = 2 * da * r[0] + db * q[0], 2 * da * r[1] + db * q[1], 2 * da * r[2] + db * q[2]
-    g0, g1, g2 = 2 * dc * q[0] + db * r[0], 2 * dc * q[1] + db * r[1], 2 * dc * q[2] + db * r[2]
+    f = (2 * da * r[0] + db * q[0], 2 * da * r[1] + db * q[1], 2 * da * r[2] + db * q[2])
+    g = (2 * dc * q[0] + db * r[0], 2 * dc * q[1] + db * r[1], 2 * dc * q[2] + db * r[2])
+    if ANTIALIASED:
+        f, g = _area_gradient(r, q, det0, sums[4], f, g)
     _store_shape(
         grad_quats, grad_log_scales, (qw, qx, qy, qz, length), R, (s0, s1, s2), (t0, t1, t2), (p0, p1, p2),
-        (f0, f1, f2), (g0, g1, g2), i, touched, mask,
+        f, g, i, touched, mask,
     )  # fmt: skip
-    d = _along_rows(R, s0 * f0, s1 * f1, s2 * f2)
-    e = _along_rows(R, s0 * g0, s1 * g1, s2 * g2)
-    g = _mean_gradient(camera, x, y, z, ratio_x, ratio_y, (t0, t1, t2), (p0, p1, p2), d, e, gu, gv, sums[3])
+    d = _along_rows(R, s0 * f[0], s1 * f[1], s2 * f[2])
+    e = _along_rows(R, s0 * g[0], s1 * g[1], s2 * g[2])
+    gm = _mean_gradient(camera, x, y, z, ratio_x, ratio_y, (t0, t1, t2), (p0, p1, p2), d, e, gu, gv, sums[3])
 
     distance = tl.sqrt(dot3(o0, o1, o2, o0, o1, o2))
     direction = (o0 / distance, o1 / distance, o2 / distance)
@@ -312,12 +330,12 @@ def project_backward_kernel(
         sh0, sh_rest, grad_sh0, grad_sh_rest, i, direction, colors, sums, mask, touched, DEGREE, REST
     )
     _store_means(
-        grad_means, camera, camera_sums, g, (w0, w1, w2), direction, distance, i, touched, mask, WITH_CAMERA
+        grad_means, camera, camera_sums, gm, (w0, w1, w2), direction, distance, i, touched, mask, WITH_CAMERA
     )
     if WITH_CAMERA:
         _camera_gradient(
             camera, camera_sums, (o0, o1, o2), (x, y, z), (ratio_x, ratio_y), (t0, t1, t2), (p0, p1, p2), d, e,
-            gu, gv, g, touched,
+            gu, gv, gm, touched,
         )  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+from native.conftest import isa as isa

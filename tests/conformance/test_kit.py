@@ -1,0 +1,236 @@
+"""The kit can fail: a renderer with one broken convention is caught by the case that names it, even in float32.
+
+The renderer is tests/simple_renderer.py, written from the specification and independent of the package; unbroken, it
+passes in float64.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+import run
+from simple_renderer import Conventions, SimpleRenderer
+
+OUTPUT_BREAKS = {
+    "pixel centres at halves": ("one_gaussian", {"pixel_offset": 0.5}),
+    "rows and columns exchanged": ("one_gaussian", {"axes_swapped": True}),
+    "no cut-off": ("one_gaussian", {"alpha_min": 0.0}),
+    "quaternions as (x, y, z, w)": ("quaternions", {"quaternion": (3, 0, 1, 2)}),
+    "quaternions not normalised": ("quaternions", {"normalised": False}),
+    "inverse rotations": ("quaternions", {"transposed": True}),
+    "harmonics without signs": ("each_harmonic", {"sh_signs": False}),
+    "degree 1 in the order x, y, z": ("each_harmonic", {"sh_order": (0, 3, 1, 2, *range(4, 16))}),
+    "no offset of colours": ("each_harmonic", {"sh_offset": 0.0}),
+    "directions to the camera": ("each_harmonic", {"toward_camera": True}),
+    "degree 3 despite the setting": ("sh_degree_1_of_3", {"sh_degree": 3}),
+    "negative colours": ("negative_colours", {"sh_floor": False}),
+    "colours clipped at 1": ("negative_colours", {"sh_ceiling": 1.0}),
+    "dilation of 0.25": ("smaller_than_a_pixel", {"dilation": 0.25}),
+    "no antialiasing": ("antialiased", {"compensates": False}),
+    "antialiasing without the root": ("antialiased", {"compensation_power": 1.0}),
+    "alpha clamped at 0.999": ("alpha_clamp", {"alpha_max": 0.999}),
+    "alpha not clamped": ("alpha_clamp", {"alpha_max": 1.0}),
+    "alpha clamped at 0.99 despite the setting": ("clamp_at_0.999", {"alpha_max": 0.99}),
+    "cut-off at 1/510": ("nearly_transparent", {"alpha_min": 1 / 510}),
+    "cut-off at 1/254": ("nearly_transparent", {"alpha_min": 1 / 254}),
+    "order of the input": ("random", {"order": "input"}),
+    "order by distance": ("random", {"order": "distance"}),
+    "no background": ("random", {"background": 0.0}),
+    "features over one": ("random", {"features_over": 1.0}),
+    "depth as distance": ("random", {"depth": "distance"}),
+    "depth divided by alpha": ("random", {"depth": "divided by alpha"}),
+    "median where T falls below 0.4": ("random", {"median_below": 0.4}),
+    "ties in reverse": ("ties_in_depth", {"ties": "last"}),
+    "dilation of 0.3 px, not px²": ("needles", {"dilation": 0.09}),
+    "ellipses cut at 3 standard deviations": ("alpha_clamp", {"largest_distance": 3.0}),
+    "Gaussians above 12 px dropped": ("larger_than_the_image", {"largest_deviation": 12.0}),
+    "means outside the image dropped": ("off_screen_centres", {"drops_means_outside": True}),
+    "no clamp of the Jacobian": ("off_screen_centres", {"clamps_jacobian": False}),
+    "clamp about the principal point": ("off_screen_centres", {"clamp_centre": "principal point"}),
+    "clamp of the Jacobian despite the setting": ("off_screen_unclamped", {"limit": 1.3}),
+    "z_near of 0.2 despite the setting": ("z_near", {"z_near": 0.2}),
+    "z_near included": ("z_near", {"near_included": True}),
+    "behind the camera drawn": ("nothing_in_view", {"z_near": -100.0}),
+    "stops before the last visible Gaussian": ("opaque_tiles_stop", {"stop": "before"}),
+    "stops at 0.001": ("opaque_tiles_stop", {"stop": "before", "stop_at": 1e-3}),
+    "at most 128 layers": ("hundreds_of_layers", {"most_layers": 128}),
+    "rows and columns exchanged, tall image": ("odd_size", {"axes_swapped": True}),
+    "pixel centre of the only pixel at a half": ("one_pixel", {"pixel_offset": 0.5}),
+    "empty scenes refused": ("no_gaussians", {"refuses_empty": True}),
+}
+"""What is broken: the case that has to catch it, and the change."""
+
+GRADIENT_BREAKS = {
+    "direction detached": ("gradient_smooth", {"direction_detached": True}),
+    "Jacobian detached": ("gradient_smooth", {"jacobian_detached": True}),
+    "length of quaternions detached": ("gradient_smooth", {"length_detached": True}),
+    "transmittance detached": ("gradient_smooth", {"transmittance_detached": True}),
+    "compensation detached": ("gradient_antialiased", {"compensation_detached": True}),
+    "gradient passes the clamp of the Jacobian": ("gradient_jacobian_clamp", {"jacobian_passes": True}),
+    "gradient passes the clamp of alpha": ("gradient_alpha_clamp", {"clamp_passes": True}),
+    "gradient passes the floor of colours": ("gradient_colour_floor", {"floor_passes": True}),
+    "gradient passes the cut-off": ("gradient_random", {"cut_passes": True}),
+}
+"""The same for breaks that leave every output as it is."""
+
+
+def checked(names, **changes):
+    renderer = SimpleRenderer(Conventions(**changes))
+    cases = run.load_cases(names)
+    return run.check(renderer.render, renderer.gradients, precision="float32", cases=cases)
+
+
+def test_a_renderer_written_from_the_specification_passes():
+    renderer = SimpleRenderer()
+    report = run.check(renderer.render, renderer.gradients)
+    assert report.passed, str(report)
+    assert not report.left_out
+    assert {row.case for row in report.rows} == {case.name for case in run.load_cases()}
+
+
+@pytest.mark.parametrize("broken", OUTPUT_BREAKS)
+def test_a_broken_convention_is_caught(broken):
+    name, changes = OUTPUT_BREAKS[broken]
+    report = checked([name], **changes)
+    assert report.failed_cases == (name,)
+    assert report.hints[name] in str(report)
+
+
+@pytest.mark.parametrize("broken", GRADIENT_BREAKS)
+def test_a_broken_gradient_is_caught_although_the_image_is_right(broken):
+    name, changes = GRADIENT_BREAKS[broken]
+    report = checked([name], **changes)
+    assert report.failed_cases == (name,)
+    assert all(row.what.startswith("d/d") for row in report.failures)
+
+
+WRONG_RESULTS = {
+    "gradient_32_features": lambda found: found | {"features": found["features"] * (np.arange(32) < 16)},
+    "gradient_sh_degree_1": lambda found: found | {"sh": found["sh"] + 1e-3},
+    "gradient_needles": lambda found: found | {"quats": found["quats"].astype(np.float16)},
+}
+"""Changes of a right gradient, for the cases that no convention breaks alone."""
+
+
+@pytest.mark.parametrize("name", WRONG_RESULTS)
+def test_a_wrong_gradient_is_caught(name):
+    renderer = SimpleRenderer()
+    change = lambda *given: WRONG_RESULTS[name](renderer.gradients(*given))  # noqa: E731
+    cases = run.load_cases([name])
+    assert run.check(renderer.render, renderer.gradients, cases=cases, precision="float32").passed
+    assert not run.check(renderer.render, change, cases=cases, precision="float32").passed
+
+
+def test_every_case_catches_something():
+    caught = {name for name, _ in (OUTPUT_BREAKS | GRADIENT_BREAKS).values()} | set(WRONG_RESULTS)
+    assert caught == {case.name for case in run.load_cases()}
+
+
+@pytest.mark.parametrize("name", [*run.OUTPUTS, *(f"gradient.{name}" for name in run.GRADIENTS)])
+def test_every_compared_array_can_fail(name):
+    """Off by twice its tolerance at the worst place, an array fails, and it alone."""
+    (case,) = run.load_cases(["gradient_smooth"])
+    renderer = SimpleRenderer()
+    prefix, _, array = name.rpartition(".")
+
+    def off(found):
+        return found | {array: found[array] + 2 * run.tolerance(case, name, "float32")}
+
+    render = renderer.render if prefix else (lambda *given: off(renderer.render(*given)))
+    gradients = (lambda *given: off(renderer.gradients(*given))) if prefix else renderer.gradients
+    report = run.check(render, gradients, precision="float32", cases=[case])
+    (row,) = report.failures
+    assert row.what == (f"d/d {array}" if prefix else array) and np.isfinite(row.error)
+    assert run.check(render, gradients, precision="float32", cases=[case], without=[name]).passed
+
+
+@pytest.mark.parametrize(
+    ("result", "says"),
+    [
+        (lambda truth: truth * np.nan, "has NaN or infinite values"),
+        (lambda truth: truth[:-1], "has shape (19, 24, 3), expected (20, 24, 3)"),
+        (lambda truth: None, "is missing"),
+    ],
+)
+def test_what_cannot_be_compared_fails_and_says_why(result, says):
+    cases = run.load_cases(["random"])
+    renderer = SimpleRenderer()
+
+    def render(*given):
+        found = renderer.render(*given)
+        return found | {"image": result(found["image"])}
+
+    (row,) = run.check(render, cases=cases).failures
+    assert row.what == "image" and row.note == says
+
+
+def test_a_renderer_that_raises_fails_that_case_only():
+    report = run.check(SimpleRenderer(Conventions(refuses_empty=True)).render)
+    assert report.failed_cases == ("no_gaussians",)
+    assert report.failures[0].note == "ValueError: no Gaussians"
+    assert report.left_out == ("all gradients",)
+
+
+def test_a_renderer_that_writes_into_its_inputs_cannot_change_the_case():
+    cases = run.load_cases(["random"])
+    before = cases[0].gaussians["means"].copy()
+
+    def render(gaussians, camera, settings):
+        found = SimpleRenderer().render(gaussians, camera, settings)
+        gaussians["means"][:] = 0.0
+        return found
+
+    assert run.check(render, cases=cases).passed
+    np.testing.assert_array_equal(cases[0].gaussians["means"], before)
+
+
+def test_nothing_compared_is_no_pass():
+    assert not run.check(SimpleRenderer().render, cases=[]).passed
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(ValueError, match="does not know 'depht'"):
+        run.check(SimpleRenderer().render, without=["depht"])
+    with pytest.raises(ValueError, match="precision: is 'half'"):
+        run.check(SimpleRenderer().render, precision="half")
+    with pytest.raises(KeyError):
+        run.load_cases(["no such case"])
+
+
+def test_the_tolerance_behind_a_stop_is_that_of_the_stop_only():
+    """Before T falls below 1e-4, a pixel of that case has no more tolerance than any other."""
+    (case,) = run.load_cases(["opaque_tiles_stop"])
+    stopped = case.truth["transmittance"] < run.T_STOP
+    assert stopped.any() and not stopped.all()
+    allowed = run.tolerance(case, "image", "float64")
+    assert allowed[stopped].min() >= 1e-4 and allowed[~stopped].max() < 1e-10
+    unstopped = dataclasses.replace(case, stopped={})
+    assert run.tolerance(unstopped, "image", "float64").max() < 1e-10
+
+
+def test_the_command_line(capsys):
+    arguments = ["simple_renderer_instance:render", "--case", "random"]
+    assert run.main(arguments) == 2
+    assert "simple_renderer_instance" in capsys.readouterr().err
+    arguments = ["ours:render_torch", "ours:gradients_torch", "--case", "gradient_smooth"]
+    assert run.main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "1 of 1 cases pass, 19 arrays compared." in out
+    assert run.main(["ours:render_torch", "--case", "random", "--without", "median_depth,features"]) == 0
+    assert "Left out: features, median_depth, all gradients." in capsys.readouterr().out
+
+
+def test_a_failure_exits_with_1(capsys, tmp_path, monkeypatch):
+    """A case whose truth is damaged fails."""
+    path = next(run.CASES.glob("one_pixel.safetensors"))
+    with run.safe_open(path, framework="numpy") as file:
+        arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        metadata = file.metadata()
+    arrays["truth.depth"] += 1e-9
+    save_file(arrays, tmp_path / "one_pixel.safetensors", metadata=metadata)
+    cases = run.load_cases(folder=tmp_path)
+    monkeypatch.setattr(run, "load_cases", lambda names: cases)
+    assert run.main(["ours:render_torch"]) == 1
+    assert "one_pixel failed." in capsys.readouterr().out
