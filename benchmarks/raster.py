@@ -82,7 +82,12 @@ def frame_seconds(
             W=size,
         ),
         settings=_native.Settings(
-            z_near=Z_NEAR, background=[0.0] * 3, sh_degree=0, antialiased=False, alpha_max=ALPHA_MAX
+            z_near=Z_NEAR,
+            background=[0.0] * 3,
+            sh_degree=0,
+            antialiased=False,
+            alpha_max=ALPHA_MAX,
+            pixel_stop=False,
         ),
         threads=threads,
     )

@@ -2,7 +2,7 @@
 //
 //     p = log2_o - s² - t²;   alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 //
-// A tile stops once the transmittance of every pixel is below 1e-4. Depth and features are composited as colours are. The
+// A tile stops once the transmittance of every pixel is below 1e-4, or every pixel has ended (Settings::pixel_stop). Depth and features are composited as colours are. The
 // median depth is that of the splat where T falls below one half, 0 if it never does.
 #include "features.h"
 #include "isa.h"
@@ -42,7 +42,10 @@ GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const T
         for (int32_t row = first; row <= last; ++row) {
             const int at = row * TILE + column;
             V key;
-            const V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at), w = t * alpha;
+            V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at);
+            if constexpr (MODE >= WITH_FEATURES)
+                if (args.settings.pixel_stop) end_pixels<T>(t, alpha);
+            const V w = t * alpha;
             store(tile.red.values + at, load<V>(tile.red.values + at) + w * red);
             store(tile.green.values + at, load<V>(tile.green.values + at) + w * green);
             store(tile.blue.values + at, load<V>(tile.blue.values + at) + w * blue);
@@ -76,7 +79,8 @@ GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box,
     const Images<T> &out = args.out;
     const double *bg = args.settings.background;
     for_each_four<T>(box, args.camera.W, [&](int from, int64_t pixel, int count) {
-        const Q t = load<Q>(tile.transmittance.values + from);
+        Q t = load<Q>(tile.transmittance.values + from);
+        if (MODE >= WITH_FEATURES) t = t < Q{} ? -t : t;
         const Q rgb[3] = {load<Q>(tile.red.values + from) + t * T(bg[0]), load<Q>(tile.green.values + from) + t * T(bg[1]),
                           load<Q>(tile.blue.values + from) + t * T(bg[2])};
         const size_t bytes = size_t(count) * sizeof(T);
@@ -135,7 +139,7 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
 template <class T>
 void composite(const CompositeArgs<T> &args, int32_t tile) {
     if (args.out.median) return composite_tile<T, WITH_ALL>(args, tile);
-    if (args.out.features) return composite_tile<T, WITH_FEATURES>(args, tile);
+    if (args.out.features || args.settings.pixel_stop) return composite_tile<T, WITH_FEATURES>(args, tile);
     args.out.depth ? composite_tile<T, WITH_DEPTH>(args, tile) : composite_tile<T, COLORS>(args, tile);
 }
 

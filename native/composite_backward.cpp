@@ -77,10 +77,12 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
         for (int32_t row = first; row <= last; ++row, dy += splat(T(1))) {
             const int at = row * TILE + column;
             V key;
-            const V alpha = falloff.alpha(row, key);
+            V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at);
+            if constexpr (MODE >= WITH_FEATURES)
+                if (forward.settings.pixel_stop) end_pixels<T>(t, alpha);
             const V r = load<V>(tile.red.values + at), g = load<V>(tile.green.values + at), b = load<V>(tile.blue.values + at);
             V cg = r * red + g * green + b * blue;
-            const V t = load<V>(tile.transmittance.values + at), w = t * alpha;
+            const V w = t * alpha;
             if (MODE != COLORS) {
                 const V z = load<V>(tile.depth.values + at);
                 cg += z * splat(s.depth);
@@ -228,7 +230,7 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
 template <class T>
 void composite_backward(const CompositeBackwardArgs<T> &args, int32_t tile) {
     if (args.statistic_slots) return tile_backward<T, WITH_ALL>(args, tile);
-    if (args.feature_slots) return tile_backward<T, WITH_FEATURES>(args, tile);
+    if (args.feature_slots || args.forward.settings.pixel_stop) return tile_backward<T, WITH_FEATURES>(args, tile);
     args.in.depth ? tile_backward<T, WITH_DEPTH>(args, tile) : tile_backward<T, COLORS>(args, tile);
 }
 

@@ -26,6 +26,7 @@ struct Settings {
     int32_t sh_degree;
     int32_t antialiased;
     double alpha_max, log2_alpha_max;                  // clamp of alpha, below 1
+    bool pixel_stop;                                   // each pixel ends by itself, see tile.h
 };
 
 // The images of one render; the last three may be null. 1 to MOST_CHANNELS channels of features.

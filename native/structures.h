@@ -39,6 +39,7 @@ inline Settings settings_of(Arguments a) {
     set.alpha_max = a.number("alpha_max");
     if (set.alpha_max < ALPHA_MIN || set.alpha_max >= 1) a.fail("alpha_max", "has to be at least 1/255 and below 1");
     set.log2_alpha_max = std::log2(set.alpha_max);
+    set.pixel_stop = a.flag("pixel_stop");
     a.finish();
     return set;
 }

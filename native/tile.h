@@ -9,6 +9,16 @@ namespace GSPLAT_ISA {
 // What is composited: colours; depth as well; features as well; or also median depth or statistics. The last three do what is asked for.
 enum Mode { COLORS, WITH_DEPTH, WITH_FEATURES, WITH_ALL };
 
+// With Settings::pixel_stop a pixel ends before the first splat that would take its transmittance to T_STOP or below, and keeps the
+// transmittance that it has. The planes mark a pixel that has ended by a negative transmittance. Sets alpha to 0 where the pixel has
+// ended or ends here, and marks the latter.
+template <class T>
+GSPLAT_INLINE void end_pixels(typename Vector<T>::V &t, typename Vector<T>::V &alpha) {
+    const typename Vector<T>::V zero{};
+    const typename Vector<T>::M ends = (t > zero) & (t - t * alpha <= splat(T(T_STOP))), open = (t > zero) & ~ends;
+    alpha = open ? alpha : zero, t = ends ? -t : t;
+}
+
 // Pixels of one tile inside the image.
 struct TileBox {
     int32_t x0, y0, width, height;

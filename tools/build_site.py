@@ -38,6 +38,7 @@ USE = {
 
 BUILD_ON = {
     "docs/PYTHON.md": "Python examples",
+    "docs/GSPLAT.md": "From gsplat",
     "reference/index.md": "Reference",
     "ARCHITECTURE.md": "Architecture",
     "docs/DECISIONS.md": "Conventions",
@@ -67,6 +68,7 @@ PUBLIC = {
         "gsplat_edu.render.cpu.render_covariances",
         "gsplat_edu.render.torch_reference.render_t",
     ),
+    "gsplat's interface": "gsplat_edu.compat.gsplat",
     "Captures": (
         "gsplat_edu.data.dataset.load_dataset",
         "gsplat_edu.data.dataset.scene_extent",

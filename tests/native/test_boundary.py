@@ -33,6 +33,7 @@ def settings(**changes):
         "sh_degree": 0,
         "antialiased": False,
         "alpha_max": 0.99,
+        "pixel_stop": False,
     }
     return _native.Settings(**fields | changes)
 
@@ -121,7 +122,7 @@ def loss(**changes):
 
 CALLS = {
     camera: ("R", "eye", "fx", "fy", "cx", "cy", "x_bounds", "y_bounds", "H", "W"),
-    settings: ("z_near", "background", "sh_degree", "antialiased", "alpha_max"),
+    settings: ("z_near", "background", "sh_degree", "antialiased", "alpha_max", "pixel_stop"),
     scene: RAW,
     images: ("image", "transmittance", "depth", "features", "median"),
     gradients: (*RAW, "means2d_norm", "background", "camera", "features"),

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 EXAMPLES = {
     f"{name}-{number}": example
-    for name in ("README.md", "docs/PYTHON.md")
+    for name in ("README.md", "docs/PYTHON.md", "docs/GSPLAT.md")
     for number, example in enumerate(
         re.findall(r"```python\n(.*?)```", (ROOT / name).read_text(), flags=re.DOTALL)
     )
@@ -27,7 +27,8 @@ def test_the_examples_of_the_documents_run(name, tmp_path, monkeypatch):
 
 
 def test_there_are_examples():
-    assert {name.split("-")[0] for name in EXAMPLES} == {"README.md", "docs/PYTHON.md"} and len(EXAMPLES) >= 5
+    assert {name.split("-")[0] for name in EXAMPLES} == {"README.md", "docs/PYTHON.md", "docs/GSPLAT.md"}
+    assert len(EXAMPLES) >= 7
 
 
 def test_the_readme_stays_short_and_shows_two_pictures():

@@ -153,6 +153,8 @@ def _render_one(
         from gsplat_edu.render.cpu import render_cpu  # backends.py has checked the native module
 
         return render_cpu(gaussians, camera, settings, extra)
+    if settings.stop != "tile":
+        raise ArgumentError(f"stop: is {settings.stop!r}, which only the backend cpu offers, not {name}")
     if name == "cuda":
         from gsplat_edu.render.triton.rasterize import render_triton  # and Triton
 

@@ -264,6 +264,7 @@ class _Rasterize(torch.autograd.Function):
                 sh_degree=call.sh_degree,
                 antialiased=settings.antialiased,
                 alpha_max=settings.alpha_max,
+                pixel_stop=settings.stop == "pixel",
             ),
             threads=torch.get_num_threads(),
         )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, SH_MAX_DEGREE, Z_NEAR
 from gsplat_edu.errors import BackendUnavailableError
-from gsplat_edu.validation import float64_array, in_range, whole_number
+from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
 
 BACKENDS = ("cuda", "cpu", "torch")
 """All backends, fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, which evaluates every
@@ -42,6 +42,9 @@ class RenderSettings:
         jacobian_limit: Clamp x/z and y/z inside the projection's Jacobian to this multiple of half the field of view
             (`Camera.jacobian_bounds`); 1.3 for captures, as in Kerbl et al.'s code; None disables clamping.
         alpha_max: Clamp of a splat's alpha in a pixel, 1/255 to 0.9999; gsplat uses 0.999.
+        stop: When compositing ends before the last Gaussian. "tile": for the pixels of a 16x16 tile together, once all
+            of their transmittances are below 1e-4. "pixel": for each pixel, before the first Gaussian that would take
+            its transmittance to 1e-4 or below, as in Kerbl et al.'s code and gsplat; only the backend cpu offers it.
         z_near: Gaussians whose means are at this camera depth or nearer are not drawn, world units.
         dense_chunk: Number of splats that the dense torch backend evaluates at once. It affects speed, not the image
             (except for rounding); 16 keeps a chunk in a core's cache at 128 px (benchmarks/RESULTS.md).
@@ -58,12 +61,14 @@ class RenderSettings:
     median_depth: bool = False
     jacobian_limit: float | None = None
     alpha_max: float = ALPHA_MAX
+    stop: str = "tile"
     z_near: float = Z_NEAR
     dense_chunk: int = 16
 
     def __post_init__(self) -> None:
         """Check the ranges, and convert NumPy scalars and arrays to plain Python values for the kernels."""
         limit = self.jacobian_limit
+        one_of("stop", self.stop, ("tile", "pixel"))
         plain = {
             "background": tuple(float64_array("background", self.background, (3,)).tolist()),
             "sh_degree": whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE),

@@ -1,0 +1,1 @@
+"""Interfaces of other rasterisers over our kernels."""

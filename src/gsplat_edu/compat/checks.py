@@ -1,0 +1,245 @@
+"""The arguments of `rasterization`, and the checks of their values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.gaussians import check_tensor
+from gsplat_edu.kernels import SUFFIXES
+from gsplat_edu.sh import num_coefficients
+from gsplat_edu.validation import in_range, one_of, whole_number
+
+
+class RollingShutterType(Enum):
+    """gsplat's names of shutters. Only GLOBAL is supported."""
+
+    ROLLING_TOP_TO_BOTTOM = 0
+    ROLLING_LEFT_TO_RIGHT = 1
+    ROLLING_BOTTOM_TO_TOP = 2
+    ROLLING_RIGHT_TO_LEFT = 3
+    GLOBAL = 4
+
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+"""Values of `render_mode`."""
+
+ONLY_VALUES = {
+    "sparse_grad": False,
+    "distributed": False,
+    "camera_model": "pinhole",
+    "with_ut": False,
+    "with_eval3d": False,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "rolling_shutter": RollingShutterType.GLOBAL,
+    "viewmats_rs": None,
+}
+"""Arguments that `rasterization` has with one value only."""
+
+REMEDIES = {
+    "sparse_grad": "gradients are dense",
+    "distributed": "render on one machine",
+    "camera_model": "undistort the photos first",
+}
+"""What to do instead, where it is not `UNDISTORT`."""
+
+UNDISTORT = "undistort the photos first"
+
+
+@dataclass(frozen=True, eq=False)
+class Arguments:
+    """The arguments of `gsplat_edu.compat.gsplat.rasterization`.
+
+    Leading axes `...` (batches of scenes) are the same for all tensors. All are on the CPU, and all of one dtype,
+    float32 or float64.
+
+    Args:
+        means: (..., N, 3) centres, world units.
+        quats: (..., N, 4) quaternions (w, x, y, z) of any length but 0. Ignored with `covars`.
+        scales: (..., N, 3) standard deviations, world units. Ignored with `covars`.
+        opacities: (..., N) 0 to 1.
+        colors: (..., N, D) or (..., C, N, D) numbers to composite; with `sh_degree` (..., N, K, 3) or (..., C, N, K, 3)
+            coefficients.
+        viewmats: (..., C, 4, 4) world to camera, OpenCV axes.
+        Ks: (..., C, 3, 3) intrinsics, px; the centre of the first pixel is at (0.5, 0.5).
+        width: Width of the images, px.
+        height: Height of the images, px.
+        near_plane: Gaussians nearer than this are not drawn, world units.
+        far_plane: Nor are Gaussians farther away than this.
+        radius_clip: Nor are Gaussians whose box has half sizes of at most this, px.
+        eps2d: Added to the diagonal of every screen covariance, px².
+        sh_degree: Highest degree of the harmonics to use, 0 to 3; None if `colors` are not coefficients.
+        packed: Whether `meta` lists the drawn Gaussians only, (nnz, ...), instead of all, (..., C, N, ...). The images
+            and the work are the same.
+        tile_size: Only sets tile_width and tile_height in `meta`; the kernels have tiles of 16 px.
+        backgrounds: (..., C, D) colours behind everything; None for 0.
+        render_mode: Which channels to return: RGB, D, ED, RGB+D, RGB+ED.
+        sparse_grad: False.
+        absgrad: Whether the backward pass sets `meta["means2d"].absgrad`.
+        rasterize_mode: "classic", or "antialiased": opacities times sqrt(det0 / det).
+        channel_chunk: No effect: any number of channels is composited, 34 at a time.
+        distributed: False.
+        camera_model: "pinhole".
+        segmented: No effect: it selects a sort in gsplat.
+        covars: (..., N, 3, 3) covariances, world units²; the upper triangle is read.
+        with_ut: False.
+        with_eval3d: False.
+        radial_coeffs: None.
+        tangential_coeffs: None.
+        thin_prism_coeffs: None.
+        ftheta_coeffs: None.
+        rolling_shutter: GLOBAL, ours or gsplat's.
+        viewmats_rs: None.
+
+    Raises:
+        ShapeError: a shape differs.
+        ArgumentError: a value is not finite, out of range or not supported; the message names the argument.
+    """
+
+    means: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    sh_degree: int | None
+    packed: bool
+    tile_size: int
+    backgrounds: Tensor | None
+    render_mode: str
+    sparse_grad: bool
+    absgrad: bool
+    rasterize_mode: str
+    channel_chunk: int
+    distributed: bool
+    camera_model: str
+    segmented: bool
+    covars: Tensor | None
+    with_ut: bool
+    with_eval3d: bool
+    radial_coeffs: Any
+    tangential_coeffs: Any
+    thin_prism_coeffs: Any
+    ftheta_coeffs: Any
+    rolling_shutter: Any
+    viewmats_rs: Any
+    batch: tuple[int, ...] = field(init=False)
+    N: int = field(init=False)
+    C: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check every argument."""
+        for name, only in ONLY_VALUES.items():
+            _check_only(name, getattr(self, name), only)
+        one_of("render_mode", self.render_mode, RENDER_MODES)
+        one_of("rasterize_mode", self.rasterize_mode, ("classic", "antialiased"))
+        for name in ("width", "height", "tile_size", "channel_chunk"):
+            whole_number(name, getattr(self, name), 1)
+        for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
+            in_range(name, getattr(self, name), 0.0)
+        named = {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities")}
+        batch, N = check_scene(named, self.covars is not None)
+        if self.covars is not None:
+            expect("covars", self.covars, (*batch, N, 3, 3), self.means)
+        C = check_cameras(self.viewmats, self.Ks, batch, self.means)
+        for name, value in (("batch", batch), ("N", N), ("C", C)):
+            object.__setattr__(self, name, value)
+        self._check_colors()
+
+    def _check_colors(self) -> None:
+        """Check colours or coefficients, and backgrounds."""
+        channels = self.colors.shape[-1] if self.colors.ndim else 0
+        tail: tuple[int, ...] = (channels,)
+        if self.sh_degree is not None:
+            K = max(
+                num_coefficients(whole_number("sh_degree", self.sh_degree, 0, 3)), *self.colors.shape[-2:-1]
+            )
+            channels, tail = 3, (K, 3)
+        per_camera = self.colors.ndim == len(self.batch) + 2 + len(tail)
+        expect(
+            "colors", self.colors, (*self.batch, *([self.C] if per_camera else []), self.N, *tail), self.means
+        )
+        if self.backgrounds is not None:
+            expect("backgrounds", self.backgrounds, (*self.batch, self.C, channels), self.means)
+
+    @property
+    def colors_per_camera(self) -> bool:
+        """Whether `colors` have an axis of cameras."""
+        return self.colors.ndim == len(self.batch) + (3 if self.sh_degree is None else 4)
+
+    @property
+    def batches(self) -> int:
+        """Number of scenes."""
+        return math.prod(self.batch)
+
+
+def _check_only(name: str, value: object, only: object) -> None:
+    """Check an argument of which one value is supported."""
+    if name == "rolling_shutter":
+        value, only = getattr(value, "name", value), RollingShutterType.GLOBAL.name
+    if isinstance(value, Tensor) or value != only:
+        shown = "a tensor" if isinstance(value, Tensor) else repr(value)
+        raise ArgumentError(
+            f"{name}: is {shown}, but only {only!r} is supported; {REMEDIES.get(name, UNDISTORT)}"
+        )
+
+
+def check_projection_options(sparse_grad: bool, camera_model: str) -> None:
+    """Check the arguments of `fully_fused_projection` of which one value is supported."""
+    _check_only("sparse_grad", sparse_grad, False)
+    _check_only("camera_model", camera_model, "pinhole")
+
+
+def check_scene(named: Mapping[str, Tensor | None], from_covars: bool) -> tuple[tuple[int, ...], int]:
+    """Check means, and quats, scales and opacities as far as they are needed; return the leading axes and N."""
+    means = named["means"]
+    if not isinstance(means, Tensor) or means.dtype not in SUFFIXES or means.device.type != "cpu":
+        raise ArgumentError("means: has to be a tensor of float32 or float64 on the CPU")
+    batch, N = tuple(means.shape[:-2]), means.shape[-2] if means.ndim >= 2 else 0
+    expect("means", means, (*batch, N, 3), means)
+    for name, tail in (("quats", (4,)), ("scales", (3,)), ("opacities", ())):
+        tensor = named[name]
+        if from_covars and name in ("quats", "scales"):
+            continue
+        if tensor is None:
+            if name == "opacities":
+                continue
+            raise ArgumentError(f"{name}: is None; give quats and scales, or covars")
+        expect(name, tensor, (*batch, N, *tail), means)
+    return batch, N
+
+
+def check_cameras(viewmats: Tensor, Ks: Tensor, batch: tuple[int, ...], means: Tensor) -> int:
+    """Check the matrices of the cameras; return their number, which is the same in each batch."""
+    C = max(viewmats.shape[-3] if viewmats.ndim >= 3 else 1, 1)
+    expect("viewmats", viewmats, (*batch, C, 4, 4), means)
+    expect("Ks", Ks, (*batch, C, 3, 3), means)
+    return C
+
+
+def expect(name: str, tensor: Any, shape: tuple[int, ...], like: Tensor) -> None:  # noqa: ANN401
+    """Check a tensor's shape, dtype and device, and that it is finite."""
+    if not isinstance(tensor, Tensor) or (tensor.dtype, tensor.device) != (like.dtype, like.device):
+        given = f"{tensor.dtype} on {tensor.device}" if isinstance(tensor, Tensor) else type(tensor).__name__
+        raise ArgumentError(f"{name}: is {given}, but has to be {like.dtype} on {like.device}, as means")
+    if tuple(tensor.shape) != shape:
+        raise ShapeError(f"{name}: has shape {tuple(tensor.shape)}, but has to be {shape}")
+    with torch.no_grad():
+        check_tensor(name, tensor, ("...",), {})

@@ -1,0 +1,204 @@
+"""A drop-in for gsplat 1.5.3: its `rasterization`, `fully_fused_projection` and `spherical_harmonics` on any CPU.
+
+    from gsplat_edu.compat.gsplat import rasterization      # instead of: from gsplat import rasterization
+
+gsplat's `DefaultStrategy` runs on it as it is; its `MCMCStrategy` calls CUDA kernels of its own. docs/GSPLAT.md
+compares the arguments one by one and lists the differences.
+
+Design. gsplat has three stages, each differentiable: projection and harmonics, then compositing of what they return.
+Its strategies call `meta["means2d"].retain_grad()` before the backward pass and read `.grad` and `.absgrad` after it.
+So the stages here are the same. Projection and harmonics are torch operations (projection.py, harmonics.py);
+`meta["means2d"]`, `meta["depths"]` and `meta["opacities"]` are nodes of the graph between them and the image.
+Compositing is our native kernels (images.py), whose gradient with respect to a mean on the screen arrives at
+`meta["means2d"]` by autograd, per axis and per px. Therefore retain_grad, hooks and losses on these tensors work
+without special cases. `absgrad` is a statistic that the kernels collect; a hook on their input stores it as an
+attribute after each backward pass.
+
+The renderer's own projection is not used: it computes in double without temporary arrays, but returns no centres that a
+graph could pass through. Training with `gsplat_edu.render.api.render` is faster.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from gsplat_edu.compat.checks import Arguments, RollingShutterType
+from gsplat_edu.compat.harmonics import spherical_harmonics
+from gsplat_edu.compat.images import Splats, composite
+from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
+from gsplat_edu.constants import SH_OFFSET
+
+__all__ = ["RollingShutterType", "fully_fused_projection", "rasterization", "spherical_harmonics"]
+
+ALPHA_FLOOR = 1e-10
+"""gsplat's lower bound of alpha where it divides the depth by it, for ED."""
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: object = None,
+    rolling_shutter: object = RollingShutterType.GLOBAL,
+    viewmats_rs: Tensor | None = None,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render Gaussians into C cameras with gsplat's arguments, which `gsplat_edu.compat.checks.Arguments` describes.
+
+    Returns:
+        images (..., C, H, W, channels), alphas (..., C, H, W, 1), and `meta`: means2d, radii, depths, conics,
+        opacities, gaussian_ids, camera_ids, batch_ids, width, height, n_cameras, n_batches, tile_size, tile_width,
+        tile_height.
+
+    Raises:
+        ShapeError: a shape differs.
+        ArgumentError: a value is not finite, out of range or not supported.
+
+    Differentiable in: means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds.
+    """
+    return _rasterize(Arguments(**locals()))
+
+
+class _Drawn(NamedTuple):
+    """The Gaussians with positive radii, by image."""
+
+    positions: Int64[Tensor, " nnz"]  # in the arrays (B C N)
+    scenes: Int64[Tensor, " nnz"]
+    images: Int64[Tensor, " nnz"]  # batch times C plus camera
+    gaussians: Int64[Tensor, " nnz"]
+
+
+def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    lens = Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
+    triangle = None if a.covars is None else a.covars[..., TRIANGLE[0], TRIANGLE[1]]
+    viewmats, Ks = a.viewmats.reshape(-1, a.C, 4, 4), a.Ks.reshape(-1, a.C, 3, 3)
+    flat, antialiased = a.opacities.reshape(a.batches, a.N), a.rasterize_mode == "antialiased"
+    solids = solids_of(a.means, triangle, a.quats, a.scales)
+    found = project(solids, viewmats, Ks, lens, flat, antialiased)
+    positions = (found.radii > 0).all(dim=-1).flatten().nonzero()[:, 0]
+    images = positions // max(a.N, 1)
+    drawn = _Drawn(positions, images // a.C, images, positions % max(a.N, 1))
+    opacities = flat[:, None].expand(-1, a.C, -1)
+    if antialiased:
+        opacities = opacities * found.compensations
+    fields = {
+        "radii": found.radii,
+        "means2d": found.means2d,
+        "depths": found.depths,
+        "conics": found.conics,
+        "opacities": opacities,
+    }
+    meta: dict[str, Any] = {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
+    if a.packed:
+        meta = {"batch_ids": drawn.scenes, "camera_ids": images % a.C, "gaussian_ids": drawn.gaussians}
+        meta |= {name: _rows(field, 3).index_select(0, positions) for name, field in fields.items()}
+        rows = torch.arange(len(positions))
+    else:
+        meta |= {name: field.view(*a.batch, a.C, a.N, *field.shape[3:]) for name, field in fields.items()}
+        rows = positions
+    meta |= {name: getattr(a, name) for name in ("width", "height", "tile_size")}
+    meta |= {"n_batches": a.batches, "n_cameras": a.C}
+    for name, size in (("tile_width", a.width), ("tile_height", a.height)):
+        meta[name] = math.ceil(size / a.tile_size)
+    views = _draw(a, lens, drawn, (rows, found.spreads), meta)
+    image, transmittance = (torch.stack(each).view(*a.batch, a.C, *each[0].shape) for each in views)
+    alphas = 1.0 - transmittance[..., None]
+    if a.render_mode.endswith("ED"):
+        image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=ALPHA_FLOOR)], dim=-1)
+    return image, alphas, meta
+
+
+def _rows(tensor: Tensor, axes: int) -> Tensor:
+    """Join the leading axes."""
+    return tensor.reshape(math.prod(tensor.shape[:axes]), *tensor.shape[axes:])
+
+
+def _draw(
+    a: Arguments,
+    lens: Lens,
+    drawn: _Drawn,
+    inputs: tuple[Int64[Tensor, " nnz"], Float[Tensor, "B C N 3"]],
+    meta: dict[str, Any],
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Draw every image; `inputs` are the rows of the drawn Gaussians in the tensors of `meta`, and spreads."""
+    rows, spreads = inputs
+    axes = 1 if a.packed else len(a.batch) + 2
+    means2d, depths, opacities = (_rows(meta[name], axes) for name in ("means2d", "depths", "opacities"))
+    with_depth = a.render_mode != "RGB"
+    colors = None if a.render_mode in ("D", "ED") else _colors(a, drawn)
+    backgrounds = None if colors is None or a.backgrounds is None else _rows(a.backgrounds, len(a.batch) + 1)
+    ends = torch.bincount(drawn.images, minlength=a.batches * a.C).cumsum(0).tolist()
+    images, transmittances = [], []
+    for k, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
+        # Near to far; ties in the order of the Gaussians.
+        order = begin + torch.argsort(depths.detach()[rows[begin:end]], stable=True)
+        own = rows[order]
+        splats = Splats(
+            means2d.index_select(0, own),
+            _rows(spreads, 3).index_select(0, drawn.positions[order]),
+            opacities.index_select(0, own),
+            None if colors is None else colors.index_select(0, order),
+            depths.index_select(0, own) if with_depth else None,
+            None if backgrounds is None else backgrounds[k],
+        )
+        store = _absgrad_store(meta["means2d"], own) if a.absgrad else None
+        image, transmittance = composite(splats, lens, store)
+        images.append(image)
+        transmittances.append(transmittance)
+    return images, transmittances
+
+
+def _colors(a: Arguments, drawn: _Drawn) -> Float[Tensor, "nnz D"]:
+    """Return the colours of the drawn Gaussians, from the harmonics if there are any."""
+    row = (drawn.images if a.colors_per_camera else drawn.scenes) * a.N + drawn.gaussians
+    if a.sh_degree is None:
+        return _rows(a.colors, a.colors.ndim - 1).index_select(0, row)
+    coefficients = _rows(a.colors, a.colors.ndim - 2).index_select(0, row)
+    eyes = torch.inverse(a.viewmats)[..., :3, 3].reshape(-1, 3)
+    means = _rows(a.means, a.means.ndim - 1).index_select(0, drawn.scenes * a.N + drawn.gaussians)
+    colors = spherical_harmonics(a.sh_degree, means - eyes.index_select(0, drawn.images), coefficients)
+    return torch.clamp_min(colors + SH_OFFSET, 0.0)
+
+
+def _absgrad_store(means2d: Tensor, rows: Int64[Tensor, " M"]) -> Callable[[Tensor, Tensor], None]:
+    """Return a function that adds sums of absolute gradients to `means2d.absgrad`, given indices into `rows`."""
+
+    def store(visible: Tensor, sums: Tensor) -> None:
+        if not hasattr(means2d, "absgrad"):
+            means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
+        means2d.absgrad.view(-1, 2).index_add_(0, rows[visible], sums)  # type: ignore[attr-defined]
+
+    return store

@@ -1,0 +1,120 @@
+"""Images from projected Gaussians: our native kernels as a rasteriser of two dimensions.
+
+The kernels project in three dimensions. A camera at the origin with focal length 1 leaves a Gaussian as it is whose
+mean is (u, v, 1) and whose covariance is the screen covariance, with zeros in the third row and column: x/z = u, and
+J W Sigma W' J' is the covariance itself, exactly. What autograd returns for that mean and covariance are the
+gradients of the centre and the screen covariance. The order near to far is the order of the rows, because all depths
+are equal.
+
+gsplat's pixels are sampled at their centres, (0.5, 0.5) for the first, ours at (0, 0): the means move by -0.5 px.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.compat.projection import Lens
+from gsplat_edu.constants import COLOR_LIMIT, DILATION
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.render.cpu import render_covariances
+from gsplat_edu.render.output import MOST_CHANNELS, RenderOutput
+from gsplat_edu.render.settings import RenderSettings
+
+SETTINGS = RenderSettings(alpha_max=0.999, z_near=0.0, depth=False, stop="pixel")
+"""gsplat's clamp of alpha, and its rule for the end of a pixel."""
+
+COLOR_CHANNELS = 3
+"""Channels that the kernels composite as the colour; the others are features."""
+
+
+class Splats(NamedTuple):
+    """M Gaussians of one image, near to far."""
+
+    means2d: Float[Tensor, "M 2"]
+    """px, gsplat's pixel centres."""
+    spreads: Float[Tensor, "M 3"]
+    """xx, xy, yy of the screen covariance before eps2d, px²."""
+    opacities: Float[Tensor, " M"]
+    colors: Float[Tensor, "M D"] | None
+    depths: Float[Tensor, " M"] | None
+    background: Float[Tensor, " D"] | None
+
+
+def composite(
+    splats: Splats, lens: Lens, absgrad: Callable[[Int64[Tensor, " V"], Tensor], None] | None
+) -> tuple[Float[Tensor, "H W K"], Float[Tensor, "H W"]]:
+    """Composite colours, then depth, over the background.
+
+    Args:
+        splats: The Gaussians; K is the number of colours, and one more for depths.
+        lens: Size of the image and eps2d.
+        absgrad: Receives, in each backward pass, rows and their sums over pixels of |dL/du| and |dL/dv|, per px.
+
+    Returns:
+        The channels, and the final transmittance. Differentiable in every tensor of the splats.
+    """
+    M = len(splats.opacities)
+    colors = splats.means2d.new_zeros(M, 0) if splats.colors is None else splats.colors
+    parts: list[Tensor] = []
+    transmittance: Tensor | None = None
+    # The depth is a feature, never a colour, because the kernels skip Gaussians whose colours exceed COLOR_LIMIT.
+    pieces = torch.split(colors, COLOR_CHANNELS + MOST_CHANNELS - 1, dim=1)
+    for k, piece in enumerate(pieces):
+        front, features = piece[:, :COLOR_CHANNELS], piece[:, COLOR_CHANNELS:]
+        if k == 0 and splats.depths is not None:
+            features = torch.cat([features, splats.depths[:, None]], dim=1)
+        view = _render(splats, front, features, lens, absgrad)
+        parts.append(view.image[..., : front.shape[1]])
+        if view.features is not None:
+            parts.append(view.features)
+        transmittance = view.transmittance if transmittance is None else transmittance
+    assert transmittance is not None
+    if splats.depths is not None:  # behind the colours of the first piece
+        parts.append(parts[1][..., -1:])
+        parts[1] = parts[1][..., :-1]
+    image = torch.cat(parts, dim=-1)
+    if splats.background is not None:
+        behind = transmittance[..., None] * splats.background
+        image = image + (behind if splats.depths is None else torch.nn.functional.pad(behind, (0, 1)))
+    return image, transmittance
+
+
+def _render(
+    splats: Splats,
+    front: Float[Tensor, "M F"],
+    features: Float[Tensor, "M G"],
+    lens: Lens,
+    absgrad: Callable[[Int64[Tensor, " V"], Tensor], None] | None,
+) -> RenderOutput:
+    """Composite up to three colours and the features over zero."""
+    if front.numel() and float(front.detach().abs().amax()) > COLOR_LIMIT:
+        raise ArgumentError(f"colors: exceed {COLOR_LIMIT:g}, beyond which the kernels skip a Gaussian")
+    u, v = (splats.means2d - 0.5).unbind(-1)
+    means = torch.stack([u, v, torch.ones_like(u)], dim=-1)
+    xx, xy, yy = splats.spreads.unbind(-1)
+    if lens.eps2d != DILATION:  # the kernels add DILATION themselves
+        xx, yy = xx + (lens.eps2d - DILATION), yy + (lens.eps2d - DILATION)
+    zero = torch.zeros_like(xx)
+    cov3ds = torch.stack([xx, xy, zero, xy, yy, zero, zero, zero, zero], dim=-1).view(-1, 3, 3)
+    view = render_covariances(
+        means,
+        cov3ds,
+        torch.nn.functional.pad(front, (0, COLOR_CHANNELS - front.shape[1])),
+        splats.opacities,
+        Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 0.0, 0.0, lens.height, lens.width),
+        SETTINGS,
+        features=features if features.shape[1] else None,
+    )
+    if absgrad is not None and means.requires_grad:
+        found, visible = view.collect("absgrad"), view.visible
+        # The hook runs when the kernels' backward pass has returned the gradient of the means. It holds no tensor of
+        # the image: that would be a circle of references through the graph.
+        means.register_hook(lambda _: absgrad(visible, found()["absgrad"]))  # type: ignore[no-untyped-call]
+    return view

@@ -1,0 +1,226 @@
+"""gsplat's projection in torch: centres, depths, conics and radii of all Gaussians in all cameras.
+
+    p = R x + t,   u = fx px/pz + cx,   Sigma2d = J R Sigma R' J' + eps2d I,   compensation = sqrt(det0 / det)
+
+R and t come from the viewmat as any matrix, so that its gradient has all entries. det0, the determinant before eps2d,
+is the squared length of a cross product where quaternions and scales are known: a c - b² would cancel for thin
+Gaussians.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int32
+from torch import Tensor
+
+from gsplat_edu.compat.checks import check_cameras, check_projection_options, check_scene, expect
+from gsplat_edu.constants import ALPHA_MIN, DET_FLOOR
+from gsplat_edu.gaussians import quat_to_R_t
+
+MARGIN = 0.15
+"""gsplat clamps x/z and y/z inside the Jacobian at the edge of the image, moved outwards by this fraction of its size.
+It is our `RenderSettings(jacobian_limit=1.3)`."""
+
+EXTENT = 3.33
+"""Largest half extent of a Gaussian, standard deviations. Alpha reaches 1/255 at 3.329 of them if the opacity is 1."""
+
+TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
+"""Rows and columns of a covariance's upper triangle, in the order of six numbers."""
+
+
+class Lens(NamedTuple):
+    """Size of the image, px, and which Gaussians count."""
+
+    width: int
+    height: int
+    eps2d: float
+    near: float
+    far: float
+    radius_clip: float
+
+
+class Solids(NamedTuple):
+    """Gaussians of B batches: covariances, or the rotations and scales that make them."""
+
+    means: Float[Tensor, "B N 3"]
+    covars: Float[Tensor, "B N 6"] | None = None
+    rotations: Float[Tensor, "B N 3 3"] | None = None
+    scales: Float[Tensor, "B N 3"] | None = None
+
+
+class Projected(NamedTuple):
+    """N Gaussians of B batches in C cameras each. Where a radius is 0, the other entries mean nothing."""
+
+    radii: Int32[Tensor, "B C N 2"]
+    means2d: Float[Tensor, "B C N 2"]
+    depths: Float[Tensor, "B C N"]
+    conics: Float[Tensor, "B C N 3"]
+    compensations: Float[Tensor, "B C N"]
+    spreads: Float[Tensor, "B C N 3"]
+    """xx, xy and yy of the covariance before eps2d, px²."""
+
+
+def solids_of(means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None) -> Solids:
+    """Join the leading axes to one, and turn quaternions to rotations.
+
+    Args:
+        means: (..., N, 3) centres, world units.
+        covars: (..., N, 6) upper triangles, used instead of quaternions and scales if not None.
+        quats: (..., N, 4) quaternions (w, x, y, z) of any length.
+        scales: (..., N, 3) standard deviations, world units.
+    """
+    shape = (math.prod(means.shape[:-2]), means.shape[-2])
+    if covars is not None:
+        return Solids(means.reshape(*shape, 3), covars.reshape(*shape, 6))
+    assert quats is not None
+    assert scales is not None
+    rotations = quat_to_R_t(quats.reshape(-1, 4)).view(*shape, 3, 3)
+    return Solids(means.reshape(*shape, 3), None, rotations, scales.reshape(*shape, 3))
+
+
+def project(
+    solids: Solids,
+    viewmats: Float[Tensor, "B C 4 4"],
+    Ks: Float[Tensor, "B C 3 3"],
+    lens: Lens,
+    opacities: Float[Tensor, "B N"] | None,
+    compensated: bool,
+) -> Projected:
+    """Project every Gaussian into every camera of its batch.
+
+    Args:
+        solids: The Gaussians.
+        viewmats: World to camera.
+        Ks: Intrinsics, px.
+        lens: Size of the image and limits.
+        opacities: Make the radii tighter; None for radii that suit every opacity.
+        compensated: Whether the compensations will multiply the opacities, for the radii.
+
+    Differentiable in: solids, viewmats, Ks.
+    """
+    R = viewmats[..., None, :3, :3]
+    points = solids.means[:, None] @ viewmats[..., :3, :3].mT + viewmats[..., None, :3, 3]
+    depths = points[..., 2]
+    before = (depths >= lens.near) & (depths <= lens.far)
+    z = torch.where(before, depths, 1.0)
+    focals, centers = [Ks[..., k, k, None] for k in (0, 1)], [Ks[..., k, 2, None] for k in (0, 1)]
+    centre, rows = [], []
+    for k, size in enumerate((lens.width, lens.height)):
+        ratio = points[..., k] / z
+        low, high = -MARGIN * size - centers[k], (1 + MARGIN) * size - centers[k]
+        clamped = torch.minimum(torch.maximum(ratio, low / focals[k]), high / focals[k])
+        centre.append(focals[k] * ratio + centers[k])
+        rows.append((focals[k] / z)[..., None] * (R[..., k, :] - clamped[..., None] * R[..., 2, :]))
+    a, b, c, det0 = _screen_covariances(solids, *rows)
+    variances = torch.stack([a, c], dim=-1) + lens.eps2d
+    det = det0 + lens.eps2d * (a + c) + lens.eps2d**2
+    floor = torch.where(det > 0, det, 1.0)
+    compensations = torch.sqrt(det0.clamp(min=DET_FLOOR) / floor)
+    means2d = torch.stack(centre, dim=-1)
+    bright = None if opacities is None else opacities[:, None] * (compensations if compensated else 1.0)
+    return Projected(
+        _radii(means2d, variances, before & (det > 0), bright, lens),
+        means2d,
+        depths,
+        torch.stack([variances[..., 1] / floor, -b / floor, variances[..., 0] / floor], dim=-1),
+        compensations,
+        torch.stack([a, b, c], dim=-1),
+    )
+
+
+def _screen_covariances(
+    solids: Solids, row0: Float[Tensor, "B C N 3"], row1: Float[Tensor, "B C N 3"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return xx, xy, yy and the determinant of J R Sigma R' J', given the two rows of J R."""
+    if solids.covars is not None:
+        xx, xy, xz, yy, yz, zz = solids.covars[:, None].unbind(-1)
+        Sigma = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1)
+        Sigma = Sigma.view(*Sigma.shape[:-1], 3, 3)
+        side0, side1 = (torch.einsum("bxnij,bcnj->bcni", Sigma, row) for row in (row0, row1))
+        a, b, c = (row0 * side0).sum(-1), (row0 * side1).sum(-1), (row1 * side1).sum(-1)
+        return a, b, c, a * c - b * b
+    assert solids.rotations is not None
+    assert solids.scales is not None
+    s0, s1, s2 = solids.scales[:, None].unbind(-1)
+    turned = [torch.einsum("bcni,bnij->bcnj", row, solids.rotations) for row in (row0, row1)]
+    normal = torch.linalg.cross(*turned) * torch.stack([s1 * s2, s2 * s0, s0 * s1], dim=-1)
+    side0, side1 = (row * solids.scales[:, None] for row in turned)
+    products = (side0 * side0, side0 * side1, side1 * side1, normal * normal)
+    a, b, c, det0 = (product.sum(dim=-1) for product in products)
+    return a, b, c, det0
+
+
+@torch.no_grad()
+def _radii(
+    means2d: Float[Tensor, "B C N 2"],
+    variances: Float[Tensor, "B C N 2"],
+    drawable: Bool[Tensor, "B C N"],
+    opacities: Float[Tensor, "B _ N"] | None,
+    lens: Lens,
+) -> Int32[Tensor, "B C N 2"]:
+    """Return the half sizes of the boxes, px, rounded up; 0 for Gaussians that are not drawn."""
+    extent: Tensor | float = EXTENT
+    if opacities is not None:
+        drawable = drawable & (opacities >= ALPHA_MIN)
+        extent = torch.sqrt(2.0 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN)).clamp(max=EXTENT)[
+            ..., None
+        ]
+    radii = torch.ceil(extent * torch.sqrt(variances.clamp(min=0.0)))
+    size = means2d.new_tensor([lens.width, lens.height])
+    meets = ((means2d + radii > 0) & (means2d - radii < size)).all(dim=-1)
+    drawn = drawable & meets & (radii > lens.radius_clip).any(dim=-1)
+    most = float(2**31 - 128)  # exact in float32
+    return torch.where(drawn[..., None], radii.clamp(max=most), 0.0).to(torch.int32)
+
+
+def fully_fused_projection(
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    eps2d: float = 0.3,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    packed: bool = False,
+    sparse_grad: bool = False,
+    calc_compensations: bool = False,
+    camera_model: str = "pinhole",
+    opacities: Tensor | None = None,
+) -> tuple[Tensor | None, ...]:
+    """Project Gaussians as gsplat 1.5.3's function of this name does; docs/GSPLAT.md lists the arguments.
+
+    Returns:
+        radii (int32), means2d, depths, conics and compensations, of shape (..., C, N, ...); packed: batch_ids,
+        camera_ids and gaussian_ids, then the same of the Gaussians with positive radii only. Compensations are None
+        unless asked for.
+
+    Raises:
+        ShapeError: a shape differs.
+        ArgumentError: a value is not finite or not supported.
+
+    Differentiable in: means, covars, quats, scales, viewmats, Ks.
+    """
+    check_projection_options(sparse_grad, camera_model)
+    batch, N = check_scene(
+        {"means": means, "quats": quats, "scales": scales, "opacities": opacities}, covars is not None
+    )
+    if covars is not None:
+        expect("covars", covars, (*batch, N, 6), means)
+    C = check_cameras(viewmats, Ks, batch, means)
+    lens = Lens(width, height, eps2d, near_plane, far_plane, radius_clip)
+    flat = None if opacities is None else opacities.reshape(math.prod(batch), N)
+    views = (viewmats.reshape(-1, C, 4, 4), Ks.reshape(-1, C, 3, 3))
+    found = project(solids_of(means, covars, quats, scales), *views, lens, flat, calc_compensations)
+    results = [*found[:4], found.compensations if calc_compensations else None]
+    if not packed:
+        return tuple(None if each is None else each.view(*batch, C, N, *each.shape[3:]) for each in results)
+    drawn = (found.radii > 0).all(dim=-1)
+    return (*drawn.nonzero().unbind(-1), *(None if each is None else each[drawn] for each in results))

@@ -1,0 +1,136 @@
+"""What `rasterization` does not support is refused by name, and so are values of wrong shapes, types and ranges."""
+
+import pytest
+import torch
+
+from gsplat_edu.compat.gsplat import RollingShutterType, fully_fused_projection, rasterization
+from gsplat_edu.errors import ArgumentError, ShapeError
+
+pytestmark = pytest.mark.usefixtures("as_shipped")
+N, C = 6, 2
+
+
+def arguments(**changes):
+    g = torch.Generator().manual_seed(0)
+    viewmats = torch.eye(4).repeat(C, 1, 1)
+    viewmats[:, 2, 3] = 4.0
+    given = {
+        "means": torch.randn(N, 3, generator=g),
+        "quats": torch.randn(N, 4, generator=g),
+        "scales": torch.full((N, 3), 0.2),
+        "opacities": torch.full((N,), 0.7),
+        "colors": torch.rand(N, 3, generator=g),
+        "viewmats": viewmats,
+        "Ks": torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]).repeat(C, 1, 1),
+        "width": 16,
+        "height": 12,
+    }
+    return given | changes
+
+
+UNSUPPORTED = {
+    "sparse_grad": True,
+    "distributed": True,
+    "camera_model": "fisheye",
+    "with_ut": True,
+    "with_eval3d": True,
+    "radial_coeffs": torch.zeros(C, 6),
+    "tangential_coeffs": torch.zeros(C, 2),
+    "thin_prism_coeffs": torch.zeros(C, 4),
+    "ftheta_coeffs": object(),
+    "rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM,
+    "viewmats_rs": torch.eye(4).repeat(C, 1, 1),
+}
+
+
+@pytest.mark.parametrize("name", UNSUPPORTED)
+def test_what_is_not_supported_is_refused_by_name(name):
+    with pytest.raises(ArgumentError, match=f"^{name}: .* only .* is supported"):
+        rasterization(**arguments(), **{name: UNSUPPORTED[name]})
+
+
+@pytest.mark.parametrize("value", ["ortho", "ftheta", "panorama"])
+def test_every_other_camera_model_is_refused(value):
+    with pytest.raises(ArgumentError, match=f"^camera_model: is '{value}'"):
+        rasterization(**arguments(), camera_model=value)
+
+
+WRONG = {
+    "render_mode": "BGR",
+    "rasterize_mode": "fancy",
+    "width": 0,
+    "height": 2.5,
+    "tile_size": 0,
+    "channel_chunk": 0,
+    "near_plane": -1.0,
+    "far_plane": float("nan"),
+    "radius_clip": -1.0,
+    "eps2d": -0.1,
+    "means": torch.zeros(N, 3, dtype=torch.int32),
+    "quats": torch.zeros(N, 4),
+    "scales": torch.zeros(N, 3, dtype=torch.float64),
+    "opacities": torch.full((N,), float("nan")),
+    "colors": torch.full((N, 3), 2e6),
+    "covars": torch.full((N, 3, 3), float("inf")),
+    "backgrounds": [0.0, 0.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_values_are_refused_by_name(name):
+    with pytest.raises(ArgumentError, match=rf"^{name}(\[|:)"):
+        rasterization(**arguments(**{name: WRONG[name]}))
+
+
+SHAPES = {
+    "means": (N, 2),
+    "quats": (N, 3),
+    "scales": (N + 1, 3),
+    "opacities": (N, 1),
+    "colors": (C + 1, N, 3),
+    "viewmats": (C, 3, 4),
+    "Ks": (C + 1, 3, 3),
+    "covars": (N, 6),
+    "backgrounds": (C, 4),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_wrong_shapes_are_refused_by_name(name):
+    with pytest.raises(ShapeError, match=f"^{name}: has shape"):
+        rasterization(**arguments(**{name: torch.zeros(SHAPES[name])}))
+
+
+@pytest.mark.parametrize("degree", [2, 4, -1, 1.0])
+def test_harmonics_need_a_degree_that_the_coefficients_have(degree):
+    with pytest.raises(ArgumentError, match="^(colors|sh_degree): "):
+        rasterization(**arguments(colors=torch.zeros(N, 4, 3)), sh_degree=degree)
+
+
+def test_gaussians_need_a_shape():
+    for missing in ("quats", "scales"):
+        with pytest.raises(ArgumentError, match=f"^{missing}: is None"):
+            rasterization(**arguments(**{missing: None}))
+
+
+def test_arguments_without_an_effect_have_none():
+    plain = rasterization(**arguments())
+    for changes in ({"tile_size": 8}, {"channel_chunk": 1}, {"segmented": True}, {"packed": False}):
+        images, alphas, meta = rasterization(**arguments(), **changes)
+        assert torch.equal(images, plain[0]) and torch.equal(alphas, plain[1])
+    assert (plain[2]["tile_width"], plain[2]["tile_height"], plain[2]["tile_size"]) == (1, 1, 16)
+    _, _, meta = rasterization(**arguments(), tile_size=8)
+    assert (meta["tile_width"], meta["tile_height"], meta["tile_size"]) == (2, 2, 8)
+
+
+def test_the_projection_refuses_by_name():
+    given = arguments()
+    names = ("means", "covars", "quats", "scales", "viewmats", "Ks", "width", "height")
+    args = [given.get(name) for name in names]
+    for name, value in (("sparse_grad", True), ("camera_model", "ortho")):
+        with pytest.raises(ArgumentError, match=f"^{name}: "):
+            fully_fused_projection(*args, **{name: value})
+    with pytest.raises(ShapeError, match="^covars: "):
+        fully_fused_projection(args[0], torch.zeros(N, 3, 3), *args[2:])
+    with pytest.raises(ShapeError, match="^opacities: "):
+        fully_fused_projection(*args, opacities=torch.zeros(N + 1))
