@@ -2,8 +2,8 @@
 //
 //     p = log2_o - s² - t²;   alpha = min(0.99, 2^p), 0 where p < log2(1/255);   w = T alpha;   image += w c;   T -= w
 //
-// A tile stops once the transmittance of every pixel is below 1e-4, or every pixel has ended (Settings::pixel_stop). Depth and features are composited as colours are. The
-// median depth is that of the splat where T falls below one half, 0 if it never does.
+// A tile stops once the transmittance of every pixel is below 1e-4, or every pixel has ended (Settings::pixel_stop). Depth and features are
+// composited as colours are. The median depth is that of the splat where T falls below one half, 0 if it never does.
 #include "features.h"
 #include "isa.h"
 
