@@ -4,7 +4,7 @@
 //
 // A tile stops once the transmittance of every pixel is below 1e-4, or every pixel has ended (Settings::pixel_stop). Depth and features are
 // composited as colours are. The median depth is that of the splat where T falls below one half, 0 if it never does.
-#include "features.h"
+#include "channels.h"
 #include "isa.h"
 
 namespace gsplat {

@@ -7,7 +7,7 @@
 //
 // Every pair writes its sums over the tile's pixels, w g and the moments of h about the splat's reference point, to its own
 // slot; those of features and statistics to slots of their own.
-#include "features.h"
+#include "channels.h"
 #include "isa.h"
 
 namespace gsplat {
