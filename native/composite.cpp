@@ -28,11 +28,11 @@ struct TileState<T, WITH_ALL> : TileState<T, WITH_FEATURES> {
 
 // Draws one splat; `weights` gets T alpha by pixel if there are features.
 template <class T, int MODE, bool GENTLY>
-GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const Splat<T> &s, const TileBox &box, const Rows<T> &rows, uint32_t i,
-                        TileState<T, MODE> &tile, [[maybe_unused]] T *weights) {
+GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const AlphaClamp<T> &clamp, const Splat<T> &s, const TileBox &box,
+                        const Rows<T> &rows, uint32_t i, TileState<T, MODE> &tile, [[maybe_unused]] T *weights) {
     using V = typename Vector<T>::V;
     FalloffRows<T> steps;
-    Falloff<T, GENTLY> falloff{steps, args.settings};
+    Falloff<T, GENTLY> falloff{steps, clamp};
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
@@ -100,6 +100,7 @@ GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box,
 template <class T, int MODE>
 void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     const TileBox box = tile_box(args.grid, args.camera, index);
+    const AlphaClamp<T> clamp(args.settings);
     TileState<T, MODE> tile;
     memset(&tile, 0, sizeof(TileState<T, COLORS>));
     if constexpr (MODE >= WITH_FEATURES) tile.features.clear(args.out.channels);
@@ -122,8 +123,8 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
         T *weights = nullptr;
         if constexpr (MODE >= WITH_FEATURES)
             weights = tile.group.take(args.features + int64_t(args.out.channels) * id, rows.top[i], rows.bottom[i]);
-        rows.gentle[i] ? draw<T, MODE, true>(args, args.splats[id], box, rows, i, tile, weights)
-                       : draw<T, MODE, false>(args, args.splats[id], box, rows, i, tile, weights);
+        rows.gentle[i] ? draw<T, MODE, true>(args, clamp, args.splats[id], box, rows, i, tile, weights)
+                       : draw<T, MODE, false>(args, clamp, args.splats[id], box, rows, i, tile, weights);
         if constexpr (MODE >= WITH_FEATURES)
             if (tile.group.count == tile.group.SIZE) tile.group.add_to(tile.features);
         if (!lets_light_through(tile.transmittance, bright)) {

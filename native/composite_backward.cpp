@@ -55,13 +55,13 @@ GSPLAT_INLINE void write_statistics(const Splat<T> &s, const typename Vector<T>:
 
 // Writes one splat's sums over the tile to its slot, and its weights to its place in the group of features.
 template <class T, int MODE, bool GENTLY>
-GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlots<T> &pair, const TileBox &box, const Rows<T> &rows,
-                                  uint32_t i, TileGradient<T, MODE> &tile) {
+GSPLAT_INLINE void splat_backward(const Settings &settings, const AlphaClamp<T> &clamp, const PairSlots<T> &pair, const TileBox &box,
+                                  const Rows<T> &rows, uint32_t i, TileGradient<T, MODE> &tile) {
     [[maybe_unused]] const uint32_t member = i % FeatureGroup<T>::SIZE;
     using V = typename Vector<T>::V;
     const Splat<T> &s = pair.s;
     FalloffRows<T> steps;
-    Falloff<T, GENTLY> falloff{steps, forward.settings};
+    Falloff<T, GENTLY> falloff{steps, clamp};
     falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     V sums[8] = {}, hyy = V{}, wz = V{};  // in the order of a slot
@@ -79,7 +79,7 @@ GSPLAT_INLINE void splat_backward(const CompositeArgs<T> &forward, const PairSlo
             V key;
             V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at);
             if constexpr (MODE >= WITH_FEATURES)
-                if (forward.settings.pixel_stop) end_pixels<T>(t, alpha);
+                if (settings.pixel_stop) end_pixels<T>(t, alpha);
             const V r = load<V>(tile.red.values + at), g = load<V>(tile.green.values + at), b = load<V>(tile.blue.values + at);
             V cg = r * red + g * green + b * blue;
             const V w = t * alpha;
@@ -161,12 +161,14 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
     for (int k = 0; k < 3; ++k) background[k] = (sums[k][0] + sums[k][2]) + (sums[k][1] + sums[k][3]);
 }
 
-template <class T>
+template <class T, int MODE>
 GSPLAT_INLINE PairSlots<T> slots_of(const CompositeBackwardArgs<T> &args, const Pair &pair) {
     const int64_t slot = pair.slot, channels = args.forward.out.channels;
-    return {args.forward.splats[pair.gaussian], args.slots + SLOT * slot,
-            args.feature_slots ? args.feature_slots + channels * slot : nullptr,
-            args.statistic_slots ? args.statistic_slots + STATISTICS * slot : nullptr, args.feature_slots ? int32_t(channels) : 0};
+    PairSlots<T> to{args.forward.splats[pair.gaussian], args.slots + SLOT * slot, nullptr, nullptr, 0};
+    if (MODE >= WITH_FEATURES && args.feature_slots)
+        to.feature_slot = args.feature_slots + channels * slot, to.channels = int32_t(channels);
+    if (MODE == WITH_ALL) to.statistic_slot = args.statistic_slots + STATISTICS * slot;
+    return to;
 }
 
 template <class T>
@@ -201,13 +203,14 @@ template <class T, int MODE>
 void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     const CompositeArgs<T> &forward = args.forward;
     const TileBox box = tile_box(forward.grid, forward.camera, index);
+    const AlphaClamp<T> clamp(forward.settings);
     TileGradient<T, MODE> tile;
     begin_tile<T, MODE>(args, box, tile, args.tile_background + 3 * index);
     const uint32_t begin = forward.tile_begin[index], end = forward.tile_begin[index + 1];
     const uint32_t stop = begin + forward.done[index];
     Rows<T> rows;
     for (uint32_t k = begin; k < end; ++k) {
-        const PairSlots<T> pair = slots_of(args, forward.pairs[k]);
+        const PairSlots<T> pair = slots_of<T, MODE>(args, forward.pairs[k]);
         const uint32_t i = (k - begin) % BATCH;
         if (k + 4 < end) __builtin_prefetch(args.slots + int64_t(SLOT) * forward.pairs[k + 4].slot, 1);
         if (i == 0 && k < stop) {
@@ -219,8 +222,8 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
         if (k >= stop || rows.top[i] > rows.bottom[i])
             write_zeros(pair);
         else
-            rows.gentle[i] ? splat_backward<T, MODE, true>(forward, pair, box, rows, i, tile)
-                           : splat_backward<T, MODE, false>(forward, pair, box, rows, i, tile);
+            rows.gentle[i] ? splat_backward<T, MODE, true>(forward.settings, clamp, pair, box, rows, i, tile)
+                           : splat_backward<T, MODE, false>(forward.settings, clamp, pair, box, rows, i, tile);
         if constexpr (MODE >= WITH_FEATURES)
             if (k < stop && pair.channels && (i % FeatureGroup<T>::SIZE == FeatureGroup<T>::SIZE - 1 || k + 1 == stop))
                 end_group(args, k - i % FeatureGroup<T>::SIZE, k + 1, tile);

@@ -166,6 +166,14 @@ struct FalloffRows {
     alignas(64) T factors[TILE];  // f
 };
 
+// The largest alpha, rounded once per tile.
+template <class T>
+struct AlphaClamp {
+    T alpha, log2_alpha;
+
+    GSPLAT_METHOD explicit AlphaClamp(const Settings &settings) : alpha(T(settings.alpha_max)), log2_alpha(T(settings.log2_alpha_max)) {}
+};
+
 template <class T, bool GENTLY>
 struct Falloff {
     using V = typename Vector<T>::V;
@@ -173,8 +181,8 @@ struct Falloff {
     T highest;             // alpha's clamp, or its logarithm
     V across, value, ratio, least, most;
 
-    GSPLAT_METHOD Falloff(FalloffRows<T> &steps, const Settings &settings)
-        : rows(steps), highest(T(GENTLY ? settings.alpha_max : settings.log2_alpha_max)), across{}, value{}, ratio{}, least{}, most{} {}
+    GSPLAT_METHOD Falloff(FalloffRows<T> &steps, const AlphaClamp<T> &clamp)
+        : rows(steps), highest(GENTLY ? clamp.alpha : clamp.log2_alpha), across{}, value{}, ratio{}, least{}, most{} {}
 
     GSPLAT_METHOD void begin_splat(const Splat<T> &s, const TileBox &box, int32_t top, int32_t bottom) {
         least = kept(splat(T(GENTLY ? ALPHA_MIN : LOG2_ALPHA_MIN))), most = kept(splat(highest));
