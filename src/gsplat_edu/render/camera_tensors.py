@@ -1,6 +1,8 @@
 """A camera made of tensors, in whose pose and intrinsics a render is differentiable.
 
 x_cam = R (x - eye);  u = fx x/z + cx,  v = fy y/z + cy
+
+Chapter: 12_the_backward_pass.
 """
 
 from __future__ import annotations
