@@ -62,7 +62,7 @@ def test_first_images_agree(datasets, layout):
 
 @functools.cache
 def trained_psnr(dataset):
-    config = recipe(500, densify_start=50, densify_stop=400)
+    config = recipe(300, densify_start=300, densify_stop=300)
     extent = scene_extent([view.camera for view in dataset.train])
     gaussians = start(dataset, config)
     strategy = make_strategy(config, extent, gaussians)
@@ -75,10 +75,14 @@ def trained_psnr(dataset):
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS[1:])
 def test_trained_scenes_agree(datasets, layout):
-    """Poses differ by rounding, so the trainings diverge, but their quality must agree."""
+    """Poses differ by rounding, so the trainings diverge, but their quality must agree.
+
+    Without density control the scores of five starts that differ by a float32 rounding lie within 0.0014 dB; with it,
+    within 0.7. A principal point that is off by half a pixel costs 0.17 dB.
+    """
     ours, theirs = trained_psnr(datasets["COLMAP"]), trained_psnr(datasets[layout])
     assert ours > 24, "something was learned"
-    assert theirs == pytest.approx(ours, abs=0.1)
+    assert theirs == pytest.approx(ours, abs=0.02)
 
 
 def test_a_mirrored_world_is_detected(datasets):
