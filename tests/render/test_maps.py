@@ -8,8 +8,8 @@ import torch
 
 from gsplat_edu import ArgumentError, build_cov3d_batch, quat_to_R_batch, render_gaussians
 from gsplat_edu.render.api import render
-from gsplat_edu.render.maps import MAPS, facing_normals, render_maps
-from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.render.maps import facing_normals, render_maps
+from gsplat_edu.render.settings import MAPS, RenderSettings
 from native_scenes import SCENES, random, smooth_scene
 
 BACKENDS = ("cpu", "torch")

@@ -27,8 +27,8 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import SOG_META, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.render.backends import device_of, resolve_backend
-from gsplat_edu.render.maps import MAPS, render_maps
-from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.render.maps import render_maps
+from gsplat_edu.render.settings import MAPS, RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
 from gsplat_edu.runs.source import file_settings, relative_to

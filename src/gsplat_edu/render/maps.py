@@ -17,10 +17,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, unchecked_rotations
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.render.settings import RenderSettings
-
-MAPS = ("alpha", "depth", "expected-depth", "median-depth", "normal")
-"""The maps by name."""
+from gsplat_edu.render.settings import MAPS, RenderSettings
 
 
 def facing_normals(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N 3"]:

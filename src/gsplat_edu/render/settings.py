@@ -12,6 +12,9 @@ BACKENDS = ("cuda", "cpu", "torch")
 """All backends, fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, which evaluates every
 splat at every pixel."""
 
+MAPS = ("alpha", "depth", "expected-depth", "median-depth", "normal")
+"""The maps of `gsplat_edu.render.maps`, by name. The command line lists them without importing torch."""
+
 
 def check_backend(name: str) -> None:
     """Check that a backend's name is known; `gsplat_edu.render.backends` tells whether it is available here.

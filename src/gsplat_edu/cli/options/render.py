@@ -6,14 +6,12 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.render.settings import MAPS
 
 EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"
 
 SCENE_SIZE = 512
 """px: size of the images of a scene file that comes without cameras."""
-
-MAPS = ("alpha", "depth", "expected-depth", "median-depth", "normal")
-"""The maps by name, as in `gsplat_edu.render.maps`, whose import takes torch along."""
 
 RUNS_CAMERAS = ""
 """Value of --dataset without a path."""
