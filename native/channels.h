@@ -9,6 +9,15 @@
 namespace gsplat {
 namespace GSPLAT_ISA {
 
+// Turns rows into columns: four pixels of four channels into four channels of four pixels, and back.
+template <class Q>
+GSPLAT_INLINE void transpose(Q *m) {
+    const Q a = __builtin_shufflevector(m[0], m[1], 0, 4, 1, 5), b = __builtin_shufflevector(m[0], m[1], 2, 6, 3, 7);
+    const Q c = __builtin_shufflevector(m[2], m[3], 0, 4, 1, 5), d = __builtin_shufflevector(m[2], m[3], 2, 6, 3, 7);
+    m[0] = __builtin_shufflevector(a, c, 0, 1, 4, 5), m[1] = __builtin_shufflevector(a, c, 2, 3, 6, 7);
+    m[2] = __builtin_shufflevector(b, d, 0, 1, 4, 5), m[3] = __builtin_shufflevector(b, d, 2, 3, 6, 7);
+}
+
 // Features of a tile's pixels: all channels of a vector of pixels are neighbours, because a splat adds to all of them at once.
 template <class T>
 struct FeaturePlanes {
@@ -36,36 +45,46 @@ struct FeaturePlanes {
         if (LANES >= 4) return store(four(place, k), q);
         for (int i = 0; i < 4; ++i) *four(place + i, k) = q[i];
     }
+
+    // Copies `count` pixels, at most four, to an interleaved image.
+    GSPLAT_METHOD void write(int place, T *to, int count) {
+        int32_t k = 0;
+        if (count == 4)
+            for (; channels - k >= 4; k += 4) {
+                Q m[4] = {load_four(place, k), load_four(place, k + 1), load_four(place, k + 2), load_four(place, k + 3)};
+                transpose(m);
+                for (int i = 0; i < 4; ++i) store(to + i * channels + k, m[i]);
+            }
+        for (; k < channels; ++k)
+            for (int i = 0; i < count; ++i) to[i * channels + k] = *four(place + i, k);
+    }
+
+    // Copies them from there; returns their products with those of another image, summed over the channels.
+    GSPLAT_METHOD Q read(int place, const T *from, const T *other, int count) {
+        Q sum{};
+        int32_t k = 0;
+        if (count == 4) {
+            Q parts[4] = {};
+            for (; channels - k >= 4; k += 4) {
+                Q m[4];
+                for (int i = 0; i < 4; ++i) {
+                    m[i] = load<Q>(from + i * channels + k);
+                    parts[i] += m[i] * load<Q>(other + i * channels + k);
+                }
+                transpose(m);
+                for (int j = 0; j < 4; ++j) store_four(place, k + j, m[j]);
+            }
+            transpose(parts);
+            sum = (parts[0] + parts[1]) + (parts[2] + parts[3]);
+        }
+        for (; k < channels; ++k)
+            for (int i = 0; i < count; ++i) {
+                *four(place + i, k) = from[i * channels + k];
+                sum[i] += from[i * channels + k] * other[i * channels + k];
+            }
+        return sum;
+    }
 };
-
-// Turns rows into columns: four pixels of four channels into four channels of four pixels, and back.
-template <class Q>
-GSPLAT_INLINE void transpose(Q *m) {
-    const Q a = __builtin_shufflevector(m[0], m[1], 0, 4, 1, 5), b = __builtin_shufflevector(m[0], m[1], 2, 6, 3, 7);
-    const Q c = __builtin_shufflevector(m[2], m[3], 0, 4, 1, 5), d = __builtin_shufflevector(m[2], m[3], 2, 6, 3, 7);
-    m[0] = __builtin_shufflevector(a, c, 0, 1, 4, 5), m[1] = __builtin_shufflevector(a, c, 2, 3, 6, 7);
-    m[2] = __builtin_shufflevector(b, d, 0, 1, 4, 5), m[3] = __builtin_shufflevector(b, d, 2, 3, 6, 7);
-}
-
-// Reads channels k to k + 3 of `count` pixels of an interleaved image, at most four; others are 0.
-template <class T>
-GSPLAT_INLINE void load_channels(const T *from, int32_t channels, int32_t k, int count, typename Four<T>::V *m) {
-    if (count == 4 && channels - k >= 4)
-        for (int i = 0; i < 4; ++i) m[i] = load<typename Four<T>::V>(from + i * channels + k);
-    else
-        for (int i = 0; i < 4; ++i) m[i] = i < count ? load_some(from + i * channels + k, vmin(channels - k, 4)) : typename Four<T>::V{};
-    transpose(m);
-}
-
-// Writes them.
-template <class T>
-GSPLAT_INLINE void store_channels(T *to, int32_t channels, int32_t k, int count, typename Four<T>::V *m) {
-    transpose(m);
-    if (count == 4 && channels - k >= 4)
-        for (int i = 0; i < 4; ++i) store(to + i * channels + k, m[i]);
-    else
-        for (int i = 0; i < count; ++i) memcpy(to + i * channels + k, m + i, size_t(vmin(channels - k, 4)) * sizeof(T));
-}
 
 // Up to SIZE neighbours in the order of depth, and their weights at the tile's pixels. Sums take them in their order, so the
 // result does not depend on the groups.
@@ -126,11 +145,14 @@ struct FeatureGroupBackward : FeatureGroup<T> {
         for (int at = Group::top * TILE; at < (Group::bottom + 1) * TILE; at += LANES) {
             V even[SIZE] = {}, odd[SIZE] = {};  // two sums of each, because an addition waits for the one before
             const T *from = gradients.at(at);
-            for (int32_t k = 0; k < channels; k += 2) {
-                const int32_t next = vmin(k + 1, channels - 1);
-                const V g = load<V>(from + k * LANES), h = next > k ? load<V>(from + next * LANES) : V{};
-                for (int j = 0; j < SIZE; ++j) even[j] += g * splat(f[j][k]), odd[j] += h * splat(f[j][next]);
+            int32_t k = 0;
+#pragma GCC unroll 2
+            for (; k + 1 < channels; k += 2) {
+                const V g = load<V>(from + k * LANES), h = load<V>(from + (k + 1) * LANES);
+                for (int j = 0; j < SIZE; ++j) even[j] += g * splat(f[j][k]), odd[j] += h * splat(f[j][k + 1]);
             }
+            if (k < channels)
+                for (int j = 0; j < SIZE; ++j) even[j] += load<V>(from + k * LANES) * splat(f[j][k]);
             for (int j = 0; j < SIZE; ++j) store(dots[j].values + at, even[j] + odd[j]);
         }
     }

@@ -88,12 +88,7 @@ GSPLAT_INLINE void finish_tile(const CompositeArgs<T> &args, const TileBox &box,
         memcpy(out.transmittance + pixel, &t, bytes);
         if (MODE != COLORS && out.depth) memcpy(out.depth + pixel, tile.depth.values + from, bytes);
         if constexpr (MODE == WITH_ALL) memcpy(out.median + pixel, tile.median.values + from, bytes);
-        if constexpr (MODE >= WITH_FEATURES)
-            for (int32_t k = 0; k < out.channels; k += 4) {
-                Q m[4] = {};
-                for (int j = 0; j < vmin(out.channels - k, 4); ++j) m[j] = tile.features.load_four(from, k + j);
-                store_channels(out.features + pixel * out.channels, out.channels, k, count, m);
-            }
+        if constexpr (MODE >= WITH_FEATURES) tile.features.write(from, out.features + pixel * out.channels, count);
     });
 }
 

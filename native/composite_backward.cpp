@@ -144,15 +144,8 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
         if constexpr (MODE == WITH_ALL)
             if (args.errors) store(tile.errors.values + to, load_some(args.errors + pixel, count));
         if constexpr (MODE >= WITH_FEATURES)
-            for (int32_t k = 0, channels = tile.features.channels; k < channels; k += 4) {
-                Q g4[4], drawn4[4];
-                load_channels(in.features + pixel * channels, channels, k, count, g4);
-                load_channels(out.features + pixel * channels, channels, k, count, drawn4);
-                for (int j = 0; j < vmin(channels - k, 4); ++j) {
-                    tile.features.store_four(to, k + j, g4[j]);
-                    rest += g4[j] * drawn4[j];
-                }
-            }
+            if (const int64_t channels = tile.features.channels)
+                rest += tile.features.read(to, in.features + pixel * channels, out.features + pixel * channels, count);
         store(tile.rest.values + to, rest);
         store(tile.red.values + to, g[0]), store(tile.green.values + to, g[1]), store(tile.blue.values + to, g[2]);
         for (int i = 0; i < count; ++i) tile.transmittance.values[to + i] = 1;
@@ -203,6 +196,7 @@ template <class T, int MODE>
 void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     const CompositeArgs<T> &forward = args.forward;
     const TileBox box = tile_box(forward.grid, forward.camera, index);
+    [[maybe_unused]] const TileBox next = tile_box(forward.grid, forward.camera, index + 1);  // below the image after the last tile
     const AlphaClamp<T> clamp(forward.settings);
     TileGradient<T, MODE> tile;
     begin_tile<T, MODE>(args, box, tile, args.tile_background + 3 * index);
@@ -213,6 +207,10 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
         const PairSlots<T> pair = slots_of<T, MODE>(args, forward.pairs[k]);
         const uint32_t i = (k - begin) % BATCH;
         if (k + 4 < end) __builtin_prefetch(args.slots + int64_t(SLOT) * forward.pairs[k + 4].slot, 1);
+        if constexpr (MODE >= WITH_FEATURES) {
+            fetch_row(args.in.features, tile.features.channels, next, forward.camera.W, k - begin);
+            fetch_row(forward.out.features, tile.features.channels, next, forward.camera.W, k - begin);
+        }
         if (i == 0 && k < stop) {
             fetch_next(forward.splats, forward.pairs + k, stop - k);
             rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
