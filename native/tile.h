@@ -90,7 +90,7 @@ template <class T>
 GSPLAT_INLINE void fetch_row(const T *image, int32_t channels, const TileBox &box, int32_t image_width, uint32_t row) {
     if (row >= uint32_t(box.height)) return;
     const T *from = image + (int64_t(box.y0 + int32_t(row)) * image_width + box.x0) * channels, *end = from + box.width * channels;
-    for (; from < end; from += 64 / sizeof(T)) __builtin_prefetch(from);
+    for (; from < end; from += 64 / sizeof(T)) __builtin_prefetch(from, 0, 2);
 }
 
 // A tile's columns, in strips of one vector each.

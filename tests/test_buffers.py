@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 import weakref
+from pathlib import Path
 
 import pytest
 import torch
@@ -18,6 +19,28 @@ LIKE = torch.zeros(())
 def address():
     """Take a buffer, release it, and return its address."""
     return reusable_tensor(SHAPE, LIKE).data_ptr()
+
+
+def flags(address):
+    """Return the flags of the mapping that holds an address (proc_pid_smaps(5))."""
+    inside = False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        name = line.split(maxsplit=1)[0]
+        if not name.endswith(":"):
+            first, last = (int(end, 16) for end in name.split("-"))
+            inside = first <= address < last
+        elif inside and name == "VmFlags:":
+            return line.split()[1:]
+    return []
+
+
+@pytest.mark.skipif(
+    not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="the system has no huge pages"
+)
+def test_buffers_ask_for_huge_pages():
+    with reused_buffers():
+        assert "hg" in flags(reusable_tensor(SHAPE, LIKE).data_ptr())
+    assert "hg" not in flags(torch.empty(SHAPE).data_ptr())
 
 
 def test_an_unreferenced_buffer_is_reused():

@@ -154,10 +154,14 @@ def reusable_tensor(shape: Sequence[int], like: Tensor, dtype: torch.dtype | Non
 
 
 def _mapped(nbytes: int) -> mmap.mmap:
-    """Map fresh memory; a forked child gets a copy."""
+    """Map fresh memory, on Linux in huge pages if the system has them; a forked child gets a copy."""
     if sys.platform == "win32":
         return mmap.mmap(-1, nbytes)
-    return mmap.mmap(-1, nbytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    block = mmap.mmap(-1, nbytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):  # a kernel without huge pages
+            block.madvise(mmap.MADV_HUGEPAGE)
+    return block
 
 
 @functools.cache
