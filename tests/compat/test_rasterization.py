@@ -266,6 +266,7 @@ def smooth():
     return {name: t.detach().double().requires_grad_() for name, t in tensors.items()}
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 def test_finite_differences(rasterize_mode):
     tensors = smooth()

@@ -1,4 +1,4 @@
-"""Compile every kernel for a GPU that may be absent: python compile_kernels.py CAPABILITY least|most
+"""Compile kernels for a GPU that may be absent: compile_kernels.py CAPABILITY least|most gaussians|pixels|loss
 
 Kernels that have variants are compiled without their options (least) or with all of them (most).
 
@@ -61,13 +61,25 @@ def stage(kernel, warps=4, **constants) -> None:
 
 def main() -> None:
     warnings.simplefilter("ignore")
+    {"gaussians": of_gaussians, "pixels": of_pixels, "loss": of_loss}[sys.argv[3]]()
+
+
+def of_gaussians() -> None:
     shape = {"DEGREE": 3 * MOST, "REST": 15 * MOST, "ANTIALIASED": MOST}
     stage(project.project_kernel, **shape, BLOCK=128)
     stage(project.project_backward_kernel, 2, **shape, WITH_CAMERA=MOST, BLOCK=64)
     stage(intersect.count_kernel, BLOCK=128)
     stage(intersect.emit_kernel, BLOCK=128)
+    arrays = dict.fromkeys(("parameter", "m", "v", "gradient"), FLOATS)
+    build(adam._adam, {**arrays, "count": "i32", "numbers": ("fp32",) * 8})
+
+
+def of_pixels() -> None:
     stage(composite.composite_kernel, WITH_DEPTH=MOST, WITH_MEDIAN=MOST, BATCH=16, PRECISION="ieee")
     stage(composite.composite_backward_kernel, 8, WITH_DEPTH=MOST, WITH_T=MOST, BATCH=16)
+
+
+def of_loss() -> None:
     image = {"image": FLOATS, "target": "*u8", "planes": FLOATS}
     sums = {"sums": FLOATS, "size": SIZE}
     build(loss._moments_across, image | {"size": SIZE, "scale": "fp32"}, warps=16)
@@ -77,8 +89,6 @@ def main() -> None:
     build(loss._gradient_down, last, warps=16)
     build(loss._gradient_down, last, {"planes": None}, warps=16)
     build(loss._add, {"sums": FLOATS, "count": "i32", "total": FLOATS})
-    arrays = dict.fromkeys(("parameter", "m", "v", "gradient"), FLOATS)
-    build(adam._adam, {**arrays, "count": "i32", "numbers": ("fp32",) * 8})
 
 
 if __name__ == "__main__":

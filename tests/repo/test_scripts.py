@@ -1,7 +1,6 @@
 """Every script runs to the end at a tiny size and gives readable results."""
 
 import json
-import os
 import re
 import shutil
 import subprocess

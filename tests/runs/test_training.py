@@ -155,6 +155,7 @@ def newest(out):
 
 @pytest.mark.slow
 @pytest.mark.own_process
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_killed_at_any_moment_and_resumed_gives_the_same_bytes(capture, whole, tmp_path, strategy):
     """kill -9 before the first checkpoint and at two later moments, alternating between one and two threads."""
@@ -424,6 +425,7 @@ def test_a_file_in_place_of_the_run_folder_is_a_one_line_error(capture, tmp_path
     assert capsys.readouterr().err.count("\n") == 2
 
 
+@pytest.mark.sliced(1, by="strategy")
 @pytest.mark.parametrize(
     ("strategy", "cap"),
     [("fast", 200), ("fast", 500), ("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 240)],

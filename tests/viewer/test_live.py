@@ -212,6 +212,7 @@ def trained(out, capture, *words, watch=None):
     return bits, repr(numbers), scene.read_bytes()
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_watching_does_not_change_the_bits_of_a_training(capture, tmp_path, strategy):
     """One training runs alone, the other with two moving cameras, pauses and steps."""

@@ -26,6 +26,12 @@ from live_clients import GROWING, PATIENCE, STRATEGIES, Client, Training, traini
 
 COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"]
 
+TEN_FRAMES_PER_SECOND = """
+requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 100);
+cancelAnimationFrame = clearTimeout;
+"""
+"""viser draws all the time. Without a graphics processor, sixty frames per second leave nothing for the training."""
+
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
@@ -40,6 +46,7 @@ class Tab:
     def __init__(self, browser, url):
         self.complaints, self.requested = [], []
         self.page = browser.new_page(viewport={"width": 700, "height": 500})
+        self.page.add_init_script(TEN_FRAMES_PER_SECOND)
         self.page.set_default_timeout(1e3 * PATIENCE)
         self.page.on("console", self._note)
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))

@@ -142,6 +142,7 @@ def test_no_splat_or_one_splat(show, random_gaussians, camera, count):
         assert likeness(drawn, visit, random_gaussians(count), one, settings) >= ALIKE
 
 
+@pytest.mark.sliced(1, by="antialiased")
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("size", [(0.0, 0.0, 0.0), (-12.0, -12.0, -12.0), (-5.0, -30.0, -30.0)])
 def test_one_black_splat_on_white(show, random_gaussians, camera, size, antialiased):
