@@ -1,6 +1,7 @@
 """Fixtures: scenes to view, and a real browser without a network."""
 
 import base64
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -36,9 +37,19 @@ class Visit:
         self.tab = tab
         self.complaints = []
         self.requests = []
-        tab.on("console", lambda message: self.complaints.append(f"{message.type}: {message.text}"))
-        tab.on("pageerror", lambda error: self.complaints.append(str(error)))
-        tab.on("request", lambda request: self.requests.append(request.url))
+        self._heard = {
+            "console": lambda message: self.complaints.append(f"{message.type}: {message.text}"),
+            "pageerror": lambda error: self.complaints.append(str(error)),
+            "request": lambda request: self.requests.append(request.url),
+        }
+        for event, note in self._heard.items():
+            tab.on(event, note)
+
+    def leave(self):
+        """Empty the tab for the next visit."""
+        for event, note in self._heard.items():
+            self.tab.remove_listener(event, note)
+        self.tab.goto("about:blank")
 
     def open(self, path):
         self.tab.goto(path.as_uri())
@@ -71,22 +82,38 @@ def browser():
         yield launched
 
 
-@pytest.fixture
-def visit(browser):
-    """Make tabs without a network. No tab may log a complaint or request anything from elsewhere."""
-    contexts, visits = [], []
+@pytest.fixture(scope="module")
+def tabs(browser):
+    """Empty tabs by the options they were made with. A new tab takes as long as everything else in most tests."""
+    return defaultdict(list)
 
-    def make(width=320, height=200, **options):
-        context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        contexts.append(context)
-        context.set_offline(True)
-        visits.append(Visit(context.new_page()))
-        return visits[-1]
+
+@pytest.fixture
+def visit(browser, tabs):
+    """Make tabs without a network. No tab may log a complaint or request anything from elsewhere."""
+    visits = []
+
+    def make(width=320, height=200, *, fresh=False, **options):
+        """Visit in a tab of this size; `fresh` if a test leaves traces in the tab: init scripts, keys, clicks."""
+        free = None if fresh else tabs[repr(sorted(options.items()))]
+        if free:
+            tab = free.pop()
+        else:
+            context = browser.new_context(**options)
+            context.set_offline(True)
+            tab = context.new_page()
+        tab.set_viewport_size({"width": width, "height": height})
+        visits.append((Visit(tab), free))
+        return visits[-1][0]
 
     yield make
-    for context in contexts:
-        context.close()
-    for one in visits:
+    for one, free in visits:
+        if free is None:
+            one.tab.context.close()
+        else:
+            one.leave()
+            free.append(one.tab)
+    for one, _ in visits:
         assert one.complaints == []
         assert [url for url in one.requests if not url.startswith(("file:", "blob:", "data:"))] == []
 

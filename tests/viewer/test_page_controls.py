@@ -18,7 +18,7 @@ MIDDLE = (400, 250)  # beside the panel
 @pytest.fixture
 def tour(show, random_gaussians, three_views):
     """A small page with three cameras, opened."""
-    return show(random_gaussians(60), three_views, width=SIZE[0], height=SIZE[1], has_touch=True)
+    return show(random_gaussians(60), three_views, width=SIZE[0], height=SIZE[1], has_touch=True, fresh=True)
 
 
 def pivot(visit):
@@ -213,7 +213,7 @@ def forward_cameras():
 def forward(show, random_gaussians):
     gaussians = random_gaussians(60)
     gaussians.means[:, 2] += 4.0
-    return show(gaussians, forward_cameras(), width=SIZE[0], height=SIZE[1])
+    return show(gaussians, forward_cameras(), width=SIZE[0], height=SIZE[1], fresh=True)
 
 
 def off_the_cameras(visit):
@@ -275,7 +275,7 @@ def wall(show):
         logit_opacities=torch.full((count,), 3.0),
     )
     view = ("a", Camera(np.eye(3), (0.0, 0.0, 0.0), 250.0, 250.0, 160.0, 100.0, 200, 320))
-    return show(gaussians, [view], width=SIZE[0], height=SIZE[1], has_touch=True)
+    return show(gaussians, [view], width=SIZE[0], height=SIZE[1], has_touch=True, fresh=True)
 
 
 def click_twice(visit, by, x, y, pause):
@@ -336,7 +336,7 @@ def test_one_click_or_two_far_apart_set_nothing(wall):
     ("options", "shown"), [({}, "mouse"), ({"has_touch": True, "is_mobile": True}, "touch")]
 )
 def test_the_help_matches_the_visitors_device(show, random_gaussians, options, shown):
-    seen = show(random_gaussians(9), width=390, height=600, **options)
+    seen = show(random_gaussians(9), width=390, height=600, fresh=True, **options)
     seen.tab.click("#help-button")
     visible = seen.tab.locator("#help tr:visible")
     assert visible.count() > 3

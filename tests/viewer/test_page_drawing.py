@@ -253,7 +253,7 @@ def test_the_page_cannot_reach_the_network(show, random_gaussians):
 
 def test_a_browser_without_webgl2_gets_a_message(visit, tmp_path, random_gaussians):
     page.write(tmp_path / "a.html", Scene(random_gaussians(3)))
-    one = visit()
+    one = visit(fresh=True)
     one.tab.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     one.open(tmp_path / "a.html").message("This page needs WebGL2")
 
@@ -267,7 +267,7 @@ def test_a_graphics_processor_with_small_textures_gets_a_message(visit, tmp_path
       };
     """
     for size, fits in ((5, True), (4, False)):  # 20 splats are 4 rows of 5, or 5 of 4
-        one = visit()
+        one = visit(fresh=True)
         one.tab.add_init_script(limited.replace("LARGEST", str(size)))
         one.open(tmp_path / "a.html")
         one.ready() if fits else one.message("more splats than this graphics processor's textures can hold")
@@ -275,7 +275,7 @@ def test_a_graphics_processor_with_small_textures_gets_a_message(visit, tmp_path
 
 def test_a_browser_that_cannot_inflate_gets_a_message(visit, tmp_path, random_gaussians):
     page.write(tmp_path / "a.html", Scene(random_gaussians(3)))
-    one = visit()
+    one = visit(fresh=True)
     one.tab.add_init_script("delete window.DecompressionStream")
     one.open(tmp_path / "a.html").message("lacks DecompressionStream")
 
@@ -297,7 +297,7 @@ def test_damaged_splats_are_reported(visit, tmp_path, random_gaussians, damage):
 
 
 def test_a_lost_context_is_reported(show, random_gaussians):
-    visit = show(random_gaussians(3))
+    visit = show(random_gaussians(3), fresh=True)
     visit.tab.evaluate("viewer.renderer.gl.getExtension('WEBGL_lose_context').loseContext()")
     visit.message("The graphics processor stopped drawing this page")
     visit.complaints[:] = [one for one in visit.complaints if not re.search("WebGL: CONTEXT_LOST", one)]
