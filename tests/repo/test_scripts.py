@@ -119,7 +119,7 @@ def test_every_make_target_is_explained_and_run():
     elsewhere = {"help", "clean", "notebooks", "site", "bench", "soak"}
     for name in targets():
         assert name == "help" or re.search(rf"^make {name} ", explained, re.M), name
-        assert name in elsewhere or re.search(rf"^make {name}\b", ci, re.M), name
+        assert name in elsewhere or re.search(rf"^make .*\b{name}\b", ci, re.M), name
 
 
 @pytest.mark.parametrize(("setting", "flags"), [("", ()), ("SMOKE=1", ("--smoke",))])
