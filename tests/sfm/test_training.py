@@ -25,9 +25,7 @@ def trained(source, run, iterations=200):
     return metrics["test"]["psnr"], metrics["train"]["psnr"]
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("colmap")
-def test_a_dozen_photos_train_as_well_as_with_their_true_poses(tmp_path, capsys):
+def a_dozen_photos_train_as_well_as_with_their_true_poses(tmp_path, capsys):
     photos, truth = tmp_path / "photos", {f"{i:02d}.png": camera for i, camera in enumerate(box_orbit(14))}
     photos.mkdir()
     for name, camera in truth.items():
@@ -51,9 +49,7 @@ def test_a_dozen_photos_train_as_well_as_with_their_true_poses(tmp_path, capsys)
     assert fitted > untrained + 4.0
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("colmap")
-def test_a_video_becomes_a_scene_in_one_command(tmp_path):
+def a_video_becomes_a_scene(tmp_path, _):
     angles = np.linspace(0.0, 2.4, 24)
     video, run = tmp_path / "orbit.mp4", tmp_path / "run"
     path = [box_camera(angle, 0.45 + 0.15 * np.sin(3 * angle)) for angle in angles]
@@ -65,3 +61,14 @@ def test_a_video_becomes_a_scene_in_one_command(tmp_path):
     assert len(found) >= 21
     check(found, {name: path[number] for name, number in numbers.items()})
     assert list(run.glob("point_cloud/*/point_cloud.ply"))
+
+
+@pytest.mark.slow
+@pytest.mark.sliced(1)
+@pytest.mark.usefixtures("colmap")
+@pytest.mark.parametrize(
+    "claim", [a_dozen_photos_train_as_well_as_with_their_true_poses, a_video_becomes_a_scene]
+)
+def test_one_command(tmp_path, capsys, claim):
+    """Each commit checks one claim: both run the same steps, of which other tests here check each."""
+    claim(tmp_path, capsys)
