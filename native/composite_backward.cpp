@@ -196,7 +196,7 @@ template <class T, int MODE>
 void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     const CompositeArgs<T> &forward = args.forward;
     const TileBox box = tile_box(forward.grid, forward.camera, index);
-    [[maybe_unused]] const TileBox next = tile_box(forward.grid, forward.camera, index + 1);  // below the image after the last tile
+    [[maybe_unused]] const TileBox next = tile_box(forward.grid, forward.camera, index + 1);  // its height is 0 or less after the last tile
     const AlphaClamp<T> clamp(forward.settings);
     TileGradient<T, MODE> tile;
     begin_tile<T, MODE>(args, box, tile, args.tile_background + 3 * index);

@@ -88,7 +88,7 @@ GSPLAT_INLINE void for_each_four(const TileBox &box, int32_t image_width, F visi
 // Prefetches one row of a tile of an interleaved image, nothing if the tile has no such row.
 template <class T>
 GSPLAT_INLINE void fetch_row(const T *image, int32_t channels, const TileBox &box, int32_t image_width, uint32_t row) {
-    if (row >= uint32_t(box.height)) return;
+    if (int32_t(row) >= box.height) return;
     const T *from = image + (int64_t(box.y0 + int32_t(row)) * image_width + box.x0) * channels, *end = from + box.width * channels;
     for (; from < end; from += 64 / sizeof(T)) __builtin_prefetch(from, 0, 2);
 }
