@@ -206,6 +206,7 @@ def test_the_machine_is_stated_once_and_the_configuration_is_folded(tmp_path):
     assert "Training machine processor <another>" in text and "Evaluation machine" in text
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("width", [1440, 390])
 def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_path, width):
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

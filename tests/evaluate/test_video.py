@@ -126,6 +126,7 @@ def test_data_that_is_not_a_video_is_refused():
             streamable(data)
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize(("height", "width"), [(63, 95), (720, 1280)])
 def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width):
     """Chromium does not play MPEG-4 Part 2, and assumes BT.709 for untagged videos of any size."""

@@ -79,7 +79,7 @@ class Tab:
         return np.asarray(shown.convert("RGB"), dtype=float)[150:, :350]
 
 
-def test_a_real_browser_draws_objects_where_our_camera_sees_them(capture, tmp_path, browser):
+def objects_are_drawn_where_our_camera_sees_them(capture, tmp_path, browser):
     """Compare three balls that the browser itself draws with `browser_camera`: axes, signs, centre and scale."""
     window, where = 700, {0: (120, 220, 2.5), 1: (310, 420, 3.2), 2: (560, 330, 4.0)}  # column, row, depth
     with (
@@ -163,8 +163,7 @@ def bits(path):
         return tensors, file.metadata()["state"]
 
 
-@pytest.mark.own_process
-def test_a_user_watches_pauses_steps_and_ends_a_training(capture, tmp_path, browser):
+def a_user_watches_pauses_steps_and_ends_a_training(capture, tmp_path, browser):
     """Command, browser and Ctrl-C together give the same bits as a training without a view."""
     out, words = tmp_path / "run", ["--iterations", "100000", *GROWING, *STRATEGIES["adc"]]
     with commanded(capture, out, *words) as (process, url), Tab(browser, url) as tab:
@@ -206,6 +205,17 @@ def test_a_user_watches_pauses_steps_and_ends_a_training(capture, tmp_path, brow
     watched, unwatched = (list_checkpoints(one / "checkpoints")[-1] for one in (out, tmp_path / "alone"))
     assert watched.name == unwatched.name == f"iteration_{held}.safetensors"
     assert bits(watched) == bits(unwatched)
+
+
+@pytest.mark.own_process
+@pytest.mark.sliced(1)
+@pytest.mark.parametrize(
+    "claim",
+    [objects_are_drawn_where_our_camera_sees_them, a_user_watches_pauses_steps_and_ends_a_training],
+)
+def test_in_a_real_browser(capture, tmp_path, browser, claim):
+    """Each commit checks one claim: viser's page alone takes the browser many seconds."""
+    claim(capture, tmp_path, browser)
 
 
 @pytest.mark.own_process

@@ -41,6 +41,7 @@ def likeness(seen, visit, gaussians, camera, settings):
     return psnr(visit.picture(camera), seen(gaussians, camera, settings).clip(0, 1))
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     "settings",
     [
@@ -182,6 +183,7 @@ def test_a_trained_scene(show):
         assert likeness(drawn, visit, gaussians, one, settings) >= ALIKE
 
 
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     ("width", "height", "scale"),
     [
