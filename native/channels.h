@@ -59,7 +59,7 @@ struct FeaturePlanes {
             for (int i = 0; i < count; ++i) to[i * channels + k] = *four(place + i, k);
     }
 
-    // Copies them from there; returns their products with those of another image, summed over the channels.
+    // Copies them from an interleaved image; returns, by pixel, their dot product with the channels of another one.
     GSPLAT_METHOD Q read(int place, const T *from, const T *other, int count) {
         Q sum{};
         int32_t k = 0;
