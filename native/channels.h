@@ -9,15 +9,6 @@
 namespace gsplat {
 namespace GSPLAT_ISA {
 
-// Turns rows into columns: four pixels of four channels into four channels of four pixels, and back.
-template <class Q>
-GSPLAT_INLINE void transpose(Q *m) {
-    const Q a = __builtin_shufflevector(m[0], m[1], 0, 4, 1, 5), b = __builtin_shufflevector(m[0], m[1], 2, 6, 3, 7);
-    const Q c = __builtin_shufflevector(m[2], m[3], 0, 4, 1, 5), d = __builtin_shufflevector(m[2], m[3], 2, 6, 3, 7);
-    m[0] = __builtin_shufflevector(a, c, 0, 1, 4, 5), m[1] = __builtin_shufflevector(a, c, 2, 3, 6, 7);
-    m[2] = __builtin_shufflevector(b, d, 0, 1, 4, 5), m[3] = __builtin_shufflevector(b, d, 2, 3, 6, 7);
-}
-
 // Features of a tile's pixels: all channels of a vector of pixels are neighbours, because a splat adds to all of them at once.
 template <class T>
 struct FeaturePlanes {

@@ -27,18 +27,19 @@ struct TileState<T, WITH_ALL> : TileState<T, WITH_FEATURES> {
 };
 
 // Draws one splat; `weights` gets T alpha by pixel if there are features.
-template <class T, int MODE, bool GENTLY>
+template <class T, int MODE, FalloffKind KIND>
 GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const AlphaClamp<T> &clamp, const Splat<T> &s, const TileBox &box,
-                        const Rows<T> &rows, uint32_t i, TileState<T, MODE> &tile, [[maybe_unused]] T *weights) {
+                        const Batch<T> &batch, uint32_t i, TileState<T, MODE> &tile, [[maybe_unused]] T *weights) {
     using V = typename Vector<T>::V;
-    FalloffRows<T> steps;
-    Falloff<T, GENTLY> falloff{steps, clamp};
-    falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
+    const Rows<T> &rows = batch.rows;
+    SteepRows<T> steep;
+    Falloff<T, KIND> falloff{batch.steps, i, steep, clamp};
+    falloff.begin_splat(s, box);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
         const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
         if (first > last) continue;
-        falloff.begin_strip(s, iota<T>() + splat(T(column + box.x0) - s.x), T(first + box.y0) - s.y);
+        falloff.begin_strip(s, column, iota<T>() + splat(T(column + box.x0) - s.x));
         for (int32_t row = first; row <= last; ++row) {
             const int at = row * TILE + column;
             V key;
@@ -105,21 +106,20 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
 
     const uint32_t begin = args.tile_begin[index], end = args.tile_begin[index + 1];
     uint32_t k = begin;
-    Rows<T> rows;
+    Batch<T> batch;
+    const Rows<T> &rows = batch.rows;
     int bright = 0;
     for (; k < end; ++k) {
         const uint32_t i = (k - begin) % BATCH;
-        if (i == 0) {
-            fetch_next(args.splats, args.pairs + k, end - k);
-            rows_of(args.splats, args.pairs + k, vmin(BATCH, end - k), box, rows);
-        }
+        if (i == 0) batch.begin(args.splats, args.pairs + k, end - k, box, clamp);
         if (rows.top[i] > rows.bottom[i]) continue;
         const uint32_t id = args.pairs[k].gaussian;
         T *weights = nullptr;
         if constexpr (MODE >= WITH_FEATURES)
             weights = tile.group.take(args.features + int64_t(args.out.channels) * id, rows.top[i], rows.bottom[i]);
-        rows.gentle[i] ? draw<T, MODE, true>(args, clamp, args.splats[id], box, rows, i, tile, weights)
-                       : draw<T, MODE, false>(args, clamp, args.splats[id], box, rows, i, tile, weights);
+        // An instance for INSIDE makes the forward pass no faster: its stores bound it.
+        rows.kind[i] == STEEP ? draw<T, MODE, STEEP>(args, clamp, args.splats[id], box, batch, i, tile, weights)
+                              : draw<T, MODE, GENTLE>(args, clamp, args.splats[id], box, batch, i, tile, weights);
         if constexpr (MODE >= WITH_FEATURES)
             if (tile.group.count == tile.group.SIZE) tile.group.add_to(tile.features);
         if (!lets_light_through(tile.transmittance, bright)) {

@@ -54,15 +54,16 @@ GSPLAT_INLINE void write_statistics(const Splat<T> &s, const typename Vector<T>:
 }
 
 // Writes one splat's sums over the tile to its slot, and its weights to its place in the group of features.
-template <class T, int MODE, bool GENTLY>
+template <class T, int MODE, FalloffKind KIND>
 GSPLAT_INLINE void splat_backward(const Settings &settings, const AlphaClamp<T> &clamp, const PairSlots<T> &pair, const TileBox &box,
-                                  const Rows<T> &rows, uint32_t i, TileGradient<T, MODE> &tile) {
+                                  const Batch<T> &batch, uint32_t i, TileGradient<T, MODE> &tile) {
     [[maybe_unused]] const uint32_t member = i % FeatureGroup<T>::SIZE;
     using V = typename Vector<T>::V;
     const Splat<T> &s = pair.s;
-    FalloffRows<T> steps;
-    Falloff<T, GENTLY> falloff{steps, clamp};
-    falloff.begin_splat(s, box, rows.top[i], rows.bottom[i]);
+    const Rows<T> &rows = batch.rows;
+    SteepRows<T> steep;
+    Falloff<T, KIND> falloff{batch.steps, i, steep, clamp};
+    falloff.begin_splat(s, box);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
     V sums[8] = {}, hyy = V{}, wz = V{};  // in the order of a slot
     V statistics[STATISTICS] = {};
@@ -70,11 +71,11 @@ GSPLAT_INLINE void splat_backward(const Settings &settings, const AlphaClamp<T> 
         const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
         if (first > last) continue;
         const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
-        falloff.begin_strip(s, dx, T(first + box.y0) - s.y);
+        falloff.begin_strip(s, column, dx);
         V wr = V{}, wg = V{}, wb = V{};
-        V sum0 = V{}, sum1 = V{}, sum2 = V{};  // h, h dy, h dy²; multiplied by dx once per strip
-        V dy = splat(T(first + box.y0) - s.y);
-        for (int32_t row = first; row <= last; ++row, dy += splat(T(1))) {
+        V sum0 = V{}, sum1 = V{}, sum2 = V{};  // of h, of sum0 after each row, of sum1 after each row
+        [[maybe_unused]] V dy = splat(T(first + box.y0) - s.y);
+        for (int32_t row = first; row <= last; ++row) {
             const int at = row * TILE + column;
             V key;
             V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at);
@@ -93,26 +94,28 @@ GSPLAT_INLINE void splat_backward(const Settings &settings, const AlphaClamp<T> 
                     cg += load<V>(tile.group.dots[member].values + at);
                     store(tile.group.weights[member].values + at, w);
                 }
-            const V rest = load<V>(tile.rest.values + at) - w * cg;
-            const V h = falloff.where_open(key, alpha * (t * cg - rest * reciprocal(splat(T(1)) - alpha)));
+            const V drawn = w * cg, rest = load<V>(tile.rest.values + at) - drawn;
+            const V h = falloff.where_open(key, drawn - rest * (alpha * reciprocal(splat(T(1)) - alpha)));
             store(tile.rest.values + at, rest);
             store(tile.transmittance.values + at, t - w);
             wr += w * r, wg += w * g, wb += w * b;
-            const V hdy = h * dy;
-            sum0 += h, sum1 += hdy, sum2 += hdy * dy;
+            sum0 += h, sum1 += sum0, sum2 += sum1;
             if constexpr (MODE == WITH_ALL) {
                 const V across = falloff.across + splat(s.sy) * dy, along = splat(s.t0) + splat(s.ty) * dy;
                 statistics[ABS_U] += absolute(h * across), statistics[ABS_V] += absolute(h * (splat(s.sy) * across + splat(s.ty) * along));
                 statistics[WEIGHT] += w, statistics[PIXELS] += w > V{} ? splat(T(1)) : V{};
                 statistics[WEIGHTED_ERROR] += w * load<V>(tile.errors.values + at);
                 statistics[WEIGHT_MAX] = w > statistics[WEIGHT_MAX] ? w : statistics[WEIGHT_MAX];
+                dy += splat(T(1));
             }
             falloff.step(row - first);
         }
-        const V hdx = sum0 * dx;
+        // Row `last` counted once in sum1 and the row above it twice, so with m = 1 there, 2 above, ...: sum1 = sum of h m and
+        // 2 sum2 - sum1 = sum of h m², while dy = end - m.
+        const V end = splat(T(last + 1 + box.y0) - s.y), hdx = sum0 * dx, shifted = end * sum0 - sum1;
         sums[RED] += wr, sums[GREEN] += wg, sums[BLUE] += wb;
-        sums[H] += sum0, sums[HX] += hdx, sums[HXX] += hdx * dx, sums[HY] += sum1, sums[HXY] += sum1 * dx;
-        hyy += sum2;
+        sums[H] += sum0, sums[HX] += hdx, sums[HXX] += hdx * dx, sums[HY] += shifted, sums[HXY] += shifted * dx;
+        hyy += end * (shifted - sum1) + (sum2 + sum2 - sum1);
     }
     sum8(sums, pair.slot);
     pair.slot[HYY] = sum(hyy), pair.slot[DEPTH] = MODE != COLORS ? sum(wz) : T(0);
@@ -125,7 +128,7 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
     using Q = typename Four<T>::V;
     const Images<T> &out = args.forward.out;
     const ImageGrads<T> &in = args.in;
-    memset(&tile, 0, sizeof(TileGradient<T, COLORS>));
+    if (MODE != COLORS || box.width < TILE || box.height < TILE) memset(&tile, 0, sizeof(TileGradient<T, COLORS>));
     if constexpr (MODE >= WITH_FEATURES) tile.features.clear(in.features ? out.channels : 0);
     if constexpr (MODE == WITH_ALL) memset(&tile.errors, 0, sizeof tile.errors);
     Q sums[3] = {};
@@ -196,32 +199,41 @@ template <class T, int MODE>
 void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     const CompositeArgs<T> &forward = args.forward;
     const TileBox box = tile_box(forward.grid, forward.camera, index);
-    [[maybe_unused]] const TileBox next = tile_box(forward.grid, forward.camera, index + 1);  // its height is 0 or less after the last tile
+    const TileBox next = tile_box(forward.grid, forward.camera, index + 1);  // its height is 0 or less after the last tile
     const AlphaClamp<T> clamp(forward.settings);
     TileGradient<T, MODE> tile;
     begin_tile<T, MODE>(args, box, tile, args.tile_background + 3 * index);
     const uint32_t begin = forward.tile_begin[index], end = forward.tile_begin[index + 1];
     const uint32_t stop = begin + forward.done[index];
-    Rows<T> rows;
+    Batch<T> batch;
+    const Rows<T> &rows = batch.rows;
     for (uint32_t k = begin; k < end; ++k) {
         const PairSlots<T> pair = slots_of<T, MODE>(args, forward.pairs[k]);
         const uint32_t i = (k - begin) % BATCH;
         if (k + 4 < end) __builtin_prefetch(args.slots + int64_t(SLOT) * forward.pairs[k + 4].slot, 1);
+        fetch_row(args.in.image, 3, next, forward.camera.W, k - begin);
+        fetch_row(forward.out.image, 3, next, forward.camera.W, k - begin);
+        fetch_row(forward.out.transmittance, 1, next, forward.camera.W, k - begin);
         if constexpr (MODE >= WITH_FEATURES) {
             fetch_row(args.in.features, tile.features.channels, next, forward.camera.W, k - begin);
             fetch_row(forward.out.features, tile.features.channels, next, forward.camera.W, k - begin);
         }
-        if (i == 0 && k < stop) {
-            fetch_next(forward.splats, forward.pairs + k, stop - k);
-            rows_of(forward.splats, forward.pairs + k, vmin(BATCH, stop - k), box, rows);
-        }
+        if (i == 0 && k < stop) batch.begin(forward.splats, forward.pairs + k, stop - k, box, clamp);
         if constexpr (MODE >= WITH_FEATURES)
             if (k < stop && pair.channels && i % FeatureGroup<T>::SIZE == 0) begin_group(args, k, stop, rows, i, tile);
         if (k >= stop || rows.top[i] > rows.bottom[i])
             write_zeros(pair);
         else
-            rows.gentle[i] ? splat_backward<T, MODE, true>(forward.settings, clamp, pair, box, rows, i, tile)
-                           : splat_backward<T, MODE, false>(forward.settings, clamp, pair, box, rows, i, tile);
+            switch (rows.kind[i]) {
+                case INSIDE:
+                    splat_backward<T, MODE, INSIDE>(forward.settings, clamp, pair, box, batch, i, tile);
+                    break;
+                case GENTLE:
+                    splat_backward<T, MODE, GENTLE>(forward.settings, clamp, pair, box, batch, i, tile);
+                    break;
+                default:
+                    splat_backward<T, MODE, STEEP>(forward.settings, clamp, pair, box, batch, i, tile);
+            }
         if constexpr (MODE >= WITH_FEATURES)
             if (k < stop && pair.channels && (i % FeatureGroup<T>::SIZE == FeatureGroup<T>::SIZE - 1 || k + 1 == stop))
                 end_group(args, k - i % FeatureGroup<T>::SIZE, k + 1, tile);

@@ -1,6 +1,8 @@
 // Code shared by the forward and backward pass of a tile.
 #pragma once
 
+#include <stddef.h>
+
 #include "gaussian_math.h"
 
 namespace gsplat {
@@ -43,6 +45,15 @@ struct Four {
     typedef T V __attribute__((vector_size(4 * sizeof(T))));
 };
 
+// Turns rows into columns: four members of four structures into four structures of four members, and back.
+template <class Q>
+GSPLAT_INLINE void transpose(Q *m) {
+    const Q a = __builtin_shufflevector(m[0], m[1], 0, 4, 1, 5), b = __builtin_shufflevector(m[0], m[1], 2, 6, 3, 7);
+    const Q c = __builtin_shufflevector(m[2], m[3], 0, 4, 1, 5), d = __builtin_shufflevector(m[2], m[3], 2, 6, 3, 7);
+    m[0] = __builtin_shufflevector(a, c, 0, 1, 4, 5), m[1] = __builtin_shufflevector(a, c, 2, 3, 6, 7);
+    m[2] = __builtin_shufflevector(b, d, 0, 1, 4, 5), m[3] = __builtin_shufflevector(b, d, 2, 3, 6, 7);
+}
+
 // Reads `count` pixels of an interleaved image, at most four; the others are 0.
 template <class T>
 GSPLAT_INLINE void load_colors(const T *from, int count, typename Four<T>::V *rgb) {
@@ -65,7 +76,10 @@ GSPLAT_INLINE void store_colors(T *to, int count, const typename Four<T>::V *rgb
     const Q out[3] = {__builtin_shufflevector(__builtin_shufflevector(r, g, 0, 4, 1, 1), b, 0, 1, 4, 2),
                       __builtin_shufflevector(__builtin_shufflevector(g, b, 1, 5, 2, 2), r, 0, 1, 6, 2),
                       __builtin_shufflevector(__builtin_shufflevector(b, r, 2, 7, 3, 3), g, 0, 1, 7, 2)};
-    memcpy(to, out, size_t(3 * count) * sizeof(T));
+    if (count == 4)  // vector by vector: reading `out` back in wider pieces than it was written waits for the stores
+        for (int k = 0; k < 3; ++k) store(to + 4 * k, out[k]);
+    else
+        memcpy(to, out, size_t(3 * count) * sizeof(T));
 }
 
 // Reads `count` numbers of a plane of an image, at most four; the others are 0.
@@ -81,8 +95,12 @@ GSPLAT_INLINE typename Four<T>::V load_some(const T *from, int count) {
 // Calls visit(index in a plane, index in the image, count) for every run of at most four pixels of the tile.
 template <class T, class F>
 GSPLAT_INLINE void for_each_four(const TileBox &box, int32_t image_width, F visit) {
-    for (int y = 0; y < box.height; ++y)
-        for (int x = 0; x < box.width; x += 4) visit(y * TILE + x, int64_t(box.y0 + y) * image_width + box.x0 + x, vmin(4, box.width - x));
+    for (int y = 0; y < box.height; ++y) {
+        const int64_t row = int64_t(box.y0 + y) * image_width + box.x0;
+        int x = 0;
+        for (; x + 4 <= box.width; x += 4) visit(y * TILE + x, row + x, 4);  // with the count as a constant
+        if (x < box.width) visit(y * TILE + x, row + x, box.width - x);
+    }
 }
 
 // Prefetches one row of a tile of an interleaved image, nothing if the tile has no such row.
@@ -111,28 +129,61 @@ GSPLAT_INLINE void fetch_next(const Splat<T> *splats, const Pair *pairs, uint32_
     }
 }
 
-// For each of the next splats, the rows that it can touch in every strip of the tile, first > last if none, and whether its
-// exponent stays in a range where 2^p can be stepped from row to row (see Falloff).
-constexpr double GENTLE = 92;  // largest s² + t² of a gentle splat: 2^-92 alone would leave 34 steps of the exponent
+// The largest alpha, rounded once per tile.
+template <class T>
+struct AlphaClamp {
+    T alpha, log2_alpha;
 
+    GSPLAT_METHOD explicit AlphaClamp(const Settings &settings) : alpha(T(settings.alpha_max)), log2_alpha(T(settings.log2_alpha_max)) {}
+};
+
+// How alpha is found in the rows of a tile that a splat touches: with an exponential for each row; by steps from row to row; by
+// steps, and it lies between its bounds everywhere. See Falloff.
+enum FalloffKind : int32_t { STEEP, GENTLE, INSIDE };
+
+constexpr double GENTLE_MOST = 92;         // largest s² + t² of a gentle splat: 2^-92 alone would leave 34 steps of the exponent
+constexpr double INSIDE_MARGIN = 1.0 / 1024;  // in log2: 7e-4 of alpha, where 16 steps in float err by less than 1e-5
+
+// For each of the next splats, the rows that it can touch in every strip of the tile, first > last if none.
 template <class T>
 struct Rows {
     int32_t first[Strips<T>::COUNT][BATCH], last[Strips<T>::COUNT][BATCH], top[BATCH], bottom[BATCH];
-    bool gentle[BATCH];
+    FalloffKind kind[BATCH];
 };
+
+// The members of the splats of a batch, member by member; the first splat fills up.
+template <class T, size_t MEMBERS>
+GSPLAT_INLINE void members_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, T (&members)[MEMBERS][BATCH]) {
+    using Q = typename Four<T>::V;
+    static_assert(MEMBERS % 4 == 0 && BATCH % 4 == 0);
+    for (uint32_t i = 0; i < BATCH; i += 4) {
+        const T *four[4];
+        for (uint32_t j = 0; j < 4; ++j) four[j] = reinterpret_cast<const T *>(splats + pairs[i + j < count ? i + j : 0].gaussian);
+        for (size_t k = 0; k < MEMBERS; k += 4) {
+            Q m[4] = {load<Q>(four[0] + k), load<Q>(four[1] + k), load<Q>(four[2] + k), load<Q>(four[3] + k)};
+            transpose(m);
+            for (size_t j = 0; j < 4; ++j) store(members[k + j] + i, m[j]);
+        }
+    }
+}
 
 // Over the columns [low, high] (relative to the mean) of a strip the ellipse spans from its highest to its lowest point; if one
 // lies outside the columns, the nearest column counts. At width dx it spans dy = tangent dx +- half sqrt(1 - (dx / ex)²).
 // Plain loops over BATCH lanes, which the compiler vectorises.
 template <class T>
-GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, Rows<T> &rows) {
+GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, const AlphaClamp<T> &clamp,
+                           Rows<T> &rows) {
     using S = Strips<T>;
-    T u[BATCH], v[BATCH], x[BATCH], y[BATCH], sx[BATCH], sy[BATCH], ty[BATCH], s0[BATCH], t0[BATCH], drop[BATCH], ex[BATCH], ey[BATCH];
+    T members[sizeof(Splat<T>) / sizeof(T)][BATCH], u[BATCH], v[BATCH], x[BATCH], y[BATCH], drop[BATCH];
+    members_of(splats, pairs, count, members);
+    const auto of = [&](size_t offset) -> const T * { return members[offset / sizeof(T)]; };
+    const T *sx = of(offsetof(Splat<T>, sx)), *sy = of(offsetof(Splat<T>, sy)), *ty = of(offsetof(Splat<T>, ty));
+    const T *s0 = of(offsetof(Splat<T>, s0)), *t0 = of(offsetof(Splat<T>, t0)), *log2_o = of(offsetof(Splat<T>, log2_o));
+    const T *ex = of(offsetof(Splat<T>, extent)), *ey = of(offsetof(Splat<T>, extent) + sizeof(T));
     for (uint32_t i = 0; i < BATCH; ++i) {
-        const Splat<T> &s = splats[pairs[i < count ? i : 0].gaussian];
-        u[i] = s.u - T(box.x0), v[i] = s.v - T(box.y0), x[i] = T(box.x0) - s.x, y[i] = T(box.y0) - s.y;
-        sx[i] = s.sx, sy[i] = s.sy, ty[i] = s.ty, s0[i] = s.s0, t0[i] = s.t0, ex[i] = s.extent[0], ey[i] = s.extent[1];
-        drop[i] = s.log2_o - T(LOG2_ALPHA_MIN);
+        u[i] = of(offsetof(Splat<T>, u))[i] - T(box.x0), v[i] = of(offsetof(Splat<T>, v))[i] - T(box.y0);
+        x[i] = T(box.x0) - of(offsetof(Splat<T>, x))[i], y[i] = T(box.y0) - of(offsetof(Splat<T>, y))[i];
+        drop[i] = log2_o[i] - T(LOG2_ALPHA_MIN);
     }
     T tangent[BATCH], half[BATCH], foot[BATCH], inverse_ex[BATCH], slack[BATCH];
     for (uint32_t i = 0; i < BATCH; ++i) {
@@ -154,11 +205,14 @@ GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t c
             rows.last[strip][i] = int32_t(floor_(vmin(vmax(bottom, T(-1)), lowest)));
             rows.top[i] = vmin(rows.top[i], rows.first[strip][i]), rows.bottom[i] = vmax(rows.bottom[i], rows.last[strip][i]);
         }
+    const T open = clamp.log2_alpha - T(LOG2_ALPHA_MIN + INSIDE_MARGIN);  // a splat that drops less to 1/255 is never clamped
     for (uint32_t i = 0; i < BATCH; ++i) {  // the largest |s| and |t| in the touched rows of the tile
         const T across = T(TILE - 1) / 2, middle = T(rows.top[i] + rows.bottom[i]) / 2, down = T(rows.bottom[i] - rows.top[i]) / 2;
         const T s = abs_(s0[i] + sx[i] * (x[i] + across) + sy[i] * (y[i] + middle)) + abs_(sx[i]) * across + abs_(sy[i]) * down;
         const T t = abs_(t0[i] + ty[i] * (y[i] + middle)) + ty[i] * down;
-        rows.gentle[i] = s * s + t * t <= T(GENTLE);
+        const T most = s * s + t * t;
+        const bool inside = most <= drop[i] - T(INSIDE_MARGIN) && drop[i] <= open;
+        rows.kind[i] = most > T(GENTLE_MOST) ? STEEP : inside ? INSIDE : GENTLE;
     }
 }
 
@@ -167,69 +221,106 @@ GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t c
 //
 //     2^p(k + 1) = 2^p(k) r(0) f(k),   r(0) = 2^(p(1) - p(0)),   f(k) = 2^(-2 k (sy² + ty²))
 //
-// Otherwise every row takes its exponential, because r and f would leave the range of a float.
+// Otherwise every row takes its exponential, because r and f would leave the range of a float. f, 2^p(0) and r(0) of a batch are
+// computed ahead: the processor mispredicts where a splat's rows end, and would wait for these exponentials after each splat.
 template <class T>
-struct FalloffRows {
-    T base[TILE], shift[TILE];    // of a splat that is not gentle: p = base - (across + shift)², row by row
-    alignas(64) T factors[TILE];  // f
+struct alignas(64) Steps {
+    T factors[BATCH][TILE];                     // f
+    T values[BATCH][TILE], ratios[BATCH][TILE];  // 2^p(0) and r(0) in the first row of each column's strip
 };
 
-// The largest alpha, rounded once per tile.
 template <class T>
-struct AlphaClamp {
-    T alpha, log2_alpha;
+GSPLAT_INLINE void steps_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, const TileBox &box, const Rows<T> &rows,
+                            Steps<T> &steps) {
+    using V = typename Vector<T>::V;
+    for (uint32_t i = 0; i < count; ++i) {
+        if (rows.kind[i] == STEEP || rows.top[i] > rows.bottom[i]) continue;
+        const Splat<T> &s = splats[pairs[i].gaussian];
+        const V curve = splat(-2 * (s.sy * s.sy + s.ty * s.ty));
+        for (int32_t k = 0; k <= rows.bottom[i] - rows.top[i]; k += Vector<T>::LANES)
+            store(steps.factors[i] + k, exp2_(curve * (iota<T>() + splat(T(k)))));
+        for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
+            const int32_t column = strip * Strips<T>::WIDTH;
+            const T dy = T(rows.first[strip][i] + box.y0) - s.y, t = s.t0 + s.ty * dy;
+            const V dx = iota<T>() + splat(T(column + box.x0) - s.x);
+            const V along = splat(s.s0) + splat(s.sx) * dx + splat(s.sy * dy);
+            store(steps.values[i] + column, exp2_(splat(s.log2_o - t * t) - along * along));
+            store(steps.ratios[i] + column, exp2_(splat(-s.ty * (2 * t + s.ty) - s.sy * s.sy) - splat(2 * s.sy) * along));
+        }
+    }
+}
 
-    GSPLAT_METHOD explicit AlphaClamp(const Settings &settings) : alpha(T(settings.alpha_max)), log2_alpha(T(settings.log2_alpha_max)) {}
+// The splats of a tile that are taken together.
+template <class T>
+struct Batch {
+    Rows<T> rows;
+    Steps<T> steps;
+
+    GSPLAT_METHOD void begin(const Splat<T> *splats, const Pair *pairs, uint32_t left, const TileBox &box, const AlphaClamp<T> &clamp) {
+        fetch_next(splats, pairs, left);
+        const uint32_t count = vmin(BATCH, left);
+        rows_of(splats, pairs, count, box, clamp, rows);
+        steps_of(splats, pairs, count, box, rows, steps);
+    }
 };
 
-template <class T, bool GENTLY>
+// The rows of a splat that is not gentle: p = base - (across + shift)².
+template <class T>
+struct SteepRows {
+    T base[TILE], shift[TILE];
+};
+
+template <class T, FalloffKind KIND>
 struct Falloff {
     using V = typename Vector<T>::V;
-    FalloffRows<T> &rows;  // outside: vectors beside an array that is indexed would not stay in registers
-    T highest;             // alpha's clamp, or its logarithm
+    static constexpr bool GENTLY = KIND != STEEP;
+    const T *factors, *values, *ratios;
+    SteepRows<T> &steep;  // outside: vectors beside an array that is indexed would not stay in registers
+    T highest;            // alpha's clamp, or its logarithm
     V across, value, ratio, least, most;
 
-    GSPLAT_METHOD Falloff(FalloffRows<T> &steps, const AlphaClamp<T> &clamp)
-        : rows(steps), highest(GENTLY ? clamp.alpha : clamp.log2_alpha), across{}, value{}, ratio{}, least{}, most{} {}
+    GSPLAT_METHOD Falloff(const Steps<T> &steps, uint32_t i, SteepRows<T> &rows, const AlphaClamp<T> &clamp)
+        : factors(steps.factors[i]),
+          values(steps.values[i]),
+          ratios(steps.ratios[i]),
+          steep(rows),
+          highest(GENTLY ? clamp.alpha : clamp.log2_alpha),
+          across{},
+          value{},
+          ratio{},
+          least(kept(splat(T(GENTLY ? ALPHA_MIN : LOG2_ALPHA_MIN)))),
+          most(kept(splat(highest))) {}
 
-    GSPLAT_METHOD void begin_splat(const Splat<T> &s, const TileBox &box, int32_t top, int32_t bottom) {
-        least = kept(splat(T(GENTLY ? ALPHA_MIN : LOG2_ALPHA_MIN))), most = kept(splat(highest));
-        if (GENTLY) {
-            const V curve = splat(-2 * (s.sy * s.sy + s.ty * s.ty));
-            for (int32_t k = 0; k <= bottom - top; k += Vector<T>::LANES) store(rows.factors + k, exp2_(curve * (iota<T>() + splat(T(k)))));
-        } else {
-            for (int row = 0; row < TILE; ++row) {
-                const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;
-                rows.base[row] = s.log2_o - t * t, rows.shift[row] = s.sy * dy;
-            }
+    GSPLAT_METHOD void begin_splat(const Splat<T> &s, const TileBox &box) {
+        if (GENTLY) return;
+        for (int row = 0; row < TILE; ++row) {
+            const T dy = T(row + box.y0) - s.y, t = s.t0 + s.ty * dy;
+            steep.base[row] = s.log2_o - t * t, steep.shift[row] = s.sy * dy;
         }
     }
 
-    GSPLAT_METHOD void begin_strip(const Splat<T> &s, V dx, T dy) {
+    GSPLAT_METHOD void begin_strip(const Splat<T> &s, int32_t column, V dx) {
         across = splat(s.s0) + splat(s.sx) * dx;
-        if (!GENTLY) return;
-        const T t = s.t0 + s.ty * dy;
-        const V along = across + splat(s.sy * dy);
-        value = exp2_(splat(s.log2_o - t * t) - along * along);
-        ratio = exp2_(splat(-s.ty * (2 * t + s.ty) - s.sy * s.sy) - splat(2 * s.sy) * along);
+        if (GENTLY) value = load<V>(values + column), ratio = load<V>(ratios + column);
     }
 
     // alpha, 0 below 1/255, and the number by which it is clamped, as `where_open` takes it.
     GSPLAT_METHOD V alpha(int32_t row, V &key) const {
+        if (KIND == INSIDE) return value;
         if (GENTLY) {
             key = value;
             return between(value, least, most);
         }
-        const V q = across + splat(rows.shift[row]);
-        key = splat(rows.base[row]) - q * q;
+        const V q = across + splat(steep.shift[row]);
+        key = splat(steep.base[row]) - q * q;
         return exp2_between(key, T(LOG2_ALPHA_MIN), highest);
     }
 
     // x where alpha is not clamped, otherwise 0.
-    GSPLAT_METHOD V where_open(V key, V x) const { return where_below(key, most, x); }
+    GSPLAT_METHOD V where_open(V key, V x) const { return KIND == INSIDE ? x : where_below(key, most, x); }
 
     GSPLAT_METHOD void step(int32_t k) {
-        if (GENTLY) value *= ratio * splat(rows.factors[k]);
+        if (GENTLY) value *= ratio * splat(factors[k]);
     }
 };
 
