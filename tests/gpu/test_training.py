@@ -13,7 +13,7 @@ from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.initialize import make_strategy, random_ball
 from gsplat_edu.train.trainer import Trainer
 
-ITERATIONS = 6
+ITERATIONS = 4
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_a_training_is_reproducible(views, device, trained):
 
 def test_a_training_follows_the_native_backend(views, trained):
     """Gradients agree to 3e-4 (test_render.py), and Adam divides by their size. So a step differs by at most one rate
-    where a gradient is pure rounding, and by 3e-4 of it elsewhere. After 6 steps at rates up to 5e-2, few parameters
+    where a gradient is pure rounding, and by 3e-4 of it elsewhere. After 4 steps at rates up to 5e-2, few parameters
     differ by more than 1 % of the distance they could have moved, and the loss differs by far less.
     """
     (ours, losses), native = trained, trainer(views, "cpu", "cpu")
