@@ -150,16 +150,13 @@ def _path_cameras(
     arguments: argparse.Namespace, origin: Sequence[float], width: int, height: int
 ) -> list[Camera]:
     """Return the cameras along the path of --path, in a scene whose origin was subtracted."""
-    try:
-        path = read_path(arguments.path, origin)
-    except ArgumentError as error:
-        raise ArgumentError(f"--path: {error}") from None
+    path = read_path(arguments.path, origin)
     frames = arguments.frames
     if frames is None:
         frames = max(1, round(path.seconds * arguments.fps) + (0 if path.loop else 1))
         if frames > MOST_FRAMES:
             raise ArgumentError(
-                f"--path: {arguments.path} lasts {path.seconds:g} s, {frames:,} frames; give --frames"
+                f"{arguments.path}: lasts {path.seconds:g} s, which is {frames:,} frames; give --frames"
             )
     return PathCurve(path).cameras(frames, width, height)
 
