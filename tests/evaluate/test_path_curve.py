@@ -162,6 +162,15 @@ def test_a_ring_of_keyframes_gives_nearly_a_circle():
     assert curve.travel.radius == pytest.approx(3 * math.sin(math.pi / 12) / (math.pi / 12))
 
 
+def test_three_keyframes_of_an_open_path_are_one_parabola():
+    """Its two ends have no fourth keyframe to mix another one from."""
+    path = KeyframePath(tuple(turned((0, 1, 0), 0, (x, x * x, 5.0)) for x in (-1.0, 0.0, 1.0)), False)
+    x, y, z = PathCurve(path).poses(np.linspace(0, 4, 41))[0].T
+    np.testing.assert_allclose(y, x * x, atol=1e-12)
+    np.testing.assert_allclose(z, 5.0)
+    assert (x[0], x[20], x[40]) == pytest.approx((-1.0, 0.0, 1.0))
+
+
 def test_equal_keyframes_are_one_place_and_with_times_a_rest():
     a, b, c = turned((0, 1, 0), 0), turned((0, 1, 0), 20, (1, 0, 0)), turned((1, 0, 0), 20, (1, 2, 0))
     twice, once = (PathCurve(KeyframePath(k, False, 4.0)) for k in ((a, b, b, c), (a, b, c)))

@@ -29,6 +29,9 @@ class Keyframes {
     const kept = this.path.keyframes.filter((_, i) => i !== index);
     // one keyframe has no time between it and another
     this.edited({ keyframes: kept.length > 1 ? kept : kept.map(({ R, eye, fov }) => ({ R, eye, fov })) });
+    // the button is gone; the next one gets the keyboard's focus
+    const buttons = element("path").querySelectorAll("li button:last-child");
+    (buttons[Math.min(index, buttons.length - 1)] ?? element("save-view")).focus();
   }
 
   // After a change, a path lasts as long as its keyframes' times say, or as usual; a loop with times needs time for the

@@ -95,7 +95,11 @@ function intervalOf(list, value) {
   return low;
 }
 
-const sums = (steps) => steps.reduce((list, step) => [...list, list[list.length - 1] + step], [0]);
+// Running sums, beginning with 0.
+function sums(steps) {
+  let sum = 0;
+  return [0, ...steps.map((step) => (sum += step))];
+}
 
 class PathCurve {
   // path: {loop, duration or null, keyframes: [{eye, R, fov, time or undefined}]}, at least two keyframes.
