@@ -7,7 +7,7 @@ import pytest
 
 from gsplat_edu.camera import Camera, look_at
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path, spread, write_path
+from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, evenly_chosen, read_path, write_path
 
 EYES = [(0.0, 0.0, -4.0), (2.5, -0.5, -2.0), (3.0, 0.0, 1.0)]
 
@@ -71,8 +71,8 @@ def test_a_camera_becomes_a_keyframe_with_its_vertical_field_of_view():
 
 def test_cameras_are_chosen_from_the_first_to_the_last():
     cameras = [Camera(np.eye(3), (i, 0, 0), 9, 9, 4, 4, 8, 8) for i in range(10)]
-    assert [c.eye[0] for c in spread(cameras, 4)] == [0, 3, 6, 9]
-    assert len(spread(cameras, 10)) == len(spread(cameras, 99)) == 10
+    assert [c.eye[0] for c in evenly_chosen(cameras, 4)] == [0, 3, 6, 9]
+    assert len(evenly_chosen(cameras, 10)) == len(evenly_chosen(cameras, 99)) == 10
 
 
 def changed(change):

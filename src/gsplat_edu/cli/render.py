@@ -15,13 +15,13 @@ from jaxtyping import Float
 from rich.progress import track
 
 from gsplat_edu.camera import WORLD_UP, Camera
-from gsplat_edu.cli.options.render import FRAMES, KEYFRAMES, RUNS_CAMERAS, SCENE_SIZE
+from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.following import path_along
 from gsplat_edu.evaluate.images import VIDEO_SUFFIX, check_output, write_frames
-from gsplat_edu.evaluate.keyframes import FEWEST, Keyframe, KeyframePath, read_path, spread, write_path
+from gsplat_edu.evaluate.keyframes import FEWEST, Keyframe, KeyframePath, evenly_chosen, read_path, write_path
 from gsplat_edu.evaluate.map_files import write_list, write_maps
 from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
@@ -131,15 +131,15 @@ def _orbit_frames(arguments: argparse.Namespace) -> int:
     """Return the number of cameras of an orbit to render, or of keyframes to save."""
     if arguments.save_path is not None:
         return int(arguments.keyframes or KEYFRAMES)
-    return int(arguments.frames or FRAMES)
+    return int(arguments.frames or ORBIT_FRAMES)
 
 
 def _save_path(arguments: argparse.Namespace, shot: Shot, orbit: bool) -> str:
     """Write the shot's cameras as keyframes; return a line about it."""
-    cameras = spread(shot.cameras, arguments.keyframes or KEYFRAMES)
+    cameras = evenly_chosen(shot.cameras, arguments.keyframes or KEYFRAMES)
     if len(cameras) < FEWEST:
         raise ArgumentError(f"--save-path: there is 1 camera, but a path needs at least {FEWEST}")
-    duration = (arguments.frames or FRAMES) / arguments.fps if orbit else None
+    duration = (arguments.frames or ORBIT_FRAMES) / arguments.fps if orbit else None
     path = KeyframePath(tuple(map(Keyframe.of_camera, cameras)), orbit, duration)
     write_path(arguments.save_path, path, shot.origin)
     kind = "loop" if orbit else "path"

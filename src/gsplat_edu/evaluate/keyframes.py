@@ -206,7 +206,7 @@ def write_path(file: Path, path: KeyframePath, origin: ArrayLike = NO_SHIFT) -> 
         aside.write_text(text + "\n", encoding="utf-8")
 
 
-def spread(cameras: Sequence[Camera], most: int) -> list[Camera]:
+def evenly_chosen(cameras: Sequence[Camera], most: int) -> list[Camera]:
     """Choose at most `most` cameras, evenly over the list, from the first to the last.
 
     Args:

@@ -17,7 +17,7 @@ SCENE_SIZE = 512
 KEYFRAMES = 24
 """Most keyframes that --save-path writes."""
 
-FRAMES = 120
+ORBIT_FRAMES = 120
 """Frames of an orbit."""
 
 RUNS_CAMERAS = ""
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     number(
         "--frames",
         None,
-        f"number of frames along the path (default: {FRAMES}; with --path, what --fps makes of its duration)",
+        f"number of frames along the path (default: {ORBIT_FRAMES}; with --path, what --fps makes of its duration)",
     )
     number(
         "--size",
