@@ -1,3 +1,4 @@
+import json
 import re
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 import torch
 
 from gsplat_edu.cli.main import main
+from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, write_path
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.io.formats import FORMATS, read_scene, write_scene
 from gsplat_edu.render.api import render
@@ -101,6 +103,30 @@ def test_scenes_are_joined_on_request(convert, plain, tmp_path):
     assert len(read_scene(tmp_path / "out.ply").gaussians) == 600
 
 
+def test_a_page_gets_a_path_that_moves_with_the_scene(convert, tmp_path):
+    """The file has the run's coordinates; the page has those of its scene, and knows the difference unless it moved."""
+    origin = (40000.0, 300.0, 7.0)
+    folder, _, cameras = make_run(tmp_path / "run", origin)
+    path = KeyframePath(tuple(map(Keyframe.of_camera, cameras[:3])), True, 4.0)
+    write_path(tmp_path / "path.json", path, origin)
+    for moves, at in (([], origin), (["--transform", "scale=2", "--transform", "rotate=y:90"], (0, 0, 0))):
+        convert(folder.path, tmp_path / "a.html", "--path", tmp_path / "path.json", *moves)
+        facts = json.loads(re.search(r'id="facts">(.*?)</script>', (tmp_path / "a.html").read_text())[1])
+        assert facts["origin"] == list(at)
+        assert (facts["path"]["loop"], facts["path"]["duration"]) == (True, 4.0)
+        named = {camera["name"]: camera for camera in facts["cameras"]}
+        for keyframe, (name, _) in zip(facts["path"]["keyframes"], sorted_by_angle(named)[1:], strict=False):
+            np.testing.assert_allclose(keyframe["position"], named[name]["eye"], atol=1e-9)
+            np.testing.assert_allclose(np.transpose(keyframe["rotation"]), named[name]["R"], atol=1e-9)
+    convert(folder.path, tmp_path / "a.html")
+    assert '"path":null' in (tmp_path / "a.html").read_text()
+
+
+def sorted_by_angle(named):
+    """The run's cameras in the order of their angles; the first is the test view, which `make_run` returns last."""
+    return sorted(named.items(), key=lambda item: float(item[0].removesuffix(".jpg")))
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -121,6 +147,12 @@ def test_scenes_are_joined_on_request(convert, plain, tmp_path):
         (["IN", "out.ply", "--transform", "move=1,2"], "cannot be read"),
         (["IN", "out.ply", "--transform", "matrix=gone.txt"], "gone.txt"),
         (["IN", "out.glb", "--verify", "--backend", "abacus"], "abacus"),
+        (
+            ["IN", "out.ply", "--path", "IN"],
+            "--path: only a page can play a camera path; out.ply is none, use .html",
+        ),
+        (["IN", "out.html", "--path", "IN"], "in.ply: is not JSON"),
+        (["IN", "out.html", "--path", "gone.json"], "gone.json"),
     ],
 )
 def test_mistakes_are_one_line_and_nothing_is_written(convert, plain, tmp_path, monkeypatch, words, says):

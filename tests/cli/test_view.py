@@ -19,6 +19,7 @@ import pytest
 
 import gsplat_edu.cli.main as command_line
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path, write_path
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.io.scene import Scene
@@ -81,14 +82,23 @@ def fetched(url):
 
 
 @own_process
-def test_a_run_is_shown_with_its_cameras_and_settings_until_ctrl_c(made):
+def test_a_run_is_shown_with_its_cameras_path_and_settings_until_ctrl_c(made, tmp_path):
     folder, _ = made
-    with viewing(folder.path, "--port", "0", "--no-open") as (printed, url):
+    frames = [Keyframe.of_camera(camera) for _, _, camera in folder.read_cameras(ORIGIN)[:3]]
+    path = KeyframePath(tuple(frames), True)
+    write_path(tmp_path / "path.json", path, ORIGIN)
+    words = ["--port", "0", "--no-open", "--path", tmp_path / "path.json"]
+    with viewing(folder.path, *words) as (printed, url):
         source = open_source(folder.path)
         assert len(source.cameras) == 6 and len(source.held_out) == 2
         assert source.settings.background == ORANGE
         assert fetched(url) == page.html(
-            source.scene, source.cameras, source.settings, "egg & spoon", source.held_out
+            source.scene,
+            source.cameras,
+            source.settings,
+            "egg & spoon",
+            source.held_out,
+            page.Tour(read_path(tmp_path / "path.json", ORIGIN), ORIGIN),
         )
         with pytest.raises(urllib.error.HTTPError) as refused:
             fetched(f"{url}config.json")
@@ -167,6 +177,7 @@ def test_the_browser_opens_for_a_user_at_a_screen(made, tmp_path):
         (["desk.html"], "desk.html: is already a page; open it in a browser: file://"),
         (["gone.html"], "gone.html: does not exist"),
         (["unfinished"], "unfinished: contains no scene"),
+        (["cut.ply", "--path", "notes.txt"], "notes.txt: is not JSON"),
         (["nowhere", "--port", "70000"], "--port: is 70000"),
         (["nowhere", "--port", "many"], "argument --port: 'many' is not a whole number"),
         (["nowhere", "--host", "no such host"], "--host: 'no such host' is not an address"),

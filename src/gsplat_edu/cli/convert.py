@@ -17,7 +17,9 @@ from gsplat_edu.cli.exporting import check_and_say
 from gsplat_edu.cli.options.convert import MOVES
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.keyframes import read_path
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
+from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
@@ -34,6 +36,11 @@ def run(arguments: argparse.Namespace) -> None:
     export.check_target("OUT", arguments.out)
     if len(arguments.sources) > 1 and not arguments.merge:
         raise ArgumentError("IN: several scenes given; add --merge to join them, or convert one at a time")
+    if arguments.path is not None and arguments.out.suffix.lower() != export.PAGE:
+        raise ArgumentError(
+            f"--path: only a page can play a camera path; {arguments.out} is none, use {export.PAGE}"
+        )
+    along = None if arguments.path is None else read_path(arguments.path)
     console = Terminal()
     columns = (
         Field("{task.description}"),
@@ -53,8 +60,12 @@ def run(arguments: argparse.Namespace) -> None:
         say = functools.partial(console.print, soft_wrap=True)
         for note in (*_origins(sources), *export.losses(arguments.out, source.scene)):
             say(note)
+        if along is not None:
+            along = along.shifted(-np.array(source.origin)).placed(move.R, move.s, move.t)
+        if move is not IDENTITY:  # the page's views then have the coordinates of the moved scene
+            source = replace(source, origin=ORIGIN)
         bar.update(steps, description=f"writing {arguments.out}")
-        export.write(arguments.out, source)
+        export.write(arguments.out, source, along)
         bar.advance(steps)
         count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
         say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}")

@@ -15,14 +15,17 @@ from jaxtyping import Float
 from rich.progress import track
 
 from gsplat_edu.camera import WORLD_UP, Camera
-from gsplat_edu.cli.options.render import RUNS_CAMERAS, SCENE_SIZE
+from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.following import path_along
 from gsplat_edu.evaluate.images import VIDEO_SUFFIX, check_output, write_frames
+from gsplat_edu.evaluate.keyframes import FEWEST, Keyframe, KeyframePath, evenly_chosen, read_path, write_path
 from gsplat_edu.evaluate.map_files import write_list, write_maps
+from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
+from gsplat_edu.files import check_writable
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import SOG_META, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
@@ -34,6 +37,9 @@ from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
 from gsplat_edu.runs.source import file_settings, relative_to
 from gsplat_edu.validation import whole_number
 
+MOST_FRAMES = 100_000
+"""Most frames of a path unless --frames asks for more: an hour at 28 frames per second."""
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -44,8 +50,9 @@ class Shot:
         cameras: One per image.
         names: File names of the images in a folder; None numbers them.
         settings: Render settings.
-        path: The kind of camera path and the reason for it; "" for the dataset's cameras.
+        path: The kind of camera path and the reason for it; "" for the dataset's cameras and for keyframes.
         maps: Names of the maps to write beside the images.
+        origin: Subtracted from the coordinates of the scene's file and of the cameras.
     """
 
     gaussians: Gaussians
@@ -54,27 +61,23 @@ class Shot:
     settings: RenderSettings
     path: str = ""
     maps: Sequence[str] = ()
+    origin: Sequence[float] = ORIGIN
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Render and report the written files."""
+    """Render and report the written files, or write the path."""
     backend = resolve_backend(arguments.backend)
-    for name in ("frames", "fps"):
-        whole_number(f"--{name}", getattr(arguments, name), 1)
-    if arguments.size is not None:
-        whole_number("--size", arguments.size, 1)
-    if arguments.out is not None:
-        check_output(arguments.out)
+    _check_numbers(arguments)
     maps = _chosen_maps(arguments)
-    name = "orbit" if maps else "orbit.mp4"
     folder = RunFolder(arguments.source)
     orbit = arguments.orbit or arguments.dataset is None
+    name = _output_name(arguments, orbit, bool(maps))
     if folder.exists():
         shot = _run_shot(arguments, folder, orbit)
-        out = arguments.out or folder.renders / (name if orbit else "views")
+        out = arguments.out or folder.renders / name
     elif arguments.source.is_file() or (arguments.source / SOG_META).is_file():
         shot = _file_shot(arguments, orbit)
-        out = arguments.out or Path("out") / f"{arguments.source.stem}_{name if orbit else 'views'}"
+        out = arguments.out or Path("out") / f"{arguments.source.stem}_{name}"
     elif arguments.source.exists():
         raise ArgumentError(
             f"{arguments.source}: is not a run (config.json is missing); give a run folder or a scene file"
@@ -84,6 +87,9 @@ def run(arguments: argparse.Namespace) -> None:
     console = Terminal()
     if shot.path:
         console.print(shot.path, soft_wrap=True)
+    if arguments.save_path is not None:
+        console.print(_save_path(arguments, shot, orbit), soft_wrap=True)
+        return
     started = time.perf_counter()
     shot = replace(shot, gaussians=shot.gaussians.to(device_of(backend)), maps=maps)
     frames = track(
@@ -103,6 +109,58 @@ def run(arguments: argparse.Namespace) -> None:
     console.print(f"wrote {out}{'' if written == [out] else '/'}: {what}", soft_wrap=True)
 
 
+def _check_numbers(arguments: argparse.Namespace) -> None:
+    for name, least in (("frames", 1), ("fps", 1), ("size", 1), ("keyframes", FEWEST)):
+        if (value := getattr(arguments, name)) is not None:
+            whole_number(f"--{name}", value, least)
+    if arguments.out is not None:
+        check_output(arguments.out)
+    if arguments.save_path is not None:
+        check_writable("--save-path", arguments.save_path)
+
+
+def _output_name(arguments: argparse.Namespace, orbit: bool, maps: bool) -> str:
+    """Return the default name of the output: a video, or a folder for maps and for the dataset's cameras."""
+    if not orbit:
+        return "views"
+    kind = "orbit" if arguments.path is None else "path"
+    return kind if maps else f"{kind}{VIDEO_SUFFIX}"
+
+
+def _orbit_frames(arguments: argparse.Namespace) -> int:
+    """Return the number of cameras of an orbit to render, or of keyframes to save."""
+    if arguments.save_path is not None:
+        return int(arguments.keyframes or KEYFRAMES)
+    return int(arguments.frames or ORBIT_FRAMES)
+
+
+def _save_path(arguments: argparse.Namespace, shot: Shot, orbit: bool) -> str:
+    """Write the shot's cameras as keyframes; return a line about it."""
+    cameras = evenly_chosen(shot.cameras, arguments.keyframes or KEYFRAMES)
+    if len(cameras) < FEWEST:
+        raise ArgumentError(f"--save-path: there is 1 camera, but a path needs at least {FEWEST}")
+    duration = (arguments.frames or ORBIT_FRAMES) / arguments.fps if orbit else None
+    path = KeyframePath(tuple(map(Keyframe.of_camera, cameras)), orbit, duration)
+    write_path(arguments.save_path, path, shot.origin)
+    kind = "loop" if orbit else "path"
+    return f"wrote {arguments.save_path}: {len(cameras)} keyframes, a {kind} of {path.seconds:g} s"
+
+
+def _path_cameras(
+    arguments: argparse.Namespace, origin: Sequence[float], width: int, height: int
+) -> list[Camera]:
+    """Return the cameras along the path of --path, in a scene whose origin was subtracted."""
+    path = read_path(arguments.path, origin)
+    frames = arguments.frames
+    if frames is None:
+        frames = max(1, round(path.seconds * arguments.fps) + (0 if path.loop else 1))
+        if frames > MOST_FRAMES:
+            raise ArgumentError(
+                f"{arguments.path}: lasts {path.seconds:g} s, which is {frames:,} frames; give --frames"
+            )
+    return PathCurve(path).cameras(frames, width, height)
+
+
 def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> Shot:
     config = folder.read_config()
     settings = _settings(render_settings(config), arguments)
@@ -115,7 +173,11 @@ def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> 
     named = [(name, camera) for name, _, camera in cameras]
     if not named:
         raise ArgumentError(f"{folder.cameras}: lists no cameras; give a dataset folder with --dataset PATH")
-    return _shot(arguments, gaussians, named, settings, orbit)
+    if arguments.path is not None:
+        first = named[0][1] if arguments.size is None else resized(named[0][1], arguments.size)
+        along = _path_cameras(arguments, origin, first.W, first.H)
+        return Shot(gaussians, along, None, settings)
+    return replace(_shot(arguments, gaussians, named, settings, orbit), origin=origin)
 
 
 def _file_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
@@ -125,9 +187,10 @@ def _file_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
     settings = _settings(file_settings(scene), arguments)
     if arguments.dataset is not None:
         return _dataset_shot(arguments, scene.gaussians, settings, DataSettings(), orbit)
-    cameras = orbit_of_scene(
-        scene.gaussians, arguments.frames, arguments.size or SCENE_SIZE, scene.up or WORLD_UP
-    )
+    side = arguments.size or SCENE_SIZE
+    if arguments.path is not None:
+        return Shot(scene.gaussians, _path_cameras(arguments, ORIGIN, side, side), None, settings)
+    cameras = orbit_of_scene(scene.gaussians, _orbit_frames(arguments), side, scene.up or WORLD_UP)
     description = (
         "a scene file has no cameras: using a full circle; --dataset PATH follows a capture's cameras"
     )
@@ -144,7 +207,8 @@ def _dataset_shot(
     dataset = load_dataset(arguments.dataset, data)
     gaussians = relative_to(gaussians, dataset.origin)  # in the coordinate frame of the cameras
     named = [(view.name, view.camera) for view in (*dataset.train, *dataset.test)]
-    return _shot(arguments, gaussians, named, settings, orbit)
+    shot = _shot(arguments, gaussians, named, settings, orbit)
+    return replace(shot, origin=tuple(dataset.origin.tolist()))
 
 
 def _shot(
@@ -154,10 +218,12 @@ def _shot(
     settings: RenderSettings,
     orbit: bool,
 ) -> Shot:
+    if arguments.save_path is not None:
+        named = sorted(named, key=lambda entry: entry[0])  # the order in which most captures were taken
     cameras = [camera for _, camera in named]
     names, description = None, ""
     if orbit:
-        path = path_along(cameras, arguments.frames, _depth(gaussians, cameras[0]))
+        path = path_along(cameras, _orbit_frames(arguments), _depth(gaussians, cameras[0]))
         cameras, description = path.cameras, path.description
     else:
         names = image_file_names([name for name, _ in named])

@@ -9,8 +9,11 @@ import threading
 import webbrowser
 from pathlib import Path
 
+import numpy as np
+
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.keyframes import read_path
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import export, page
 from gsplat_edu.viewer.serve import PageServer, exposure
@@ -22,9 +25,12 @@ def run(arguments: argparse.Namespace) -> None:
     _check_is_no_page(arguments.source)
     # first: report a port in use before loading the scene
     with PageServer(b"", arguments.host, arguments.port, policy=page.policy()) as server:
+        along = None if arguments.path is None else read_path(arguments.path)
         source = open_source(arguments.source)
-        title = _title(arguments.source)
-        server.page = page.html(source.scene, source.cameras, source.settings, title, source.held_out)
+        if along is not None:
+            along = along.shifted(-np.array(source.origin))
+        title, tour = _title(arguments.source), page.Tour(along, source.origin)
+        server.page = page.html(source.scene, source.cameras, source.settings, title, source.held_out, tour)
         cameras = f", {len(source.cameras)} cameras" if source.cameras else ""
         console.print(
             f"{source.path}: {len(source.scene.gaussians):,} Gaussians{cameras}, {len(server.page):,} bytes",

@@ -10,6 +10,7 @@ from typing import Any
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.fidelity import compare_scenes
+from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.files import check_folder
 from gsplat_edu.io import formats
@@ -84,15 +85,21 @@ def check_target(name: str, path: Path) -> None:
     check_folder(name, path.parent)
 
 
-def write(path: Path, source: Source) -> None:
+def write(path: Path, source: Source, keyframes: KeyframePath | None = None) -> None:
     """Write a scene in the format given by the file's name; a page also gets the cameras and settings.
+
+    Args:
+        path: Output file.
+        source: The scene.
+        keyframes: A camera path for the page to play, in the coordinates of the scene.
 
     Raises:
         ArgumentError: the suffix belongs to no format, or the format cannot hold the scene.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     if path.suffix.lower() == PAGE:
-        page.write(path, source.scene, source.cameras, source.settings, source.held_out)
+        tour = page.Tour(keyframes, source.origin)
+        page.write(path, source.scene, source.cameras, source.settings, source.held_out, tour)
     else:
         write_scene(path, source.scene)
 

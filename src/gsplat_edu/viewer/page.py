@@ -15,6 +15,7 @@ import math
 import re
 import zlib
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,13 @@ from gsplat_edu import constants
 from gsplat_edu.camera import Camera
 from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.files import written_aside
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.reading import parse_json, read_bytes
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.page_start import first_camera, start_of
@@ -35,7 +38,18 @@ from gsplat_edu.viewer.page_start import first_camera, start_of
 FORMAT = "gsplat-edu page"
 VERSION = 1
 
-SCRIPTS = ("scene.js", "region.js", "camera.js", "draw.js", "sorter.js", "controls.js", "panel.js", "main.js")
+SCRIPTS = (
+    "scene.js",
+    "region.js",
+    "camera.js",
+    "path.js",
+    "draw.js",
+    "sorter.js",
+    "controls.js",
+    "panel.js",
+    "keyframes.js",
+    "main.js",
+)
 """The page's scripts in loading order; they share one scope."""
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
@@ -68,12 +82,26 @@ FACTS_OPEN, SPLATS_OPEN, CLOSE = (
 )
 
 
+@dataclass(frozen=True)
+class Tour:
+    """The camera path of a page.
+
+    Args:
+        path: Keyframes that the page plays, in the coordinates of the page's scene; None for none.
+        origin: Origin subtracted from the coordinates of the scene's file; the page adds it to the views that it saves.
+    """
+
+    path: KeyframePath | None = None
+    origin: Sequence[float] = ORIGIN
+
+
 def write(
     path: Path,
     scene: Scene,
     views: Sequence[NamedCamera] = (),
     settings: RenderSettings | None = None,
     held_out: Collection[str] = (),
+    tour: Tour | None = None,
 ) -> None:
     """Write the page; its title is the file's name without the suffix.
 
@@ -84,12 +112,13 @@ def write(
             out.
         settings: Render settings; None takes those of scene files (`gsplat_edu.runs.source.file_settings`).
         held_out: Names of the test views, which are marked in the list.
+        tour: The camera path to play and the origin of the coordinates; None for no path and none subtracted.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
-    pieces = _pieces(path.stem, scene, views, settings, held_out)
+    pieces = _pieces(path.stem, scene, views, settings, held_out, tour or Tour())
     with written_aside(path) as aside, aside.open("wb") as file:
         file.writelines(pieces)
 
@@ -100,6 +129,7 @@ def html(
     settings: RenderSettings | None = None,
     title: str = "scene",
     held_out: Collection[str] = (),
+    tour: Tour | None = None,
 ) -> bytes:
     """Return the page's bytes.
 
@@ -109,11 +139,12 @@ def html(
         settings: As for `write`.
         title: Heading of the page.
         held_out: As for `write`.
+        tour: As for `write`.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
     """
-    return b"".join(_pieces(title, scene, views, settings, held_out))
+    return b"".join(_pieces(title, scene, views, settings, held_out, tour or Tour()))
 
 
 def policy() -> str:
@@ -153,10 +184,11 @@ def _pieces(
     views: Sequence[NamedCamera],
     settings: RenderSettings | None,
     held_out: Collection[str],
+    tour: Tour,
 ) -> Iterator[bytes]:
     """Yield the file in parts, so that they need not be in memory together."""
     scene.gaussians.check_finite()
-    facts = _facts(title, scene, views, settings or file_settings(scene), held_out)
+    facts = _facts(title, scene, views, settings or file_settings(scene), held_out, tour)
     head, tail = _web("index.html").split("{{splats}}\n")
     yield _filled(head, title, facts).encode("utf-8", errors="replace")  # a file name may not be valid text
     compressed = memoryview(gzip.compress(page_data.packed(scene.gaussians), 6, mtime=0))
@@ -171,6 +203,7 @@ def _facts(
     views: Sequence[NamedCamera],
     settings: RenderSettings,
     held_out: Collection[str],
+    tour: Tour,
 ) -> dict[str, Any]:
     cameras = [camera for _, camera in views]
     trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
@@ -197,6 +230,8 @@ def _facts(
             "up": start.up.tolist(),
             "index": start.index,
         },
+        "origin": [float(x) for x in tour.origin],
+        "path": None if tour.path is None else tour.path.document(),
         "cameras": [
             {"name": name, "held_out": name in held_out, **_camera(camera)} for name, camera in views
         ],

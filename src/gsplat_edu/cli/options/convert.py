@@ -53,6 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"transform the scene after --crop: {MOVES}; may be repeated and is applied in order",
     )
     parser.add_argument(
+        "--path",
+        type=Path,
+        metavar="FILE",
+        help="keyframes, as for render --path, that the page (OUT.html) plays; in the coordinates of IN",
+    )
+    parser.add_argument(
         "--verify",
         action="store_true",
         help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",

@@ -6,12 +6,19 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
+from gsplat_edu.errors import ArgumentError
 from gsplat_edu.render.settings import MAPS
 
 EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"
 
 SCENE_SIZE = 512
 """px: size of the images of a scene file that comes without cameras."""
+
+KEYFRAMES = 24
+"""Most keyframes that --save-path writes."""
+
+ORBIT_FRAMES = 120
+"""Frames of an orbit."""
 
 RUNS_CAMERAS = ""
 """Value of --dataset without a path."""
@@ -33,11 +40,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="render along a path that stays where the photos were taken: a full circle if the cameras surround the"
         " scene, otherwise only as far as they reach (default)",
     )
+    _add_path(parser)
 
     def number(flag: str, default: int | None, text: str) -> None:
         parser.add_argument(flag, type=whole_number_text, metavar="N", default=default, help=text)
 
-    number("--frames", 120, "number of frames along the path (default: 120)")
+    number(
+        "--frames",
+        None,
+        f"number of frames along the path (default: {ORBIT_FRAMES}; with --path, what --fps makes of its duration)",
+    )
     number(
         "--size",
         None,
@@ -60,3 +72,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--white-background", action="store_true", help="render over white (default: the run's background)"
     )
     add_backend(parser)
+
+
+def _add_path(parser: argparse.ArgumentParser) -> None:
+    """Add the options of camera paths in files."""
+    parser.add_argument(
+        "--path",
+        type=Path,
+        metavar="FILE",
+        help="render along the keyframes of a JSON file, from --save-path or from the page of view and convert",
+    )
+    parser.add_argument(
+        "--save-path",
+        type=Path,
+        metavar="FILE",
+        help="instead of rendering, write the orbit, or with --dataset the cameras in order of their names, as"
+        " keyframes for --path",
+    )
+    parser.add_argument(
+        "--keyframes",
+        type=whole_number_text,
+        metavar="N",
+        help=f"most keyframes that --save-path writes (default: {KEYFRAMES})",
+    )
+
+
+def check(arguments: argparse.Namespace) -> None:
+    """Check the options that exclude each other.
+
+    Raises:
+        ArgumentError: two of them were given.
+    """
+    others = {
+        "--dataset": arguments.dataset is not None,
+        "--orbit": arguments.orbit,
+        "--save-path": arguments.save_path is not None,
+    }
+    if arguments.path is not None and (given := [flag for flag, is_given in others.items() if is_given]):
+        raise ArgumentError(f"--path: cannot be combined with {given[0]}; give one of them")
+    if arguments.save_path is not None and (given := _given(arguments, "out", "maps")):
+        raise ArgumentError(f"--save-path: renders nothing; remove {given[0]}")
+    if arguments.save_path is None and arguments.keyframes is not None:
+        raise ArgumentError("--keyframes: is only for --save-path; remove it")
+
+
+def _given(arguments: argparse.Namespace, *names: str) -> list[str]:
+    return [f"--{name}" for name in names if getattr(arguments, name) is not None]

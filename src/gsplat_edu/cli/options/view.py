@@ -29,4 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"port to listen on; 0 for any free one (default: {PORT})",
     )
+    parser.add_argument(
+        "--path",
+        type=Path,
+        metavar="FILE",
+        help="keyframes, as for render --path, that the page plays",
+    )
     parser.add_argument("--no-open", action="store_true", help="print the URL without opening a browser")

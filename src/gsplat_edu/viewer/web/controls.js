@@ -22,7 +22,8 @@ const STEPS = {
 
 class Controls {
   // actions: moved() after every move, awake() when a held key starts to move, shown() for the camera on the screen,
-  // orbitAround(x, y) for a double click or tap, and the keys' actions: fly(), reset(), help(), step(by).
+  // orbitAround(x, y) for a double click or tap, and the keys' actions: fly(), reset(), help(), step(by), saveView(),
+  // playPath().
   constructor(canvas, view, actions) {
     Object.assign(this, { canvas, view, actions, flying: false, pointers: new Map(), held: new Set(), hurried: false });
     this.lastTap = null;
@@ -112,6 +113,8 @@ class Controls {
       f: () => this.actions.fly(),
       r: () => this.actions.reset(),
       h: () => this.actions.help(),
+      k: () => this.actions.saveView(),
+      p: () => this.actions.playPath(),
       arrowleft: () => this.actions.step(-1),
       arrowright: () => this.actions.step(1),
     }[event.key.toLowerCase()];

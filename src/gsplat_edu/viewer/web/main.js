@@ -22,6 +22,8 @@ class Viewer {
     this.smoothed = 0; // seconds per frame
     const actions = this.actions();
     this.panel = new Panel(facts, actions);
+    this.keyframes = new Keyframes(facts, actions);
+    this.journey = null; // the curve and the time it began, while the camera path is played
     this.controls = new Controls(this.canvas, this.view, actions);
     this.panel.mark(this.cameraIndex);
     addEventListener("resize", () => this.askFrame());
@@ -40,6 +42,14 @@ class Viewer {
       reset: () => this.reset(),
       goTo: (index) => this.goTo(index),
       step: (by) => this.step(by),
+      view: () => this.view.camera,
+      goToView: (camera) => {
+        this.view.goTo(camera);
+        this.moved(-1);
+      },
+      saveView: () => this.keyframes.save(),
+      playPath: () => (this.journey ? this.stop() : this.play()),
+      pathChanged: () => this.stop(),
       degree: (degree) => {
         this.settings.sh_degree = degree;
         this.askFrame();
@@ -57,6 +67,7 @@ class Viewer {
   // For programs: draws with exactly this camera, regardless of the window's size, and returns float32 RGB with the
   // first row on top. The camera stays until the user moves.
   async setCamera(camera) {
+    this.stop();
     this.exact = camera;
     await this.settled();
     return { width: camera.W, height: camera.H, pixels: this.renderer.pixels() };
@@ -76,6 +87,7 @@ class Viewer {
 
   // Makes the visible surface at a window position (CSS pixels) the pivot; no change if nothing is visible there.
   orbitAround(x, y) {
+    this.stop();
     const camera = this.camera();
     const { left, top, width, height } = this.canvas.getBoundingClientRect();
     const column = Math.min(camera.W - 1, Math.max(0, Math.floor(((x - left) / width) * camera.W)));
@@ -100,7 +112,31 @@ class Viewer {
     if (length) this.goTo((from + by + length) % length);
   }
 
+  // Plays the camera path from its beginning until its end, in a loop forever, or until the user moves.
+  play() {
+    if (!this.keyframes.playable) return;
+    this.moved(-1);
+    this.journey = { curve: this.keyframes.curve(), began: null };
+    this.keyframes.playing(true);
+  }
+
+  stop() {
+    if (this.journey) this.keyframes.playing(false);
+    this.journey = null;
+  }
+
+  // Moves the view to where the journey is now.
+  follow(now) {
+    const { curve, began } = this.journey;
+    if (began === null) this.journey.began = now;
+    const seconds = (now - this.journey.began) / 1000;
+    this.view.goTo(this.keyframes.camera(curve.pose(seconds)));
+    if (!curve.loop && seconds >= curve.seconds) this.stop();
+    this.askFrame();
+  }
+
   moved(cameraIndex) {
+    this.stop();
     this.exact = null;
     this.cameraIndex = cameraIndex;
     this.panel.mark(cameraIndex);
@@ -115,6 +151,7 @@ class Viewer {
     this.frameAsked = 0;
     const seconds = this.lastFrame ? (now - this.lastFrame) / 1000 : 0;
     if (this.controls.advance(Math.min(seconds, LONGEST_STEP))) this.moved(-1);
+    if (this.journey) this.follow(now);
     const camera = this.camera();
     this.draw(camera);
     if (!this.sorter.running && !this.sorter.fits(camera)) this.sorter.sort(camera).then(() => this.askFrame(), fail);

@@ -1,0 +1,312 @@
+"""Keyframes of a camera path, and the JSON file that holds them.
+
+    {"format": "gsplat_edu path", "version": 1, "loop": false, "duration": 8.0,
+     "keyframes": [{"position": [x, y, z], "rotation": [[...], [...], [...]], "fov": 50.0, "time": 0.0}, ...]}
+
+`position` and `rotation` are those of a run's cameras.json: the camera's centre in the coordinates of the scene's file,
+and the rotation from camera to world. `docs/FORMATS.md` describes every key. The page's script `keyframes.js` writes
+the same file.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsplat_edu.camera import ROTATION_TOLERANCE, Camera
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.files import written_aside
+from gsplat_edu.reading import parse_json, read_text
+from gsplat_edu.validation import ArrayLike, float64_array
+
+FORMAT = "gsplat_edu path"
+VERSION = 1
+
+FEWEST = 2
+"""Keyframes of the shortest path."""
+
+FARTHEST = 1e30
+"""World units: positions lie within this distance along each axis, so that squares of distances stay finite."""
+
+NARROWEST, WIDEST = 0.01, 179.0
+"""Degrees: limits of the vertical field of view."""
+
+LEAST_STEP = 1e-3
+"""Seconds: the times of consecutive keyframes differ by at least this."""
+
+LONGEST = 1e6
+"""Seconds: limit of times and durations, 11 days."""
+
+SEGMENT_SECONDS = 2.0
+"""Seconds from one keyframe to the next, on average, if a path states neither times nor a duration."""
+
+NO_SHIFT = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A camera that a path passes through.
+
+    Args:
+        eye: (3,) camera centre, world units.
+        R: (3, 3) world-to-camera rotation, rows (right, down, forward).
+        fov: Vertical field of view, degrees.
+        time: When the path is here, seconds; None if the path chooses.
+    """
+
+    eye: Float64[np.ndarray, "3"]
+    R: Float64[np.ndarray, "3 3"]
+    fov: float
+    time: float | None = None
+
+    @classmethod
+    def of_camera(cls, camera: Camera) -> Keyframe:
+        """Return the keyframe with a camera's pose and vertical field of view."""
+        return cls(camera.eye, camera.R, math.degrees(2.0 * math.atan(0.5 * camera.H / camera.fy)))
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframePath:
+    """The keyframes of a path.
+
+    Args:
+        keyframes: At least two; all have times, or none has.
+        loop: Whether the path returns from the last keyframe to the first.
+        duration: Seconds from the first keyframe to the end; None takes the last keyframe's time, or
+            `SEGMENT_SECONDS` per segment without times.
+
+    Raises:
+        ArgumentError: a value is out of range; times and duration contradict each other.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    loop: bool
+    duration: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check all values."""
+        if len(self.keyframes) < FEWEST:
+            raise ArgumentError(
+                f"keyframes: has {len(self.keyframes)}, but a path needs at least {FEWEST} keyframes"
+            )
+        for index, keyframe in enumerate(self.keyframes):
+            try:
+                _check(keyframe)
+            except ArgumentError as error:
+                raise type(error)(f"keyframes[{index}].{error}") from None
+        self._check_times()
+
+    @property
+    def timed(self) -> bool:
+        """Whether the keyframes have times."""
+        return self.keyframes[0].time is not None
+
+    @property
+    def seconds(self) -> float:
+        """Length of the path in time."""
+        if self.duration is not None:
+            return self.duration
+        first, last = self.keyframes[0].time, self.keyframes[-1].time
+        if first is not None and last is not None:
+            return last - first
+        return SEGMENT_SECONDS * (len(self.keyframes) - (0 if self.loop else 1))
+
+    def placed(self, R: ArrayLike, scale: float, shift: ArrayLike) -> KeyframePath:
+        """Return the path that sees the scene x' = scale R x + shift as this one sees x.
+
+        Args:
+            R: (3, 3) rotation.
+            scale: Above 0.
+            shift: (3,) world units of the result.
+        """
+        turn, by = float64_array("R", R, (3, 3)), float64_array("shift", shift, (3,))
+        moved = (replace(k, eye=scale * turn @ k.eye + by, R=k.R @ turn.T) for k in self.keyframes)
+        return replace(self, keyframes=tuple(moved))
+
+    def shifted(self, shift: ArrayLike) -> KeyframePath:
+        """Return the path with (3,) `shift` added to all positions."""
+        by = float64_array("shift", shift, (3,))
+        return replace(self, keyframes=tuple(replace(k, eye=k.eye + by) for k in self.keyframes))
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of the path's file."""
+        duration = {} if self.duration is None else {"duration": self.duration}
+        entries = [_entry(keyframe) for keyframe in self.keyframes]
+        return {"format": FORMAT, "version": VERSION, "loop": self.loop, **duration, "keyframes": entries}
+
+    def _check_times(self) -> None:
+        if self.duration is not None and not LEAST_STEP <= self.duration <= LONGEST:
+            raise ArgumentError(
+                f"duration: is {self.duration}, but has to be between {LEAST_STEP} and {LONGEST:g} seconds"
+            )
+        times = [keyframe.time for keyframe in self.keyframes if keyframe.time is not None]
+        if not times:
+            return
+        if len(times) < len(self.keyframes):
+            raise ArgumentError("keyframes: some have a time and some have none; give it for all or for none")
+        for index, (before, after) in enumerate(itertools.pairwise(times), 1):
+            if after - before < LEAST_STEP:
+                raise ArgumentError(
+                    f"keyframes[{index}].time: is {after}, but has to be at least {LEAST_STEP} s after the"
+                    f" keyframe before, at {before}"
+                )
+        if not self.loop and self.duration is not None:
+            raise ArgumentError("duration: follows from the keyframes' times; remove it, or the times")
+        if self.loop and (self.duration is None or self.duration - (times[-1] - times[0]) < LEAST_STEP):
+            raise ArgumentError(
+                f"duration: is {self.duration}, but a loop with times needs one that is longer than its keyframes,"
+                f" {times[-1] - times[0]} s, for the way back to the first"
+            )
+
+
+def read_path(file: Path, origin: ArrayLike = NO_SHIFT) -> KeyframePath:
+    """Read a path.
+
+    Args:
+        file: The JSON file.
+        origin: (3,) subtracted from the positions: the origin that was subtracted from the scene.
+
+    Raises:
+        ArgumentError: the file is not a path of this version; the message names the file and the key.
+        OSError: the file cannot be read.
+    """
+    shift = float64_array("origin", origin, (3,))
+    try:
+        found = parse_json(read_text(file), _refuse)
+    except ValueError as error:  # a UnicodeDecodeError is one, too
+        raise ArgumentError(f"{file}: is not JSON ({str(error)[:80]}); give a path file") from None
+    try:
+        return _parsed(found).shifted(-shift)
+    except ArgumentError as error:
+        raise ArgumentError(f"{file}: {error}") from None
+
+
+def write_path(file: Path, path: KeyframePath, origin: ArrayLike = NO_SHIFT) -> None:
+    """Write a path.
+
+    Args:
+        file: Output file; parent folders are created.
+        path: The path.
+        origin: (3,) added to the positions.
+
+    Raises:
+        OSError: the file cannot be written. An existing file stays unchanged.
+    """
+    document = path.shifted(origin).document()
+    text = json.dumps(document, indent=2, allow_nan=False)
+    with written_aside(file) as aside:
+        aside.write_text(text + "\n", encoding="utf-8")
+
+
+def evenly_chosen(cameras: Sequence[Camera], most: int) -> list[Camera]:
+    """Choose at most `most` cameras, evenly over the list, from the first to the last.
+
+    Args:
+        cameras: At least one.
+        most: At least 2.
+    """
+    if len(cameras) <= most:
+        return list(cameras)
+    return [cameras[i] for i in np.linspace(0, len(cameras) - 1, most).round().astype(int)]
+
+
+def _check(keyframe: Keyframe) -> None:
+    eye = float64_array("position", keyframe.eye, (3,))
+    if np.abs(eye).max() > FARTHEST:
+        raise ArgumentError(f"position: is beyond {FARTHEST:g}; move the scene closer to zero")
+    R = float64_array("rotation", keyframe.R, (3, 3))
+    # the first test also keeps the product finite
+    off = np.abs(R).max() > 1.0 + ROTATION_TOLERANCE or np.abs(R @ R.T - np.eye(3)).max() > ROTATION_TOLERANCE
+    if off or np.linalg.det(R) < 0:
+        raise ArgumentError("rotation: is not a rotation; its columns must be right, down and forward")
+    if not NARROWEST <= keyframe.fov <= WIDEST:
+        raise ArgumentError(
+            f"fov: is {keyframe.fov}, but has to be between {NARROWEST} and {WIDEST:g} degrees"
+        )
+    if keyframe.time is not None and not abs(keyframe.time) <= LONGEST:
+        raise ArgumentError(f"time: is {keyframe.time}, but has to be within {LONGEST:g} seconds of 0")
+
+
+def _entry(keyframe: Keyframe) -> dict[str, Any]:
+    time = {} if keyframe.time is None else {"time": keyframe.time}
+    return {
+        "position": keyframe.eye.tolist(),
+        "rotation": keyframe.R.T.tolist(),
+        "fov": keyframe.fov,
+        **time,
+    }
+
+
+def _parsed(found: object) -> KeyframePath:
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise ArgumentError(f'is not a camera path: its "format" has to be "{FORMAT}"')
+    version = found.get("version")
+    if type(version) is not int or version != VERSION:
+        raise ArgumentError(f"version: is {version!r}, but {VERSION} is supported")
+    _check_keys("", found, ("format", "version", "loop", "keyframes"), ("duration",))
+    loop, entries = found["loop"], found["keyframes"]
+    if not isinstance(loop, bool):
+        raise ArgumentError(f"loop: is {_shown(loop)}, but has to be true or false")
+    if not isinstance(entries, list):
+        raise ArgumentError(f"keyframes: is {_shown(entries)}, but has to be a list")
+    keyframes = tuple(_keyframe(f"keyframes[{index}]", entry) for index, entry in enumerate(entries))
+    duration = _number("duration", found["duration"]) if "duration" in found else None
+    return KeyframePath(keyframes, loop, duration)
+
+
+def _keyframe(where: str, entry: object) -> Keyframe:
+    if not isinstance(entry, dict):
+        raise ArgumentError(f"{where}: is {_shown(entry)}, but has to be an object")
+    _check_keys(f"{where}: ", entry, ("position", "rotation", "fov"), ("time",))
+    eye = _numbers(f"{where}.position", entry["position"], 3)
+    rows = entry["rotation"]
+    if not isinstance(rows, list) or len(rows) != 3:
+        raise ArgumentError(f"{where}.rotation: is {_shown(rows)}, but has to be three rows of three numbers")
+    rotation = [_numbers(f"{where}.rotation[{i}]", row, 3) for i, row in enumerate(rows)]
+    time = _number(f"{where}.time", entry["time"]) if "time" in entry else None
+    return Keyframe(np.array(eye), np.array(rotation).T, _number(f"{where}.fov", entry["fov"]), time)
+
+
+def _check_keys(where: str, found: dict[str, Any], needed: Sequence[str], optional: Sequence[str]) -> None:
+    """Reject a missing key, and one that would be ignored, such as a misspelt one."""
+    if missing := [key for key in needed if key not in found]:
+        raise ArgumentError(f"{where}lacks {missing[0]!r}")
+    if unknown := [key for key in found if key not in (*needed, *optional)]:
+        raise ArgumentError(
+            f"{where}has an unknown key {_shown(unknown[0])}; known are {', '.join((*needed, *optional))}"
+        )
+
+
+def _numbers(where: str, value: object, count: int) -> list[float]:
+    if not isinstance(value, list) or len(value) != count:
+        raise ArgumentError(f"{where}: is {_shown(value)}, but has to be {count} numbers")
+    return [_number(f"{where}[{index}]", number) for index, number in enumerate(value)]
+
+
+def _number(where: str, value: object) -> float:
+    if type(value) not in (int, float):
+        raise ArgumentError(f"{where}: is {_shown(value)}, but has to be a number")
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ArgumentError(f"{where}: is {_shown(value)}, but has to be finite")
+    return number
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _refuse(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not valid JSON")
