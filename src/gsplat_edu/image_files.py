@@ -136,12 +136,16 @@ def require_room(path: Path, image: Image.Image) -> None:
     Raises:
         NotEnoughMemoryError: too little memory is free.
     """
-    per_pixel = HEIF_BYTES_PER_PIXEL if image.format == HEIF else BYTES_PER_PIXEL
     require_memory(
         f"{path}: {image.width}x{image.height} px",
-        per_pixel * image.width * image.height,
+        bytes_per_pixel(image) * image.width * image.height,
         "close other programs, or make the photo smaller",
     )
+
+
+def bytes_per_pixel(image: Image.Image) -> int:
+    """Return the memory that decoding an image takes, bytes per pixel."""
+    return HEIF_BYTES_PER_PIXEL if image.format == HEIF else BYTES_PER_PIXEL
 
 
 def is_image(path: Path) -> bool:

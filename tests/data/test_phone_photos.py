@@ -10,6 +10,7 @@ import pytest
 from PIL import Image, ImageCms, PngImagePlugin
 
 import phone_photos
+from gsplat_edu.budget.costs import Facts
 from gsplat_edu.data.colors import make_profile
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import decode, decode_mask, image_header, image_orientation, image_size
@@ -346,6 +347,18 @@ def test_a_capture_with_heic_photos_loads(one_photo):
     np.testing.assert_allclose(image, expected, atol=3)
     (shot,) = prepare(folder).shots
     assert shot.size == (64, 48) and np.abs(shot.stats.thumbnail - p3_as_srgb(quarters())).max() < 3
+
+
+def test_the_forecast_knows_that_these_photos_take_more_memory_to_decode(one_photo):
+    """Measured: 14.3 bytes per pixel for HEIC, up to 21 for 16 bits; 10 are planned for other photos."""
+    folder = one_photo(quarters())
+    path = folder / "images" / "a.png"
+    plain = Facts.of(load_dataset(folder)).decoding
+    png16(path, np.zeros((48, 64, 3), np.uint16), 2)
+    deep = Facts.of(load_dataset(folder)).decoding
+    save(folder / "a.heic", quarters()).replace(path)
+    heic = Facts.of(load_dataset(folder)).decoding
+    assert (plain, heic) == (10, 16) and deep >= 21
 
 
 def test_profiles_are_read_from_bytes_as_pillow_gives_them():

@@ -127,13 +127,15 @@ def load_dataset(
 
     frames = oriented(frames, size_of)
     made = [photo_file(frame, settings.resolution, settings.background, size_of) for frame in frames]
-    store = ImageStore(settings.image_memory, [source for source, _, _ in made])
+    sources = [source for source, _, _ in made]
+    decoding = max(header_of(source.path).decoding for source in sources)
+    store = ImageStore(settings.image_memory, sources, decoding)
     views = [
         View.stored(camera, partial(store.read, source), frame.name)
         for frame, (source, camera, _) in zip(frames, made, strict=True)
     ]
     notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
-    notes += _file_notes(frames, [source for source, _, _ in made], header_of)
+    notes += _file_notes(frames, sources, header_of)
     if store.needed > store.budget:
         notes.append(
             f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} are kept: the "

@@ -12,7 +12,7 @@ from PIL import Image
 from gsplat_edu.headroom import require_memory
 from gsplat_edu.image_files import opened_image
 
-BYTES_PER_PIXEL = 24
+DEEP_BYTES_PER_PIXEL = 24
 """Memory needed for decoding: two images of Pillow, two arrays and the result, and one band. Measured: 19 to 21."""
 
 ROWS = 64
@@ -45,7 +45,7 @@ def rounded_image(path: Path, file: Image.Image) -> Image.Image:
         UNDECODABLE: as for `opened_image`.
         NotEnoughMemoryError: the pixels need more memory than is free.
     """
-    needed = BYTES_PER_PIXEL * file.width * file.height
+    needed = DEEP_BYTES_PER_PIXEL * file.width * file.height
     require_memory(
         f"{path}: {file.width}x{file.height} px", needed, "close other programs, or make the photo smaller"
     )

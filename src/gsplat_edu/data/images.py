@@ -15,11 +15,19 @@ from jaxtyping import Bool, Float32, Shaped, UInt8
 from PIL import ExifTags, Image
 
 from gsplat_edu.data.colors import conversion_of, to_srgb
-from gsplat_edu.data.deep_pixels import is_deep, rounded_image
+from gsplat_edu.data.deep_pixels import DEEP_BYTES_PER_PIXEL, is_deep, rounded_image
 from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.data.watch import FileWatch
 from gsplat_edu.errors import DatasetError, NotEnoughMemoryError, SplatError
-from gsplat_edu.image_files import HEIF, SPELLED, UNDECODABLE, opened_image, require_room
+from gsplat_edu.image_files import (
+    BYTES_PER_PIXEL,
+    HEIF,
+    SPELLED,
+    UNDECODABLE,
+    bytes_per_pixel,
+    opened_image,
+    require_room,
+)
 from gsplat_edu.resizing import area_mean, premultiplied, smaller_mask, unweighted
 from gsplat_edu.views import Photo
 
@@ -69,10 +77,12 @@ class ImageHeader:
     Args:
         size: Width and height as stored, px. A HEIC's are upright, because its container turns it.
         problem: Why the colours are taken as sRGB although the file declares others; empty if they are not.
+        decoding: Bytes per pixel that decoding takes.
     """
 
     size: tuple[int, int]
     problem: str
+    decoding: int = BYTES_PER_PIXEL
 
 
 def image_header(path: Path) -> ImageHeader:
@@ -83,7 +93,8 @@ def image_header(path: Path) -> ImageHeader:
     """
     try:
         with opened_image(path) as file:
-            return ImageHeader(stored_size(file), conversion_of(file.info).problem)
+            decoding = DEEP_BYTES_PER_PIXEL if is_deep(file) else bytes_per_pixel(file)
+            return ImageHeader(stored_size(file), conversion_of(file.info).problem, decoding)
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
 
@@ -250,10 +261,12 @@ class ImageStore:
     Args:
         budget: Bytes of decoded photos to keep.
         sources: The photos that will be read.
+        decoding: Largest `ImageHeader.decoding` of them.
     """
 
-    def __init__(self, budget: int, sources: Sequence[PhotoFile]) -> None:
+    def __init__(self, budget: int, sources: Sequence[PhotoFile], decoding: int = BYTES_PER_PIXEL) -> None:
         self.budget = budget
+        self.decoding = decoding
         self.needed = sum(source.W * source.H * _planes(source) for source in sources)
         """Bytes that all photos take at most; whether a photo that may have alpha does is known once it is decoded."""
         largest = max((source.lens.W * source.lens.H for source in sources), default=1)
