@@ -320,6 +320,7 @@ def broken_profiles():
         (b"not a profile", damaged),
         (good[:200], damaged),
         (good[:128] + bytes(len(good) - 128), damaged),
+        (good[:16] + b"R\x1bB " + good[20:], damaged),  # a name for the terminal to act on
         (lab, "its colour profile is for Lab, not for RGB"),
     ]
 

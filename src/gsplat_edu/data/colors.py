@@ -40,6 +40,8 @@ PLAIN_PRIMARIES = (1, 2)
 HDR_CURVES = {16: "PQ", 18: "HLG"}
 """Curves in H.273 of high dynamic range. The others resemble sRGB's, and phones mean that one by them."""
 
+DAMAGED = "its colour profile is damaged"
+
 SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 """sRGB's curve as parameters g, a, b, c, d: (a v + b)^g from v = d on, c v below (IEC 61966-2-1)."""
 
@@ -153,6 +155,8 @@ def _from_profile(profile: bytes) -> Conversion:
     try:
         given = ImageCms.ImageCmsProfile(BytesIO(profile))
         space = given.profile.xcolor_space.strip()
+        if not (space.isascii() and space.isalnum()):
+            return Conversion(problem=DAMAGED)
         if space != "RGB":
             return Conversion(problem=f"its colour profile is for {space}, not for RGB")
         target = ImageCms.createProfile("sRGB")
@@ -160,7 +164,7 @@ def _from_profile(profile: bytes) -> Conversion:
     except ImportError:
         return Conversion(problem="this Pillow was built without LittleCMS, which reads colour profiles")
     except (OSError, ValueError, TypeError, ImageCms.PyCMSError):
-        return Conversion(problem="its colour profile is damaged")
+        return Conversion(problem=DAMAGED)
     steps = np.arange(0, 256, 17, dtype=np.uint8)  # 0 and 255 are among them
     colors = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(1, -1, 3)
     converted = rgb.apply(Image.fromarray(colors))
