@@ -92,7 +92,7 @@ def _unreadable(folder):
         (lambda folder: save(folder, box_orbit(1)), "photos: holds one photo; poses need at least 3"),
         (
             _unreadable,
-            "holds no photo that can be decoded: 0.jpg (not a JPEG, PNG, WebP, TIFF, BMP or PPM image), 1.jpg",
+            "holds no photo that can be decoded: 0.jpg (not a JPEG, PNG, WebP, TIFF, BMP, PPM or HEIC image), 1.jpg",
         ),
         (_noise, "of 6 pairs, none match: the photos show too little in common; walk around the subject"),
         (_blank, "the photos show too little in common"),

@@ -15,7 +15,7 @@ from PIL import EpsImagePlugin, Image
 from gsplat_edu.data import capture
 from gsplat_edu.data.colmap import read_images, read_points
 from gsplat_edu.data.dataset import DataSettings, load_dataset
-from gsplat_edu.data.images import decode, decode_mask, image_size
+from gsplat_edu.data.images import ImageHeader, decode, decode_mask, image_size
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import DatasetError, SceneFormatError
@@ -61,7 +61,7 @@ def test_a_drawing_named_like_a_photo_starts_no_other_program(tmp_path, monkeypa
     monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)  # Pillow looks for the program once
     photo = tmp_path / "a.png"
     photo.write_bytes(EPS)
-    with pytest.raises(DatasetError, match="not a JPEG, PNG, WebP, TIFF, BMP or PPM image"):
+    with pytest.raises(DatasetError, match="not a JPEG, PNG, WebP, TIFF, BMP, PPM or HEIC image"):
         read(photo)
     assert not mark.exists()
     subprocess.run(["gs"], check=True, env=dict(os.environ))
@@ -192,7 +192,7 @@ def transforms(folder: Path, names, **more) -> Path:
 
 
 def test_many_frames_without_a_photo_need_few_system_calls(tmp_path, monkeypatch):
-    """300,000 of them used to take minutes: each could have 22 endings in 4 folders."""
+    """300,000 of them used to take minutes: each could have 28 endings in 4 folders."""
     checked = []
     monkeypatch.setattr(
         capture, "is_file", lambda path, really=capture.is_file: checked.append(path) or really(path)
@@ -207,7 +207,8 @@ def test_many_frames_of_one_photo_read_its_header_once(tmp_path, monkeypatch):
     from gsplat_edu.data import dataset
 
     read = []
-    monkeypatch.setattr(dataset, "image_size", lambda path: read.append(path) or (16, 12))
+    header = ImageHeader((16, 12), "")
+    monkeypatch.setattr(dataset, "image_header", lambda path: read.append(path) or header)
     assert len(load_dataset(transforms(tmp_path, ["images/a.png"] * 300), EVERYTHING).train) == 300
     assert len(read) == 1
 

@@ -54,9 +54,9 @@ def test_a_mask_of_another_size_is_refused(tmp_path):
     photo = image(tmp_path / "a.png")
     mask = image(tmp_path / "masks" / "a.png", np.zeros((15, 20), np.uint8))
     with pytest.raises(DatasetError, match=r"the mask is 20x15 but its photo 40x30; make them the same size"):
-        upright_masks({photo: mask}, {photo: (40, 30, 0)})
-    with pytest.raises(DatasetError, match=r"but its photo 40x30 \(30x40 upright\); make them the same size"):
         upright_masks({photo: mask}, {photo: (40, 30, 1)})
+    with pytest.raises(DatasetError, match=r"but its photo 40x30 \(30x40 upright\); make them the same size"):
+        upright_masks({photo: mask}, {photo: (40, 30, 6)})
     with pytest.raises(DatasetError, match=r"masks.a\.png: the mask is 20x15"):
         copy_photos([photo], tmp_path, tmp_path / "copies", 1600)
 

@@ -104,8 +104,8 @@ def test_undecodable_photos_are_named_with_a_reason(tmp_path):
     found, unreadable = copy_photos(files, source, tmp_path / "copies", 1600)
     assert [(f.name, f.copy) for f in found] == [("good.png", "000001.jpg")]
     assert unreadable[:2] == [
-        "empty.jpg (not a JPEG, PNG, WebP, TIFF, BMP or PPM image)",
-        "phone.HEIC (HEIC is not supported: export it as JPEG)",
+        "empty.jpg (not a JPEG, PNG, WebP, TIFF, BMP, PPM or HEIC image)",
+        "phone.HEIC (not a JPEG, PNG, WebP, TIFF, BMP, PPM or HEIC image)",
     ]
     assert unreadable[2].startswith("torn.png") and len(unreadable) == 3
     assert all("\n" not in reason for reason in unreadable)

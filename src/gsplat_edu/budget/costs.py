@@ -17,6 +17,7 @@ from jaxtyping import Int64
 from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.image_files import BYTES_PER_PIXEL
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
 from gsplat_edu.train.schedule import photo_factor, planned_counts
@@ -56,9 +57,6 @@ TRAINED_PAIRS = 5
 PER_PIXEL = 180
 """Bytes per pixel during evaluation: float64 images and their differences. A training step takes fewer."""
 
-DECODING = 10
-"""Bytes per pixel of the file during decoding (`gsplat_edu.data.images.AT_ONCE`)."""
-
 PICTURE_BYTES = 250_000
 """Bytes per test view held for the report until it is written."""
 
@@ -79,6 +77,7 @@ class Facts:
         full: Pixels of the largest photo as decoded, before it is downscaled.
         photo_bytes: Bytes of all photos in memory.
         workers: Number of photos decoded at the same time.
+        decoding: Bytes per pixel of the file during decoding, most for HEIC and 16 bits.
     """
 
     train: int
@@ -89,6 +88,7 @@ class Facts:
     full: float
     photo_bytes: int
     workers: int
+    decoding: int = BYTES_PER_PIXEL
 
     @classmethod
     def of(cls, dataset: Dataset, full: Dataset | None = None) -> Facts:
@@ -110,6 +110,7 @@ class Facts:
             max(decoded),
             dataset.images.needed,
             dataset.images.workers,
+            dataset.images.decoding,
         )
 
     def smaller(self, factor: float) -> Facts:
@@ -273,7 +274,7 @@ class Footprint:
         facts = self.facts
         kept = min(facts.photo_bytes, image_memory)
         pairs = max(self.pairs, TRAINED_PAIRS * gaussians)
-        read_again = 2 * DECODING * facts.full if kept < facts.photo_bytes else 0.0
+        read_again = 2 * facts.decoding * facts.full if kept < facts.photo_bytes else 0.0
         found = {
             "program": self.process,
             "photos": kept,
@@ -281,7 +282,7 @@ class Footprint:
             "images": int(PER_PIXEL * facts.largest + read_again) + facts.test * PICTURE_BYTES,
         }
         # Photos are first read before any Gaussian exists, several at once and at full size.
-        reading = int(facts.workers * DECODING * facts.full)
+        reading = int(facts.workers * facts.decoding * facts.full)
         found["images"] = max(found["images"], reading - found["Gaussians"])
         return found
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.camera import Camera
-from gsplat_edu.data.images import PhotoFile, image_size
+from gsplat_edu.data.images import UPRIGHT, PhotoFile, image_orientation, image_size, upright_size
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
 from gsplat_edu.errors import DatasetError
@@ -34,7 +34,7 @@ READY_MADE = (2, 4, 8)
 PHOTO_FOLDERS = ("images", *(f"images_{factor}" for factor in READY_MADE))
 """Folders with the same photos in several sizes."""
 
-PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic")
+PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".heif", ".hif")
 """Suffixes of photos, in any case."""
 
 
@@ -51,6 +51,7 @@ class Frame:
         mask: Image file that is zero for pixels that do not count.
         part: "train" or "test" if the capture assigns it, "left out" if it is missing from the capture's lists, else
             "".
+        orientation: EXIF orientation by which the stored photo has to be turned to fit its pose; 1 for as stored.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Frame:
     eye: Float64[np.ndarray, "3"]
     mask: Path | None = None
     part: str = ""
+    orientation: int = UPRIGHT
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +117,8 @@ def is_folder(path: Path) -> bool:
 class Listings:
     """Names in the photo folders, each folder listed once.
 
-    A capture may name hundreds of thousands of missing photos, each with twenty-two possible suffixes in four folders.
-    Asking the system about every spelling would take minutes.
+    A capture may name hundreds of thousands of missing photos, each with 28 possible suffixes in four folders. Asking
+    the system about every spelling would take minutes.
     """
 
     def __init__(self) -> None:
@@ -249,8 +251,8 @@ def photo_file(
         DatasetError: a file is not an image, the sizes of photo, mask and camera are inconsistent, or the photo cannot
             be undistorted.
     """
-    path = frame.image
-    size = size_of(path)
+    path, orientation = frame.image, frame.orientation
+    size = upright_size(size_of(path), orientation)
     rescaled = size != (frame.lens.W, frame.lens.H)
     lens = _fitted(frame, path, size)
     if frame.mask is not None and (mask_size := size_of(frame.mask)) != size:
@@ -260,23 +262,35 @@ def photo_file(
     # A mask has the size of the full photo, so a photo with a mask is always downscaled here.
     smaller = _smaller_copy(path, resolution) if frame.mask is None else None
     if smaller is not None:
-        path = smaller
-        W, H = size_of(path)
+        # A copy may be turned already, or have the photo's EXIF.
+        path, orientation = smaller, UPRIGHT if orientation == UPRIGHT else image_orientation(smaller)
+        W, H = upright_size(size_of(path), orientation)
         lens = _fitted(frame, path, (W, H))
     try:
         pinhole = lens.undistorted().scaled(W, H)
     except DatasetError as error:
         raise DatasetError(f"{frame.name}: {error}", error.reason) from None
     camera = Camera.posed(frame.R, frame.eye, pinhole)
-    return PhotoFile(path, frame.mask, lens, W, H, background), camera, rescaled
+    return PhotoFile(path, frame.mask, lens, W, H, background, orientation), camera, rescaled
+
+
+def fits_camera(lens: Lens, size: tuple[int, int]) -> bool:
+    """Return whether a photo of a size has its camera's aspect ratio, up to rounding.
+
+    Args:
+        lens: The camera.
+        size: Width and height of the photo, px.
+    """
+    W, H = size
+    # Both sizes may have been rounded by up to a pixel of the smaller one of photo and camera.
+    slack = max(1.0, W / lens.W) * (1.0 + lens.H / lens.W)
+    return abs(H - lens.H * W / lens.W) <= slack
 
 
 def _fitted(frame: Frame, path: Path, size: tuple[int, int]) -> Lens:
     """Return the lens scaled to the file's size."""
     (W, H), lens = size, frame.lens
-    # Both sizes may have been rounded by up to a pixel of the smaller one of photo and camera.
-    slack = max(1.0, W / lens.W) * (1.0 + lens.H / lens.W)
-    if abs(H - lens.H * W / lens.W) > slack:
+    if not fits_camera(lens, size):
         what = f"is {_spelled(size)} but its camera {lens.W}x{lens.H}, another aspect ratio"
         raise DatasetError(
             f"{path}: the photo of {frame.name} {what}; was the photo cropped or turned after the poses were found?",

@@ -26,8 +26,9 @@ from gsplat_edu.data.capture import (
     photo_file,
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
-from gsplat_edu.data.images import ImageStore, PhotoFile, image_size
-from gsplat_edu.data.notes import TwoLayouts
+from gsplat_edu.data.images import UPRIGHT, ImageHeader, ImageStore, PhotoFile, image_header
+from gsplat_edu.data.notes import TwoLayouts, UnreadColors
+from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
@@ -119,14 +120,22 @@ def load_dataset(
     notes = [str(note) for note in capture.notes]
     frames = sorted(capture.frames, key=lambda frame: frame.name)
     frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
-    size_of = functools.cache(image_size)
+    header_of = functools.cache(image_header)
+
+    def size_of(path: Path) -> tuple[int, int]:
+        return header_of(path).size
+
+    frames = oriented(frames, size_of)
     made = [photo_file(frame, settings.resolution, settings.background, size_of) for frame in frames]
-    store = ImageStore(settings.image_memory, [source for source, _, _ in made])
+    sources = [source for source, _, _ in made]
+    decoding = max(header_of(source.path).decoding for source in sources)
+    store = ImageStore(settings.image_memory, sources, decoding)
     views = [
         View.stored(camera, partial(store.read, source), frame.name)
         for frame, (source, camera, _) in zip(frames, made, strict=True)
     ]
     notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
+    notes += _file_notes(frames, sources, header_of)
     if store.needed > store.budget:
         notes.append(
             f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} are kept: the "
@@ -233,6 +242,25 @@ def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
         notes.append(
             f"{len(uneven)} of {len(frames)} cameras have fx and fy that differ widely, first {lens.fx:.4g} and "
             f"{lens.fy:.4g} px: the calibration may be wrong"
+        )
+    return notes
+
+
+def _file_notes(
+    frames: Sequence[Frame], sources: Sequence[PhotoFile], header_of: Callable[[Path], ImageHeader]
+) -> list[str]:
+    """Report colours that are not converted, and photos that are turned."""
+    problems = [
+        (frame.name, header_of(source.path).problem) for frame, source in zip(frames, sources, strict=True)
+    ]
+    notes = [str(note) for note in UnreadColors.of(problems)]
+    turned = [
+        frame.name for frame, source in zip(frames, sources, strict=True) if source.orientation != UPRIGHT
+    ]
+    if turned:
+        notes.append(
+            f"{len(turned)} of {len(frames)} photos are turned as EXIF says, because their poses are those of upright "
+            f"photos, first {turned[0]}"
         )
     return notes
 

@@ -4,23 +4,47 @@ from __future__ import annotations
 
 import os
 import threading
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Shaped, UInt8
+from PIL import ExifTags, Image
 
+from gsplat_edu.data.colors import conversion_of, to_srgb
+from gsplat_edu.data.deep_pixels import DEEP_BYTES_PER_PIXEL, is_deep, rounded_image
 from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.data.watch import FileWatch
 from gsplat_edu.errors import DatasetError, NotEnoughMemoryError, SplatError
-from gsplat_edu.image_files import SPELLED, UNDECODABLE, opened_image, require_room
+from gsplat_edu.image_files import (
+    BYTES_PER_PIXEL,
+    HEIF,
+    SPELLED,
+    UNDECODABLE,
+    bytes_per_pixel,
+    opened_image,
+    require_room,
+)
 from gsplat_edu.resizing import area_mean, premultiplied, smaller_mask, unweighted
 from gsplat_edu.views import Photo
 
 AT_ONCE = 64_000_000
 """Pixels to decode at once; decoding takes about 10 bytes per pixel, and 25 more if alpha is resampled."""
+
+UPRIGHT = 1
+"""EXIF orientation of a photo that is stored upright."""
+
+TURNS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}
+"""Quarter turns clockwise that bring a photo upright, by EXIF orientation; mirrored ones are mirrored before."""
+
+MIRRORED = (2, 4, 5, 7)
+"""EXIF orientations of photos whose stored columns are reversed."""
+
+BACK = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
+"""EXIF orientation that undoes another one."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +58,7 @@ class PhotoFile:
         W: Width after downscaling, px.
         H: Height after downscaling, px.
         background: (r, g, b), 0 to 1, behind transparent pixels; None keeps the alpha.
+        orientation: EXIF orientation by which the stored photo is turned; lens and mask are those of the turned one.
     """
 
     path: Path
@@ -42,23 +67,105 @@ class PhotoFile:
     W: int
     H: int
     background: tuple[float, float, float] | None
+    orientation: int = UPRIGHT
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What a file's header tells.
+
+    Args:
+        size: Width and height as stored, px. A HEIC's are upright, because its container turns it.
+        problem: Why the colours are taken as sRGB although the file declares others; empty if they are not.
+        decoding: Bytes per pixel that decoding takes.
+    """
+
+    size: tuple[int, int]
+    problem: str
+    decoding: int = BYTES_PER_PIXEL
+
+
+def image_header(path: Path) -> ImageHeader:
+    """Read a file's header.
+
+    Raises:
+        DatasetError: the file is not an image, or is HEIC and pillow-heif is not installed.
+    """
+    try:
+        with opened_image(path) as file:
+            decoding = DEEP_BYTES_PER_PIXEL if is_deep(file) else bytes_per_pixel(file)
+            return ImageHeader(stored_size(file), conversion_of(file.info).problem, decoding)
+    except UNDECODABLE as error:
+        raise _undecodable(path, error) from None
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Read width and height from a file's header, px. EXIF orientation is ignored, as in COLMAP.
 
     Raises:
-        DatasetError: the file is not an image.
+        DatasetError: as for `image_header`.
     """
     try:
         with opened_image(path) as file:
-            return file.size
+            return stored_size(file)
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
 
 
-def decode(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
-    """Decode an image file in one of `gsplat_edu.image_files.FORMATS` to 8 bits.
+def image_orientation(path: Path) -> int:
+    """Read the EXIF orientation, 1 to 8; 1 if a file has none. Always 1 for HEIC: see `stored_orientation`.
+
+    Raises:
+        DatasetError: as for `image_header`.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about invalid EXIF, which the user cannot fix
+            with opened_image(path) as file:
+                return stored_orientation(file)
+    except UNDECODABLE as error:
+        raise _undecodable(path, error) from None
+
+
+def stored_size(file: Image.Image) -> tuple[int, int]:
+    """Return width and height of an opened image as stored, px; Pillow exchanges those of a TIFF that EXIF turns."""
+    W, H = file.size
+    return (H, W) if file.format == "TIFF" and TURNS[stored_orientation(file)] % 2 else (W, H)
+
+
+def stored_orientation(file: Image.Image) -> int:
+    """Return the EXIF orientation of an opened image that is not decoded, 1 to 8.
+
+    A HEIC's container has its own rotation, which the decoder applies; by ISO 23008-12 that of EXIF does not count.
+    """
+    if file.format == HEIF:
+        return UPRIGHT
+    orientation = file.getexif().get(ExifTags.Base.Orientation, UPRIGHT)
+    return orientation if orientation in TURNS else UPRIGHT
+
+
+def upright_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
+    """Return the size of a photo after it is turned.
+
+    Args:
+        size: Width and height as stored, px.
+        orientation: EXIF orientation.
+    """
+    return size[::-1] if TURNS[orientation] % 2 else size
+
+
+def decode(
+    path: Path, orientation: int = UPRIGHT, smaller: int | None = None
+) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
+    """Decode an image file in one of `gsplat_edu.image_files.FORMATS` to 8-bit sRGB.
+
+    Every reader of photos calls this. 16 bits are rounded to 8, and colours of another profile are converted; all other
+    pixels are as the file stores them.
+
+    Args:
+        path: The file.
+        orientation: EXIF orientation by which the stored pixels are turned. The file's own does not count.
+        smaller: Decode JPEGs at 1/2, 1/4 or 1/8 of their size, if both sides stay this long, px; None for full size.
 
     Returns:
         RGB and alpha; alpha is None if the photo is opaque.
@@ -69,19 +176,35 @@ def decode(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H
     """
     try:
         with opened_image(path) as file:
+            if smaller is not None and file.format == "JPEG":
+                file.draft("RGB", (smaller, smaller))
             require_room(path, file)
-            if file.mode.startswith("I"):  # 16-bit gray
-                gray = np.clip(np.asarray(file, dtype=np.int64), 0, 65535)
-                return np.repeat(((gray + 128) // 257).astype(np.uint8)[..., None], 3, axis=2), None
             if file.mode == "F":
                 raise ValueError("its pixels are floats")
-            if not file.has_transparency_data:
-                return np.array(file.convert("RGB")), None
-            pixels = np.array(file.convert("RGBA"))
+            info, already = file.info, _turned_by_pillow(file)
+            image = rounded_image(path, file) if is_deep(file) else file
+            converted = image.convert("RGBA" if image.has_transparency_data else "RGB")
+            to_srgb(converted, info)
+            pixels = turned(turned(np.array(converted), BACK[already]), orientation)
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
+    if pixels.shape[2] == 3:
+        return pixels, None
     rgb, alpha = np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
     return rgb, None if alpha.min() == 255 else alpha
+
+
+def turned(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "H W *c"]:
+    """Turn stored pixels upright.
+
+    Args:
+        pixels: The stored pixels, of a photo or a mask.
+        orientation: EXIF orientation.
+    """
+    if orientation == UPRIGHT:
+        return pixels
+    plain = pixels[:, ::-1] if orientation in MIRRORED else pixels
+    return np.ascontiguousarray(np.rot90(plain, -TURNS[orientation]))
 
 
 def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
@@ -94,8 +217,9 @@ def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
     try:
         with opened_image(path) as file:
             require_room(path, file)
+            already = _turned_by_pillow(file)
             plain = file if file.mode[0] in "IF" else file.convert("L")
-            mask: Bool[np.ndarray, "H W"] = np.asarray(plain) != 0
+            mask: Bool[np.ndarray, "H W"] = turned(np.asarray(plain) != 0, BACK[already])
             return mask
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
@@ -107,7 +231,7 @@ def load_photo(source: PhotoFile) -> Photo:
     Raises:
         DatasetError: the photo or its mask cannot be decoded, or its size differs from the header read before.
     """
-    image, alpha = decode(source.path)
+    image, alpha = decode(source.path, source.orientation)
     mask = None if source.mask is None else decode_mask(source.mask)
     for path, plane in ((source.path, image), (source.mask, mask)):
         if plane is not None and plane.shape[:2] != (source.lens.H, source.lens.W):
@@ -137,10 +261,12 @@ class ImageStore:
     Args:
         budget: Bytes of decoded photos to keep.
         sources: The photos that will be read.
+        decoding: Largest `ImageHeader.decoding` of them.
     """
 
-    def __init__(self, budget: int, sources: Sequence[PhotoFile]) -> None:
+    def __init__(self, budget: int, sources: Sequence[PhotoFile], decoding: int = BYTES_PER_PIXEL) -> None:
         self.budget = budget
+        self.decoding = decoding
         self.needed = sum(source.W * source.H * _planes(source) for source in sources)
         """Bytes that all photos take at most; whether a photo that may have alpha does is known once it is decoded."""
         largest = max((source.lens.W * source.lens.H for source in sources), default=1)
@@ -177,6 +303,11 @@ class ImageStore:
                 self._kept[source] = photo
                 self._nbytes += photo.nbytes
         return photo
+
+
+def _turned_by_pillow(file: Image.Image) -> int:
+    """Return the EXIF orientation by which Pillow will turn an image while it decodes it: it does so for TIFF only."""
+    return stored_orientation(file) if file.format == "TIFF" else UPRIGHT
 
 
 def _planes(source: PhotoFile) -> int:

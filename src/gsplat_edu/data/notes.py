@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,4 +121,35 @@ class TwoLayouts:
         return f"{self.folder} holds transforms.json and a COLMAP model: using the poses of transforms.json"
 
 
-Note = MissingPhotos | FilesOutside | UnclearMasks | OtherModels | UnusedSplit | TwoLayouts
+@dataclass(frozen=True)
+class UnreadColors:
+    """Photos whose colours are taken as sRGB although their files declare others.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos of the capture.
+        first: Name of the first such photo.
+        reason: Why its colours are not converted.
+    """
+
+    photos: int
+    total: int
+    first: str
+    reason: str
+
+    @classmethod
+    def of(cls, problems: Sequence[tuple[str, str]]) -> list[UnreadColors]:
+        """Return the note, if there is one to make.
+
+        Args:
+            problems: Name of each photo and `gsplat_edu.data.images.ImageHeader.problem`.
+        """
+        found = [(name, problem) for name, problem in problems if problem]
+        return [cls(len(found), len(problems), *found[0])] if found else []
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return f"{self.photos} of {self.total} photos are taken as sRGB, first {self.first}: {self.reason}"
+
+
+Note = MissingPhotos | FilesOutside | UnclearMasks | OtherModels | UnusedSplit | TwoLayouts | UnreadColors

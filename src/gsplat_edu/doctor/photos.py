@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from gsplat_edu.data.images import decode, decode_mask, image_size
-from gsplat_edu.data.lens import Lens, undistortion
-from gsplat_edu.image_files import UNDECODABLE, opened_image
+from gsplat_edu.data.images import PhotoFile, decode, decode_mask
+from gsplat_edu.data.lens import undistortion
 from gsplat_edu.views import Photo
 
 WORK_SIDE = 1024
@@ -56,20 +54,19 @@ class PhotoStats:
     detail: Float64[np.ndarray, "8"]
 
 
-def measure_photo(path: Path, lens: Lens, mask: Path | None = None) -> PhotoStats:
+def measure_photo(source: PhotoFile) -> PhotoStats:
     """Decode a photo and measure it.
 
     Args:
-        path: The image file.
-        lens: The camera that took it, at the file's size.
-        mask: Its mask, decoded only to check that training can read it.
+        source: The photo at its full size. Its mask is decoded only to check that training can read it.
 
     Raises:
         DatasetError: the photo or its mask cannot be decoded, or the lens cannot be undistorted.
     """
-    if mask is not None:
-        decode_mask(mask)
-    pixels = _shrunk(_decoded(path), WORK_SIDE)
+    lens = source.lens
+    if source.mask is not None:
+        decode_mask(source.mask)
+    pixels = _shrunk(_decoded(source), WORK_SIDE)
     small = _shrunk(pixels, THUMBNAIL_SIDE)
     h, w = small.shape[:2]
     if lens.distorts and min(h, w) > 1:
@@ -103,21 +100,13 @@ def _energy(gray: Float32[np.ndarray, "H W"], sigma: float) -> Float64[np.ndarra
     return np.asarray(c * c * xx + s * s * yy + 2.0 * c * s * xy)
 
 
-def _decoded(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+def _decoded(source: PhotoFile) -> UInt8[np.ndarray, "H W 3"]:
     """Decode a photo; JPEGs at a reduced size, no smaller than the working size; transparent photos over black.
 
-    Pillow decodes here as it does in training, so that both refuse the same files.
+    Decodes as training does, so that both refuse the same files.
     """
-    W, H = image_size(path)
-    if path.suffix.lower() in (".jpg", ".jpeg") and W * H <= JPEG_ONLY:
-        try:
-            with opened_image(path) as file:
-                if file.format == "JPEG":
-                    file.draft("RGB", (WORK_SIDE, WORK_SIDE))
-                    return np.array(file.convert("RGB"))
-        except UNDECODABLE:
-            pass  # `decode` reports the problem
-    image, alpha = decode(path)
+    smaller = WORK_SIDE if source.lens.W * source.lens.H <= JPEG_ONLY else None
+    image, alpha = decode(source.path, source.orientation, smaller)
     return image if alpha is None else np.asarray(Photo(image, alpha).over((0.0, 0.0, 0.0)))
 
 

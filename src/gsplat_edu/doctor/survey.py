@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,8 +15,10 @@ from jaxtyping import Float64
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
 from gsplat_edu.data.dataset import read_capture
+from gsplat_edu.data.images import image_header, image_size
 from gsplat_edu.data.lens import Lens
-from gsplat_edu.data.notes import Note
+from gsplat_edu.data.notes import Note, UnreadColors
+from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.photos import PhotoStats, measure_photo
@@ -40,6 +42,7 @@ class Shot:
         size: Width and height of the file, px.
         camera: The undistorted pinhole camera at the thumbnail's size.
         stats: Its thumbnail and measurements.
+        colors: Why its colours are taken as sRGB although its file declares others; empty if they are not.
     """
 
     name: str
@@ -47,6 +50,7 @@ class Shot:
     size: tuple[int, int]
     camera: Camera
     stats: PhotoStats
+    colors: str = ""
 
 
 class Refused(NamedTuple):
@@ -104,11 +108,12 @@ def prepare(path: Path, progress: Progress | None = None) -> Survey:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
     capture = read_capture(path)
-    frames = sorted(capture.frames, key=lambda frame: frame.name)
+    size_of = cache(image_size)
+    frames = oriented(sorted(capture.frames, key=lambda frame: frame.name), size_of)
     shots, refused = list[Shot](), list[Refused]()
     with ThreadPoolExecutor(WORKERS) as pool:
         try:
-            for done, found in enumerate(pool.map(_shot, frames), 1):
+            for done, found in enumerate(pool.map(partial(_shot, size_of), frames), 1):
                 if isinstance(found, Shot):
                     shots.append(found)
                 else:
@@ -125,21 +130,22 @@ def prepare(path: Path, progress: Progress | None = None) -> Survey:
         tuple(refused),
         _unposed(capture),
         _points(capture),
-        capture.notes,
+        (*capture.notes, *UnreadColors.of([(shot.name, shot.colors) for shot in shots])),
         observed_points(path) if capture.layout == "COLMAP" else {},
     )
 
 
-def _shot(frame: Frame) -> Shot | Refused:
+def _shot(size_of: Callable[[Path], tuple[int, int]], frame: Frame) -> Shot | Refused:
     """Measure a photo, or return the reason why it cannot be used."""
     try:
-        source, camera, _ = photo_file(frame, None, (0.0, 0.0, 0.0))
-        stats = measure_photo(source.path, source.lens, source.mask)
+        source, camera, _ = photo_file(frame, None, (0.0, 0.0, 0.0), size_of)
+        colors = image_header(source.path).problem
+        stats = measure_photo(source)
     except DatasetError as error:
         return Refused(frame.name, error.reason)
     h, w = stats.thumbnail.shape[:2]
     small = Camera.posed(camera.R, camera.eye, camera.intrinsics.scaled(w, h))
-    return Shot(frame.name, frame.lens, (camera.W, camera.H), small, stats)
+    return Shot(frame.name, frame.lens, (camera.W, camera.H), small, stats, colors)
 
 
 def _points(capture: Capture) -> Float64[np.ndarray, "N 3"]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from gsplat_edu.data.capture import PHOTO_ENDINGS, entries, is_file, is_folder
-from gsplat_edu.data.images import decode_mask, image_size
+from gsplat_edu.data.images import UPRIGHT, decode_mask, image_size, turned, upright_size
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 
@@ -64,13 +64,12 @@ def unused_folders(files: Sequence[Path], masks: Mapping[Path, Path]) -> list[Pa
 def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, int, int]]) -> set[Path]:
     """Find the photos whose masks are upright rather than oriented like the stored pixels; check all sizes.
 
-    The size of a mask reveals its orientation unless the photo is square or upside down. Such masks are oriented like
-    the other masks. If those are ambiguous too, they are read as stored, which is COLMAP's convention.
+    The size of a mask reveals its orientation unless the photo is square, mirrored or upside down. Such masks are
+    oriented like the other masks. If those are ambiguous too, they are read as stored, which is COLMAP's convention.
 
     Args:
         masks: The result of `find_masks`.
-        shapes: Width, height and quarter turns clockwise to upright of the photos; photos without an entry are
-            skipped.
+        shapes: Width, height and EXIF orientation of the photos as decoded; photos without an entry are skipped.
 
     Raises:
         DatasetError: the size of a mask fits neither its photo nor its upright photo, or the mask is not an image.
@@ -79,16 +78,16 @@ def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, i
     for photo, mask in masks.items():
         if photo not in shapes:
             continue
-        W, H, turns = shapes[photo]
-        size, turned = image_size(mask), ((H, W) if turns % 2 else (W, H))
-        if size not in ((W, H), turned):
-            also = f" ({H}x{W} upright)" if turns % 2 else ""
+        W, H, orientation = shapes[photo]
+        size, shown = image_size(mask), upright_size((W, H), orientation)
+        if size not in ((W, H), shown):
+            also = f" ({H}x{W} upright)" if shown != (W, H) else ""
             raise DatasetError(
                 f"{mask}: the mask is {size[0]}x{size[1]} but its photo {W}x{H}{also}; make them the same size, or "
                 "move the mask away"
             )
-        if turns:
-            kind = either if turned == (W, H) else stored if size == (W, H) else upright
+        if orientation != UPRIGHT:
+            kind = either if shown == (W, H) else stored if size == (W, H) else upright
             kind.add(photo)
     return upright | either if upright and not stored else upright
 
@@ -109,18 +108,18 @@ def counting(mask: Path | None, alpha: UInt8[np.ndarray, "H W"] | None) -> Bool[
     return counts
 
 
-def turn_mask(mask: Path, turns: int, target: Path) -> None:
-    """Turn an upright mask to the orientation of its photo's stored pixels, and write it.
+def turn_mask(mask: Path, orientation: int, target: Path) -> None:
+    """Turn a mask to the orientation of the picture in which features are detected, and write it.
 
     Args:
         mask: The mask's file.
-        turns: Quarter turns clockwise that bring the photo upright.
+        orientation: EXIF orientation by which to turn it.
         target: The file to write.
 
     Raises:
         DatasetError: the mask cannot be decoded.
     """
-    counts = np.ascontiguousarray(np.rot90(decode_mask(mask), turns))
+    counts = turned(decode_mask(mask), orientation)
     write_mask(counts, target, (counts.shape[1], counts.shape[0]))
 
 

@@ -16,10 +16,19 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, is_file
-from gsplat_edu.data.images import AT_ONCE, decode
+from gsplat_edu.data.colors import conversion_of
+from gsplat_edu.data.images import (
+    AT_ONCE,
+    MIRRORED,
+    TURNS,
+    UPRIGHT,
+    decode,
+    stored_orientation,
+    stored_size,
+)
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import unreadable, written_aside
-from gsplat_edu.image_files import SPELLED, UNDECODABLE, is_image, opened_image
+from gsplat_edu.image_files import HEIF, SPELLED, UNDECODABLE, is_image, opened_image
 from gsplat_edu.sfm.masks import MASK_ENDING, counting, find_masks, turn_mask, upright_masks, write_mask
 from gsplat_edu.views import Photo
 
@@ -32,8 +41,8 @@ PEEK = 65536
 FULL_FRAME = math.hypot(36.0, 24.0)
 """Film diagonal that 35 mm equivalent focal lengths refer to, mm (CIPA DCG-001)."""
 
-TURNS = {3: 2, 6: 1, 8: 3}
-"""Quarter turns clockwise that bring a photo upright, by EXIF orientation. Cameras do not write the mirrored ones."""
+COUNTER = {0: UPRIGHT, 1: 8, 2: 3, 3: 6}
+"""EXIF orientation that turns back a photo that was turned clockwise by so many quarters."""
 
 COPY_QUALITY = 97
 """JPEG quality of the working copies."""
@@ -49,13 +58,16 @@ class PhotoFacts:
     Args:
         name: Path below the source, with slashes.
         copy: Name of the working copy.
-        W: Width as stored, px.
-        H: Height as stored, px.
-        turns: Quarter turns clockwise that bring the photo upright.
+        W: Width of the sensor's picture, px.
+        H: Height of the sensor's picture, px.
+        turns: Quarter turns clockwise that bring the sensor's picture upright.
         focal: Focal length from EXIF, px; None if unknown.
         camera: A key that is equal for photos taken by one camera with one lens and zoom.
         place: Latitude and longitude in degrees and height in m from EXIF; None if unknown.
-        mask: File of the mask, oriented like the stored photo; empty if there is none.
+        mask: File of the mask, oriented like the sensor's picture; empty if there is none.
+        sensor: EXIF orientation that makes the sensor's picture of the decoded pixels: 2 for a mirrored photo, and for
+            HEIC, which is decoded upright, the one that turns it back. Photos of one camera then share a lens.
+        problem: `gsplat_edu.data.images.ImageHeader.problem`.
     """
 
     name: str
@@ -67,6 +79,8 @@ class PhotoFacts:
     camera: str = ""
     place: tuple[float, float, float] | None = None
     mask: str = ""
+    sensor: int = UPRIGHT
+    problem: str = ""
 
     def copy_size(self, longest: int) -> tuple[int, int]:
         """Return width and height of the working copy, px.
@@ -158,7 +172,7 @@ def _made_here(folder: Path) -> bool:
 
 def is_photo(path: Path) -> bool:
     """Return whether a file has a photo's ending or a photo's contents."""
-    if path.suffix.lower() in (*PHOTO_ENDINGS, ".heif"):
+    if path.suffix.lower() in PHOTO_ENDINGS:
         return True
     return is_image(path)
 
@@ -195,7 +209,8 @@ def copy_photos(
 
     Copies have names without spaces, as COLMAP's pair lists require, and are 8-bit RGB, because pycolmap reads fewer
     formats than Pillow. A photo with a mask or transparent parts gets a mask masks/COPY.png in the neighbouring folder.
-    If the mask is upright and the stored photo is not, a mask turned like the photo goes to masks/stored/COPY.png.
+    If the mask is not oriented like the sensor's picture, one that is goes to masks/stored/COPY.png, or to
+    masks/mirrored/COPY.png if the mask was mirrored like its photo.
 
     Args:
         files: The photos.
@@ -209,14 +224,15 @@ def copy_photos(
         unreadable: Name and reason for each of the others.
 
     Raises:
-        DatasetError: the size of a mask fits neither its photo nor its upright photo.
+        DatasetError: the size of a mask fits neither its photo nor its upright photo, or a photo is HEIC and
+            pillow-heif is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    headers, upright, unreadable = _headers(files, source, folder)
+    headers, remade, unreadable = _headers(files, source, folder)
     facts = list[PhotoFacts]()
     largest = max((photo.W * photo.H for _, photo in headers), default=1)
     pool = ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, AT_ONCE // largest)))
-    futures = [pool.submit(_copy, path, photo, folder, longest, upright.get(path)) for path, photo in headers]
+    futures = [pool.submit(_copy, path, photo, folder, longest, remade.get(path)) for path, photo in headers]
     try:
         for done, ((_, photo), future) in enumerate(zip(headers, futures, strict=True), 1):
             try:
@@ -238,55 +254,73 @@ def copy_photos(
 
 def _headers(
     files: Sequence[Path], source: Path, folder: Path
-) -> tuple[list[tuple[Path, PhotoFacts]], dict[Path, Path], list[str]]:
+) -> tuple[list[tuple[Path, PhotoFacts]], dict[Path, tuple[Path, int]], list[str]]:
     """Read the headers of photos.
 
     Returns:
-        The facts of each photo, the upright masks, and name and reason for each file that is not a photo.
+        The facts of each photo; the masks to be turned, each with an EXIF orientation; and name and reason for each
+        file that is not a photo.
 
     Raises:
         DatasetError: the size of a mask fits neither its photo nor its upright photo.
     """
     found, unreadable, masks = list[tuple[Path, PhotoFacts]](), list[str](), find_masks(files)
+    shapes = dict[Path, tuple[int, int, int]]()
     for number, path in enumerate(files):
         try:
-            photo = _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")
+            photo, shapes[path] = _facts(path, path.relative_to(source).as_posix(), f"{number:06d}.jpg")
             found.append((path, replace(photo, mask=str(masks.get(path, "")))))
         except ValueError as error:
             unreadable.append(f"{path.relative_to(source).as_posix()} ({error})")
-    turned = upright_masks(masks, {path: (photo.W, photo.H, photo.turns) for path, photo in found})
-    headers = [
-        (path, replace(photo, mask=str(stored_mask(folder, photo.copy))) if path in turned else photo)
-        for path, photo in found
-    ]
-    return headers, {path: masks[path] for path in turned}, unreadable
+    upright = upright_masks(masks, shapes)
+    headers, remade = list[tuple[Path, PhotoFacts]](), dict[Path, tuple[Path, int]]()
+    for path, photo in found:
+        as_stored = (
+            shapes[path][2] != UPRIGHT and path not in upright
+        )  # a HEIC's mask is upright like the HEIC
+        back = photo.sensor if as_stored else COUNTER[photo.turns]
+        if path not in masks or (back == UPRIGHT and path not in upright):
+            headers.append((path, photo))
+            continue
+        remade[path] = masks[path], back
+        target = mirrored_mask(folder, photo.copy) if as_stored else stored_mask(folder, photo.copy)
+        headers.append((path, replace(photo, mask=str(target))))
+    return headers, remade, unreadable
 
 
-def _facts(path: Path, name: str, copy: str) -> PhotoFacts:
+def _facts(path: Path, name: str, copy: str) -> tuple[PhotoFacts, tuple[int, int, int]]:
     """Read a header.
+
+    Returns:
+        The facts; and width, height and EXIF orientation of the decoded pixels.
 
     Raises:
         ValueError: the file is not a photo; the message says why.
+        DatasetError: it is HEIC, and pillow-heif is not installed.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about sizes and invalid EXIF, which the user cannot fix
             with opened_image(path) as file:
-                (W, H), exif = file.size, file.getexif()
+                (W, H), exif = stored_size(file), file.getexif()
+                orientation, heif = stored_orientation(file), file.format == HEIF
+                taken = file.info.get("original_orientation") if heif else orientation
+                problem = conversion_of(file.info).problem
                 details = exif.get_ifd(ExifTags.IFD.Exif)
                 place = _place(exif.get_ifd(ExifTags.IFD.GPSInfo))
     except UNDECODABLE as error:
-        if path.suffix.lower() in (".heic", ".heif"):
-            raise ValueError("HEIC is not supported: export it as JPEG") from None
         reason = f"not a {SPELLED} image" if "cannot identify" in str(error) else str(error).split("\n")[0]
         raise ValueError(reason) from None
+    decoded, turns = (W, H, orientation), TURNS.get(taken or UPRIGHT, 0)
+    sensor = COUNTER[turns] if heif else 2 if orientation in MIRRORED else UPRIGHT
+    if heif and turns % 2:
+        W, H = H, W
     focal = _focal(details, W, H)
     said = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)]
     said += [details.get(tag) for tag in (ExifTags.Base.LensModel, ExifTags.Base.FocalLength)]
     said += [details.get(ExifTags.Base.FocalLengthIn35mmFilm), details.get(ExifTags.Base.DigitalZoomRatio)]
     camera = " ".join([f"{W}x{H}", *(str(value).strip("\0 ") for value in said if value is not None)])
-    turns = TURNS.get(exif.get(ExifTags.Base.Orientation, 1), 0)
-    return PhotoFacts(name, copy, W, H, turns, focal, camera, place)
+    return PhotoFacts(name, copy, W, H, turns, focal, camera, place, sensor=sensor, problem=problem), decoded
 
 
 def _number(value: object) -> float:
@@ -332,8 +366,8 @@ def _place(gps: dict[int, object]) -> tuple[float, float, float] | None:
     return angles[0], angles[1], height if math.isfinite(height) else 0.0
 
 
-def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, upright: Path | None) -> None:
-    """Write the mask and then the working copy, unless the copy exists; an upright mask is turned first.
+def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, remade: tuple[Path, int] | None) -> None:
+    """Write the mask and then the working copy, unless the copy exists; a mask is turned first if necessary.
 
     Raises:
         DatasetError: the photo or its mask cannot be decoded.
@@ -341,11 +375,11 @@ def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, upright: Pa
     target = folder / photo.copy
     if target.is_file():
         return
-    pixels, alpha = decode(path)
+    pixels, alpha = decode(path, photo.sensor)
     size = photo.copy_size(longest)
     try:
-        if upright is not None:
-            turn_mask(upright, photo.turns, Path(photo.mask))
+        if remade is not None:
+            turn_mask(*remade, Path(photo.mask))
         counts = counting(Path(photo.mask) if photo.mask else None, alpha)
     except DatasetError as error:
         raise DatasetError(f"{path}: its mask {error}") from None
@@ -364,5 +398,10 @@ def mask_folder(folder: Path) -> Path:
 
 
 def stored_mask(folder: Path, copy: str) -> Path:
-    """Return the file for an upright mask turned like its stored photo, given the folder of the working copies."""
+    """Return the file for an upright mask turned like the sensor's picture, given the folder of the working copies."""
     return mask_folder(folder) / "stored" / f"{copy}.png"
+
+
+def mirrored_mask(folder: Path, copy: str) -> Path:
+    """Return the file for a mask that was stored mirrored like its photo, given the folder of the working copies."""
+    return mask_folder(folder) / "mirrored" / f"{copy}.png"

@@ -14,6 +14,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.data.images import UPRIGHT
+from gsplat_edu.data.notes import UnreadColors
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
@@ -217,6 +219,8 @@ class _Run:
         if masked := sum(bool(photo.mask) for photo in photos):
             summary += "; all have a mask" if masked == len(photos) else f"; {masked} of them have a mask"
         self._note_masks(files, photos)
+        for note in UnreadColors.of([(photo.name, photo.problem) for photo in photos]):
+            self._say(str(note))
         return {"summary": summary, "photos": [asdict(photo) for photo in photos], "unreadable": unreadable}
 
     def _note_masks(self, files: Sequence[Path], photos: Sequence[PhotoFacts]) -> None:
@@ -229,7 +233,9 @@ class _Run:
         unknown = [
             photo.name
             for photo in photos
-            if photo.mask and photo.turns and (photo.turns == 2 or photo.W == photo.H)
+            if photo.mask
+            and (photo.turns or photo.sensor != UPRIGHT)
+            and (photo.turns % 2 == 0 or photo.W == photo.H)
             if Path(photo.mask).parent != stored
         ]
         if unknown:

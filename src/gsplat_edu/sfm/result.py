@@ -32,7 +32,10 @@ QUALITY = 95
 """JPEG quality of undistorted photos."""
 
 JPEGS = (".jpg", ".jpeg")
-"""Endings of photos written as JPEG, because they were lossy before; the others are written as PNG."""
+"""Endings of photos written as JPEG, because they were lossy before."""
+
+HEICS = (".heic", ".heif", ".hif")
+"""Endings of photos that become .jpg, because they were lossy before; the others are written as PNG."""
 
 PARTS = ("images", "masks", "sparse")
 """Parts of a capture. The model comes last: its presence means that the capture is complete."""
@@ -206,14 +209,18 @@ def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
         photos: The photos.
 
     Returns:
-        Paths below images/: JPEGs keep their names, others end in .png. Characters that COLMAP's files cannot store
-        become "_".
+        Paths below images/: JPEGs keep their names, HEIC becomes .jpg, others end in .png. Characters that
+        COLMAP's files cannot store become "_".
     """
     paths = [PurePosixPath(re.sub("[\\\\\x00-\x1f\ud800-\udfff]", "_", photo.name)) for photo in photos]
     names = list[str]()
     taken = {str(folder).lower() for path in paths for folder in path.parents}  # folders' names are taken too
     for path in paths:
-        base, ending = path.with_suffix(""), path.suffix if path.suffix.lower() in JPEGS else ".png"
+        kind = path.suffix.lower()
+        base, ending = (
+            path.with_suffix(""),
+            path.suffix if kind in JPEGS else ".jpg" if kind in HEICS else ".png",
+        )
         name, number = f"{base}{ending}", 2
         while name.lower() in taken:  # some file systems ignore case
             name, number = f"{base}_{number}{ending}", number + 1
@@ -240,7 +247,9 @@ def _write_photos(
 def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
     lens = entry.lens
     counts = Path(entry.photo.mask) if entry.photo.mask else None
-    photo = load_photo(PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None))
+    photo = load_photo(
+        PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None, entry.photo.sensor)
+    )
     pixels = np.asarray(photo.image)
     if photo.alpha is not None:
         pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)

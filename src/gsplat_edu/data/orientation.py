@@ -1,0 +1,50 @@
+"""Decide which photos of a capture are turned as EXIF says: those whose poses refer to upright pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from gsplat_edu.data.capture import Frame, fits_camera
+from gsplat_edu.data.images import UPRIGHT, image_orientation
+from gsplat_edu.errors import DatasetError
+
+QUARTER_TURNS = (5, 6, 7, 8)
+"""EXIF orientations that exchange width and height."""
+
+
+def oriented(frames: Sequence[Frame], size_of: Callable[[Path], tuple[int, int]]) -> list[Frame]:
+    """Mark the photos to be turned. The sizes of the cameras decide, because poses refer to the pixels that were used.
+
+    COLMAP ignores EXIF, so photos are read as stored if that fits their camera. A photo is turned if only its upright
+    size fits. If there are such photos, and none with a quarter turn in EXIF that fits as stored, then the program that
+    found the poses turned all photos, also those whose size does not tell: half turns, mirrored and square ones.
+
+    Args:
+        frames: The frames of a capture.
+        size_of: Reads the size of an image file as stored. Files that it cannot read are left to their reader.
+    """
+    sizes: dict[Path, tuple[int, int]] = {}
+    for frame in frames:
+        try:
+            sizes[frame.image] = size_of(frame.image)
+        except DatasetError:
+            continue
+    turned = {
+        frame.image: orientation
+        for frame in frames
+        if frame.image in sizes and not fits_camera(frame.lens, sizes[frame.image])
+        if fits_camera(frame.lens, sizes[frame.image][::-1])
+        if (orientation := image_orientation(frame.image)) in QUARTER_TURNS
+    }
+    if not turned:
+        return list(frames)
+    others = {frame.image: frame for frame in frames if frame.image in sizes and frame.image not in turned}
+    unclear = {path: orientation for path in others if (orientation := image_orientation(path)) != UPRIGHT}
+    if all(
+        orientation not in QUARTER_TURNS or fits_camera(others[path].lens, sizes[path][::-1])
+        for path, orientation in unclear.items()
+    ):
+        turned |= unclear
+    return [replace(frame, orientation=turned.get(frame.image, UPRIGHT)) for frame in frames]
