@@ -1,4 +1,3 @@
-import dataclasses
 import json
 import signal
 import time
@@ -9,18 +8,13 @@ import pytest
 from PIL import Image
 
 import gsplat_edu.cli.main as command_line
-from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.writers import write_colmap
+from far_run import BLUE, write_far_run
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from processes import Program
-from splats import splats_on
-
-ORIGIN = (512.0, -64.0, 8.0)
-BLUE = (0.0, 0.0, 1.0)
 
 
 @pytest.fixture
@@ -31,19 +25,7 @@ def cli(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A capture, and a run of it with moved coordinates and a blue background."""
-    root = tmp_path_factory.mktemp("made")
-    views, points, colors = procedural_capture(size=32, count=6)
-    write_colmap(root / "capture", views, points, colors)
-    gaussians = splats_on(points, colors)
-    folder = RunFolder(root / "run")
-    folder.write_config(
-        {"render": dataclasses.asdict(RenderSettings(background=BLUE)), "origin": list(ORIGIN), "data": {}}
-    )
-    save_ply(folder.scene(30), gaussians, ORIGIN)
-    folder.write_cameras(views[:4], views[4:], ORIGIN)
-    save_ply(root / "bare.ply", gaussians)
-    return folder, root / "capture", root / "bare.ply", views
+    return write_far_run(tmp_path_factory.mktemp("made"))
 
 
 def pixels(path):

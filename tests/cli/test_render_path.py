@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 
 import gsplat_edu.cli.main as command_line
-from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.writers import write_colmap
+from far_run import BLUE, ORIGIN, write_far_run
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path, write_path
 from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.evaluate.paths import orbit_of_scene
@@ -20,10 +19,8 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import file_settings
-from splats import splats_on
 
-ORIGIN = (512.0, -64.0, 8.0)
-SETTINGS = RenderSettings(background=(0.0, 0.0, 1.0))
+SETTINGS = RenderSettings(background=BLUE)
 
 
 @pytest.fixture
@@ -34,17 +31,7 @@ def cli(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A run whose capture lies far from zero, its capture, the scene near zero, and the views near zero."""
-    root = tmp_path_factory.mktemp("made")
-    views, points, colors = procedural_capture(size=32, count=6)
-    write_colmap(root / "capture", views, points, colors)
-    folder = RunFolder(root / "run")
-    folder.write_config({"render": dataclasses.asdict(SETTINGS), "origin": list(ORIGIN), "data": {}})
-    gaussians = splats_on(points, colors)
-    save_ply(folder.scene(30), gaussians, ORIGIN)
-    folder.write_cameras(views[:4], views[4:], ORIGIN)
-    save_ply(root / "bare.ply", gaussians)
-    return folder, root / "capture", root / "bare.ply", views
+    return write_far_run(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture
