@@ -109,7 +109,7 @@ def opened_image(source: Path | bytes, formats: Sequence[str] = FORMATS) -> Iter
         yield image
 
 
-def _opened(file: BinaryIO, source: Path | bytes, formats: Sequence[str]) -> Image.Image:
+def _opened(file: BinaryIO | BytesIO, source: Path | bytes, formats: Sequence[str]) -> Image.Image:
     """Open an image by its contents.
 
     Raises:
