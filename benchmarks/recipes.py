@@ -384,7 +384,10 @@ def figure(results: Results, title: str) -> Figure:
             if below is not None:
                 axes.set_ylim(bottom=min(run[score] for run in results.runs) - below)
             axes.set(xlabel="processor time (s)" if key == TIME else "Gaussians", ylabel=label)
-            axes.set_xscale("log" if key == TIME else "linear")
+            if key == TIME:
+                axes.set_xscale("log")
+            else:
+                axes.locator_params(axis="x", nbins=5)
             axes.grid(alpha=0.3, which="both")
     for name, color in colors.items():
         grid[0, 0].plot([], [], "o-", color=color, label=name)
