@@ -128,6 +128,7 @@ GSPLAT_INLINE void begin_tile(const CompositeBackwardArgs<T> &args, const TileBo
     using Q = typename Four<T>::V;
     const Images<T> &out = args.forward.out;
     const ImageGrads<T> &in = args.in;
+    // A full tile of colours is written completely below.
     if (MODE != COLORS || box.width < TILE || box.height < TILE) memset(&tile, 0, sizeof(TileGradient<T, COLORS>));
     if constexpr (MODE >= WITH_FEATURES) tile.features.clear(in.features ? out.channels : 0);
     if constexpr (MODE == WITH_ALL) memset(&tile.errors, 0, sizeof tile.errors);

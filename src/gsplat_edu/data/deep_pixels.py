@@ -92,7 +92,7 @@ def _repack(file: Image.Image, packing: str) -> None:
 
 
 def _lower_bytes(packing: str) -> str:
-    """Return the arrangement in which Pillow keeps the other byte of each value: that of the other byte order."""
+    """Return the packing with the opposite byte order, with which Pillow keeps the lower byte of each value."""
     native = "L" if sys.byteorder == "little" else "B"
     order = native if packing[-1] == "N" else packing[-1]
     return packing[:-1] + ("B" if order == "L" else "L")
