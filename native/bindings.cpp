@@ -13,6 +13,7 @@
 #include <cstdlib>
 #include <limits>
 #include <utility>
+#include <vector>
 
 #include "buffers.h"
 #include "dispatch.h"
@@ -275,6 +276,48 @@ void noise(nb::args positional, nb::kwargs given) {
              [&](int64_t task, int) { kernels<T>().noise(args, task * GRAIN, std::min(n, (task + 1) * GRAIN)); });
 }
 
+// What both passes take: image, matrix and photo. Returns the image's shape too.
+template <class T>
+std::pair<RecolorArgs<T>, Shape> recolor_args(Arguments &a) {
+    const Array image = a.array("image", {KIND<T>}, {ANY, ANY, 3}), matrix = a.array("matrix", {KIND<T>}, {3, 4});
+    const Array photo = a.array_or_none("photo", Kind::U8, image.shape);
+    RecolorArgs<T> args{};
+    args.image = image.as<T>(), args.photo = photo.as<uint8_t>(), args.pixels = image.shape.size() / 3;
+    std::copy_n(matrix.as<T>(), RECOLOR_NUMBERS, args.matrix);
+    return {args, image.shape};
+}
+
+template <class T>
+void recolor(nb::args positional, nb::kwargs given) {
+    Arguments a("recolor", positional, given);
+    auto [args, shape] = recolor_args<T>(a);
+    args.out = a.array("out", {KIND<T>}, shape, true).template as<T>();
+    const int threads = int(a.whole("threads", 1, MOST_THREADS));
+    a.finish();
+    nb::gil_scoped_release release;
+    parallel(threads, args.tasks(), [&args = args](int64_t task, int) { kernels<T>().recolor(args, task); });
+}
+
+// Writes the gradient of the image, and that of the matrix unless it is None.
+template <class T>
+void recolor_backward(nb::args positional, nb::kwargs given) {
+    Arguments a("recolor_backward", positional, given);
+    auto [args, shape] = recolor_args<T>(a);
+    args.grad = a.array("grad", {KIND<T>}, shape).template as<T>();
+    args.out = a.array("grad_image", {KIND<T>}, shape, true).template as<T>();
+    T *grad_matrix = a.array_or_none("grad_matrix", KIND<T>, {3, 4}, true).template as<T>();
+    const int threads = int(a.whole("threads", 1, MOST_THREADS));
+    a.finish();
+    nb::gil_scoped_release release;
+    std::vector<double> sums(size_t(args.tasks()) * RECOLOR_NUMBERS);
+    args.sums = grad_matrix ? sums.data() : nullptr;
+    parallel(threads, args.tasks(), [&args = args](int64_t task, int) { kernels<T>().recolor_backward(args, task); });
+    if (!grad_matrix) return;
+    double total[RECOLOR_NUMBERS] = {};
+    for (size_t i = 0; i < sums.size(); ++i) total[i % RECOLOR_NUMBERS] += sums[i];
+    std::copy(total, total + RECOLOR_NUMBERS, grad_matrix);
+}
+
 // Returns (mean |x - y|, mean SSIM) and writes the gradient.
 template <class T>
 std::array<double, 2> loss_of(nb::args positional, nb::kwargs given) {
@@ -352,6 +395,10 @@ NB_MODULE(_native, m) {
     m.def("adam_f64", &adam<double>);
     m.def("noise_f32", &noise<float>);
     m.def("noise_f64", &noise<double>);
+    m.def("recolor_f32", &recolor<float>);
+    m.def("recolor_f64", &recolor<double>);
+    m.def("recolor_backward_f32", &recolor_backward<float>);
+    m.def("recolor_backward_f64", &recolor_backward<double>);
     m.def("loss_f32", &loss_of<float>);
     m.def("loss_f64", &loss_of<double>);
     m.def("ask_before_large_blocks", [](const nb::object &function) {

@@ -14,6 +14,8 @@ template <class T> void composite_backward(const CompositeBackwardArgs<T> &, int
 template <class T> void project_backward(const ProjectBackwardArgs<T> &, int64_t block);
 template <class T> void loss(const LossArgs<T> &, int64_t task, T *scratch);
 template <class T> void noise(const NoiseArgs<T> &, int64_t begin, int64_t end);
+template <class T> void recolor(const RecolorArgs<T> &, int64_t task);
+template <class T> void recolor_backward(const RecolorArgs<T> &, int64_t task);
 template <class T> void adam(const AdamArgs<T> &, int64_t begin, int64_t end);
 template <class T> void adam_backward(const AdamBackwardArgs<T> &, int64_t block, T *scratch);
 

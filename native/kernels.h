@@ -202,6 +202,22 @@ struct NoiseArgs {
     double amount, sharpness, threshold;
 };
 
+constexpr int64_t RECOLOR_PIXELS = 4096;               // per task, so that the order of the sums depends on the image only
+constexpr int RECOLOR_NUMBERS = 12;                    // of a matrix 3 x 4, row by row
+
+template <class T>
+struct RecolorArgs {
+    const T *image;                                    // pixels x 3
+    const uint8_t *photo;                              // pixels x 3, or null
+    int64_t pixels;
+    T matrix[RECOLOR_NUMBERS];
+    T *out;                                            // pixels x 3: the corrected image, or in the backward pass the image's gradient
+    const T *grad;                                     // pixels x 3, only in the backward pass: the corrected image's gradient
+    double *sums;                                      // tasks x 12: each task's part of the matrix's gradient; or null
+
+    int64_t tasks() const { return (pixels + RECOLOR_PIXELS - 1) / RECOLOR_PIXELS; }
+};
+
 constexpr int SSIM_HALF = 5;                           // taps on each side of the central one
 constexpr int SSIM_BLOCK = 2 * SSIM_HALF;              // rows that are processed together
 constexpr int64_t SSIM_ROWS = 160;                     // image rows per task, at most
@@ -241,6 +257,8 @@ struct Kernels {
     void (*adam_backward)(const AdamBackwardArgs<T> &, int64_t block, T *scratch);
     void (*loss)(const LossArgs<T> &, int64_t task, T *scratch);
     void (*noise)(const NoiseArgs<T> &, int64_t begin, int64_t end);
+    void (*recolor)(const RecolorArgs<T> &, int64_t task);
+    void (*recolor_backward)(const RecolorArgs<T> &, int64_t task);
 };
 
 struct Isa {

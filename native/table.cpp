@@ -10,8 +10,8 @@ namespace GSPLAT_ISA {
 
 template <class T>
 static constexpr Kernels<T> kernels() {
-    return {project<T>,          count<T>, scatter<T>,       composite<T>, composite_backward<T>,
-            project_backward<T>, adam<T>,  adam_backward<T>, loss<T>,      noise<T>};
+    return {project<T>,       count<T>, scatter<T>, composite<T>, composite_backward<T>, project_backward<T>, adam<T>,
+            adam_backward<T>, loss<T>,  noise<T>,   recolor<T>,   recolor_backward<T>};
 }
 
 // Twelve independent chains of vector FMAs, enough to hide their latency and few enough for sixteen registers: a

@@ -3,9 +3,10 @@
 import torch
 
 from gsplat_edu.train.optimizer import ParameterGroup
+from gsplat_edu.train.view_model import Identity
 
 
-class Gains:
+class Gains(Identity):
     """A small but real view model: one brightness per view."""
 
     def __init__(self, count):
@@ -17,5 +18,5 @@ class Gains:
     def groups(self):
         return {"gains": ParameterGroup(0.02, eps=1e-8, per_gaussian=False)}
 
-    def __call__(self, index, image):
+    def image(self, index, image, target, iteration):
         return image * self.gains[index]

@@ -12,6 +12,7 @@ from gsplat_edu.evaluate.metrics import (
     mean_absolute_error,
     psnr,
     psnr_8bit,
+    psnr_fitted,
     score_views,
     ssim,
     summarize,
@@ -176,6 +177,28 @@ def test_views_are_scored_over_the_background_in_their_order():
 
 
 def test_no_images_means_no_averages():
-    assert summarize([]) == {"psnr": None, "psnr_8bit": None, "ssim": None, "l1": None, "num_images": 0}
+    assert summarize([]) == {
+        "psnr": None,
+        "psnr_8bit": None,
+        "ssim": None,
+        "l1": None,
+        "psnr_fitted": None,
+        "num_images": 0,
+    }
     with pytest.raises(ArgumentError, match="scores: is empty"):
         worst([])
+
+
+def test_the_fitted_psnr_does_not_depend_on_the_exposure_of_the_photo():
+    """A photo of a third less light: the fit on the left half makes up for it on the right half."""
+    truth = np.random.default_rng(4).uniform(0.2, 0.8, (40, 60, 3))
+    render = np.clip(truth + np.random.default_rng(5).normal(0.0, 0.01, truth.shape), 0.0, 1.0)
+    darker = (truth + 0.055) * (2 / 3) ** (1 / 2.4) - 0.055
+    # Noise of 0.01 is 40 dB; the dark photo shrinks it by a sixth.
+    assert psnr_fitted(render, truth) == pytest.approx(40.0, abs=0.4)
+    assert psnr_fitted(render, darker) == pytest.approx(41.4, abs=0.6)
+    assert psnr(render, darker) < 21.0
+    right = np.zeros(truth.shape[:2], dtype=bool)
+    right[:, :30] = True
+    assert psnr_fitted(render, darker, right) is None, "no pixel of the right half counts"
+    assert psnr_fitted(render[:, :1], truth[:, :1]) == pytest.approx(psnr(render[:, :1], truth[:, :1]))

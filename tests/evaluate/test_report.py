@@ -53,7 +53,7 @@ class Page(HTMLParser):
 
 
 def score(name, psnr):
-    return ImageScore(name, psnr, psnr - 0.1, 0.9, 0.02)
+    return ImageScore(name, psnr, psnr - 0.1, 0.9, 0.02, psnr + 0.2)
 
 
 def picture(name, value=0):

@@ -28,6 +28,7 @@ from gsplat_edu.evaluate.report import Picture
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
+from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import TrainConfig
@@ -165,7 +166,9 @@ def _trial(
 ) -> _Trial:
     pairs, moments = [0], list[float]()
 
-    def counting(gaussians: Gaussians, camera: Camera, *, settings: RenderSettings) -> RenderOutput:
+    def counting(
+        gaussians: Gaussians, camera: Camera | CameraTensors, *, settings: RenderSettings
+    ) -> RenderOutput:
         output = render(gaussians, camera, settings=settings, backend=backend)
         pairs.append(output.num_pairs or 0)
         return output

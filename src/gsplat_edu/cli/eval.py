@@ -101,14 +101,16 @@ def _evaluate(
 
 
 def score_lines(test: Sequence[ImageScore], train: Sequence[ImageScore]) -> list[str]:
-    """Return the table of scores, one line per split."""
-    lines = [f"{'':5} {'images':>6} {'PSNR':>7} {'8-bit':>7} {'SSIM':>7} {'L1':>7}  worst view"]
+    """Return the table of scores, one line per split. "fitted" is `gsplat_edu.evaluate.metrics.psnr_fitted`."""
+    lines = [f"{'':5} {'images':>6} {'PSNR':>7} {'8-bit':>7} {'SSIM':>7} {'L1':>7} {'fitted':>7}  worst view"]
     for name, scores in (("test", test), ("train", train)):
         if not scores:
             lines.append(f"{name:5} {0:6}  no views")
             continue
         means = summarize(scores)
         numbers = f"{means['psnr']:7.2f} {means['psnr_8bit']:7.2f} {means['ssim']:7.4f} {means['l1']:7.4f}"
+        fitted = means["psnr_fitted"]
+        numbers += f" {'-':>7}" if fitted is None else f" {fitted:7.2f}"
         low = worst(scores)
         lines.append(f"{name:5} {len(scores):6} {numbers}  {low.name} ({low.psnr:.2f} dB)")
     return lines

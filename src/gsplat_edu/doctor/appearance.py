@@ -210,16 +210,19 @@ def check_exposure(survey: Survey) -> list[Finding]:
         names = tuple(survey.names[i] for i in jumping)
         stops = tuple(f"{light[i]:+.1f}" for i in jumping)
         what = f"{len(names)} of {len(light)} photos are brighter or darker than neighbours that see the same, in stops"
-        advice = f"check {names[0]}: did the exposure jump, or did your shadow fall on the scene? correct or remove it"
+        advice = (
+            f"check {names[0]}: if the exposure jumped, train with --appearance exposure;"
+            " if your shadow fell on the scene, remove the photo"
+        )
         found.append(Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops))
     elif (share := gains.differing(unsure * JUMP)) > DIFFERING:
         what = f"{100 * share:.0f} % of consecutive photos differ by more than {unsure * JUMP:.1f} stops"
-        advice = "lock the exposure while you take photos: some are brighter than the rest"
+        advice = "train with --appearance exposure; next time, lock the exposure while you take photos"
         found.append(Finding(EXPOSURE, Severity.WARNING, what, advice))
     if len(tinted := [i for i in np.argsort(-tint) if tint[i] > unsure * TINT]):
         names = tuple(survey.names[i] for i in tinted)
         what = f"{len(names)} of {len(tint)} photos have another tint than neighbours that see the same"
-        advice = "lock the white balance while you take photos, or remove the photos with another tint"
+        advice = "train with --appearance exposure; next time, lock the white balance while you take photos"
         found.append(Finding("white balance", Severity.WARNING, what, advice, names))
     return found
 

@@ -47,18 +47,22 @@ class PhotoStats:
 
     Args:
         thumbnail: (h, w, 3) RGB, undistorted, at most 128 px long.
-        detail: (8,) natural logarithm of the energy of fine gradients over that of coarse ones, by direction.
+        detail: (8,) natural logarithm of the energy of fine gradients over that of coarse ones, by direction; zero if
+            it was not measured.
+        transparent: Whether a pixel is not opaque.
     """
 
     thumbnail: UInt8[np.ndarray, "h w 3"]
     detail: Float64[np.ndarray, "8"]
+    transparent: bool = False
 
 
-def measure_photo(source: PhotoFile) -> PhotoStats:
+def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
     """Decode a photo and measure it.
 
     Args:
         source: The photo at its full size. Its mask is decoded only to check that training can read it.
+        sharpness: Measure the detail too; without it, JPEGs are decoded at a smaller size.
 
     Raises:
         DatasetError: the photo or its mask cannot be decoded, or the lens cannot be undistorted.
@@ -66,13 +70,15 @@ def measure_photo(source: PhotoFile) -> PhotoStats:
     lens = source.lens
     if source.mask is not None:
         decode_mask(source.mask)
-    pixels = _shrunk(_decoded(source), WORK_SIDE)
+    decoded, transparent = _decoded(source, WORK_SIDE if sharpness else 2 * THUMBNAIL_SIDE)
+    pixels = _shrunk(decoded, WORK_SIDE)
     small = _shrunk(pixels, THUMBNAIL_SIDE)
     h, w = small.shape[:2]
     if lens.distorts and min(h, w) > 1:
         columns, rows, _ = undistortion(lens.scaled(w, h), slice(0, h))
         small = cv2.remap(small, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return PhotoStats(np.asarray(small, dtype=np.uint8), detail_of(pixels))
+    detail = detail_of(pixels) if sharpness else np.zeros(len(ANGLES))
+    return PhotoStats(np.asarray(small, dtype=np.uint8), detail, transparent)
 
 
 def detail_of(pixels: UInt8[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "8"]:
@@ -100,14 +106,17 @@ def _energy(gray: Float32[np.ndarray, "H W"], sigma: float) -> Float64[np.ndarra
     return np.asarray(c * c * xx + s * s * yy + 2.0 * c * s * xy)
 
 
-def _decoded(source: PhotoFile) -> UInt8[np.ndarray, "H W 3"]:
-    """Decode a photo; JPEGs at a reduced size, no smaller than the working size; transparent photos over black.
+def _decoded(source: PhotoFile, side: int) -> tuple[UInt8[np.ndarray, "H W 3"], bool]:
+    """Decode a photo, and say whether it is transparent anywhere; there it lies over black.
 
-    Decodes as training does, so that both refuse the same files.
+    JPEGs are decoded at a reduced size, the longest side no smaller than `side`. Otherwise as in training, so that both
+    refuse the same files.
     """
-    smaller = WORK_SIDE if source.lens.W * source.lens.H <= JPEG_ONLY else None
+    smaller = side if source.lens.W * source.lens.H <= JPEG_ONLY else None
     image, alpha = decode(source.path, source.orientation, smaller)
-    return image if alpha is None else np.asarray(Photo(image, alpha).over((0.0, 0.0, 0.0)))
+    if alpha is None:
+        return image, False
+    return np.asarray(Photo(image, alpha).over((0.0, 0.0, 0.0))), bool((alpha < 255).any())
 
 
 def _shrunk(pixels: UInt8[np.ndarray, "H W 3"], side: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -97,12 +97,13 @@ class Survey:
         return Geometry([shot.camera for shot in self.shots], self.points)
 
 
-def prepare(path: Path, progress: Progress | None = None) -> Survey:
+def prepare(path: Path, progress: Progress | None = None, sharpness: bool = True) -> Survey:
     """Read a capture and measure its photos, a few at a time.
 
     Args:
         path: Folder or transforms.json, as for `gsplat_edu.data.dataset.load_dataset`.
         progress: Called with (photos done, total) in the calling thread.
+        sharpness: Measure the photos' sharpness too, which takes most of the time.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
@@ -113,7 +114,7 @@ def prepare(path: Path, progress: Progress | None = None) -> Survey:
     shots, refused = list[Shot](), list[Refused]()
     with ThreadPoolExecutor(WORKERS) as pool:
         try:
-            for done, found in enumerate(pool.map(partial(_shot, size_of), frames), 1):
+            for done, found in enumerate(pool.map(partial(_shot, size_of, sharpness), frames), 1):
                 if isinstance(found, Shot):
                     shots.append(found)
                 else:
@@ -135,12 +136,12 @@ def prepare(path: Path, progress: Progress | None = None) -> Survey:
     )
 
 
-def _shot(size_of: Callable[[Path], tuple[int, int]], frame: Frame) -> Shot | Refused:
+def _shot(size_of: Callable[[Path], tuple[int, int]], sharpness: bool, frame: Frame) -> Shot | Refused:
     """Measure a photo, or return the reason why it cannot be used."""
     try:
         source, camera, _ = photo_file(frame, None, (0.0, 0.0, 0.0), size_of)
         colors = image_header(source.path).problem
-        stats = measure_photo(source)
+        stats = measure_photo(source, sharpness)
     except DatasetError as error:
         return Refused(frame.name, error.reason)
     h, w = stats.thumbnail.shape[:2]

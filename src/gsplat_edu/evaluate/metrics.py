@@ -5,6 +5,8 @@ number of threads. Renders are clamped to 0..1 first, as a screen would do. Defi
 
     psnr        10 log10(1 / MSE) of the floating-point render against the photo's bytes / 255
     psnr_8bit   the same with the render rounded to bytes, as in a PNG
+    psnr_fitted the PSNR of the right half alone, after the render's exposure and white balance were fitted to the
+                photo's left half: a held-out photo may be brighter or darker than the scene
     ssim        mean SSIM over pixels and channels: Gaussian window of 11 taps, sigma 1.5, zero outside the image
 
 A mean over images averages the images' values. It is not the PSNR of the mean error.
@@ -23,6 +25,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.exposure import color_matrix, measured_gains
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import l1_ssim
 from gsplat_edu.render.output import RenderOutput
@@ -46,6 +49,8 @@ class ImageScore:
         psnr_8bit: dB, of the render rounded to bytes.
         ssim: -1 to 1; 1 for equal images.
         l1: Mean absolute difference, 0 to 1.
+        psnr_fitted: dB, of the right half after an exposure fit on the left half; None if no pixel counts in the right
+            half.
     """
 
     name: str
@@ -53,7 +58,11 @@ class ImageScore:
     psnr_8bit: float
     ssim: float
     l1: float
+    psnr_fitted: float | None
 
+
+MEASURES = ("psnr", "psnr_8bit", "ssim", "l1", "psnr_fitted")
+"""The scores of an image, by their names in `ImageScore`."""
 
 OnImage = Callable[[View, ImageScore, UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"]], None]
 """Called after each scored view with the view, its score, the render and the photo, both rounded to bytes."""
@@ -83,6 +92,21 @@ def psnr_8bit(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None)
     Arguments, result and errors are those of `psnr`.
     """
     return _Pair(image, truth, mask).psnr_8bit()
+
+
+def psnr_fitted(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float | None:
+    """Return the PSNR of the right half of an image after a fit of its colours on the left half.
+
+    Each channel's gain is `gsplat_edu.exposure.measured_gains` of the left halves, which is applied to the right half.
+    So a held-out photo can be compared with a scene of another exposure, on pixels that the fit has not seen. Unlike
+    `psnr`, it covers only half of the image.
+
+    Arguments and errors are those of `psnr`.
+
+    Returns:
+        dB; None if no pixel of the right half counts.
+    """
+    return _Pair(image, truth, mask).psnr_fitted()
 
 
 def mean_absolute_error(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
@@ -141,7 +165,7 @@ def score_image(name: str, image: ArrayLike, truth: ArrayLike, mask: ArrayLike |
         BackendUnavailableError: as for `ssim`.
     """
     pair = _Pair(image, truth, mask)
-    return ImageScore(name, pair.psnr(), pair.psnr_8bit(), pair.ssim(), pair.l1())
+    return ImageScore(name, pair.psnr(), pair.psnr_8bit(), pair.ssim(), pair.l1(), pair.psnr_fitted())
 
 
 def score_views(
@@ -179,9 +203,14 @@ def score_views(
 
 
 def summarize(scores: Sequence[ImageScore]) -> dict[str, float | int | None]:
-    """Average scores over images: psnr, psnr_8bit, ssim, l1 (each None if there are no images), and num_images."""
-    keys = ("psnr", "psnr_8bit", "ssim", "l1")
-    means = {key: float(np.mean([getattr(s, key) for s in scores])) if scores else None for key in keys}
+    """Average scores over images, by the names of `ImageScore`; and count them as num_images.
+
+    A mean is None if there are no images, or if the score is None for all of them.
+    """
+    means: dict[str, float | int | None] = {}
+    for key in MEASURES:
+        values = [value for score in scores if (value := getattr(score, key)) is not None]
+        means[key] = float(np.mean(values)) if values else None
     return {**means, "num_images": len(scores)}
 
 
@@ -241,6 +270,21 @@ class _Pair:
             planes = (np.where(inside, self.render, 0.0), np.where(inside, self.photo, 0.0))
         x, y = (torch.from_numpy(np.array(plane)) for plane in planes)
         return 1.0 - float(l1_ssim(x, y, ssim_weight=1.0))
+
+    def psnr_fitted(self) -> float | None:
+        middle = self.render.shape[1] // 2
+        left, right = np.s_[:, :middle], np.s_[:, middle:]
+        sides = (None, None) if self.counts is None else (self.counts[left], self.counts[right])
+        counts, tested = sides
+        if not self.render[right].size or (tested is not None and not tested.any()):
+            return None
+        x, y = (torch.from_numpy(plane[left].copy()) for plane in (self.render, self.photo))
+        matrix = color_matrix(
+            measured_gains(x, y, None if counts is None else torch.from_numpy(counts.copy()))
+        ).numpy()
+        gains, offset = np.diagonal(matrix), matrix[:, 3]
+        fitted = np.clip(self.render[right] * gains + offset, 0.0, 1.0)
+        return _Pair(fitted, self.photo[right], tested).psnr()
 
     def l1(self) -> float:
         return self._mean(np.abs(self.render - self.photo))

@@ -35,7 +35,13 @@ PICTURE_SIDE = 640
 
 JPEG_QUALITY = 88
 
-SCORES = (("psnr", "PSNR (dB)"), ("psnr_8bit", "PSNR, 8-bit (dB)"), ("ssim", "SSIM"), ("l1", "L1"))
+SCORES = (
+    ("psnr", "PSNR (dB)"),
+    ("psnr_8bit", "PSNR, 8-bit (dB)"),
+    ("ssim", "SSIM"),
+    ("l1", "L1"),
+    ("psnr_fitted", "PSNR, right half, exposure fitted on the left (dB)"),
+)
 
 OVERFITTED = 5.0
 """Report overfitting from this gap between the PSNR of training and test views, dB. Measured after 2,000 iterations: 2
@@ -219,7 +225,9 @@ def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> st
         metrics: As in `Report`.
         scores: Scores of the test views.
     """
-    test, train = (_mean_psnr(metrics, split) for split in ("test", "train"))
+    fitted = metrics.get("appearance", "none") != "none"
+    key = "psnr_fitted" if fitted else "psnr"
+    test, train = (_mean(metrics, split, key) for split in ("test", "train"))
     steps = metrics.get("iterations")
     after = f"After {steps:,} iterations, " if isinstance(steps, int) else ""
     if test is None:
@@ -229,27 +237,28 @@ def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> st
         sentence = f"{after}{known}; no photo was held out, so the quality of new views is unknown."
         return sentence[0].upper() + sentence[1:]
     grade = next((words for least, words in GRADES if test >= least), "wrong in places")
-    parts = [f"{after}renders of the held-out photos reach {test:.1f} dB PSNR ({grade})"]
+    once = " once their exposure is fitted" if fitted else ""
+    parts = [f"{after}renders of the held-out photos reach {test:.1f} dB PSNR{once} ({grade})"]
     if train is not None:
         gap = train - test
         how = f"{abs(gap):.1f} dB {'below' if gap > 0 else 'above'} the training photos"
         parts.append(f"{how}, so the scene has overfitted to them" if gap >= OVERFITTED else how)
-    if len(scores) > 1:
+    if len(scores) > 1 and not fitted:
         low = worst(scores)
         parts.append(f"the worst view is {low.name} at {low.psnr:.1f} dB")
     sentence = "; ".join(parts) + "."
     return sentence[0].upper() + sentence[1:]
 
 
-def _mean_psnr(metrics: Mapping[str, Any], split: str) -> float | None:
+def _mean(metrics: Mapping[str, Any], split: str, key: str) -> float | None:
     means = metrics.get(split)
-    value = means.get("psnr") if isinstance(means, Mapping) else None
+    value = means.get(key) if isinstance(means, Mapping) else None
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
 def _with_last(log: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Append the final evaluation, which only the metrics contain, to the log."""
-    test, steps = _mean_psnr(metrics, "test"), metrics.get("iterations")
+    test, steps = _mean(metrics, "test", "psnr"), metrics.get("iterations")
     lines = [line for line in log if "psnr" not in line or line.get("iteration") != steps]
     final = [] if test is None or not isinstance(steps, int) else [{"iteration": steps, "psnr": test}]
     return [*lines, *final]
@@ -299,7 +308,9 @@ def _headline(metrics: Mapping[str, Any]) -> str:
     }
     how = (
         "Each value is the mean over the images. PSNR compares the render, clamped to 0..1, with the photo's bytes; "
-        "8-bit PSNR rounds the render to bytes first. SSIM uses a Gaussian window of 11 taps, sigma 1.5."
+        "8-bit PSNR rounds the render to bytes first. SSIM uses a Gaussian window of 11 taps, sigma 1.5. "
+        "A held-out photo may be brighter or darker than the scene: the last column covers its right half, after one "
+        "gain per colour channel was fitted on its left half."
     )
     return _section("Result", f'{table if rows else ""}<p class="quiet">{how}</p>\n{_facts(singles)}')
 

@@ -105,6 +105,7 @@ def evaluate_run(
         "test": summarize(test),
         "train": summarize(train),
         "num_gaussians": len(gaussians),
+        **_appearance(config),
         **(facts or {}),
         "test_views": [dataclasses.asdict(score) for score in test],
     }
@@ -116,6 +117,13 @@ def evaluate_run(
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated
     return Evaluation(test, train, metrics)
+
+
+def _appearance(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the report has to know of the photos' exposures: that they were corrected, if they were."""
+    train = config.get("train")
+    chosen = train.get("appearance", "none") if isinstance(train, Mapping) else "none"
+    return {} if chosen == "none" else {"appearance": chosen}
 
 
 class _Gallery:

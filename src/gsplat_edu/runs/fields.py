@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from gsplat_edu.errors import CheckpointError
+from gsplat_edu.evaluate.metrics import MEASURES
 
 LARGEST_WHOLE = 2**63
 """Integers must be smaller than this in absolute value."""
@@ -78,7 +79,7 @@ METRICS: Mapping[str, Check] = {
         for field, check in {
             split: _section,
             f"{split}.num_images": _whole,
-            **dict.fromkeys((f"{split}.{score}" for score in ("psnr", "psnr_8bit", "ssim", "l1")), _number),
+            **dict.fromkeys((f"{split}.{score}" for score in MEASURES), _number),
         }.items()
     },
 }

@@ -14,13 +14,16 @@ from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.train.config import ONLY_FOR
+from gsplat_edu.train.config import ONLY_FOR, SETTINGS
 
 SAME = ("train", "render", "data")
 """Sections of config.json that must be equal in a resumed run."""
 
 MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("iterations",)}
 """Keys of these sections that may differ: files with the same contents may have moved, and a run may be extended."""
+
+ADDED = ("appearance",)
+"""Settings of the training that came after the first version. A run without them was trained with their defaults."""
 
 MOVED = 1e-9
 """Tolerance of camera coordinates, relative and absolute: subtracting an origin and adding it back rounds."""
@@ -29,7 +32,8 @@ MOVED = 1e-9
 def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     """Compare the options of a resumed run with those it was started with.
 
-    Settings of strategies that the run does not use may differ; older versions lack those of newer strategies.
+    Settings of strategies that the run does not use may differ. A setting that the version which started the run did
+    not have counts as its default.
 
     Raises:
         CheckpointError: an option differs, or config.json is damaged; the message names the option.
@@ -47,6 +51,8 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
     idle = {name for strategy, names in ONLY_FOR.items() if strategy != used for name in names}
     for section in SAME:
         before, now = (_section(folder, config, section) for config in (old, new))
+        if section == "train":
+            before = {setting.name: setting.default for setting in SETTINGS if setting.name in ADDED} | before
         names = {*before, *now} - idle - set(MAY_DIFFER.get(section, ()))
         # The strategy first: it explains other differences.
         for key in sorted(names, key=lambda name: (name != "strategy", name)):

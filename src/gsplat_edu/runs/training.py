@@ -39,8 +39,8 @@ from gsplat_edu.train.checkpoint import (
 )
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
-from gsplat_edu.train.initialize import from_points, make_strategy
-from gsplat_edu.train.trainer import Callback, Trainer
+from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
+from gsplat_edu.train.trainer import Callback, StepParts, Trainer
 
 
 def document(options: RunOptions) -> dict[str, Any]:
@@ -152,6 +152,7 @@ class CaptureRun:
         for note in self.dataset.notes:
             say(note)
         self.dataset.preload(progress)
+        self._check_opaque()
         gaussians = self._begin()
         self._log = LogWriter(self.folder.log_file)
         self.trainer = self._trainer(gaussians)
@@ -199,7 +200,20 @@ class CaptureRun:
             extent=extent,
             density=make_strategy(options.config, extent, gaussians),
             callbacks=[self._record],
+            parts=StepParts(view_model=make_view_model(options.config, len(dataset.train), gaussians.means)),
         )
+
+    def _check_opaque(self) -> None:
+        """Refuse to correct the exposure of photos with transparency: the background would be corrected with them."""
+        if self.options.config.appearance == "none":
+            return
+        for view in self.dataset.train:
+            alpha = view.read().alpha
+            if alpha is not None and bool((alpha < 255).any()):
+                raise ArgumentError(
+                    f"--appearance: {view.name} is partly transparent, and exposures of such photos are not corrected;"
+                    " use --appearance none, or opaque photos with masks"
+                )
 
     def _start_cloud(self) -> tuple[Gaussians, str | None]:
         """Make the start Gaussians, and their digest if they come from a scene."""

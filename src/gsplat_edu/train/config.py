@@ -10,11 +10,12 @@ strategy. Options, config.json and docs/RECIPE.md use one flat list of them, `SE
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.train.setting import Check
+from gsplat_edu.train.setting import Setting as Setting
 from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
 
 RECIPE_ITERATIONS = 30_000
@@ -26,6 +27,7 @@ SHORT_RUN = 3_000
 STRATEGIES = ("adc", "mcmc", "fast", "none")
 OVER_CAP = ("strongest", "cut")
 VIEW_ORDERS = ("shuffled", "random")
+APPEARANCES = ("none", "exposure")
 
 FROM_SCENE = {"means_rate": 1.6e-5, "sh_every": 0}
 """Defaults of a run that starts from a trained scene. Its Gaussians are nearly in place, so the means' rate starts at
@@ -54,9 +56,6 @@ DEFAULT_STRATEGY, DEFAULT_QUALITY = "fast", "standard"
 
 FAST_FROM_SCENE = {"fast_start_factor": 1.0}
 """Further default of a fast run that starts from a scene: small photos would undo its detail."""
-
-Check = Callable[[str, Any], object]
-"""Raises an `ArgumentError` that names the setting if a value is out of range."""
 
 Class = TypeVar("Class", bound=type)
 
@@ -307,6 +306,13 @@ class TrainConfig:
         '"shuffled" shows each view once before any is repeated; "random" draws with replacement.',
         "2023",
     )
+    appearance: str = _number(
+        "none",
+        _one_of(APPEARANCES),
+        '"exposure": measure the exposure and white balance of each photo while training, and correct the render by'
+        ' them before it is compared; "none": compare the render itself.',
+        "ours",
+    )
     background: tuple[float, float, float] = _number(
         (0.0, 0.0, 0.0), _color, "Background colour, RGB, 0 to 1.", "2023"
     )
@@ -410,37 +416,6 @@ class TrainConfig:
             "sh_rest": self.sh_rest_rate,
             "logit_opacities": self.opacities_rate,
         }
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A setting, as used by the command line, config.json and docs/RECIPE.md.
-
-    Args:
-        name: Flat name: the field's name, with the prefix "mcmc_" for `McmcConfig` and "fast_" for `FastConfig`.
-        field: The field's name in its class.
-        strategy: The only strategy that uses it; None for the settings of `TrainConfig` itself.
-        default: Its default for 30,000 iterations.
-        help: Its meaning.
-        source: Source of the default; "" if it is ours.
-        milestone: Whether `recipe` scales it with the length of the run.
-        check: Raises if a value is out of range.
-    """
-
-    name: str
-    field: str
-    strategy: str | None
-    default: Any
-    help: str
-    source: str
-    milestone: bool
-    check: Check
-
-    @property
-    def meaning(self) -> str:
-        """The help text for --help and tables: it starts in lower case, after the strategy that uses the setting."""
-        only = f"{self.strategy}: " if self.strategy else ""
-        return f"{only}{self.help[0].lower()}{self.help[1:].rstrip('.')}"
 
 
 def _settings(kind: type, strategy: str | None, prefix: str = "") -> list[Setting]:

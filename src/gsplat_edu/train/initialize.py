@@ -16,6 +16,8 @@ from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
+from gsplat_edu.train.exposure import Exposure
+from gsplat_edu.train.view_model import Identity, ViewModel
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
 START_SCALE = 0.09
@@ -140,6 +142,17 @@ def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> D
     if config.strategy == "fast":
         return PlannedDensity(config, gaussians)
     return MCMC(config, generator) if config.strategy == "mcmc" else None
+
+
+def make_view_model(config: TrainConfig, count: int, like: torch.Tensor) -> ViewModel:
+    """Make the view model of a configuration.
+
+    Args:
+        config: The configuration.
+        count: Number of training views.
+        like: A tensor of the renders' dtype and device.
+    """
+    return Exposure(count, config.iterations, like) if config.appearance == "exposure" else Identity()
 
 
 def random_ball(count: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Gaussians:

@@ -20,6 +20,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.moments import AdamInBackward
+from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.threads import one_thread
@@ -39,7 +40,9 @@ from gsplat_edu.views import View
 class Renderer(Protocol):
     """Renders Gaussians from a camera, differentiably. The trainer does not depend on the backend."""
 
-    def __call__(self, gaussians: Gaussians, camera: Camera, *, settings: RenderSettings) -> RenderOutput:
+    def __call__(
+        self, gaussians: Gaussians, camera: Camera | CameraTensors, *, settings: RenderSettings
+    ) -> RenderOutput:
         """Render; see `gsplat_edu.render.api.render`."""
         ...
 
@@ -73,7 +76,7 @@ class StepParts:
 
     Args:
         objective: The objective to minimise; `make_objective` of the configuration if None.
-        view_model: Maps a render to the image that the loss compares.
+        view_model: Corrects the camera and the image of a view before the loss compares it.
         reduce: Combines the gradients of a step's views before they are applied.
         adam: Updates one tensor by Adam's rule; by default the fastest kernel that supports it.
         fused: Takes Adam's step for the Gaussians in the backward pass where that gives the same bits, so that their
@@ -302,8 +305,9 @@ class Trainer:
             depth=self._objective.needs_depth,
         )
         target = self._feed.target(draw, background)
-        output = self._render(self.gaussians, draw.view.camera, settings=settings)
-        image = self._parts.view_model(draw.index, output.image)
+        model = self._parts.view_model
+        output = self._render(self.gaussians, model.camera(draw.index, draw.view.camera), settings=settings)
+        image = model.image(draw.index, output.image, target, self.iteration)
         return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 
     def apply(self, in_backward: AdamInBackward | None = None) -> None:

@@ -1,26 +1,30 @@
-"""View models, which map the rendered image of a view to the image that its loss compares.
+"""View models, which stand between the Gaussians and the photo of one view.
 
-Exposure, white balance and vignetting differ between the photos of a capture. A view model learns such differences for
-each view, so that the Gaussians need not.
+A view model may correct the camera a view is rendered from, and the colours of the render before they are compared with
+the photo. It learns these corrections for each view, so that the Gaussians need not explain them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
+from gsplat_edu.camera import Camera
+from gsplat_edu.render.camera_tensors import CameraTensors
+from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
 
 
 @runtime_checkable
 class ViewModel(Protocol):
-    """Maps the rendered image of a view to the image that is compared with the photo.
+    """Corrects the camera and the image of a view.
 
-    Its state consists of its parameters: leaves that collect gradients. The trainer's optimiser updates them in place,
-    and checkpoints store them and their moments by name. Names must differ from those of the Gaussians' parameters.
+    Its state consists of its parameters, which checkpoints store by name. Those with a group are leaves that collect
+    gradients, and the trainer's optimiser updates them in place; the model itself updates the others. Names must differ
+    from those of the Gaussians' parameters.
     """
 
     def parameters(self) -> Mapping[str, Tensor]:
@@ -28,21 +32,34 @@ class ViewModel(Protocol):
         ...
 
     def groups(self) -> Mapping[str, ParameterGroup]:
-        """Return the optimiser settings by the same names; none is per Gaussian."""
+        """Return the optimiser settings of the parameters that gradients move, by name; none is per Gaussian."""
         ...
 
-    def __call__(self, index: int, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    def camera(self, index: int, camera: Camera | CameraTensors) -> Camera | CameraTensors:
+        """Return the camera to render the view from, differentiable in the parameters.
+
+        Args:
+            index: Index into the trainer's views.
+            camera: The view's camera, at the size of this step's photo.
+        """
+        ...
+
+    def image(
+        self, index: int, image: Float[Tensor, "H W 3"], target: Target, iteration: int
+    ) -> Float[Tensor, "H W 3"]:
         """Return the image that is compared, differentiable in the render and in the parameters.
 
         Args:
             index: Index into the trainer's views.
             image: (H, W, 3) the render.
+            target: The photo that it is compared with, and its mask.
+            iteration: Counted from 0.
         """
         ...
 
 
 class Identity:
-    """Compares the render itself and learns nothing."""
+    """Corrects nothing and learns nothing; a base class for models that correct only one of camera and image."""
 
     def parameters(self) -> Mapping[str, Tensor]:
         """Return none."""
@@ -52,6 +69,45 @@ class Identity:
         """Return none."""
         return {}
 
-    def __call__(self, index: int, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    def camera(self, index: int, camera: Camera | CameraTensors) -> Camera | CameraTensors:
+        """Return the camera unchanged."""
+        return camera
+
+    def image(
+        self, index: int, image: Float[Tensor, "H W 3"], target: Target, iteration: int
+    ) -> Float[Tensor, "H W 3"]:
         """Return the image unchanged."""
+        return image
+
+
+class InTurn:
+    """Applies several view models, one after the other.
+
+    Args:
+        models: The models; the names of their parameters differ.
+    """
+
+    def __init__(self, models: Sequence[ViewModel]) -> None:
+        self.models = tuple(models)
+
+    def parameters(self) -> Mapping[str, Tensor]:
+        """Return the parameters of all models."""
+        return {name: tensor for model in self.models for name, tensor in model.parameters().items()}
+
+    def groups(self) -> Mapping[str, ParameterGroup]:
+        """Return the groups of all models."""
+        return {name: group for model in self.models for name, group in model.groups().items()}
+
+    def camera(self, index: int, camera: Camera | CameraTensors) -> Camera | CameraTensors:
+        """Return the camera after all models."""
+        for model in self.models:
+            camera = model.camera(index, camera)
+        return camera
+
+    def image(
+        self, index: int, image: Float[Tensor, "H W 3"], target: Target, iteration: int
+    ) -> Float[Tensor, "H W 3"]:
+        """Return the image after all models."""
+        for model in self.models:
+            image = model.image(index, image, target, iteration)
         return image

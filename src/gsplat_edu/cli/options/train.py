@@ -12,6 +12,7 @@ from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.train.config import (
+    APPEARANCES,
     DEFAULT_QUALITY,
     DEFAULT_STRATEGY,
     FAST_FROM_SCENE,
@@ -45,12 +46,24 @@ COMMON = (
         "quality",
         "max_gaussians",
     ),
-    *("resolution", "test_every", "white_background", "antialiased", "seed", "backend", "debug"),
+    *(
+        "resolution",
+        "test_every",
+        "appearance",
+        "white_background",
+        "antialiased",
+        "seed",
+        "backend",
+        "debug",
+    ),
     *("eval_every", "save_every", "export", "view"),
 )
 """What `--help` shows; `--help-all` shows the other options too."""
 
-NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background")
+AUTO = "auto"
+"""The appearance that stands for a choice by the photos."""
+
+NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background", "appearance")
 """Settings whose options are declared below; those of the others come from `SETTINGS`."""
 
 
@@ -209,6 +222,12 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         metavar="SIZE",
         help="memory for decoded photos, for example 500MB; others are read again for each use (default: 4GiB)",
     )
+    group.add_argument(
+        "--appearance",
+        metavar="NAME",
+        help='"exposure" corrects the exposure and white balance of each photo; "none" does not; "auto" lets the photos'
+        " decide (default: auto for the strategy fast, none for the others)",
+    )
     behind = group.add_mutually_exclusive_group()
     behind.add_argument("--white-background", action="store_true", help="white background (default: black)")
     behind.add_argument(
@@ -304,6 +323,7 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         given = getattr(arguments, name, None)
         if given is not None and name not in ("iterations", "background"):
             changes[name] = None if name == "jacobian_limit" and given == "none" else given
+    changes["appearance"] = _appearance(arguments)
     if arguments.white_background or arguments.background:
         changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
     for only, names in ONLY_FOR.items():
@@ -335,6 +355,25 @@ def _strategy(arguments: argparse.Namespace) -> str:
     stored = folder.read_config().get("train") if arguments.resume and folder.exists() else None
     found = stored.get("strategy") if isinstance(stored, dict) else None
     return DEFAULT_STRATEGY if found is None else str(found)
+
+
+def _appearance(arguments: argparse.Namespace) -> str:
+    """Return the appearance: that given, that of the run to resume, or "none" (see `chooses_appearance`)."""
+    given = arguments.appearance
+    if given is not None:
+        one_of("--appearance", given, (*APPEARANCES, AUTO))
+    if given not in (None, AUTO):
+        return str(given)
+    folder = RunFolder(arguments.out)
+    stored = folder.read_config().get("train") if arguments.resume and folder.exists() else None
+    return str(stored.get("appearance", "none")) if isinstance(stored, dict) else "none"
+
+
+def chooses_appearance(arguments: argparse.Namespace) -> bool:
+    """Say whether the photos decide on the appearance of a new run: by --appearance auto, the default for fast."""
+    if arguments.resume and RunFolder(arguments.out).exists():
+        return False
+    return arguments.appearance == AUTO or (arguments.appearance is None and _strategy(arguments) == "fast")
 
 
 def _length(arguments: argparse.Namespace, strategy: str) -> int:

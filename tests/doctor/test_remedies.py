@@ -1,0 +1,58 @@
+"""What `--appearance auto` chooses, and why."""
+
+import numpy as np
+
+from doctor.rooms import replaced, room, with_photo
+from gsplat_edu.data.writers import write_blender, write_colmap
+from gsplat_edu.doctor.remedies import appearance_for
+from gsplat_edu.views import View
+
+
+def written(folder, views, points):
+    write_colmap(folder, views, points, np.full((len(points), 3), 0.5))
+    return folder
+
+
+def brighter(view, stops):
+    return with_photo(view, view.image * 2.0 ** (stops / 2.2))
+
+
+def test_steady_photos_need_nothing(tmp_path):
+    remedy = appearance_for(written(tmp_path, *room("orbit", 160)))
+    assert (remedy.value, remedy.reason) == ("none", "")
+
+
+def test_wandering_exposures_are_corrected(tmp_path):
+    views, points = room("orbit", 160)
+    rng = np.random.default_rng(2)
+    spoiled = {
+        i: brighter(view, s)
+        for i, (view, s) in enumerate(zip(views, rng.uniform(-0.7, 0.7, len(views)), strict=True))
+    }
+    remedy = appearance_for(written(tmp_path, replaced(views, spoiled), points))
+    assert remedy.value == "exposure"
+    assert "photos differ in brightness or tint from neighbours that see the same" in remedy.reason
+
+
+def test_a_single_dark_photo_is_no_reason(tmp_path):
+    views, points = room("orbit", 160)
+    remedy = appearance_for(written(tmp_path, replaced(views, {4: brighter(views[4], -0.7)}), points))
+    assert remedy.value == "none"
+
+
+def test_transparent_photos_are_not_corrected(tmp_path):
+    views, _ = room("orbit", 64)
+    rng = np.random.default_rng(2)
+    uneven = []
+    for view in views:
+        alpha = np.full(view.image.shape[:2], 255, np.uint8)
+        alpha[0] = 0
+        image = brighter(view, rng.uniform(-0.7, 0.7)).image
+        uneven.append(View(view.camera, image, alpha=alpha, name=view.name.removesuffix(".png")))
+    write_blender(tmp_path, uneven, uneven[:1])
+    assert appearance_for(tmp_path).value == "none"
+
+
+def test_one_photo_alone_cannot_be_compared(tmp_path):
+    views, points = room("orbit", 64)
+    assert appearance_for(written(tmp_path, views[:1], points)).value == "none"

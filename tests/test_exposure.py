@@ -1,0 +1,84 @@
+"""One gain per channel: exact for a scale of linear light, and measured from an image and a photo."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.exposure import color_matrix, measured_gains, stops
+from gsplat_edu.recolor import recolored
+
+
+def decoded(encoded):
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def encoded(light):
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-12) ** (1 / 2.4) - 0.055)
+
+
+def photographed(image, scales):
+    """Scale an image's linear light and round it to bytes, as a camera does."""
+    return np.round(255 * np.clip(encoded(decoded(image) * scales), 0, 1)).astype(np.uint8)
+
+
+def texture(size=(90, 120), seed=3):
+    return np.random.default_rng(seed).uniform(0.0, 1.0, (*size, 3))
+
+
+def test_a_scale_of_linear_light_is_the_line_of_its_gain():
+    """Exactly, above the linear start of the sRGB curve: 0.04045 before and after the scale."""
+    image, scales = np.linspace(0.07, 0.8, 99).reshape(11, 3, 3), np.array([0.6, 1.0, 1.5])
+    logs = torch.from_numpy(np.log(scales) / 2.4)
+    found = recolored(torch.from_numpy(image), color_matrix(logs)).numpy()
+    np.testing.assert_allclose(found, encoded(decoded(image) * scales), rtol=1e-12)
+    np.testing.assert_allclose(stops(logs).numpy(), np.log2(scales), rtol=1e-12)
+
+
+@pytest.mark.parametrize("scales", [(1.0, 1.0, 1.0), (0.5, 0.6, 0.55), (1.6, 1.4, 1.5)])
+def test_gains_are_measured_to_a_hundredth_of_a_stop(scales):
+    """The photo is rounded to bytes and clipped. The render is off by noise, and a fifth of it shows nothing (black)."""
+    image, rng = texture(), np.random.default_rng(0)
+    render = np.clip(image + 0.02 * rng.normal(size=image.shape), 0, 1)
+    render[:, :24] = 0.0
+    logs = measured_gains(torch.from_numpy(render), torch.from_numpy(photographed(image, np.array(scales))))
+    # The black fifth shifts the median to the 37.5th percentile of the rest, whose ratios scatter by a few per cent.
+    np.testing.assert_allclose(stops(logs).numpy(), np.log2(scales), atol=0.1)
+    render[:, :24] = image[:, :24]
+    logs = measured_gains(torch.from_numpy(render), torch.from_numpy(photographed(image, np.array(scales))))
+    np.testing.assert_allclose(stops(logs).numpy(), np.log2(scales), atol=0.01)
+
+
+def test_masked_and_clipped_pixels_do_not_count():
+    image = texture()
+    photo = torch.from_numpy(photographed(image, np.ones(3)))
+    mask = torch.ones(photo.shape[:2], dtype=torch.bool)
+    photo[:, 30:80] //= 2
+    mask[:, 30:80] = False
+    photo[:, 80:] = 255
+    render = torch.from_numpy(image)
+    assert stops(measured_gains(render, photo, mask)).abs().max() < 0.01
+    assert stops(measured_gains(render, photo)).abs().max() > 0.1, "the mask matters"
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_without_usable_pixels_the_gain_is_1(value):
+    render, photo = torch.rand(40, 40, 3), torch.full((40, 40, 3), value, dtype=torch.uint8)
+    assert torch.equal(measured_gains(render, photo), torch.zeros(3))
+    assert torch.equal(measured_gains(torch.full((40, 40, 3), math.nan), photo // 2 + 60), torch.zeros(3))
+
+
+def test_the_bits_do_not_depend_on_the_threads():
+    render, photo = (
+        torch.from_numpy(texture((300, 200))).float(),
+        torch.from_numpy(photographed(texture((300, 200)), 1.2)),
+    )
+    found, before = [], torch.get_num_threads()
+    try:
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            found.append(measured_gains(render, photo))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(found[0], other) for other in found[1:]) and found[0].dtype == torch.float32
