@@ -38,7 +38,7 @@ def test_a_scale_of_linear_light_is_the_line_of_its_gain():
 
 @pytest.mark.parametrize("scales", [(1.0, 1.0, 1.0), (0.5, 0.6, 0.55), (1.6, 1.4, 1.5)])
 def test_gains_are_measured_to_a_hundredth_of_a_stop(scales):
-    """The photo is rounded to bytes and clipped. The render is off by noise, and a fifth of it shows nothing (black)."""
+    """The photo is rounded to bytes and clipped; the render is off by noise, and a fifth of it may be black."""
     image, rng = texture(), np.random.default_rng(0)
     render = np.clip(image + 0.02 * rng.normal(size=image.shape), 0, 1)
     render[:, :24] = 0.0

@@ -75,7 +75,7 @@ def test_a_run_of_an_older_version_resumes(uneven, tmp_path):
 
 def test_transparent_photos_and_unknown_names_are_refused(tmp_path, capsys):
     views, *_ = procedural_capture(24, 4, splats=60)
-    alpha = np.full((24, 24), 255, np.uint8)
+    alpha = np.full(views[0].image.shape[:2], 255, np.uint8)
     alpha[:3] = 0
     clear = [View(v.camera, v.image, alpha=alpha, name=v.name.rsplit(".")[0]) for v in views]
     write_blender(tmp_path / "capture", clear, clear[:1])

@@ -239,7 +239,7 @@ def test_in_a_browser_nothing_breaks_and_the_slider_takes_keys_and_fingers(tmp_p
             "[...document.querySelectorAll('td.n')].map((e) => {const r = document.createRange();"
             " r.selectNodeContents(e); return r.getClientRects().length; })"
         )
-        assert len(heights) == 18 and set(lines) == {1}
+        assert len(heights) == 22 and set(lines) == {1}
         at = "getComputedStyle(document.querySelector('.pair')).getPropertyValue('--at')"
         slider = tab.locator(".pair input").first
         slider.focus()

@@ -75,6 +75,7 @@ def test_a_run_without_test_views_is_evaluated(capture, folder):
         "psnr_8bit": None,
         "ssim": None,
         "l1": None,
+        "psnr_fitted": None,
         "num_images": 0,
     }
     assert result.metrics["train"]["num_images"] == 1

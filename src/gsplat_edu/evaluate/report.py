@@ -40,7 +40,7 @@ SCORES = (
     ("psnr_8bit", "PSNR, 8-bit (dB)"),
     ("ssim", "SSIM"),
     ("l1", "L1"),
-    ("psnr_fitted", "PSNR, right half, exposure fitted on the left (dB)"),
+    ("psnr_fitted", "PSNR, exposure fitted (dB)"),
 )
 
 OVERFITTED = 5.0

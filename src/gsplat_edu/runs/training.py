@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.data.dataset import load_dataset, scene_extent
+from gsplat_edu.data.images import decode
 from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
@@ -60,6 +61,9 @@ def document(options: RunOptions) -> dict[str, Any]:
         "machine": machine_facts(),
     }
 
+
+WITHOUT_ALPHA = (".jpg", ".jpeg")
+"""Endings of photos that are never transparent, so that they need not be decoded to know."""
 
 Export = Callable[[Source], list[dict[str, Any]]]
 """Writes a scene in further formats and returns a record of each file: "path", "psnr" and more."""
@@ -205,13 +209,12 @@ class CaptureRun:
 
     def _check_opaque(self) -> None:
         """Refuse to correct the exposure of photos with transparency: the background would be corrected with them."""
-        if self.options.config.appearance == "none":
+        if self.options.config.appearance == "none" or self.folder.exists():
             return
-        for view in self.dataset.train:
-            alpha = view.read().alpha
-            if alpha is not None and bool((alpha < 255).any()):
+        for name, source in self.dataset.files:
+            if source.path.suffix.lower() not in WITHOUT_ALPHA and decode(source.path)[1] is not None:
                 raise ArgumentError(
-                    f"--appearance: {view.name} is partly transparent, and exposures of such photos are not corrected;"
+                    f"--appearance: {name} is partly transparent, and exposures of such photos are not corrected;"
                     " use --appearance none, or opaque photos with masks"
                 )
 

@@ -236,6 +236,11 @@ class Trainer:
         return StepEvent(iteration, terms[PHOTO], len(self.gaussians), terms, factor)
 
     @property
+    def view_model(self) -> ViewModel:
+        """The view model of the run's steps."""
+        return self._parts.view_model
+
+    @property
     def fuses(self) -> bool:
         """Whether the Gaussians may be moved in the backward pass of a single view, with the same bits.
 
