@@ -1,14 +1,17 @@
 """How much of what a fault of the photos costs does its remedy bring back?
 
-    python benchmarks/faults.py [CAPTURE] --out FILE.json [--resolution R] [--iterations N] [--smoke]
+    python benchmarks/faults.py [CAPTURE] [--fault exposure|poses] [--resolution R] [--iterations N] [--out FILE]
 
-Plants a fault with known truth into a copy of a capture, and trains four times with the fast recipe: the capture and the
-copy, each without and with the remedy. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data unless given; the word
-"traced" stands for 60 photos of 400 x 400 px, traced here, whose own exposure does not vary.
+Plants a fault with known truth into a copy of a capture, and trains four times with the fast recipe: the capture and
+the copy, each without and with the remedy. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data unless given;
+the word "traced" stands for 60 photos of 400 x 400 px, traced here, whose own exposure does not vary.
 
-The fault is exposure and white balance: linear light times 2^u for u from -0.7 to 0.7, and its red and blue times 0.85 to
-1.15 in addition, rounded to bytes and clipped. Held-out photos have it too, so scenes are compared by the PSNR of their
-right half after a fit on the left half. Gains are compared with the truth beyond those found in the capture itself.
+exposure: linear light times 2^u for u from -0.7 to 0.7, and its red and blue times 0.85 to 1.15 in addition, rounded
+to bytes and clipped. Held-out photos have it too, so scenes are compared by the PSNR of the photos' right half after a
+fit on the left half. Gains are compared with the truth beyond those found in the capture itself.
+
+poses: every camera turned by 0.5 degrees and shifted by 1 % of the extent, in random directions. Held-out cameras have
+it too, so scenes are compared by the PSNR of the photos' right half after their poses are aligned on the left half.
 """
 
 from __future__ import annotations
@@ -17,25 +20,31 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import hardware
 import numpy as np
+import torch
 from captures import capture
 from jaxtyping import Float64
 from traced import traced_capture
 
 from gsplat_edu.budget.plan import Limits, plan
+from gsplat_edu.camera import Camera
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
-from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.data.dataset import load_dataset, scene_extent
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.exposure import stops
+from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.exposure import Exposure
+from gsplat_edu.train.poses import Refinement
 from gsplat_edu.validation import ArrayLike
 from gsplat_edu.views import View
 
@@ -47,6 +56,9 @@ GREY = 0.4
 
 STOPS, TINT = 0.7, 0.15
 """Largest planted exposure, stops, and largest planted change of red and blue."""
+
+DEGREES, SHIFT = 0.5, 0.01
+"""Planted errors of the poses: degrees, and fraction of the extent."""
 
 SEED = 7
 
@@ -84,21 +96,33 @@ def opaque(views: Sequence[View]) -> list[View]:
 
 def stored(folder: Path, views: Sequence[View], points: ArrayLike, colors: ArrayLike) -> Path:
     """Write a capture; names end in .png."""
-    named = [
-        View(view.camera, photo.image, mask=photo.mask, name=str(Path(view.name).with_suffix(".png")))
-        for view in views
-        for photo in (view.read(),)
-    ]
-    write_colmap(folder, named, points, colors)
+    write_colmap(
+        folder, [View.stored(view.camera, view.read, png_name(view.name)) for view in views], points, colors
+    )
     return folder
 
 
-def trained(
-    folder: Path, appearance: str, arguments: argparse.Namespace
-) -> tuple[dict[str, Any], CaptureRun]:
-    """Train a capture; return the scores of its held-out views and the run."""
-    words = ["--iterations", str(arguments.iterations), "--appearance", appearance, "--eval-every", "0"]
-    words += ["--save-every", "0"]
+def png_name(name: str) -> str:
+    """Return a view's name with the ending .png."""
+    return str(Path(name).with_suffix(".png"))
+
+
+def misplaced(views: Sequence[View]) -> tuple[list[View], list[Camera]]:
+    """Return the views with wrong poses, and their true cameras."""
+    rng, extent = np.random.default_rng(SEED), scene_extent([view.camera for view in views])
+    changed = []
+    for view in views:
+        directions = rng.normal(size=(2, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        sizes = np.repeat([np.radians(DEGREES), SHIFT * extent], 3)
+        camera = CameraTensors.of(view.camera).moved(torch.from_numpy(directions.ravel() * sizes)).value()
+        changed.append(View.stored(camera, view.read, view.name))
+    return changed, [view.camera for view in views]
+
+
+def trained(folder: Path, words: Sequence[str], arguments: argparse.Namespace) -> CaptureRun:
+    """Train a capture with further options of `gsplat-edu train`."""
+    words = ["--iterations", str(arguments.iterations), "--eval-every", "0", "--save-every", "0", *words]
     if arguments.resolution is not None:
         words += ["--resolution", str(arguments.resolution)]
     parser = OneLineParser(prog="faults.py")
@@ -107,64 +131,140 @@ def trained(
         out = str(Path(scratch) / "run")
         options = command.options_from(parser.parse_args([str(folder), *words, "--out", out]))
         run = CaptureRun(plan(options, Limits()).options)
-        before = time.process_time()
         run.train()
-        seconds = time.process_time() - before
-    scores = score_views(
-        run.trainer.gaussians, run.dataset.test, run.options.renderer, run.options.config.background
-    )
-    return {**summarize(scores), "processor_seconds": seconds, "gaussians": len(run.trainer.gaussians)}, run
+    return run
 
 
-def gains_of(run: CaptureRun) -> dict[str, Float64[np.ndarray, "3"]]:
-    """Return the stops that a run found, by the name of the photo."""
+def scores(run: CaptureRun) -> dict[str, Any]:
+    """Score the held-out views of a run: as they are, with their exposure fitted, and with their poses aligned."""
+    gaussians, options, test = run.trainer.gaussians, run.options, run.dataset.test
+    means = summarize(score_views(gaussians, test, options.renderer, options.config.background))
+    aligned = [
+        aligned_psnr(gaussians, view, options.renderer, options.config.background, run.trainer.extent)
+        for view in test
+    ]
+    return {**means, "psnr_aligned": mean_aligned_psnr(aligned), "gaussians": len(gaussians)}
+
+
+def gain_errors(clean: CaptureRun, faulty: CaptureRun, truth: dict[str, Any]) -> dict[str, float]:
+    """Return errors of the gains, stops: those of the faulty run beyond those of the clean one, against the truth."""
+    before, after = (stops(exposure_of(run).log_gains()).double().numpy() for run in (clean, faulty))
+    wanted = np.log2([truth[view.name] for view in faulty.dataset.train])
+    error = after - before - wanted
+    error -= error.mean(axis=0)  # the gauge: the mean of the truth over the training photos is not 0
+    found = np.abs(error)
+    return {
+        "rms error of gains (stops)": float(np.sqrt(np.mean(error**2))),
+        "90 % of gains within (stops)": float(np.quantile(found, 0.9)),
+        "largest error of gains (stops)": float(found.max()),
+    }
+
+
+def pose_errors(clean: CaptureRun, faulty: CaptureRun, truth: dict[str, Any]) -> dict[str, float]:
+    """Return mean errors of the poses, degrees and per cent of the extent: planted, left, and of the clean run."""
+    found: dict[str, float] = {}
+    for name, run, refined in (
+        ("planted", faulty, False),
+        ("left", faulty, True),
+        ("clean run", clean, True),
+    ):
+        angles, shifts = [], []
+        for i, view in enumerate(run.dataset.train):
+            camera = refinement_of(run).refined(i, view.camera) if refined else view.camera
+            true = truth[view.name]
+            angles.append(np.degrees(np.arccos(np.clip((np.trace(camera.R @ true.R.T) - 1) / 2, -1, 1))))
+            shifts.append(
+                100 * np.linalg.norm(camera.eye + run.dataset.origin - true.eye) / run.trainer.extent
+            )
+        found[f"{name}: rotation (degrees)"] = float(np.mean(angles))
+        found[f"{name}: position (% of the extent)"] = float(np.mean(shifts))
+    return found
+
+
+def exposure_of(run: CaptureRun) -> Exposure:
+    """Return the exposures of a run that corrects them."""
     model = run.trainer.view_model
     if not isinstance(model, Exposure):
         raise TypeError("the run does not correct exposures")
-    names = [view.name for view in run.dataset.train]
-    return dict(zip(names, stops(model.log_gains()).double().numpy(), strict=True))
+    return model
+
+
+def refinement_of(run: CaptureRun) -> Refinement:
+    """Return the refined cameras of a run that refines them."""
+    model = run.trainer.view_model
+    if not isinstance(model, Refinement):
+        raise TypeError("the run does not refine cameras")
+    return model
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault and its remedy.
+
+    Args:
+        plant: Returns the views with the fault, and the truth of each view.
+        without: Options of `gsplat-edu train` without the remedy.
+        remedy: Options with it.
+        score: The score of the held-out views that the fault itself does not change.
+        errors: Returns how well the remedy found the truth.
+    """
+
+    plant: Callable[[Sequence[View]], tuple[list[View], Sequence[Any]]]
+    without: tuple[str, ...]
+    remedy: tuple[str, ...]
+    score: str
+    errors: Callable[[CaptureRun, CaptureRun, dict[str, Any]], dict[str, float]]
+
+
+PLAIN = ("--appearance", "none", "--refine", "none")
+
+FAULTS = {
+    "exposure": Fault(
+        uneven, PLAIN, ("--appearance", "exposure", "--refine", "none"), "psnr_fitted", gain_errors
+    ),
+    "poses": Fault(
+        misplaced, PLAIN, ("--appearance", "none", "--refine", "poses"), "psnr_aligned", pose_errors
+    ),
+}
+"""The faults by name."""
 
 
 def compare(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Train the four runs; return their scores, what was regained, and the errors of the gains."""
-    dataset = load_dataset(folder)
+    """Train the four runs; return their scores, what was regained, and how well the truth was found."""
+    dataset, fault = load_dataset(folder), FAULTS[arguments.fault]
     views = sorted((*dataset.train, *dataset.test), key=lambda view: view.name)
-    if arguments.capture is not None and str(arguments.capture) == TRACED:
-        views = opaque(views)
+    found: dict[str, dict[str, Any]] = {}
+    cured = []
     with tempfile.TemporaryDirectory() as scratch:
-        changed, scales = uneven(views)
-        clean = stored(Path(scratch) / "clean", views, dataset.points, dataset.colors)
-        faulty = stored(Path(scratch) / "faulty", changed, dataset.points, dataset.colors)
-        runs: dict[str, dict[str, Any]] = {}
-        gains = {}
-        for name, place in (("clean", clean), ("faulty", faulty)):
-            for appearance in ("none", "exposure"):
-                found, run = trained(place, appearance, arguments)
-                runs[f"{name}, {appearance}"] = found
-                if appearance == "exposure":
-                    gains[name] = gains_of(run)
-                print(f"{name}, {appearance}: {line(found)}", flush=True)
-    names = [str(Path(view.name).with_suffix(".png")) for view in views]
-    truth = dict(zip(names, np.log2(scales), strict=True))
-    error = np.array([gains["faulty"][name] - gains["clean"][name] - truth[name] for name in gains["clean"]])
-    error -= error.mean(axis=0)  # the gauge: the mean of the truth over the training photos is not 0
+        changed, truths = fault.plant(views)
+        for state, given in (("clean", views), ("faulty", changed)):
+            place = stored(Path(scratch) / state, given, dataset.points, dataset.colors)
+            for kind, words in (("without", fault.without), ("with", fault.remedy)):
+                before = time.process_time()
+                run = trained(place, words, arguments)
+                seconds = time.process_time() - before
+                found[f"{state}, {kind}"] = {**scores(run), "processor_seconds": seconds}
+                print(f"{state}, {kind}: {line(found[f'{state}, {kind}'])}", flush=True)
+                if kind == "with":
+                    cured.append(run)
+    truth = dict(zip([png_name(view.name) for view in views], truths, strict=True))
     best, lost, back = (
-        runs[name]["psnr_fitted"] for name in ("clean, none", "faulty, none", "faulty, exposure")
+        found[name][fault.score] for name in ("clean, without", "faulty, without", "faulty, with")
     )
     return {
-        "runs": runs,
+        "fault": arguments.fault,
+        "runs": found,
         "regained": (back - lost) / (best - lost),
-        "stops_rms": float(np.sqrt(np.mean(error**2))),
-        "stops_p90": float(np.quantile(np.abs(error), 0.9)),
-        "stops_max": float(np.abs(error).max()),
+        "errors": fault.errors(cured[0], cured[1], truth),
     }
 
 
 def line(found: dict[str, Any]) -> str:
     """Return one run's scores."""
     return (
-        f"PSNR {found['psnr']:.2f} dB, exposure fitted {found['psnr_fitted']:.2f} dB,"
-        f" {found['gaussians']} Gaussians, {found['processor_seconds']:.0f} s of processor time"
+        f"PSNR {found['psnr']:.2f} dB, exposure fitted {found['psnr_fitted']:.2f}, pose aligned"
+        f" {found['psnr_aligned']:.2f}; {found['gaussians']} Gaussians,"
+        f" {found['processor_seconds']:.0f} s of processor time"
     )
 
 
@@ -183,11 +283,10 @@ def measure(arguments: argparse.Namespace) -> None:
     else:
         with capture(arguments.capture, arguments.smoke) as folder:
             result = compare(folder, arguments)
-    print(f"regained: {100 * result['regained']:.0f} % of the PSNR, exposure fitted, that the fault costs")
     print(
-        f"errors of the gains: {result['stops_rms']:.3f} stops rms, 90 % below {result['stops_p90']:.3f},"
-        f" largest {result['stops_max']:.3f}"
+        f"regained: {100 * result['regained']:.0f} % of the {FAULTS[arguments.fault].score} that the fault costs"
     )
+    print(*(f"{name}: {value:.3f}" for name, value in result["errors"].items()), sep="\n")
     hardware.report(result, arguments.out)
 
 
@@ -195,6 +294,9 @@ def main() -> int:
     """Read the command line and measure."""
     parser = hardware.parser(__doc__.partition("\n")[0])
     parser.add_argument("capture", nargs="?", type=Path, help=f'folder of a capture, or the word "{TRACED}"')
+    parser.add_argument(
+        "--fault", choices=tuple(FAULTS), default="exposure", help="fault to plant (default: exposure)"
+    )
     parser.add_argument("--resolution", type=float, help="divisor of the photos' size, as in train")
     parser.add_argument("--iterations", type=int, default=3_000, help="length of each run (default: 3000)")
     arguments = parser.parse_args()

@@ -18,5 +18,5 @@ class Gains(Identity):
     def groups(self):
         return {"gains": ParameterGroup(0.02, eps=1e-8, per_gaussian=False)}
 
-    def image(self, index, image, target, iteration):
-        return image * self.gains[index]
+    def image(self, index, seen, target, iteration):
+        return seen.image * self.gains[index]

@@ -53,7 +53,11 @@ GRADES = ((30.0, "very close"), (25.0, "close"), (20.0, "soft or partly wrong"))
 SHOWN = 0.95
 """This quantile of a difference stays below white when the picture of the difference is brightened."""
 
-NAMES = {"num_gaussians": "Gaussians", "seconds": "training time"}
+NAMES = {
+    "num_gaussians": "Gaussians",
+    "seconds": "training time",
+    "psnr_aligned": "test PSNR, right half, pose aligned on the left (dB)",
+}
 """Labels for the keys of metrics.json that are not plain English."""
 
 STYLE = """

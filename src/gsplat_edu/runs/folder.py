@@ -81,6 +81,11 @@ class RunFolder:
         return self.path / "renders"
 
     @property
+    def refined(self) -> Path:
+        """The capture with refined cameras, if the run refines them."""
+        return self.path / "refined"
+
+    @property
     def checkpoints(self) -> Path:
         """Folder of the states to resume from."""
         return self.path / "checkpoints"

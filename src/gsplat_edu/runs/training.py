@@ -30,6 +30,7 @@ from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_ru
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
+from gsplat_edu.runs.refined import aligned_score, refined_views, write_refined
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
 from gsplat_edu.train.checkpoint import (
@@ -196,6 +197,8 @@ class CaptureRun:
         options, dataset = self.options, self.dataset
         extent = scene_extent([view.camera for view in dataset.train])
         gaussians = gaussians.to(device_of(options.backend))
+        cameras = [view.camera for view in dataset.train]
+        model, self._refinement = make_view_model(options.config, cameras, extent, gaussians)
         return Trainer(
             gaussians,
             dataset.train,
@@ -204,7 +207,7 @@ class CaptureRun:
             extent=extent,
             density=make_strategy(options.config, extent, gaussians),
             callbacks=[self._record],
-            parts=StepParts(view_model=make_view_model(options.config, len(dataset.train), gaussians.means)),
+            parts=StepParts(view_model=model),
         )
 
     def _check_opaque(self) -> None:
@@ -337,6 +340,11 @@ class CaptureRun:
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         if export is not None:
             facts["exports"] = export(open_source(path))
+        if self._refinement is not None:
+            views = refined_views(self._refinement, dataset)
+            write_refined(self.folder, views, dataset)
+            self._say(f"wrote {self.folder.refined}: the capture with its refined cameras")
+            facts |= aligned_score(views[1], gaussians, self.options, trainer.extent, self._say)
         return evaluate_run(
             self.folder,
             Judged(dataset.test, dataset.train, self.options.config.background, dataset.notes),

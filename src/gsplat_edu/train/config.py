@@ -28,6 +28,7 @@ STRATEGIES = ("adc", "mcmc", "fast", "none")
 OVER_CAP = ("strongest", "cut")
 VIEW_ORDERS = ("shuffled", "random")
 APPEARANCES = ("none", "exposure")
+REFINEMENTS = ("none", "poses", "intrinsics", "both")
 
 FROM_SCENE = {"means_rate": 1.6e-5, "sh_every": 0}
 """Defaults of a run that starts from a trained scene. Its Gaussians are nearly in place, so the means' rate starts at
@@ -312,6 +313,20 @@ class TrainConfig:
         '"exposure": measure the exposure and white balance of each photo while training, and correct the render by'
         ' them before it is compared; "none": compare the render itself.',
         "ours",
+    )
+    refine: str = _number(
+        "none",
+        _one_of(REFINEMENTS),
+        "Which numbers of the cameras are learned with the scene: poses, intrinsics, both or none.",
+    )
+    pose_rate: float = _number(
+        2e-3,
+        _not_negative,
+        "Initial learning rate of the poses per visit of a view, radians and fractions of the extent; it falls to a"
+        " hundredth.",
+    )
+    lens_rate: float = _number(
+        2e-4, _not_negative, "Initial learning rate of the intrinsics, relative; it falls to a hundredth."
     )
     background: tuple[float, float, float] = _number(
         (0.0, 0.0, 0.0), _color, "Background colour, RGB, 0 to 1.", "2023"

@@ -23,13 +23,16 @@ from gsplat_edu.recolor import recolored
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
-from gsplat_edu.train.view_model import Identity
+from gsplat_edu.train.view_model import Identity, Seen
 
 NAME = "exposures"
 """Name of the state, as in checkpoints."""
 
 WARM_UP = 0.015
 """Share of the run before the first measurement: the scene has to show something."""
+
+OPAQUE = 0.05
+"""Only pixels of a lower transmittance count: elsewhere the render is dark because the scene is not finished."""
 
 NEWEST = 0.3
 """Weight of a measurement against those before it; 1, 1/2, 1/3 for the first ones of a photo."""
@@ -58,14 +61,12 @@ class Exposure(Identity):
         """Return none: gradients do not move it."""
         return {}
 
-    def image(
-        self, index: int, image: Float[Tensor, "H W 3"], target: Target, iteration: int
-    ) -> Float[Tensor, "H W 3"]:
+    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
         """Return the render with the exposure of photo `index`, which is measured first."""
         if iteration >= self._begin:
-            self._measure(index, image, target)
+            self._measure(index, seen, target)
         matrix = color_matrix(self.log_gains()[index])
-        return recolored(image, matrix, target.image if target.image.dtype == torch.uint8 else None)
+        return recolored(seen.image, matrix, target.image if target.image.dtype == torch.uint8 else None)
 
     def log_gains(self) -> Float[Tensor, "views 3"]:
         """Return the natural logarithm of every view's gains; their mean over the views is 0."""
@@ -74,10 +75,13 @@ class Exposure(Identity):
             return logs - logs.mean(dim=0)
 
     @torch.no_grad()
-    def _measure(self, index: int, image: Tensor, target: Target) -> None:
+    def _measure(self, index: int, seen: Seen, target: Target) -> None:
+        counts = seen.transmittance < OPAQUE
+        if target.mask is not None:
+            counts &= target.mask
         row, mean = self._state[index], self._state[:, :3]
         with one_thread():
             mean = mean.mean(dim=0)
         weight = (1.0 / (1.0 + row[3])).clamp_min(NEWEST)
-        row[:3] += weight * (measured_gains(image, target.image, target.mask) + mean - row[:3])
+        row[:3] += weight * (measured_gains(seen.image, target.image, counts) + mean - row[:3])
         row[3] += 1.0

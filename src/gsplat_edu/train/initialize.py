@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from gsplat_edu.camera import Camera
 from gsplat_edu.constants import C0, SH_OFFSET
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
@@ -17,7 +19,8 @@ from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.train.exposure import Exposure
-from gsplat_edu.train.view_model import Identity, ViewModel
+from gsplat_edu.train.poses import Refinement
+from gsplat_edu.train.view_model import Identity, InTurn, ViewModel
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
 START_SCALE = 0.09
@@ -144,15 +147,23 @@ def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> D
     return MCMC(config, generator) if config.strategy == "mcmc" else None
 
 
-def make_view_model(config: TrainConfig, count: int, like: torch.Tensor) -> ViewModel:
-    """Make the view model of a configuration.
+def make_view_model(
+    config: TrainConfig, cameras: Sequence[Camera], extent: float, gaussians: Gaussians
+) -> tuple[ViewModel, Refinement | None]:
+    """Make the view model of a configuration; return it, and the part of it that refines the cameras, if any.
 
     Args:
         config: The configuration.
-        count: Number of training views.
-        like: A tensor of the renders' dtype and device.
+        cameras: The cameras of the training views, at their full size.
+        extent: Size of the scene, world units.
+        gaussians: The start Gaussians.
     """
-    return Exposure(count, config.iterations, like) if config.appearance == "exposure" else Identity()
+    refinement = None if config.refine == "none" else Refinement(cameras, config, extent)
+    models: list[ViewModel] = [] if refinement is None else [refinement]
+    if config.appearance == "exposure":
+        models.append(Exposure(len(cameras), config.iterations, gaussians.means))
+    model = models[0] if len(models) == 1 else InTurn(models) if models else Identity()
+    return model, refinement
 
 
 def random_ball(count: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Gaussians:

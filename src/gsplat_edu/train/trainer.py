@@ -32,7 +32,7 @@ from gsplat_edu.train.objective import PHOTO, Objective, Rendered, make_objectiv
 from gsplat_edu.train.optimizer import MOMENTS, Adam
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_tensor_kind, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
-from gsplat_edu.train.view_model import Identity, ViewModel
+from gsplat_edu.train.view_model import Identity, Seen, ViewModel
 from gsplat_edu.views import View
 
 
@@ -312,7 +312,8 @@ class Trainer:
         target = self._feed.target(draw, background)
         model = self._parts.view_model
         output = self._render(self.gaussians, model.camera(draw.index, draw.view.camera), settings=settings)
-        image = model.image(draw.index, output.image, target, self.iteration)
+        seen = Seen(output.image, output.transmittance.detach())
+        image = model.image(draw.index, seen, target, self.iteration)
         return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 
     def apply(self, in_backward: AdamInBackward | None = None) -> None:

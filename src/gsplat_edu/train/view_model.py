@@ -7,7 +7,7 @@ the photo. It learns these corrections for each view, so that the Gaussians need
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -16,6 +16,18 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
+
+
+class Seen(NamedTuple):
+    """What a view model sees of a render.
+
+    Args:
+        image: (H, W, 3) the render, or what models before have made of it.
+        transmittance: (H, W) fraction of light that passes all Gaussians; without a gradient.
+    """
+
+    image: Float[Tensor, "H W 3"]
+    transmittance: Float[Tensor, "H W"]
 
 
 @runtime_checkable
@@ -44,14 +56,12 @@ class ViewModel(Protocol):
         """
         ...
 
-    def image(
-        self, index: int, image: Float[Tensor, "H W 3"], target: Target, iteration: int
-    ) -> Float[Tensor, "H W 3"]:
+    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
         """Return the image that is compared, differentiable in the render and in the parameters.
 
         Args:
             index: Index into the trainer's views.
-            image: (H, W, 3) the render.
+            seen: The render.
             target: The photo that it is compared with, and its mask.
             iteration: Counted from 0.
         """
@@ -73,11 +83,9 @@ class Identity:
         """Return the camera unchanged."""
         return camera
 
-    def image(
-        self, index: int, image: Float[Tensor, "H W 3"], target: Target, iteration: int
-    ) -> Float[Tensor, "H W 3"]:
+    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
         """Return the image unchanged."""
-        return image
+        return seen.image
 
 
 class InTurn:
@@ -104,10 +112,8 @@ class InTurn:
             camera = model.camera(index, camera)
         return camera
 
-    def image(
-        self, index: int, image: Float[Tensor, "H W 3"], target: Target, iteration: int
-    ) -> Float[Tensor, "H W 3"]:
+    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
         """Return the image after all models."""
         for model in self.models:
-            image = model.image(index, image, target, iteration)
-        return image
+            seen = seen._replace(image=model.image(index, seen, target, iteration))
+        return seen.image
