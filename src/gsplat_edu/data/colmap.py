@@ -32,7 +32,7 @@ from gsplat_edu.data.capture import (
     is_outside,
     unit_colors,
 )
-from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels, UnclearMasks
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import unreadable
@@ -62,16 +62,18 @@ MODELS: tuple[tuple[str, str], ...] = (
 )
 """COLMAP's camera models by number, with their parameters."""
 
-REFUSED = (
-    "FOV",
-    "THIN_PRISM_FISHEYE",
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    "SIMPLE_DIVISION",
-    "DIVISION",
-    "EUCM",
-    "EQUIRECTANGULAR",
-)
-"""Models that are not supported."""
+SPHERE = "EQUIRECTANGULAR"
+"""The model whose images show all directions; no pinhole does."""
+
+FORMULA_OF = {
+    "FOV": "field of view",
+    "THIN_PRISM_FISHEYE": "thin prism fisheye",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "radial tangential prism fisheye",
+    "SIMPLE_DIVISION": "division",
+    "DIVISION": "division",
+    "EUCM": "enhanced unified",
+}
+"""Formulas of the models that are neither perspective nor, by their names, a fisheye."""
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """Locations of a model in a capture, in search order; after these, numbered folders in sparse, colmap/sparse and the
@@ -325,7 +327,12 @@ def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64
 
 def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
     names = dict(MODELS).get(model, "").split()
-    if not names or model in REFUSED:
+    if model == SPHERE:
+        raise DatasetError(
+            f"camera model {SPHERE} shows all directions, which no pinhole image can; give the panoramas to "
+            "`gsplat-edu sfm --panorama`, or cut them into pinhole images with `colmap image_undistorter`"
+        )
+    if not names:
         raise DatasetError(
             f"camera model {model} is not supported; run `colmap image_undistorter` and load its output"
         )
@@ -334,7 +341,8 @@ def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
     named = dict(zip(names, values, strict=True))
     if "f" in named:
         named["fx"] = named["fy"] = named.pop("f")
-    return lens_of(named, W, H, fisheye=model.endswith("FISHEYE"))
+    plain = FISHEYE if model.endswith("FISHEYE") else PINHOLE_LIKE
+    return lens_of(named, W, H, FORMULA_OF.get(model, plain))
 
 
 class _Binary:

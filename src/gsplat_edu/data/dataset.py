@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -27,6 +28,7 @@ from gsplat_edu.data.capture import (
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import UPRIGHT, ImageHeader, ImageStore, PhotoFile, image_header
+from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
 from gsplat_edu.data.notes import TwoLayouts, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
@@ -230,6 +232,12 @@ def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
     if distorted:
         notes.append(
             f"{len(distorted)} of {len(frames)} photos have lens distortion and are undistorted on loading"
+        )
+    if wide := [frame.name for frame in distorted if frame.lens.cropped]:
+        seen, shown = (round(2 * math.degrees(angle)) for angle in (MAX_ANGLE, CROPPED_ANGLE))
+        notes.append(
+            f"{len(wide)} of {len(frames)} photos see more than {seen} degrees and are cropped to {shown}, first "
+            f"{wide[0]}"
         )
     if others := [frame for frame, is_it in zip(frames, rescaled, strict=True) if is_it]:
         notes.append(

@@ -122,7 +122,7 @@ def _oddities(shot: Shot, zoomed: bool) -> list[tuple[str, str]]:
         what = f"the principal point ({cx}, {cy}) px is far from the image centre, ({middle})"
         found.append(("off centre", what))
     field = 2.0 * math.atan(0.5 * max(lens.W / lens.fx, lens.H / lens.fy))
-    if not (NARROWEST < field < WIDEST or lens.fisheye):
+    if not (NARROWEST < field < WIDEST or lens.wide):
         found.append(("field", f"a field of view of {math.degrees(field):.0f} degrees is implausible"))
     if zoomed:
         found.append(("zoom", f"a focal length of {fx} px differs from that of the other photos"))
