@@ -256,7 +256,7 @@ def test_a_resumed_run_keeps_its_poses(tmp_path):
     words = ["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--resume"]
     options = train_options_from(build_parser(["train"]).parse_args(words))
     said = []
-    assert _with_poses(options, Console(file=io.StringIO()), said.append).data == found
+    assert _with_poses(options, "auto", Console(file=io.StringIO()), said.append).data == found
     assert len(said) == 1 and "using the poses that this run started with" in said[0]
 
 

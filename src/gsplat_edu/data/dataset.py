@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import cKDTree
 
 from gsplat_edu.camera import Camera, point_nearest_axes
 from gsplat_edu.data.blender import TRAIN_FILE, read_blender
@@ -39,6 +40,9 @@ from gsplat_edu.views import View
 
 TEST_EVERY = 8
 """Hold out every 8th view if the capture defines no split (the usual convention)."""
+
+ONE_PLACE = 1e-5
+"""Largest distance of two centres that count as one, as a fraction of the cameras' spread."""
 
 FAR = 1e4
 """Camera coordinates beyond which the origin is moved, world units; float32 would resolve them only to 1e-3."""
@@ -290,14 +294,36 @@ def _split(
         if test_every is None:
             notes.append("the capture has only one photo: it is used for training, and none is held out")
     else:
-        every = test_every or TEST_EVERY
-        train = tuple(view for i, view in enumerate(views) if i % every)
-        test = tuple(view for i, view in enumerate(views) if i % every == 0)
+        every, places = test_every or TEST_EVERY, _places([view.camera for view in views])
+        if max(places) == 0:  # all views have one centre: a panorama is all there is
+            places = list(range(len(views)))
+        elif (count := max(places) + 1) < len(views):
+            notes.append(
+                f"{len(views)} photos have {count} centres, like the faces of panoramas: those with one centre are "
+                "held out together"
+            )
+        train = tuple(view for i, view in zip(places, views, strict=True) if i % every)
+        test = tuple(view for i, view in zip(places, views, strict=True) if i % every == 0)
     if not train:
         raise DatasetError(
             f"{path}: the split leaves none of its {len(views)} photos for training; set test_every to 0"
         )
     return train, test
+
+
+def _places(cameras: Sequence[Camera]) -> list[int]:
+    """Number the centres of cameras in the order in which they occur; centres within `ONE_PLACE` are one.
+
+    Poses that were estimated from photos one by one never agree so well: the centres of a panorama's faces do.
+    """
+    eyes = np.stack([camera.eye for camera in cameras])
+    near = ONE_PLACE * float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
+    tree, number = cKDTree(eyes), list[int]()
+    found = dict[int, int]()
+    for i, others in enumerate(tree.query_ball_point(eyes, near)):
+        first = min(others)
+        number.append(found.setdefault(first, len(found)) if first == i else number[first])
+    return number
 
 
 def _random_start(

@@ -11,6 +11,8 @@ MATCHERS = ("auto", "exhaustive", "sequential", "nearest")
 
 MAPPERS = ("auto", "incremental", "global")
 
+PANORAMA = ("auto", "yes", "no")
+
 CAMERA_MODELS = (
     "auto",
     "SIMPLE_PINHOLE",
@@ -39,6 +41,7 @@ class SfmOptions:
         max_features: Most SIFT features per photo.
         max_image_size: Longest side for feature extraction, px. The capture keeps the photos' full size.
         threads: Threads of COLMAP; 0 uses all.
+        panorama: Whether the photos or frames are 360-degree panoramas; "auto": if their XMP says so.
 
     Raises:
         ArgumentError: a value is out of range.
@@ -53,6 +56,7 @@ class SfmOptions:
     max_features: int = 8192
     max_image_size: int = 1600
     threads: int = 0
+    panorama: str = "auto"
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -63,3 +67,4 @@ class SfmOptions:
         whole_number("max_features", self.max_features, 100)
         whole_number("max_image_size", self.max_image_size, 64)
         whole_number("threads", self.threads, 0)
+        one_of("panorama", self.panorama, PANORAMA)

@@ -26,16 +26,10 @@ from gsplat_edu.intrinsics import Intrinsics
 from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.sfm.align import upright
 from gsplat_edu.sfm.colmap import call
-from gsplat_edu.sfm.photos import PhotoFacts
+from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts
 
 QUALITY = 95
 """JPEG quality of undistorted photos."""
-
-JPEGS = (".jpg", ".jpeg")
-"""Endings of photos written as JPEG, because they were lossy before."""
-
-HEICS = (".heic", ".heif", ".hif")
-"""Endings of photos that become .jpg, because they were lossy before; the others are written as PNG."""
 
 PARTS = ("images", "masks", "sparse")
 """Parts of a capture. The model comes last: its presence means that the capture is complete."""
@@ -219,7 +213,7 @@ def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
         kind = path.suffix.lower()
         base, ending = (
             path.with_suffix(""),
-            path.suffix if kind in JPEGS else ".jpg" if kind in HEICS else ".png",
+            path.suffix if kind in JPEG_ENDINGS else ".jpg" if kind in HEIC_ENDINGS else ".png",
         )
         name, number = f"{base}{ending}", 2
         while name.lower() in taken:  # some file systems ignore case
@@ -245,7 +239,15 @@ def _write_photos(
 
 
 def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
-    lens = entry.lens
+    lens, target = entry.lens, result / "images" / entry.name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if entry.photo.final:
+        shutil.copyfile(source / entry.photo.name, target)
+        if entry.photo.mask:
+            mask = result / "masks" / f"{entry.name}.png"
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(entry.photo.mask, mask)
+        return
     counts = Path(entry.photo.mask) if entry.photo.mask else None
     photo = load_photo(
         PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None, entry.photo.sensor)
@@ -253,9 +255,7 @@ def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
     pixels = np.asarray(photo.image)
     if photo.alpha is not None:
         pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)
-    target = result / "images" / entry.name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    jpeg = target.suffix.lower() in JPEGS and pixels.shape[2] == 3
+    jpeg = target.suffix.lower() in JPEG_ENDINGS and pixels.shape[2] == 3
     options: dict[str, Any] = {"quality": QUALITY, "subsampling": 0} if jpeg else {"compress_level": 3}
     upright_pixels = np.ascontiguousarray(np.rot90(pixels, -entry.photo.turns))
     Image.fromarray(upright_pixels).save(target, format="JPEG" if jpeg else "PNG", **options)

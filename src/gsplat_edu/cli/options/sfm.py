@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.cli.arguments import whole_number_text
-from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, SfmOptions
+from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA, SfmOptions
 
 EXAMPLE = "example: gsplat-edu sfm holiday.mp4 captures/holiday --frames 200"
 
@@ -49,11 +49,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "lens model (auto refines as many parameters as held-out photos support)",
         CAMERA_MODELS,
     )
+    add_panorama(parser)
     number("--max-features", "maximum number of features per photo", SfmOptions.max_features)
     number(
         "--max-image-size", "longest side of the photos for feature detection, px", SfmOptions.max_image_size
     )
     number("--threads", "threads of COLMAP; 0 for all", SfmOptions.threads)
+
+
+def add_panorama(group: argparse._ActionsContainer) -> None:
+    """Add the option for 360-degree photos, which `train` has as well."""
+    group.add_argument(
+        "--panorama",
+        metavar="NAME",
+        default="auto",
+        help="whether the photos or frames are 360-degree panoramas, to be cut into pinhole images:"
+        f" {', '.join(PANORAMA)} (default: auto, if their XMP says so)",
+    )
 
 
 def options_from(arguments: argparse.Namespace) -> SfmOptions:
@@ -72,4 +84,5 @@ def options_from(arguments: argparse.Namespace) -> SfmOptions:
         arguments.max_features,
         arguments.max_image_size,
         arguments.threads,
+        arguments.panorama,
     )
