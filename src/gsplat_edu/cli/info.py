@@ -14,6 +14,7 @@ from jaxtyping import Float
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.data.scale import Scale
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io import ply
@@ -144,6 +145,9 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
         if said:
             facts.append((key, ", ".join(said)))
     facts.append(("backend", str(config.get("backend", "?"))))
+    if units := _section(config, "scale"):
+        known = Scale(*(str(units.get(name, "?")) for name in ("unit", "source", "detail")))
+        facts.append(("units", str(known)))
     try:
         scene, iteration = folder.latest_scene()
     except CheckpointError as error:
@@ -179,6 +183,8 @@ def _dataset_facts(path: Path) -> list[Fact]:
     if len(dataset.points):
         inner = np.percentile(dataset.points, (1, 99), axis=0)
         facts.append(("", f"middle 98 %: {_bounds(inner)}"))
+    if dataset.scale is not None:
+        facts.append(("units", str(dataset.scale)))
     if np.any(dataset.origin):
         facts.append(("origin", f"shifted to {', '.join(f'{x:.6g}' for x in dataset.origin)}"))
     return facts + [("note", note) for note in dataset.notes]

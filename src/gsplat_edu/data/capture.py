@@ -16,6 +16,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.images import UPRIGHT, PhotoFile, image_orientation, image_size, upright_size
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
+from gsplat_edu.data.scale import Scale
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import unreadable
 
@@ -88,6 +89,7 @@ class Capture:
         notes: Facts that the user should know.
         no_cloud: The reason for missing points.
         cube: Half the edge of the cube around the origin that contains the scene, if the layout defines it.
+        scale: What a unit of the coordinates is; None if unknown.
     """
 
     layout: str
@@ -96,6 +98,7 @@ class Capture:
     notes: tuple[Note, ...] = ()
     no_cloud: str = "the capture has no points"
     cube: float | None = None
+    scale: Scale | None = None
 
 
 def is_file(path: Path) -> bool:

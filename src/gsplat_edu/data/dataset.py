@@ -33,6 +33,7 @@ from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
 from gsplat_edu.data.notes import TwoLayouts, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
+from gsplat_edu.data.scale import Scale, read_scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.errors import ArgumentError, DatasetError
@@ -66,6 +67,7 @@ class Dataset:
         notes: Notes for the user: skipped, rescaled, undistorted or generated data.
         images: The photo cache.
         files: Name and files of each photo, sorted by name.
+        scale: What a unit of the coordinates is; None if unknown.
     """
 
     path: Path
@@ -78,6 +80,7 @@ class Dataset:
     notes: tuple[str, ...]
     images: ImageStore
     files: tuple[tuple[str, PhotoFile], ...] = ()
+    scale: Scale | None = None
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Decode every photo once, several in parallel, and keep those within the budget.
@@ -152,7 +155,17 @@ def load_dataset(
     start = cloud or _random_start(capture, [view.camera for view in views], notes, origin)
     files = tuple((frame.name, source) for frame, (source, _, _) in zip(frames, made, strict=True))
     return Dataset(
-        path, capture.layout, train, test, start.points, start.colors, origin, tuple(notes), store, files
+        path,
+        capture.layout,
+        train,
+        test,
+        start.points,
+        start.colors,
+        origin,
+        tuple(notes),
+        store,
+        files,
+        capture.scale,
     )
 
 
@@ -197,7 +210,7 @@ def read_capture(path: Path) -> Capture:
         capture = read_transforms(path / "transforms.json")
         return capture if model is None else replace(capture, notes=(TwoLayouts(path), *capture.notes))
     if model is not None:
-        return read_colmap(path, model)
+        return replace(read_colmap(path, model), scale=read_scale(path))
     places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
     looked = f"{TRAIN_FILE}, transforms.json, and cameras and images (.bin or .txt) in {places}"
     folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]

@@ -119,6 +119,18 @@ class Lens(Intrinsics):
         """
         return self.wide and _chosen(self)[1]
 
+    def rays(
+        self, columns: Float64[np.ndarray, " n"], rows: Float64[np.ndarray, " n"]
+    ) -> Float64[np.ndarray, "2 n"]:
+        """Return x / z and y / z of the rays through pixels.
+
+        Args:
+            columns: Their columns, px; pixel centres have integer coordinates.
+            rows: Their rows, px.
+        """
+        with np.errstate(all="ignore"):  # implausible coefficients overflow; what they give is NaN
+            return _rays(self, columns, rows)
+
     def undistorted(self) -> Intrinsics:
         """Return the pinhole of the undistorted photo, see `undistorted_pinhole`."""
         return undistorted_pinhole(self)
@@ -235,8 +247,7 @@ def _rectangle(lens: Lens, steepest: float) -> Float64[np.ndarray, "3 3"]:
     middle_x, middle_y = (lens.W - 1) / 2, (lens.H - 1) / 2
     columns = np.concatenate([zero - lens.W / 2, zero + lens.W / 2, x, x]) + middle_x
     rows = np.concatenate([y, y, zero - lens.H / 2, zero + lens.H / 2]) + middle_y
-    with np.errstate(all="ignore"):  # implausible coefficients overflow; what they give is NaN
-        rays = _rays(lens, columns, rows)
+    rays = lens.rays(columns, rows)
     slope = math.tan(steepest)
     left, right = max(rays[0, :RIM].max(), -slope), min(rays[0, RIM : 2 * RIM].min(), slope)
     top, bottom = max(rays[1, 2 * RIM : 3 * RIM].max(), -slope), min(rays[1, 3 * RIM :].min(), slope)

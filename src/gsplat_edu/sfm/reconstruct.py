@@ -16,6 +16,7 @@ from typing import Any
 
 from gsplat_edu.data.images import UPRIGHT
 from gsplat_edu.data.notes import UnreadColors
+from gsplat_edu.data.scale import Scale
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
@@ -41,6 +42,7 @@ from gsplat_edu.sfm.photos import (
     stored_mask,
 )
 from gsplat_edu.sfm.result import build_capture, note_published, publish, published
+from gsplat_edu.sfm.scale_text import AUTO
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
@@ -170,7 +172,8 @@ class _Run:
         self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
         if not all((options.out / part).is_dir() for part in ("images", "sparse/0")):
             self.stages.forget("capture")
-        self._stage("capture", {}, self._finish, [])
+        wanted = {} if options.scale == AUTO else {"scale": options.scale}
+        self._stage("capture", wanted, self._finish, [])
         return options.out
 
     def _stage(
@@ -408,8 +411,12 @@ class _Run:
         return model | {"summary": summary}
 
     def _finish(self) -> dict[str, Any]:
-        facts = build_capture(self.model, self.photos, self.source, self.folder, self._progress)
+        facts = build_capture(
+            self.model, self.photos, self.source, self.folder, self._progress, self.options.scale, self._say
+        )
         publish(self.folder, self.options.out)
+        if scale := Scale.of_json(facts["scale"]):
+            self._say(f"scale: {scale}")
         if self.panoramas is not None:
             names = {face: one.name for one in self.panoramas for face in one.faces}
             for kind in ("left_out", "doubtful"):
