@@ -4,16 +4,23 @@ import math
 
 import numpy as np
 import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from gsplat_edu.data.colmap import read_cameras
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.images import PhotoFile
 from gsplat_edu.data.panorama import (
     FACES,
+    FaceLens,
     cut_face,
     face_pinhole,
     face_rotations,
     face_side,
     is_panorama_size,
 )
-from gsplat_edu.errors import ShapeError
+from gsplat_edu.doctor.photos import measure_photo
+from gsplat_edu.errors import DatasetError, ShapeError
 
 
 def directions(W, H):
@@ -133,3 +140,55 @@ def test_only_whole_panoramas_are_cut(as_shipped):
     assert not is_panorama_size(4000, 2100) and not is_panorama_size(40_000, 20_000)
     with pytest.raises(ShapeError, match="image: is 40x30, but a panorama has to be 2:1"):
         cut_face(np.zeros((30, 40, 3), np.uint8), None, None, np.eye(3), 10)
+
+
+@pytest.mark.parametrize(("resolution", "side"), [(None, 163), (2.0, 82), (100, 100)])
+def test_a_capture_of_colmaps_panoramas_is_read_as_faces(tmp_path, resolution, side):
+    """COLMAP's model EQUIRECTANGULAR: one image becomes eight views from one centre, with mask, of any resolution."""
+    W, H = 512, 256
+    R = Rotation.from_euler("xyz", [0.2, 0.5, -0.1])
+    eyes = np.array([[1.0, 2.0, 3.0], [4.0, 2.0, 0.0]])
+    for folder in ("images", "masks", "sparse/0"):
+        (tmp_path / folder).mkdir(parents=True)
+    lines, x, y, z, w = [], *R.as_quat()
+    for number, eye in enumerate(eyes, 1):
+        rays = directions(W, H) @ R.as_matrix()  # in the world
+        Image.fromarray(painted(rays)).save(tmp_path / "images" / f"p{number}.png")
+        Image.fromarray(np.where(rays[..., 1] < 0.3, 255, 0).astype(np.uint8)).save(
+            tmp_path / f"masks/p{number}.png"
+        )
+        t = -R.as_matrix() @ eye
+        lines.append(f"{number} {w} {x} {y} {z} {t[0]} {t[1]} {t[2]} 1 p{number}.png\n\n")
+    (tmp_path / "sparse/0/cameras.txt").write_text(f"1 EQUIRECTANGULAR {W} {H} {W} {H}\n")
+    (tmp_path / "sparse/0/images.txt").write_text("".join(lines))
+    dataset = load_dataset(tmp_path, DataSettings(resolution=resolution, test_every=2))
+    assert [view.name for view in dataset.test] == [f"p1_{k}.png" for k in range(8)]
+    assert len(dataset.train) == 8 and not any("cropped" in note for note in dataset.notes)
+    for view in dataset.test:
+        camera, photo = view.camera, view.read()
+        assert (side, side) == (camera.W, camera.H) and camera.fx == pytest.approx(side / 2)
+        np.testing.assert_allclose(camera.eye, eyes[0], atol=1e-9)
+        c = (np.arange(side) - camera.cx) / camera.fx
+        X, Y = np.meshgrid(c, c)
+        rays = np.stack([X, Y, np.ones_like(X)], axis=2) @ camera.R
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        wrong = np.abs(photo.image.astype(int) - painted(rays))
+        assert wrong.mean() < 2.0 and wrong.max() < 25  # of 240 grey levels; a wrong face differs by 80
+        below = rays[..., 1]
+        assert not photo.mask[below > 0.33].any() and photo.mask[below < 0.27].all()
+
+
+def test_colmaps_panoramas_of_another_shape_are_refused(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 300 100 300 100\n")
+    with pytest.raises(DatasetError, match="size 300x100 is not that of a panorama"):
+        read_cameras(tmp_path / "cameras.txt")
+
+
+def test_the_doctor_reads_panoramas(tmp_path):
+    """Its thumbnails are those of the faces."""
+    Image.fromarray(painted(directions(512, 256))).save(tmp_path / "a.png")
+    lens = FaceLens.of(512, 256, 5)
+    stats = measure_photo(PhotoFile(tmp_path / "a.png", None, lens, 163, 163, None))
+    assert stats.thumbnail.shape == (128, 128, 3)
+    wrong = np.abs(stats.thumbnail.astype(int) - painted(face_rays(face_rotations()[5], 128)))
+    assert wrong.mean() < 2.0

@@ -26,6 +26,7 @@ from gsplat_edu.data.capture import (
     Listings,
     checked_frame,
     entries,
+    faces_of,
     find_photo,
     is_file,
     is_folder,
@@ -34,6 +35,7 @@ from gsplat_edu.data.capture import (
 )
 from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels, UnclearMasks
+from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import unreadable
 from gsplat_edu.gaussian_math import quat_to_R
@@ -63,7 +65,7 @@ MODELS: tuple[tuple[str, str], ...] = (
 """COLMAP's camera models by number, with their parameters."""
 
 SPHERE = "EQUIRECTANGULAR"
-"""The model whose images show all directions; no pinhole does."""
+"""The model whose images show all directions; they are read as several faces."""
 
 FORMULA_OF = {
     "FOV": "field of view",
@@ -139,7 +141,7 @@ def read_colmap(folder: Path, model: Path) -> Capture:
             )
         R, eye = _placed(where, pose)
         frame = Frame(name, photos[pose.name], lenses[pose.camera], R, eye, masks.get(pose.name))
-        frames.append(checked_frame(where, frame))
+        frames += faces_of(checked_frame(where, frame))
     if missing:
         notes.append(MissingPhotos(len(missing), len(poses), missing[0]))
     others = [place.name for place in _numbered(model.parent) if place != model]
@@ -327,17 +329,14 @@ def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64
 
 def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
     names = dict(MODELS).get(model, "").split()
-    if model == SPHERE:
-        raise DatasetError(
-            f"camera model {SPHERE} shows all directions, which no pinhole image can; give the panoramas to "
-            "`gsplat-edu sfm --panorama`, or cut them into pinhole images with `colmap image_undistorter`"
-        )
     if not names:
         raise DatasetError(
             f"camera model {model} is not supported; run `colmap image_undistorter` and load its output"
         )
     if len(values) != len(names):
         raise DatasetError(f"{model} has {len(names)} parameters ({', '.join(names)}), got {len(values)}")
+    if model == SPHERE:
+        return FaceLens.of(W, H, 0)
     named = dict(zip(names, values, strict=True))
     if "f" in named:
         named["fx"] = named["fy"] = named.pop("f")

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from gsplat_edu.data.lens import MAX_REMAPPED
-from gsplat_edu.errors import ShapeError
+from gsplat_edu.data.lens import MAX_REMAPPED, Lens
+from gsplat_edu.errors import DatasetError, ShapeError
 from gsplat_edu.intrinsics import Intrinsics
 from gsplat_edu.resizing import area_mean, premultiplied, smaller_mask, unweighted
 
@@ -44,8 +45,50 @@ face's pixels. Twice as many give the same face to 0.05 dB."""
 MARGIN = 4
 """Columns repeated on each side of the panorama, so that no interpolation sees a border at +-180 degrees."""
 
+PANORAMIC = "equirectangular"
+"""Model of `FaceLens`; it has no formula on the plane."""
+
 BAND = 128
 """Rows of a face cut at a time."""
+
+
+@dataclass(frozen=True)
+class FaceLens(Lens):
+    """The lens of a panorama of which one face is shown. Its sizes are those of the panorama.
+
+    Args:
+        number: Index in `face_rotations`.
+    """
+
+    number: int = 0
+
+    @classmethod
+    def of(cls, W: int, H: int, number: int) -> FaceLens:
+        """Return the lens of a face of a panorama.
+
+        Raises:
+            DatasetError: the size is not that of a panorama.
+        """
+        if not is_panorama_size(W, H):
+            raise DatasetError(
+                f"size {W}x{H} is not that of a panorama, 2:1 and narrower than {MAX_REMAPPED} px"
+            )
+        focal = W / (2.0 * math.pi)  # px per radian
+        return cls(W, H, focal, focal, (W - 1) / 2, (H - 1) / 2, (), PANORAMIC, number)
+
+    @property
+    def cropped(self) -> bool:
+        """Whether something of the photo is lost: the other faces show it."""
+        return False
+
+    @property
+    def R(self) -> Float64[np.ndarray, "3 3"]:
+        """Rotation from the panorama's axes to the face's."""
+        return face_rotations()[self.number]
+
+    def undistorted(self) -> Intrinsics:
+        """Return the pinhole of the face; its size differs from the panorama's."""
+        return face_pinhole(face_side(self.W))
 
 
 def face_rotations() -> list[Float64[np.ndarray, "3 3"]]:
