@@ -19,7 +19,9 @@ from gsplat_edu.data.panorama import (
     face_side,
     is_panorama_size,
 )
+from gsplat_edu.doctor.cameras import check_sizes
 from gsplat_edu.doctor.photos import measure_photo
+from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.errors import DatasetError, ShapeError
 
 
@@ -163,7 +165,11 @@ def test_a_capture_of_colmaps_panoramas_is_read_as_faces(tmp_path, resolution, s
     (tmp_path / "sparse/0/images.txt").write_text("".join(lines))
     dataset = load_dataset(tmp_path, DataSettings(resolution=resolution, test_every=2))
     assert [view.name for view in dataset.test] == [f"p1_{k}.png" for k in range(8)]
-    assert len(dataset.train) == 8 and not any("cropped" in note for note in dataset.notes)
+    assert len(dataset.train) == 8 and not any(
+        "distortion" in note or "cropped" in note for note in dataset.notes
+    )
+    assert "16 of 16 views are faces of panoramas, cut on loading" in dataset.notes
+    assert not check_sizes(prepare(tmp_path))
     for view in dataset.test:
         camera, photo = view.camera, view.read()
         assert (side, side) == (camera.W, camera.H) and camera.fx == pytest.approx(side / 2)

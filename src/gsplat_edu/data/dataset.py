@@ -32,6 +32,7 @@ from gsplat_edu.data.images import UPRIGHT, ImageHeader, ImageStore, PhotoFile, 
 from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
 from gsplat_edu.data.notes import TwoLayouts, UnreadColors
 from gsplat_edu.data.orientation import oriented
+from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.scale import Scale, read_scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
@@ -245,7 +246,9 @@ def _spelled(nbytes: int) -> str:
 
 def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
     """Report changes of the intrinsics."""
-    notes, distorted = [], [frame for frame in frames if frame.lens.distorts]
+    faces = [frame for frame in frames if isinstance(frame.lens, FaceLens)]
+    notes = [f"{len(faces)} of {len(frames)} views are faces of panoramas, cut on loading"] if faces else []
+    distorted = [frame for frame in frames if frame.lens.distorts and not isinstance(frame.lens, FaceLens)]
     if distorted:
         notes.append(
             f"{len(distorted)} of {len(frames)} photos have lens distortion and are undistorted on loading"

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 
+from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
@@ -145,7 +146,11 @@ def _zoomed(shots: Sequence[Shot]) -> set[str]:
 
 def check_sizes(survey: Survey) -> list[Finding]:
     """Find photos whose size differs from their camera's: correct for resized photos, wrong for cropped ones."""
-    other = [shot for shot in survey.shots if shot.size != (shot.lens.W, shot.lens.H)]
+    other = [
+        shot
+        for shot in survey.shots
+        if shot.size != (shot.lens.W, shot.lens.H) and not isinstance(shot.lens, FaceLens)
+    ]
     if not other:
         return []
     (w, h), lens = other[0].size, other[0].lens
