@@ -54,8 +54,11 @@ def face_cameras(side=SIDE):
 def room(colmap, tmp_path_factory):
     """The capture made from panoramas whose XMP says what they are."""
     folder = tmp_path_factory.mktemp("room")
-    (folder / "photos").mkdir()
+    (folder / "photos" / "masks").mkdir(parents=True)
+    mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)
+    mask[WIDTH * 5 // 12 :] = 0  # what is more than 60 degrees below the horizon, such as a tripod
     for i, eye in enumerate(walk(COUNT)):
+        Image.fromarray(mask).save(folder / "photos" / "masks" / f"p{i}.png")
         picture = Image.fromarray(panorama(eye, TURN * i, WIDTH))
         picture.save(folder / "photos" / f"p{i}.jpg", quality=95, subsampling=0, xmp=XMP)
     said = []
@@ -85,6 +88,20 @@ def test_panoramas_become_faces_with_one_centre_each(room):
             (SIDE - 1) / 2,
             (SIDE - 1) / 2,
         ), name
+
+
+def test_masks_of_panoramas_become_masks_of_faces(room):
+    """A pixel of a face counts if its ray is less than 60 degrees below the horizon."""
+    views = {view.name: view for view in load_dataset(room.capture, DataSettings(test_every=0)).train}
+    for number, R in enumerate(face_rotations()):
+        pinhole = face_pinhole(SIDE)
+        x = (np.arange(SIDE) - pinhole.cx) / pinhole.fx
+        X, Y = np.meshgrid(x, x)
+        rays = np.stack([X, Y, np.ones_like(X)], axis=2) @ R
+        below = np.degrees(np.arcsin(rays[..., 1] / np.linalg.norm(rays, axis=2)))
+        counts = views[f"p2_{number}.jpg"].read().mask
+        assert counts[below < 59].all() and not counts[below > 61].any()
+        assert (below > 61).any() == (number >= 4)  # only the lower ring sees so far down
 
 
 def test_whole_panoramas_are_held_out(room):
