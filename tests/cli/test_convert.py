@@ -102,6 +102,11 @@ def test_a_known_distance_sets_the_unit(convert, plain, tmp_path):
     out, before = tmp_path / "metres.ply", read_scene(plain).gaussians
     said = convert(plain, out, "--transform", "move=1,0,0", "--scale", "-0.5,1,2 -0.5,1,4.1 1.20m")
     assert "1 unit of metres.ply = 1 m; it was 1.75 units before" in said
+    assert read_scene(out).unit == "m" and read_scene(plain).unit is None
+    convert(out, tmp_path / "twice.ply", "--transform", "scale=2")
+    convert(out, tmp_path / "moved.ply", "--transform", "move=1,2,3")
+    assert [read_scene(tmp_path / f"{name}.ply").unit for name in ("twice", "moved")] == [None, "m"]
+    assert "comment gsplat_edu unit m" in out.read_bytes()[:1000].decode("latin-1")
     after = read_scene(out).gaussians
     factor = 1.2 / 2.1
     shift = torch.tensor([1.0, 0.0, 0.0])

@@ -14,6 +14,8 @@ from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.scale import Scale, read_scale
 from gsplat_edu.data.textured_box import align_cameras, box_orbit, photograph_box
 from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.io.formats import read_scene
+from gsplat_edu.runs.source import open_source
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.scale import Sight, placed
@@ -74,6 +76,8 @@ def test_marks_give_the_scale_end_to_end(done, tmp_path, capsys):
         capsys.readouterr()
         assert main(["info", str(run)]) == 0
         assert "units      1 unit = 1 m, from a given distance" in capsys.readouterr().out
+        assert main(["convert", str(run), str(tmp_path / "x.compressed.ply")]) == 0
+        assert read_scene(tmp_path / "x.compressed.ply").unit == "m"
         # What is written has the capture's coordinates, in metres.
         eyes = np.array([one["position"] for one in json.loads((run / "cameras.json").read_text())])
         given = np.stack([camera.eye for camera in cameras_of(capture).values()])
@@ -122,6 +126,11 @@ def test_gps_gives_scale_and_up_end_to_end(tmp_path):
     (line,) = [line for line in said if line.startswith("scale: ")]
     assert re.search(r"1 unit = 1 m, from GPS \(1[234] of 14 positions agree", line)
     assert "up from GPS, +z is north" in line
+    run = tmp_path / "run"
+    brief = "--iterations 1 --strategy none --no-rescale --eval-every 0"
+    assert main(["train", str(tmp_path / "out"), "--out", str(run), *brief.split()]) == 0
+    scene = open_source(run).scene
+    assert scene.up == (0.0, -1.0, 0.0) and scene.unit == "m"  # not the photos' up, which is 25 degrees off
     found = cameras_of(tmp_path / "out")
     move = align_cameras(found, truth)  # from the capture to the box's world
     # one degree of latitude is 111.194 km here by the ellipsoid, one of longitude 74.628 km: 0.05 % apart at most

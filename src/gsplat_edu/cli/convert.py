@@ -61,6 +61,8 @@ def run(arguments: argparse.Namespace) -> None:
             sources.append(_edited(open_source(path), keep, move))
             bar.advance(steps)
         source = _joined(sources)
+        if arguments.scale is not None:
+            source = replace(source, scene=replace(source.scene, unit=given.unit))
         say = functools.partial(console.print, soft_wrap=True)
         for note in (*_origins(sources), *export.losses(arguments.out, source.scene)):
             say(note)

@@ -77,6 +77,8 @@ def _scene_facts(path: Path) -> list[Fact]:
     ]
     if scene.antialiased is not None:
         facts.append(("render", f"{'with' if scene.antialiased else 'without'} antialiasing"))
+    if scene.unit is not None:
+        facts.append(("units", f"1 unit = 1 {scene.unit}"))
     if scene.up is not None:
         facts.append(("up", ", ".join(f"{x:.4g}" for x in scene.up)))
     finite = gaussians.finite_rows()
@@ -146,7 +148,8 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
             facts.append((key, ", ".join(said)))
     facts.append(("backend", str(config.get("backend", "?"))))
     if units := _section(config, "scale"):
-        known = Scale(*(str(units.get(name, "?")) for name in ("unit", "source", "detail")))
+        unit, source, detail = (str(units.get(name) or "?") for name in ("unit", "source", "detail"))
+        known = Scale(unit, source, detail)
         facts.append(("units", str(known)))
     try:
         scene, iteration = folder.latest_scene()

@@ -22,17 +22,19 @@ class Scale:
         unit: "m", "cm" or "mm"; one unit of the coordinates is one of these.
         source: "GPS" or "a given distance".
         detail: How well it is known, in words.
+        level: Whether up is known to be (0, -1, 0), from GPS; else it is what most photos show as up.
     """
 
     unit: str
     source: str
     detail: str = ""
+    level: bool = False
 
     def __str__(self) -> str:
         """Return the sentence for the user."""
         return f"1 unit = 1 {self.unit}, from {self.source}" + f" ({self.detail})" * bool(self.detail)
 
-    def json(self) -> dict[str, str]:
+    def json(self) -> dict[str, str | bool]:
         """Return the fields as JSON values."""
         return asdict(self)
 
@@ -48,7 +50,8 @@ class Scale:
         fields = ("unit", "source", "detail")
         if not isinstance(values, dict) or not all(isinstance(values.get(name), str) for name in fields):
             raise ValueError
-        return cls(*(values[name] for name in fields))
+        unit, source, detail = (values[name] for name in fields)
+        return cls(unit, source, detail, values.get("level") is True)
 
 
 def read_scale(folder: Path) -> Scale | None:

@@ -121,7 +121,7 @@ def placed(
 
 def _by_gps(move: Similarity, fit: GpsFit) -> tuple[Similarity, Scale]:
     """Take the scale, and up if it is determined, from a fit of GPS positions."""
-    level = fit.tilt <= TILT
+    level = bool(fit.tilt <= TILT)
     count, total = int(fit.inside.sum()), len(fit.inside)
     detail = (
         f"{count} of {total} positions agree, median residual {fit.residual:.3g} m over {fit.spread:.3g} m"
@@ -133,7 +133,7 @@ def _by_gps(move: Similarity, fit: GpsFit) -> tuple[Similarity, Scale]:
         origin = -move.R.T @ move.t / move.s  # what `upright` puts at zero
         R = LEVEL @ fit.move.R
         found = Similarity(R, fit.move.s, -fit.move.s * R @ origin)
-    return found, Scale("m", "GPS", detail)
+    return found, Scale("m", "GPS", detail, level)
 
 
 def _rescaled(move: Similarity, s: float) -> Similarity:
