@@ -97,6 +97,24 @@ def test_filters_and_transforms_are_applied_in_order(convert, plain, tmp_path):
     )
 
 
+def test_a_known_distance_sets_the_unit(convert, plain, tmp_path):
+    """Two points that are 2.1 units apart after the transform become 1.2 m apart; the scales of Gaussians follow."""
+    out, before = tmp_path / "metres.ply", read_scene(plain).gaussians
+    said = convert(plain, out, "--transform", "move=1,0,0", "--scale", "-0.5,1,2 -0.5,1,4.1 1.20m")
+    assert "1 unit of metres.ply = 1 m; it was 1.75 units before" in said
+    assert read_scene(out).unit == "m" and read_scene(plain).unit is None
+    convert(out, tmp_path / "twice.ply", "--transform", "scale=2")
+    convert(out, tmp_path / "moved.ply", "--transform", "move=1,2,3")
+    assert [read_scene(tmp_path / f"{name}.ply").unit for name in ("twice", "moved")] == [None, "m"]
+    assert "comment gsplat_edu unit m" in out.read_bytes()[:1000].decode("latin-1")
+    after = read_scene(out).gaussians
+    factor = 1.2 / 2.1
+    shift = torch.tensor([1.0, 0.0, 0.0])
+    torch.testing.assert_close(after.means, (before.means + shift) * factor)
+    torch.testing.assert_close(after.scales, before.scales * factor)
+    assert "does not end with a distance" in convert(plain, out, "--scale", "0,0,0 1,0,0 12 yards", code=2)
+
+
 def test_scenes_are_joined_on_request(convert, plain, tmp_path):
     assert "add --merge" in convert(plain, plain, tmp_path / "out.ply", code=2)
     convert(plain, plain, tmp_path / "out.ply", "--merge")

@@ -1,5 +1,6 @@
 """`gsplat-edu sfm`: its messages, and one-line errors for bad input."""
 
+import argparse
 import importlib.util
 import io
 import signal
@@ -256,7 +257,15 @@ def test_a_resumed_run_keeps_its_poses(tmp_path):
     words = ["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--resume"]
     options = train_options_from(build_parser(["train"]).parse_args(words))
     said = []
-    assert _with_poses(options, Console(file=io.StringIO()), said.append).data == found
+    assert (
+        _with_poses(
+            options,
+            argparse.Namespace(panorama="auto", scale="auto"),
+            Console(file=io.StringIO()),
+            said.append,
+        ).data
+        == found
+    )
     assert len(said) == 1 and "using the poses that this run started with" in said[0]
 
 

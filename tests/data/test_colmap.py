@@ -86,7 +86,7 @@ def test_camera_models(tmp_path, line, intrinsics, coefficients, fisheye):
     for suffix in ("bin", "txt"):
         (lens,) = read_cameras(tmp_path / f"cameras.{suffix}").values()
         assert (lens.fx, lens.fy, lens.cx, lens.cy) == intrinsics and (lens.W, lens.H) == (24, 18)
-        assert lens.fisheye == fisheye
+        assert lens.model == ("fisheye" if fisheye else "perspective")
         assert lens.coefficients == (*coefficients, *[0.0] * ((4 if fisheye else 8) - len(coefficients)))
 
 
@@ -98,7 +98,7 @@ def test_the_ids_of_the_models():
     assert names[11] == "RAD_TAN_THIN_PRISM_FISHEYE" and len(names) == 18
 
 
-@pytest.mark.parametrize("number", [7, 10, 11, 12, 13, 16, 17, 18, 99, -1])
+@pytest.mark.parametrize("number", [18, 99, -1])
 def test_unsupported_models_are_refused_by_name(tmp_path, number):
     path = tmp_path / "cameras.bin"
     path.write_bytes(struct.pack("<QIiQQ16d", 1, 7, number, 24, 18, *range(1, 17)))

@@ -348,3 +348,41 @@ def test_a_camera_with_uneven_pixels_is_reported(tmp_path):
     camera = Camera(look_at((0, 0, -3), (0, 0, 0)), (0, 0, -3), 40, 20, 3.5, 3.5, 8, 8)
     write_transforms(tmp_path, [View(camera, np.zeros((8, 8, 3), np.uint8), name="a.png")])
     assert any("calibration may be wrong" in note for note in load_dataset(tmp_path).notes)
+
+
+def test_views_with_one_centre_are_held_out_together(tmp_path, small):
+    """Faces of four panoramas, three each, whose names are not in order of place; centres agree to float precision."""
+    views, points, colors = small
+    places = [3, 0, 0, 1, 2, 3, 0, 1, 3]
+    moved = [
+        View(
+            Camera.posed(view.camera.R, views[place].camera.eye, view.camera.intrinsics),
+            view.image,
+            name=view.name,
+        )
+        for view, place in zip(views, places, strict=True)
+    ]
+    write_colmap(tmp_path, moved, points, colors)
+    dataset = load_dataset(tmp_path, DataSettings(test_every=2))
+    held = {int(view.name[5:8]) for view in dataset.test}
+    # In the order of names, places are numbered 3, 0, 1, 2; every second one of these is held out: 3 and 1.
+    assert held == {0, 3, 5, 7, 8}
+    said = "9 photos have 4 centres, like the faces of panoramas: those with one centre are held out together"
+    assert said in dataset.notes
+
+
+def test_a_single_panorama_is_split_by_faces(tmp_path, small):
+    """All views have one centre: holding them out together would leave nothing to train on."""
+    views, points, colors = small
+    moved = [
+        View(
+            Camera.posed(view.camera.R, views[0].camera.eye, view.camera.intrinsics),
+            view.image,
+            name=view.name,
+        )
+        for view in views
+    ]
+    write_colmap(tmp_path, moved, points, colors)
+    dataset = load_dataset(tmp_path)
+    assert len(dataset.test) == 2 and len(dataset.train) == 7
+    assert not any("centres" in note for note in dataset.notes)

@@ -44,7 +44,7 @@ def seen(number):
 
 def test_every_pose_of_a_sound_model_counts(work):
     assert printed(
-        work + "print(judge.unsupported(model), judge.agreement(model, database).contradictory)"
+        work + "print(judge.unsupported(model), judge.agreement(model, database).contradictory(model))"
     ) == ["{} set()"]
 
 
@@ -101,9 +101,10 @@ truth = {{i: model.image(i).projection_center() for i in (5, 9)}}
 keep(9, seen(9)[0][:8])
 moved(9, [0.0, 0.0, 60.0], [0.0, 0.5, 0.0])
 moved(5, [1.0, 0.0, 0.0], [0.1, 0.0, 0.0])
-print(sorted(judge.agreement(model, database).contradictory | set(judge.unsupported(model))))
+print(sorted(judge.agreement(model, database).contradictory(model) | set(judge.unsupported(model))))
 repaired = mappers.repaired(model, database, photos, Path({str(tmp_path)!r}), mappers.Options(False, 1, 0))
-print(judge.unsupported(repaired), judge.agreement(repaired, database).contradictory, repaired.num_reg_images())
+left = judge.agreement(repaired, database).contradictory(repaired)
+print(judge.unsupported(repaired), left, repaired.num_reg_images())
 print(max(abs(repaired.image(i).projection_center() - truth[i]).max() for i in truth))
 """
     broken, after, off = printed(work + script)

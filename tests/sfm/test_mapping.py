@@ -110,7 +110,9 @@ def mapped(monkeypatch, tmp_path):
         monkeypatch.setattr(mapping, "_usable", lambda out, model: model)
         ways = WAYS[: len(counts)]
         try:
-            best = mapping.map_photos(tmp_path, ways, {}, 10, 10, 1, said.append, lambda *progress: None)
+            best = mapping.map_photos(
+                tmp_path, ways, mapping.Cameras({}), 10, 10, 1, said.append, lambda *progress: None
+            )
         except DatasetError as error:
             best = error
         return best, len(tried), said

@@ -131,7 +131,9 @@ def test_the_sound_model_is_chosen_over_one_with_more_poses(models, tmp_path, mo
     (tmp_path / "database.db").write_bytes((models.root / "database.db").read_bytes())
     ways = mapping.attempts("auto", "SIMPLE_RADIAL", ALL, 1, one_lens=True)
     said = []
-    best = mapping.map_photos(tmp_path, ways, {}, ALL, ALL, 1, said.append, lambda *progress: None)
+    best = mapping.map_photos(
+        tmp_path, ways, mapping.Cameras({}), ALL, ALL, 1, said.append, lambda *progress: None
+    )
     sound = [f"{number:02d}.png" for number in range(1, SOUND + 1)]
     assert best["names"] == sound
     assert said[0] == "incremental mapper, SIMPLE_RADIAL: 26 of 40 photos have a pose that counts"

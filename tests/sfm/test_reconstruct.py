@@ -346,7 +346,7 @@ def test_the_last_attempt_registers_most_photos(done, tmp_path):
         photos=str(work / "photos"),
         out=str(tmp_path),
         attempt=asdict(way),
-        shared={},
+        cameras={"shared": {}, "rig": None},
         threads=1,
         seed=0,
     )["models"]

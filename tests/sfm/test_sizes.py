@@ -58,7 +58,8 @@ for mapper in ("incremental", "global"):
     out = root / mapper
     out.mkdir()
     attempt = {{"mapper": mapper, "model": "auto", "free": False, "per_photo": False, "loose": False}}
-    found = jobs.mapping(lambda done: None, str(root / "database.db"), str(root), str(out), attempt, shared, 1, 0)
+    cameras = {{"shared": shared, "rig": None}}
+    found = jobs.mapping(lambda done: None, str(root / "database.db"), str(root), str(out), attempt, cameras, 1, 0)
     (facts,) = found["models"]
     model = pycolmap.Reconstruction(str(out / facts["folder"]))
     lenses = {{tuple(model.camera(model.image(i).camera_id).params) for i in model.reg_image_ids()}}

@@ -23,6 +23,7 @@ from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
+from gsplat_edu.sfm.scale_text import points_of
 from gsplat_edu.viewer import export
 
 
@@ -32,6 +33,9 @@ def run(arguments: argparse.Namespace) -> None:
     move = IDENTITY
     for text in arguments.transform:
         move = _similarity(text).after(move)
+    if arguments.scale is not None:
+        given = points_of(arguments.scale)
+        move = Similarity(np.eye(3), given.length / given.apart, np.zeros(3)).after(move)
     backend = resolve_backend(arguments.backend) if arguments.verify else ""
     export.check_target("OUT", arguments.out)
     if len(arguments.sources) > 1 and not arguments.merge:
@@ -57,6 +61,8 @@ def run(arguments: argparse.Namespace) -> None:
             sources.append(_edited(open_source(path), keep, move))
             bar.advance(steps)
         source = _joined(sources)
+        if arguments.scale is not None:
+            source = replace(source, scene=replace(source.scene, unit=given.unit))
         say = functools.partial(console.print, soft_wrap=True)
         for note in (*_origins(sources), *export.losses(arguments.out, source.scene)):
             say(note)
@@ -69,6 +75,10 @@ def run(arguments: argparse.Namespace) -> None:
         bar.advance(steps)
         count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
         say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}")
+        if arguments.scale is not None:
+            say(
+                f"1 unit of {arguments.out.name} = 1 {given.unit}; it was {given.apart / given.length:.6g} units before"
+            )
         if arguments.verify:
             check_and_say(arguments.out, source, backend, bar, say)
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.data.scale import Scale
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io import ply
@@ -76,6 +77,8 @@ def _scene_facts(path: Path) -> list[Fact]:
     ]
     if scene.antialiased is not None:
         facts.append(("render", f"{'with' if scene.antialiased else 'without'} antialiasing"))
+    if scene.unit is not None:
+        facts.append(("units", f"1 unit = 1 {scene.unit}"))
     if scene.up is not None:
         facts.append(("up", ", ".join(f"{x:.4g}" for x in scene.up)))
     finite = gaussians.finite_rows()
@@ -144,6 +147,10 @@ def _run_facts(folder: RunFolder) -> list[Fact]:
         if said:
             facts.append((key, ", ".join(said)))
     facts.append(("backend", str(config.get("backend", "?"))))
+    if units := _section(config, "scale"):
+        unit, source, detail = (str(units.get(name) or "?") for name in ("unit", "source", "detail"))
+        known = Scale(unit, source, detail)
+        facts.append(("units", str(known)))
     try:
         scene, iteration = folder.latest_scene()
     except CheckpointError as error:
@@ -179,6 +186,8 @@ def _dataset_facts(path: Path) -> list[Fact]:
     if len(dataset.points):
         inner = np.percentile(dataset.points, (1, 99), axis=0)
         facts.append(("", f"middle 98 %: {_bounds(inner)}"))
+    if dataset.scale is not None:
+        facts.append(("units", str(dataset.scale)))
     if np.any(dataset.origin):
         facts.append(("origin", f"shifted to {', '.join(f'{x:.6g}' for x in dataset.origin)}"))
     return facts + [("note", note) for note in dataset.notes]

@@ -125,9 +125,14 @@ def _run(
             view.stay()
 
 
-def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None]) -> RunOptions:
+def _with_poses(
+    options: RunOptions, arguments: argparse.Namespace, console: Console, say: Callable[[str], None]
+) -> RunOptions:
     """Find the poses first if the input is plain photos or a video; keep the capture in the run's folder."""
     if not needs_poses(options.data):
+        for name in ("panorama", "scale"):
+            if getattr(arguments, name) != "auto":
+                raise ArgumentError(f"--{name}: has an effect only if DATA has no poses; omit it")
         return options
     if options.points is not None:
         read_points_ply(options.points)  # report errors in the file before the long computation
@@ -144,7 +149,8 @@ def _with_poses(options: RunOptions, console: Console, say: Callable[[str], None
     say(f"{options.data}: has no poses; finding them first and writing them to {found}")
     with stage_bars(console) as progress:
         try:
-            reconstruct(SfmOptions(options.data, found), say, progress)
+            chosen = SfmOptions(options.data, found, panorama=arguments.panorama, scale=arguments.scale)
+            reconstruct(chosen, say, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 "interrupted while finding poses; the same command resumes after the last completed stage"
@@ -156,7 +162,7 @@ def _planned(
     arguments: argparse.Namespace, deadline: Deadline | None, console: Console, say: Callable[[str], None]
 ) -> Plan:
     """Find poses if necessary, and choose the options that the limits leave open."""
-    options = _with_poses(options_from(arguments), console, say)
+    options = _with_poses(options_from(arguments), arguments, console, say)
     if chooses_appearance(arguments):
         remedy = appearance_for(options.data)
         options = replace(options, config=options.config.changed(appearance=remedy.value))

@@ -16,6 +16,8 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.images import UPRIGHT, PhotoFile, image_orientation, image_size, upright_size
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
+from gsplat_edu.data.panorama import FaceLens, face_rotations
+from gsplat_edu.data.scale import Scale
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import unreadable
 
@@ -88,6 +90,7 @@ class Capture:
         notes: Facts that the user should know.
         no_cloud: The reason for missing points.
         cube: Half the edge of the cube around the origin that contains the scene, if the layout defines it.
+        scale: What a unit of the coordinates is; None if unknown.
     """
 
     layout: str
@@ -96,6 +99,7 @@ class Capture:
     notes: tuple[Note, ...] = ()
     no_cloud: str = "the capture has no points"
     cube: float | None = None
+    scale: Scale | None = None
 
 
 def is_file(path: Path) -> bool:
@@ -229,6 +233,26 @@ def checked_frame(where: str, frame: Frame) -> Frame:
     return replace(frame, R=U @ Vt)
 
 
+def faces_of(frame: Frame) -> list[Frame]:
+    """Return the faces of a panorama as frames, or the frame itself if it is none.
+
+    Args:
+        frame: The frame; its lens is a `FaceLens` if it is a panorama.
+    """
+    lens, path = frame.lens, PurePosixPath(frame.name)
+    if not isinstance(lens, FaceLens):
+        return [frame]
+    return [
+        replace(
+            frame,
+            name=str(path.with_name(f"{path.stem}_{number}{path.suffix}")),
+            lens=replace(lens, number=number),
+            R=R @ frame.R,
+        )
+        for number, R in enumerate(face_rotations())
+    ]
+
+
 def photo_file(
     frame: Frame,
     resolution: float | None,
@@ -267,7 +291,10 @@ def photo_file(
         W, H = upright_size(size_of(path), orientation)
         lens = _fitted(frame, path, (W, H))
     try:
-        pinhole = lens.undistorted().scaled(W, H)
+        pinhole = lens.undistorted()
+        if isinstance(lens, FaceLens):
+            W, H = _target(pinhole.W, pinhole.H, resolution if smaller is None else None)
+        pinhole = pinhole.scaled(W, H)
     except DatasetError as error:
         raise DatasetError(f"{frame.name}: {error}", error.reason) from None
     camera = Camera.posed(frame.R, frame.eye, pinhole)

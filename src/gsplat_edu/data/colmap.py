@@ -26,14 +26,16 @@ from gsplat_edu.data.capture import (
     Listings,
     checked_frame,
     entries,
+    faces_of,
     find_photo,
     is_file,
     is_folder,
     is_outside,
     unit_colors,
 )
-from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels, UnclearMasks
+from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import unreadable
 from gsplat_edu.gaussian_math import quat_to_R
@@ -62,16 +64,18 @@ MODELS: tuple[tuple[str, str], ...] = (
 )
 """COLMAP's camera models by number, with their parameters."""
 
-REFUSED = (
-    "FOV",
-    "THIN_PRISM_FISHEYE",
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    "SIMPLE_DIVISION",
-    "DIVISION",
-    "EUCM",
-    "EQUIRECTANGULAR",
-)
-"""Models that are not supported."""
+SPHERE = "EQUIRECTANGULAR"
+"""The model whose images show all directions; they are read as several faces."""
+
+FORMULA_OF = {
+    "FOV": "field of view",
+    "THIN_PRISM_FISHEYE": "thin prism fisheye",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "radial tangential prism fisheye",
+    "SIMPLE_DIVISION": "division",
+    "DIVISION": "division",
+    "EUCM": "enhanced unified",
+}
+"""Formulas of the models that are neither perspective nor, by their names, a fisheye."""
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """Locations of a model in a capture, in search order; after these, numbered folders in sparse, colmap/sparse and the
@@ -137,7 +141,7 @@ def read_colmap(folder: Path, model: Path) -> Capture:
             )
         R, eye = _placed(where, pose)
         frame = Frame(name, photos[pose.name], lenses[pose.camera], R, eye, masks.get(pose.name))
-        frames.append(checked_frame(where, frame))
+        frames += faces_of(checked_frame(where, frame))
     if missing:
         notes.append(MissingPhotos(len(missing), len(poses), missing[0]))
     others = [place.name for place in _numbered(model.parent) if place != model]
@@ -325,16 +329,19 @@ def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64
 
 def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
     names = dict(MODELS).get(model, "").split()
-    if not names or model in REFUSED:
+    if not names:
         raise DatasetError(
             f"camera model {model} is not supported; run `colmap image_undistorter` and load its output"
         )
     if len(values) != len(names):
         raise DatasetError(f"{model} has {len(names)} parameters ({', '.join(names)}), got {len(values)}")
+    if model == SPHERE:
+        return FaceLens.of(W, H, 0)
     named = dict(zip(names, values, strict=True))
     if "f" in named:
         named["fx"] = named["fy"] = named.pop("f")
-    return lens_of(named, W, H, fisheye=model.endswith("FISHEYE"))
+    plain = FISHEYE if model.endswith("FISHEYE") else PINHOLE_LIKE
+    return lens_of(named, W, H, FORMULA_OF.get(model, plain))
 
 
 class _Binary:

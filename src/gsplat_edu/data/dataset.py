@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import cKDTree
 
 from gsplat_edu.camera import Camera, point_nearest_axes
 from gsplat_edu.data.blender import TRAIN_FILE, read_blender
@@ -27,9 +29,12 @@ from gsplat_edu.data.capture import (
 )
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import UPRIGHT, ImageHeader, ImageStore, PhotoFile, image_header
+from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
 from gsplat_edu.data.notes import TwoLayouts, UnreadColors
 from gsplat_edu.data.orientation import oriented
+from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
+from gsplat_edu.data.scale import Scale, read_scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
 from gsplat_edu.errors import ArgumentError, DatasetError
@@ -37,6 +42,9 @@ from gsplat_edu.views import View
 
 TEST_EVERY = 8
 """Hold out every 8th view if the capture defines no split (the usual convention)."""
+
+ONE_PLACE = 1e-5
+"""Largest distance of two centres that count as one, as a fraction of the cameras' spread."""
 
 FAR = 1e4
 """Camera coordinates beyond which the origin is moved, world units; float32 would resolve them only to 1e-3."""
@@ -60,6 +68,7 @@ class Dataset:
         notes: Notes for the user: skipped, rescaled, undistorted or generated data.
         images: The photo cache.
         files: Name and files of each photo, sorted by name.
+        scale: What a unit of the coordinates is; None if unknown.
     """
 
     path: Path
@@ -72,6 +81,7 @@ class Dataset:
     notes: tuple[str, ...]
     images: ImageStore
     files: tuple[tuple[str, PhotoFile], ...] = ()
+    scale: Scale | None = None
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Decode every photo once, several in parallel, and keep those within the budget.
@@ -146,7 +156,17 @@ def load_dataset(
     start = cloud or _random_start(capture, [view.camera for view in views], notes, origin)
     files = tuple((frame.name, source) for frame, (source, _, _) in zip(frames, made, strict=True))
     return Dataset(
-        path, capture.layout, train, test, start.points, start.colors, origin, tuple(notes), store, files
+        path,
+        capture.layout,
+        train,
+        test,
+        start.points,
+        start.colors,
+        origin,
+        tuple(notes),
+        store,
+        files,
+        capture.scale,
     )
 
 
@@ -191,7 +211,7 @@ def read_capture(path: Path) -> Capture:
         capture = read_transforms(path / "transforms.json")
         return capture if model is None else replace(capture, notes=(TwoLayouts(path), *capture.notes))
     if model is not None:
-        return read_colmap(path, model)
+        return replace(read_colmap(path, model), scale=read_scale(path))
     places = ", ".join("the folder itself" if place == "." else place for place in PLACES)
     looked = f"{TRAIN_FILE}, transforms.json, and cameras and images (.bin or .txt) in {places}"
     folders = [folder for folder in (path, *(path / name for name in PHOTO_FOLDERS)) if is_folder(folder)]
@@ -226,10 +246,18 @@ def _spelled(nbytes: int) -> str:
 
 def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
     """Report changes of the intrinsics."""
-    notes, distorted = [], [frame for frame in frames if frame.lens.distorts]
+    faces = [frame for frame in frames if isinstance(frame.lens, FaceLens)]
+    notes = [f"{len(faces)} of {len(frames)} views are faces of panoramas, cut on loading"] if faces else []
+    distorted = [frame for frame in frames if frame.lens.distorts and not isinstance(frame.lens, FaceLens)]
     if distorted:
         notes.append(
             f"{len(distorted)} of {len(frames)} photos have lens distortion and are undistorted on loading"
+        )
+    if wide := [frame.name for frame in distorted if frame.lens.cropped]:
+        seen, shown = (round(2 * math.degrees(angle)) for angle in (MAX_ANGLE, CROPPED_ANGLE))
+        notes.append(
+            f"{len(wide)} of {len(frames)} photos see more than {seen} degrees and are cropped to {shown}, first "
+            f"{wide[0]}"
         )
     if others := [frame for frame, is_it in zip(frames, rescaled, strict=True) if is_it]:
         notes.append(
@@ -282,14 +310,36 @@ def _split(
         if test_every is None:
             notes.append("the capture has only one photo: it is used for training, and none is held out")
     else:
-        every = test_every or TEST_EVERY
-        train = tuple(view for i, view in enumerate(views) if i % every)
-        test = tuple(view for i, view in enumerate(views) if i % every == 0)
+        every, places = test_every or TEST_EVERY, _places([view.camera for view in views])
+        if max(places) == 0:  # all views have one centre: a panorama is all there is
+            places = list(range(len(views)))
+        elif (count := max(places) + 1) < len(views):
+            notes.append(
+                f"{len(views)} photos have {count} centres, like the faces of panoramas: those with one centre are "
+                "held out together"
+            )
+        train = tuple(view for i, view in zip(places, views, strict=True) if i % every)
+        test = tuple(view for i, view in zip(places, views, strict=True) if i % every == 0)
     if not train:
         raise DatasetError(
             f"{path}: the split leaves none of its {len(views)} photos for training; set test_every to 0"
         )
     return train, test
+
+
+def _places(cameras: Sequence[Camera]) -> list[int]:
+    """Number the centres of cameras in the order in which they occur; centres within `ONE_PLACE` are one.
+
+    Poses that were estimated from photos one by one never agree so well: the centres of a panorama's faces do.
+    """
+    eyes = np.stack([camera.eye for camera in cameras])
+    near = ONE_PLACE * float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
+    tree, number = cKDTree(eyes), list[int]()
+    found = dict[int, int]()
+    for i, others in enumerate(tree.query_ball_point(eyes, near)):
+        first = min(others)
+        number.append(found.setdefault(first, len(found)) if first == i else number[first])
+    return number
 
 
 def _random_start(

@@ -17,6 +17,7 @@ from PIL import ExifTags, Image
 from gsplat_edu.data.colors import conversion_of, to_srgb
 from gsplat_edu.data.deep_pixels import DEEP_BYTES_PER_PIXEL, is_deep, rounded_image
 from gsplat_edu.data.lens import Lens, bands, undistortion
+from gsplat_edu.data.panorama import FaceLens, cut_face
 from gsplat_edu.data.watch import FileWatch
 from gsplat_edu.errors import DatasetError, NotEnoughMemoryError, SplatError
 from gsplat_edu.image_files import (
@@ -238,6 +239,8 @@ def load_photo(source: PhotoFile) -> Photo:
             raise DatasetError(f"{path}: its size changed while it was in use; load the capture again")
     if alpha is not None and source.background is not None:
         image, alpha = np.asarray(Photo(image, alpha).over(source.background)), None
+    if isinstance(source.lens, FaceLens):
+        return Photo(*cut_face(image, alpha, mask, source.lens.R, source.W))
     if not source.lens.distorts and (source.W, source.H) == (source.lens.W, source.lens.H):
         return Photo(image, alpha, mask)
     if alpha is not None:

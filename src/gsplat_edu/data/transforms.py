@@ -30,7 +30,7 @@ from gsplat_edu.data.capture import (
 )
 from gsplat_edu.data.colmap import find_model, points_file, read_points
 from gsplat_edu.data.images import image_size
-from gsplat_edu.data.lens import Lens, lens_of
+from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.errors import DatasetError
@@ -235,7 +235,7 @@ def _lens(where: str, values: Mapping[str, Any], image: Path) -> Lens:
         if key in values:
             named[key] = _number(where, values, key)
     try:
-        return lens_of(named, W, H, fisheye=model == FISHEYE_MODEL)
+        return lens_of(named, W, H, FISHEYE if model == FISHEYE_MODEL else PINHOLE_LIKE)
     except DatasetError as error:
         raise DatasetError(f"{where}: {error}") from None
 

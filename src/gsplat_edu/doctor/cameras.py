@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 
+from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
@@ -122,7 +123,7 @@ def _oddities(shot: Shot, zoomed: bool) -> list[tuple[str, str]]:
         what = f"the principal point ({cx}, {cy}) px is far from the image centre, ({middle})"
         found.append(("off centre", what))
     field = 2.0 * math.atan(0.5 * max(lens.W / lens.fx, lens.H / lens.fy))
-    if not (NARROWEST < field < WIDEST or lens.fisheye):
+    if not (NARROWEST < field < WIDEST or lens.wide):
         found.append(("field", f"a field of view of {math.degrees(field):.0f} degrees is implausible"))
     if zoomed:
         found.append(("zoom", f"a focal length of {fx} px differs from that of the other photos"))
@@ -145,7 +146,11 @@ def _zoomed(shots: Sequence[Shot]) -> set[str]:
 
 def check_sizes(survey: Survey) -> list[Finding]:
     """Find photos whose size differs from their camera's: correct for resized photos, wrong for cropped ones."""
-    other = [shot for shot in survey.shots if shot.size != (shot.lens.W, shot.lens.H)]
+    other = [
+        shot
+        for shot in survey.shots
+        if shot.size != (shot.lens.W, shot.lens.H) and not isinstance(shot.lens, FaceLens)
+    ]
     if not other:
         return []
     (w, h), lens = other[0].size, other[0].lens

@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from gsplat_edu.data.images import PhotoFile, decode, decode_mask
 from gsplat_edu.data.lens import undistortion
+from gsplat_edu.data.panorama import FaceLens, cut_face, face_side
 from gsplat_edu.views import Photo
 
 WORK_SIDE = 1024
@@ -72,9 +73,11 @@ def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
         decode_mask(source.mask)
     decoded, transparent = _decoded(source, WORK_SIDE if sharpness else 2 * THUMBNAIL_SIDE)
     pixels = _shrunk(decoded, WORK_SIDE)
+    if face := isinstance(lens, FaceLens):
+        pixels = cut_face(pixels, None, None, lens.R, face_side(pixels.shape[1]))[0]
     small = _shrunk(pixels, THUMBNAIL_SIDE)
     h, w = small.shape[:2]
-    if lens.distorts and min(h, w) > 1:
+    if lens.distorts and not face and min(h, w) > 1:
         columns, rows, _ = undistortion(lens.scaled(w, h), slice(0, h))
         small = cv2.remap(small, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     detail = detail_of(pixels) if sharpness else np.zeros(len(ANGLES))

@@ -75,7 +75,7 @@ class Similarity:
         return Camera.posed(camera.R @ self.R.T, eye, as_camera("camera", camera).intrinsics)
 
     def scene(self, scene: Scene) -> Scene:
-        """Transform a scene: means, rotations, scales, SH coefficients and the up direction.
+        """Transform a scene: means, rotations, scales, SH coefficients and the up direction; scaling drops its unit.
 
         Returns:
             The scene; its Gaussians are computed in float64 and rounded to their dtype.
@@ -103,7 +103,10 @@ class Similarity:
         )
         x, y, z = self.R @ np.asarray(scene.up) if scene.up is not None else (0.0, 0.0, 0.0)
         return replace(
-            scene, gaussians=moved, up=None if scene.up is None else (float(x), float(y), float(z))
+            scene,
+            gaussians=moved,
+            up=None if scene.up is None else (float(x), float(y), float(z)),
+            unit=scene.unit if self.s == 1.0 else None,
         )
 
 
@@ -172,8 +175,12 @@ def joined(scenes: Sequence[Scene]) -> Scene:
         rest = torch.nn.functional.pad(scene.gaussians.sh_rest, (0, 0, 0, missing))
         parts.append(replace(scene.gaussians, sh_rest=rest))
     ups = {scene.up for scene in scenes}
+    units = {scene.unit for scene in scenes}
     return Scene(
-        Gaussians.concatenated(parts), said.pop() if said else None, ups.pop() if len(ups) == 1 else None
+        Gaussians.concatenated(parts),
+        said.pop() if said else None,
+        ups.pop() if len(ups) == 1 else None,
+        units.pop() if len(units) == 1 else None,
     )
 
 

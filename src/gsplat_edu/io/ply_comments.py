@@ -3,6 +3,7 @@
     comment SplatRenderMode: mip
     comment antialiased 1
     comment gsplat_edu up 0.0 -1.0 0.0
+    comment gsplat_edu unit m
 
 Each line is written if its value is known. There is no standard spelling for antialiasing: Brush writes and reads the
 first line ("default" without antialiasing), Postshot writes the second, PlayCanvas' splat-transform reads both since
@@ -22,6 +23,9 @@ from gsplat_edu.io.scene import Scene
 OURS = "gsplat_edu"
 """First word of comments that are specific to this package."""
 
+UNITS = ("m", "cm", "mm")
+"""Units that a scene's coordinates may have."""
+
 RENDER_MODES = {"mip": True, "default": False}
 """Brush's render modes, and whether each uses antialiasing."""
 
@@ -37,13 +41,15 @@ def comments(scene: Scene) -> list[str]:
         lines += [f"comment SplatRenderMode: {mode}", f"comment antialiased {int(scene.antialiased)}"]
     if scene.up is not None:
         lines.append(f"comment {OURS} up {' '.join(repr(float(x)) for x in scene.up)}")
+    if scene.unit is not None:
+        lines.append(f"comment {OURS} unit {scene.unit}")
     return lines
 
 
 def read_comments(
     path: Path, said: tuple[tuple[str, ...], ...]
-) -> tuple[bool | None, tuple[float, float, float] | None]:
-    """Parse the comments of a header: whether the scene is antialiased, and its up direction.
+) -> tuple[bool | None, tuple[float, float, float] | None, str | None]:
+    """Parse the comments of a header: whether the scene is antialiased, its up direction, and its unit.
 
     Args:
         path: The file, for messages.
@@ -52,7 +58,7 @@ def read_comments(
     Raises:
         SceneFormatError: one of our comments is malformed.
     """
-    antialiased, up = None, None
+    antialiased, up, unit = None, None, None
     for words in said:
         if found := ANTIALIASED.fullmatch(" ".join(words).lower()):
             mode, number = found.groups()
@@ -63,7 +69,9 @@ def read_comments(
                 raise SceneFormatError(
                     f"{path}: comment {' '.join(words)[:60]!r} is not a direction; correct or remove it"
                 )
-    return antialiased, up
+        elif words[:2] == (OURS, "unit") and len(words) == 3 and words[2] in UNITS:
+            unit = words[2]
+    return antialiased, up, unit
 
 
 def _direction(numbers: list[str]) -> tuple[float, float, float] | None:

@@ -18,8 +18,10 @@ class Scene:
         gaussians: N Gaussians, raw parameters; float32 if read from a file.
         antialiased: Whether they were trained for antialiased rendering; None if the file does not say.
         up: The scene's up direction, of length 1; None if unknown.
+        unit: What one unit of the coordinates is, "m", "cm" or "mm"; None if unknown.
     """
 
     gaussians: Gaussians
     antialiased: bool | None = None
     up: tuple[float, float, float] | None = None
+    unit: str | None = None

@@ -14,6 +14,7 @@ from gsplat_edu.evaluate.paths import common_up, orbit_of_scene, resized
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import SOG_META, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
+from gsplat_edu.io.ply_comments import UNITS
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder, render_settings
@@ -140,7 +141,10 @@ def _of_run(folder: RunFolder, path: Path) -> Source:
         known = sorted(folder.read_cameras((x, y, z)), key=lambda entry: entry[0])
         cameras = tuple((name, camera) for name, _, camera in known)
         held_out = frozenset(name for name, split, _ in known if split == "test")
-    scene = Scene(gaussians, settings.antialiased, scene_up([camera for _, camera in cameras]))
+    scale = config.get("scale") or {}
+    up = WORLD_UP if scale.get("level") is True else scene_up([camera for _, camera in cameras])
+    unit = scale.get("unit") if scale.get("unit") in UNITS else None
+    scene = Scene(gaussians, settings.antialiased, up, unit)
     return Source(path, scene, cameras, settings, (x, y, z), held_out)
 
 

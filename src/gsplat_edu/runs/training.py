@@ -190,6 +190,7 @@ class CaptureRun:
             folder.write_cameras(dataset.train, dataset.test, dataset.origin)
             folder.write_photos(photo_digests(dataset))
             facts = {"origin": dataset.origin.tolist(), "fingerprint": fingerprint(dataset)}
+            facts |= {} if dataset.scale is None else {"scale": dataset.scale.json()}
             folder.write_config(document(options) | facts | ({"start": digest} if digest else {}))
         return sorted_in_space(gaussians)
 

@@ -42,6 +42,10 @@ PER_PHOTO = 6 / 8
 coefficient) instead of six."""
 
 
+RIG = "PINHOLE"
+"""Camera model of the faces of panoramas."""
+
+
 @dataclass(frozen=True)
 class Attempt:
     """The settings of one attempt at mapping.
@@ -62,10 +66,24 @@ class Attempt:
 
     def __str__(self) -> str:
         """Describe the attempt."""
-        words = [f"{self.mapper} mapper"] + [self.model] * (self.model != "auto")
+        words = [f"{self.mapper} mapper"] + [self.model] * (self.model not in ("auto", RIG))
         words += ["a freer lens at first"] * self.free
         words += ["a camera per photo"] * self.per_photo + ["lower thresholds"] * self.loose
         return ", ".join(words)
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """The cameras that photos are mapped with.
+
+    Args:
+        shared: For each replaced camera, the number of its replacement: `shared_cameras`.
+        rig: For faces of panoramas, the rig's "rotations" and the names of the faces of all "panoramas", as for
+            `gsplat_edu.sfm.engine.database.with_rig`.
+    """
+
+    shared: dict[int, int]
+    rig: dict[str, Any] | None = None
 
 
 def attempts(mapper: str, model: str, photos: int, cameras: int, one_lens: bool) -> list[Attempt]:
@@ -88,6 +106,16 @@ def attempts(mapper: str, model: str, photos: int, cameras: int, one_lens: bool)
     if not one_lens and cameras < photos:
         ways.append(Attempt(steady, model, per_photo=True, loose=True))
     return ways
+
+
+def rig_attempts(mapper: str) -> list[Attempt]:
+    """List the attempts for panoramas, whose faces are pinholes with known intrinsics.
+
+    Args:
+        mapper: The mapper chosen by the user, or "auto".
+    """
+    order = ["incremental", "global"] if mapper == "auto" else [mapper]
+    return [*(Attempt(name, RIG) for name in order), Attempt(order[0], RIG, loose=True)]
 
 
 def shared_cameras(groups: Sequence[Mapping[str, Any]]) -> dict[int, int]:
@@ -129,7 +157,7 @@ def _scaled(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 def map_photos(
     folder: Path,
     ways: Sequence[Attempt],
-    shared: Mapping[int, int],
+    cameras: Cameras,
     total: int,
     connected: int,
     threads: int,
@@ -141,7 +169,7 @@ def map_photos(
     Args:
         folder: Folder with database.db and photos/; models/ is recreated.
         ways: The attempts, in order.
-        shared: For each replaced camera, the number of its replacement.
+        cameras: Their cameras.
         total: Number of photos.
         connected: Number of photos connected by matches.
         threads: Number of threads for COLMAP.
@@ -164,7 +192,7 @@ def map_photos(
         out.mkdir(parents=True)
         try:
             made = _mapped(
-                folder, out, way, shared, threads, lambda done: progress("mapping", min(done, total), total)
+                folder, out, way, cameras, threads, lambda done: progress("mapping", min(done, total), total)
             )
         except DatasetError as error:
             if number == len(ways) and not found:
@@ -234,7 +262,7 @@ def _mapped(
     folder: Path,
     out: Path,
     way: Attempt,
-    shared: Mapping[int, int],
+    cameras: Cameras,
     threads: int,
     progress: Callable[[int], None],
 ) -> list[dict[str, Any]]:
@@ -247,7 +275,7 @@ def _mapped(
         photos=str(folder / "photos"),
         out=str(out),
         attempt=asdict(way),
-        shared=dict(shared),
+        cameras=asdict(cameras),
         threads=threads,
         seed=COLMAP_SEED,
     )["models"]

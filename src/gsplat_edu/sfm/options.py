@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsplat_edu.sfm.scale_text import AUTO, check_scale
 from gsplat_edu.validation import one_of, whole_number
 
 MATCHERS = ("auto", "exhaustive", "sequential", "nearest")
 
 MAPPERS = ("auto", "incremental", "global")
+
+PANORAMA = ("auto", "yes", "no")
 
 CAMERA_MODELS = (
     "auto",
@@ -39,6 +42,9 @@ class SfmOptions:
         max_features: Most SIFT features per photo.
         max_image_size: Longest side for feature extraction, px. The capture keeps the photos' full size.
         threads: Threads of COLMAP; 0 uses all.
+        scale: "auto": scale and up from GPS in EXIF if the positions fit the cameras; "none"; or two points marked in
+            photos and their distance, `gsplat_edu.sfm.scale_text.marks_of`.
+        panorama: Whether the photos or frames are 360-degree panoramas; "auto": if their XMP says so.
 
     Raises:
         ArgumentError: a value is out of range.
@@ -53,6 +59,8 @@ class SfmOptions:
     max_features: int = 8192
     max_image_size: int = 1600
     threads: int = 0
+    panorama: str = "auto"
+    scale: str = AUTO
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -63,3 +71,5 @@ class SfmOptions:
         whole_number("max_features", self.max_features, 100)
         whole_number("max_image_size", self.max_image_size, 64)
         whole_number("threads", self.threads, 0)
+        check_scale(self.scale)
+        one_of("panorama", self.panorama, PANORAMA)

@@ -47,6 +47,12 @@ COUNTER = {0: UPRIGHT, 1: 8, 2: 3, 3: 6}
 COPY_QUALITY = 97
 """JPEG quality of the working copies."""
 
+JPEG_ENDINGS = (".jpg", ".jpeg")
+"""Endings of photos written as JPEG, because they were lossy before."""
+
+HEIC_ENDINGS = (".heic", ".heif", ".hif")
+"""Endings of photos that become .jpg, because they were lossy before; the others are written as PNG."""
+
 GRAY = (0.5, 0.5, 0.5)
 """Background of transparent photos in the working copies."""
 
@@ -68,6 +74,7 @@ class PhotoFacts:
         sensor: EXIF orientation that makes the sensor's picture of the decoded pixels: 2 for a mirrored photo, and for
             HEIC, which is decoded upright, the one that turns it back. Photos of one camera then share a lens.
         problem: `gsplat_edu.data.images.ImageHeader.problem`.
+        final: Whether the file is an upright pinhole image made here, which the capture takes as it is.
     """
 
     name: str
@@ -81,6 +88,7 @@ class PhotoFacts:
     mask: str = ""
     sensor: int = UPRIGHT
     problem: str = ""
+    final: bool = False
 
     def copy_size(self, longest: int) -> tuple[int, int]:
         """Return width and height of the working copy, px.
@@ -364,6 +372,17 @@ def _place(gps: dict[int, object]) -> tuple[float, float, float] | None:
     if not all(math.isfinite(angle) for angle in angles) or not any(angles):
         return None
     return angles[0], angles[1], height if math.isfinite(height) else 0.0
+
+
+def taken_at(path: Path) -> tuple[float, float, float] | None:
+    """Read latitude and longitude in degrees and height in m from a photo's EXIF; None if it has none."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about invalid EXIF, which the user cannot fix
+            with opened_image(path) as file:
+                return _place(file.getexif().get_ifd(ExifTags.IFD.GPSInfo))
+    except UNDECODABLE:
+        return None
 
 
 def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, remade: tuple[Path, int] | None) -> None:

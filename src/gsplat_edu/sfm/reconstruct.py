@@ -16,13 +16,23 @@ from typing import Any
 
 from gsplat_edu.data.images import UPRIGHT
 from gsplat_edu.data.notes import UnreadColors
+from gsplat_edu.data.scale import Scale
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap
-from gsplat_edu.sfm.mapping import attempts, map_photos, no_overlap, shared_cameras
+from gsplat_edu.sfm.mapping import Cameras, attempts, map_photos, no_overlap, rig_attempts, shared_cameras
 from gsplat_edu.sfm.masks import find_masks, unused_folders
 from gsplat_edu.sfm.options import SfmOptions as SfmOptions
+from gsplat_edu.sfm.panoramas import (
+    Panorama,
+    are_panoramas,
+    color_problems,
+    cut_panoramas,
+    face_facts,
+    face_groups,
+    rig_of,
+)
 from gsplat_edu.sfm.photos import (
     PhotoFacts,
     copy_photos,
@@ -32,6 +42,7 @@ from gsplat_edu.sfm.photos import (
     stored_mask,
 )
 from gsplat_edu.sfm.result import build_capture, note_published, publish, published
+from gsplat_edu.sfm.scale_text import AUTO
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
@@ -56,6 +67,9 @@ FEATURES, MAPPING = 2, 4
 """Versions of the methods. They are part of the stages' options, so results of an earlier version in a work folder are
 recomputed. Before 2, photos kept more features than `max_features`, and every pose counted. Before 3, photos of each
 size had their own focal length; before 4, this still held if every photo had its own size."""
+
+FACES = 1
+"""Version of the method that cuts panoramas."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
@@ -115,6 +129,9 @@ class _Run:
             note_published(self.folder, parts)  # before the stage that records them is discarded
         self.stages = Stages(self.folder / "stages.json", say)
         self.video = is_video(options.source)
+        self.panoramas: list[Panorama] | None = None
+        self.unit = 1
+        """Photos with one pose: a panorama's faces."""
         self.threads = options.threads or -1
 
     def run(self, files: list[Path]) -> Path:
@@ -125,6 +142,8 @@ class _Run:
             self._stage("frames", wanted, self._take_frames, [self.folder / "frames"])
             source = self.folder / "frames"
             files = photo_files(source)
+        if are_panoramas(files, options.panorama, self._say):
+            files = self._faces(files)
         self.source = source = files[0].parent
         masks = find_masks(files)
         wanted = {
@@ -134,8 +153,12 @@ class _Run:
         }
         copies = self.folder / "photos"
         facts = self._stage("photos", wanted, lambda: self._copy(files), [copies, mask_folder(copies)])
-        self.photos = [PhotoFacts(**photo | {"place": _tuple(photo["place"])}) for photo in facts["photos"]]
-        self.groups = _groups(self.photos, options.max_image_size)
+        self.photos = [PhotoFacts(**photo | {"place": _place(photo["place"])}) for photo in facts["photos"]]
+        if self.panoramas is None:
+            self.groups = _groups(self.photos, options.max_image_size)
+        else:
+            self.photos = face_facts(self.photos, self.panoramas)
+            self.groups = face_groups(self.photos, options.max_image_size)
         database = [self.folder / f"database.db{ending}" for ending in ("", "-wal", "-shm")]
         wanted = {
             "max_features": options.max_features,
@@ -149,7 +172,8 @@ class _Run:
         self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
         if not all((options.out / part).is_dir() for part in ("images", "sparse/0")):
             self.stages.forget("capture")
-        self._stage("capture", {}, self._finish, [])
+        wanted = {} if options.scale == AUTO else {"scale": options.scale}
+        self._stage("capture", wanted, self._finish, [])
         return options.out
 
     def _stage(
@@ -199,6 +223,32 @@ class _Run:
         )
         return {"summary": f"{len(written)} of {source.name}{same}"}
 
+    def _faces(self, files: Sequence[Path]) -> list[Path]:
+        """Cut panoramas; return the faces."""
+        folder, masks = self.folder / "faces", find_masks(files)
+        wanted = {
+            "panoramas": fingerprint(files, files[0].parent),
+            "masks": fingerprint(sorted(masks.values()), files[0].parent) if masks else "",
+            "method": FACES,
+        }
+        facts = self._stage("faces", wanted, lambda: self._cut(files, folder), [folder])
+        self.panoramas = [
+            Panorama(one["name"], tuple(one["faces"]), _place(one["place"])) for one in facts["panoramas"]
+        ]
+        self.unit = len(self.panoramas[0].faces)
+        return [folder / name for panorama in self.panoramas for name in panorama.faces]
+
+    def _cut(self, files: Sequence[Path], folder: Path) -> dict[str, Any]:
+        found, side, unreadable = cut_panoramas(files, folder, None, self._progress)
+        if unreadable:
+            self._say(f"left out, cannot be decoded: {listed(unreadable)}")
+        if len(found) < FEWEST:
+            raise DatasetError(too_few(files[0].parent, len(found), unreadable))
+        for note in UnreadColors.of(color_problems(files)):
+            self._say(str(note))
+        summary = f"{len(found)} panoramas cut into {len(found[0].faces)} faces each of {side}x{side} px"
+        return {"summary": summary, "panoramas": [asdict(one) for one in found]}
+
     def _copy(self, files: Sequence[Path]) -> dict[str, Any]:
         longest = self.options.max_image_size
         photos, unreadable = copy_photos(
@@ -216,6 +266,8 @@ class _Run:
         known = sum(photo.focal is not None for photo in photos)
         kinds = "one camera" if lenses == 1 else f"{lenses} kinds of camera or zoom"
         summary = f"{len(photos)} from {kinds}; {known} with a focal length in EXIF"
+        if self.panoramas is not None:
+            summary = f"{len(photos)} faces of {len(self.panoramas)} panoramas"
         if masked := sum(bool(photo.mask) for photo in photos):
             summary += "; all have a mask" if masked == len(photos) else f"; {masked} of them have a mask"
         self._note_masks(files, photos)
@@ -268,29 +320,50 @@ class _Run:
             kind = "exhaustive" if count <= EXHAUSTIVE and not self.video else "nearest"
         chosen = self._pairs(kind, 1)
         verified = self._match_pairs(chosen)
-        part = pairs.largest_part(count, verified)
+        part = self._connected(verified)
         if len(part) < count and self.options.matcher == "auto" and kind == "nearest":
             # Neighbours in the sequence and similar photos did not connect all photos: try more pairs.
-            chosen |= pairs.all_pairs(count) if count <= EXHAUSTIVE else self._pairs(kind, 3)
+            chosen |= self._pairs("exhaustive" if count <= EXHAUSTIVE else kind, 3)
             verified = self._match_pairs(chosen)
-            part = pairs.largest_part(count, verified)
+            part = self._connected(verified)
         if not verified:
             raise DatasetError(no_overlap(f"{self.options.source}: of {len(chosen):,} pairs, none match"))
         summary = f"{len(verified):,} of {len(chosen):,} pairs match"
         if len(part) < count:
-            summary += f"; {len(part)} of {count} photos are connected"
+            summary += f"; {len(part) // self.unit} of {count // self.unit} {self._kind} are connected"
         return {"summary": summary, "connected": len(part)}
 
     def _forget_matches(self) -> None:
         """Delete the matches, because those of pairs chosen by another matcher would be mapped too."""
         forget_matches(self.folder / "database.db")
 
+    @property
+    def _kind(self) -> str:
+        return "photos" if self.panoramas is None else "panoramas"
+
+    def _connected(self, verified: Sequence[pairs.Pair]) -> list[int]:
+        """Return the photos of the largest connected part; the faces of a panorama are connected."""
+        unit = self.unit
+        units = [(a // unit, b // unit) for a, b in verified]
+        part = pairs.largest_part(len(self.photos) // unit, units)
+        return [unit * one + face for one in part for face in range(unit)]
+
     def _pairs(self, kind: str, farther: int) -> set[pairs.Pair]:
+        """Choose pairs; never two faces of one panorama, which show no depth."""
+        chosen = self._candidates(kind, farther)
+        return chosen if self.unit == 1 else {(a, b) for a, b in chosen if a // self.unit != b // self.unit}
+
+    def _candidates(self, kind: str, farther: int) -> set[pairs.Pair]:
         count, origin = len(self.photos), "video" if self.video else "photos"
         if kind == "exhaustive":
             return pairs.all_pairs(count)
-        overlap = OVERLAP["video"] if kind == "sequential" else OVERLAP[origin]
-        chosen = pairs.sequential_pairs(count, overlap)
+        overlap, unit = OVERLAP["video"] if kind == "sequential" else OVERLAP[origin], range(self.unit)
+        chosen = {
+            (self.unit * a + i, self.unit * b + j)
+            for a, b in pairs.sequential_pairs(count // self.unit, overlap)
+            for i in unit
+            for j in unit
+        }
         if kind == "sequential":
             return chosen
         described = pairs.photo_descriptors(
@@ -317,14 +390,18 @@ class _Run:
 
     def _map(self, connected: int) -> dict[str, Any]:
         options, total = self.options, len(self.photos)
-        shared = shared_cameras(self.groups)
-        cameras = len(self.groups) - len(shared)
-        ways = attempts(options.mapper, options.camera_model, total, cameras, self.video)
+        if self.panoramas is None:
+            shared = shared_cameras(self.groups)
+            cameras = Cameras(shared)
+            used = len(self.groups) - len(shared)
+            ways = attempts(options.mapper, options.camera_model, total, used, self.video)
+        else:
+            cameras, ways = Cameras({}, rig_of(self.photos)), rig_attempts(options.mapper)
         model = map_photos(
-            self.folder, ways, shared, total, connected, self.threads, self._say, self._progress
+            self.folder, ways, cameras, total, connected, self.threads, self._say, self._progress
         )
-        count = len(model["names"])
-        summary = f"{count} of {total} photos have a pose ({model['way']})"
+        count, total = len(model["names"]) // self.unit, total // self.unit
+        summary = f"{count} of {total} {self._kind} have a pose ({model['way']})"
         unclear = len(set(model["unclear"]) - set(model["names"]))
         if left := total - count - unclear:
             others = f"{left} more" if unclear else f"the other {left}" if left > 1 else "the other one"
@@ -334,8 +411,16 @@ class _Run:
         return model | {"summary": summary}
 
     def _finish(self) -> dict[str, Any]:
-        facts = build_capture(self.model, self.photos, self.source, self.folder, self._progress)
+        facts = build_capture(
+            self.model, self.photos, self.source, self.folder, self._progress, self.options.scale, self._say
+        )
         publish(self.folder, self.options.out)
+        if scale := Scale.of_json(facts["scale"]):
+            self._say(f"scale: {scale}")
+        if self.panoramas is not None:
+            names = {face: one.name for one in self.panoramas for face in one.faces}
+            for kind in ("left_out", "doubtful"):
+                facts[kind] = list(dict.fromkeys(names[face] for face in facts[kind]))
         if facts["left_out"]:
             self._say(f"left out, no pose was found: {listed(facts['left_out'])}")
         if facts["unclear"]:
@@ -382,5 +467,5 @@ def _groups(photos: Sequence[PhotoFacts], longest: int) -> list[dict[str, Any]]:
     return list(groups.values())
 
 
-def _tuple(value: list[float] | None) -> tuple[float, ...] | None:
-    return None if value is None else tuple(value)
+def _place(value: Sequence[float] | None) -> tuple[float, float, float] | None:
+    return None if value is None else (value[0], value[1], value[2])

@@ -19,25 +19,22 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.colmap import read_cameras, read_images, read_points
 from gsplat_edu.data.images import AT_ONCE, PhotoFile, load_photo
 from gsplat_edu.data.lens import Lens
+from gsplat_edu.data.scale import SCALE_FILE, write_scale
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.gaussian_math import quat_to_R
 from gsplat_edu.intrinsics import Intrinsics
 from gsplat_edu.reading import parse_json, read_text
-from gsplat_edu.sfm.align import upright
 from gsplat_edu.sfm.colmap import call
-from gsplat_edu.sfm.photos import PhotoFacts
+from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts
+from gsplat_edu.sfm.scale import Sight
+from gsplat_edu.sfm.scale import placed as placed_world
+from gsplat_edu.sfm.scale_text import AUTO
 
 QUALITY = 95
 """JPEG quality of undistorted photos."""
 
-JPEGS = (".jpg", ".jpeg")
-"""Endings of photos written as JPEG, because they were lossy before."""
-
-HEICS = (".heic", ".heif", ".hif")
-"""Endings of photos that become .jpg, because they were lossy before; the others are written as PNG."""
-
-PARTS = ("images", "masks", "sparse")
+PARTS = ("images", "masks", SCALE_FILE, "sparse")
 """Parts of a capture. The model comes last: its presence means that the capture is complete."""
 
 PUBLISHED = "published.json"
@@ -76,8 +73,10 @@ def build_capture(
     source: Path,
     folder: Path,
     progress: Callable[[str, int, int], None],
+    scale: str = AUTO,
+    say: Callable[[str], None] = lambda sentence: None,
 ) -> dict[str, Any]:
-    """Write images/, masks/ (if a photo has a mask) and sparse/0 into folder/result.
+    """Write images/, masks/ (if a photo has a mask), scale.json (if it is known) and sparse/0 into folder/result.
 
     Args:
         model: The result of `gsplat_edu.sfm.mapping.map_photos`.
@@ -85,34 +84,29 @@ def build_capture(
         source: Their folder.
         folder: Work folder; result/ in it is recreated.
         progress: Called with the number of undistorted photos.
+        scale: As for `gsplat_edu.sfm.scale.placed`.
+        say: As for `gsplat_edu.sfm.scale.placed`.
 
     Returns:
         "points", their number; "error" in px of the undistorted photos; "left_out", the names of photos without a pose;
         "unclear", those of another size whose focal length is ambiguous; and "doubtful", the others whose pose did not
-        count.
+        count. "scale" is the scale as JSON, or None.
 
     Raises:
+        ArgumentError: a mark of the scale cannot be used.
         DatasetError: a photo can no longer be decoded, or COLMAP failed.
     """
     result = folder / "result"
     shutil.rmtree(result, ignore_errors=True)
     found, placed = folder / model["folder"], set(model["names"])
-    chosen = [photo for photo in photos if photo.copy in placed]
-    poses = {pose.name: pose for pose in read_images(found / "images.bin")}
-    lenses = read_cameras(found / "cameras.bin")
-    entries, cameras = list[Undistorted](), list[Camera]()
-    for photo, name in zip(chosen, output_names(chosen), strict=True):
-        pose = poses[photo.copy]
-        lens = lenses[pose.camera].scaled(photo.W, photo.H)
-        pinhole = lens.undistorted().turned(photo.turns)
-        entries.append(Undistorted(photo, name, lens, pinhole))
-        R, turn = quat_to_R(pose.quat), np.linalg.matrix_power(QUARTER, photo.turns)
-        cameras.append(Camera.posed(turn @ R, -R.T @ pose.shift, pinhole))
+    entries, cameras, sights = _views(found, [photo for photo in photos if photo.copy in placed])
     cloud = read_points(found)
     if cloud is None:
         raise DatasetError(f"{found}: contains no points; the photos show too little in common")
+    move, known = placed_world(cameras, cloud.points, sights, scale, say)
     _write_photos(entries, source, result, progress)
-    move = upright(cameras, cloud.points)
+    if known is not None:
+        write_scale(result, known)
     facts = call(
         "finish",
         folder / "log.txt",
@@ -127,9 +121,28 @@ def build_capture(
     doubtful = set(model["doubtful"]) - placed - unclear
     others = {photo.copy for photo in photos} - placed - unclear - doubtful
     kinds = {"left_out": others, "unclear": unclear, "doubtful": doubtful}
-    return facts | {
-        kind: [photo.name for photo in photos if photo.copy in copies] for kind, copies in kinds.items()
-    }
+    return (
+        facts
+        | {"scale": None if known is None else known.json()}
+        | {kind: [photo.name for photo in photos if photo.copy in copies] for kind, copies in kinds.items()}
+    )
+
+
+def _views(model: Path, photos: Sequence[PhotoFacts]) -> tuple[list[Undistorted], list[Camera], list[Sight]]:
+    """Return the photos of the capture, their cameras in the model's world, and the photos before undistortion."""
+    poses = {pose.name: pose for pose in read_images(model / "images.bin")}
+    lenses = read_cameras(model / "cameras.bin")
+    entries, cameras, sights = list[Undistorted](), list[Camera](), list[Sight]()
+    for photo, name in zip(photos, output_names(photos), strict=True):
+        pose = poses[photo.copy]
+        lens = lenses[pose.camera].scaled(photo.W, photo.H)
+        pinhole = lens.undistorted().turned(photo.turns)
+        entries.append(Undistorted(photo, name, lens, pinhole))
+        R, turn = quat_to_R(pose.quat), np.linalg.matrix_power(QUARTER, photo.turns)
+        eye = -R.T @ np.array(pose.shift)
+        cameras.append(Camera.posed(turn @ R, eye, pinhole))
+        sights.append(Sight(photo, lens, R, eye))
+    return entries, cameras, sights
 
 
 def published(folder: Path) -> tuple[str, ...]:
@@ -219,7 +232,7 @@ def output_names(photos: Sequence[PhotoFacts]) -> list[str]:
         kind = path.suffix.lower()
         base, ending = (
             path.with_suffix(""),
-            path.suffix if kind in JPEGS else ".jpg" if kind in HEICS else ".png",
+            path.suffix if kind in JPEG_ENDINGS else ".jpg" if kind in HEIC_ENDINGS else ".png",
         )
         name, number = f"{base}{ending}", 2
         while name.lower() in taken:  # some file systems ignore case
@@ -245,7 +258,15 @@ def _write_photos(
 
 
 def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
-    lens = entry.lens
+    lens, target = entry.lens, result / "images" / entry.name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if entry.photo.final:
+        shutil.copyfile(source / entry.photo.name, target)
+        if entry.photo.mask:
+            mask = result / "masks" / f"{entry.name}.png"
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(entry.photo.mask, mask)
+        return
     counts = Path(entry.photo.mask) if entry.photo.mask else None
     photo = load_photo(
         PhotoFile(source / entry.photo.name, counts, lens, lens.W, lens.H, None, entry.photo.sensor)
@@ -253,9 +274,7 @@ def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
     pixels = np.asarray(photo.image)
     if photo.alpha is not None:
         pixels = np.concatenate([pixels, photo.alpha[..., None]], axis=2)
-    target = result / "images" / entry.name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    jpeg = target.suffix.lower() in JPEGS and pixels.shape[2] == 3
+    jpeg = target.suffix.lower() in JPEG_ENDINGS and pixels.shape[2] == 3
     options: dict[str, Any] = {"quality": QUALITY, "subsampling": 0} if jpeg else {"compress_level": 3}
     upright_pixels = np.ascontiguousarray(np.rot90(pixels, -entry.photo.turns))
     Image.fromarray(upright_pixels).save(target, format="JPEG" if jpeg else "PNG", **options)

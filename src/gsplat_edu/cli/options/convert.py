@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.cli.arguments import add_backend, numbers_text, whole_number_text
 from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.sfm.scale_text import POINTS
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
 
@@ -51,6 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="KIND=VALUE",
         help=f"transform the scene after --crop: {MOVES}; may be repeated and is applied in order",
+    )
+    parser.add_argument(
+        "--scale",
+        metavar='"A B 1.20m"',
+        help="two points of the scene, after --transform, and their distance in m, cm or mm, which becomes the unit:"
+        f" {POINTS}",
     )
     parser.add_argument(
         "--path",

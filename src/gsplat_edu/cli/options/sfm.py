@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from gsplat_edu.cli.arguments import whole_number_text
-from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, SfmOptions
+from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA, SfmOptions
+from gsplat_edu.sfm.scale_text import AUTO, MARKS
 
 EXAMPLE = "example: gsplat-edu sfm holiday.mp4 captures/holiday --frames 200"
 
@@ -49,11 +50,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "lens model (auto refines as many parameters as held-out photos support)",
         CAMERA_MODELS,
     )
+    add_panorama(parser)
+    add_scale(parser)
     number("--max-features", "maximum number of features per photo", SfmOptions.max_features)
     number(
         "--max-image-size", "longest side of the photos for feature detection, px", SfmOptions.max_image_size
     )
     number("--threads", "threads of COLMAP; 0 for all", SfmOptions.threads)
+
+
+def add_panorama(group: argparse._ActionsContainer) -> None:
+    """Add the option for 360-degree photos, which `train` has as well."""
+    group.add_argument(
+        "--panorama",
+        metavar="NAME",
+        default="auto",
+        help="whether the photos or frames are 360-degree panoramas, to be cut into pinhole images:"
+        f" {', '.join(PANORAMA)} (default: auto, if their XMP says so)",
+    )
+
+
+def add_scale(group: argparse._ActionsContainer) -> None:
+    """Add the option for the scale of the coordinates, which `train` has as well."""
+    group.add_argument(
+        "--scale",
+        metavar='"A B 1.20m"',
+        default=AUTO,
+        help="two points, each marked in two photos or more, and their distance in m, cm or mm, which becomes the unit:"
+        f" {MARKS}, in pixels of the upright photos; auto takes scale and up from GPS if the photos' positions fit;"
+        " none leaves the scale arbitrary (default: auto)",
+    )
 
 
 def options_from(arguments: argparse.Namespace) -> SfmOptions:
@@ -72,4 +98,6 @@ def options_from(arguments: argparse.Namespace) -> SfmOptions:
         arguments.max_features,
         arguments.max_image_size,
         arguments.threads,
+        arguments.panorama,
+        arguments.scale,
     )

@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
+from gsplat_edu.cli.options.sfm import add_panorama, add_scale
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.sfm.options import PANORAMA
+from gsplat_edu.sfm.scale_text import check_scale
 from gsplat_edu.train.config import (
     APPEARANCES,
     DEFAULT_QUALITY,
@@ -88,7 +91,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_number(run, "--seed", "seed of every random draw (default: 0)", 0)
     add_backend(run)
     _add_length(parser.add_argument_group("length and limits"))
-    _add_photos(parser.add_argument_group("photos"))
+    photos = parser.add_argument_group("photos")
+    _add_photos(photos)
+    add_panorama(photos)
+    add_scale(photos)
     _add_results(parser.add_argument_group("results"))
     _add_view(parser.add_argument_group("live view"))
     group = parser.add_argument_group(
@@ -271,6 +277,8 @@ def check(arguments: argparse.Namespace) -> None:
         DatasetError: there is nothing under DATA.
     """
     _options(arguments, arguments.backend)
+    one_of("--panorama", arguments.panorama, PANORAMA)
+    check_scale(arguments.scale)
     if not arguments.data.exists():
         raise DatasetError(
             f"{arguments.data}: does not exist; give the folder of a capture, of photos, or a video"

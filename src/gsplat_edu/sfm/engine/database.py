@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -74,6 +74,52 @@ def with_cameras(source: str, target: str, model: str, per_photo: bool, shared: 
         for pair, geometry in zip(*old.read_two_view_geometries(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair)
             _scale(geometry, scales[first], scales[second])
+            new.write_two_view_geometry(first, second, geometry)
+            new.write_matches(first, second, old.read_matches(first, second))
+    return target
+
+
+def with_rig(source: str, target: str, rotations: Sequence[np.ndarray], panoramas: list[list[str]]) -> str:
+    """Copy a database without descriptors, with the faces of each panorama as one frame of a rig.
+
+    Camera k of the rig took the faces k. Its intrinsics are those that the database has for these photos.
+
+    Args:
+        source: The database, in which the faces with one number share a camera, the first one camera 1.
+        target: The copy.
+        rotations: For each face, the rotation from the panorama's axes to the face's.
+        panoramas: For each panorama, the names of its faces.
+
+    Returns:
+        The path of the copy.
+    """
+    with opened(source) as old, opened(target) as new, pycolmap.DatabaseTransaction(new):
+        images = {image.name: image for image in old.read_all_images()}
+        cameras = [old.read_camera(images[name].camera_id) for name in panoramas[0]]
+        rig = pycolmap.Rig(rig_id=1)
+        for number, (camera, R) in enumerate(zip(cameras, rotations, strict=True)):
+            pinhole = pycolmap.Camera.create_from_model_name(
+                camera.camera_id, "PINHOLE", camera.mean_focal_length(), camera.width, camera.height
+            )
+            pinhole.has_prior_focal_length = True
+            new.write_camera(pinhole, use_camera_id=True)
+            if number:
+                turn = pycolmap.Rigid3d(pycolmap.Rotation3d(R @ rotations[0].T), np.zeros(3))
+                rig.add_sensor(pinhole.sensor_id, turn)
+            else:
+                rig.add_ref_sensor(pinhole.sensor_id)
+        new.write_rig(rig, use_rig_id=True)
+        for number, names in enumerate(panoramas, 1):
+            frame = pycolmap.Frame(frame_id=number, rig_id=1)
+            for name in names:
+                image = images[name]
+                written = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
+                new.write_image(written, use_image_id=True)
+                frame.add_data_id(written.data_id)
+                new.write_keypoints(image.image_id, old.read_keypoints(image.image_id))
+            new.write_frame(frame, use_frame_id=True)
+        for pair, geometry in zip(*old.read_two_view_geometries(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair)
             new.write_two_view_geometry(first, second, geometry)
             new.write_matches(first, second, old.read_matches(first, second))
     return target

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from .database import add_camera, add_photo, opened, with_cameras
+from .database import add_camera, add_photo, opened, with_cameras, with_rig
 from .judge import agreement, scattered, steady_points
 from .kin import placed_anew
 from .lenses import Kin, refined, simplified
@@ -140,7 +140,7 @@ def mapping(
     photos: str,
     out: str,
     attempt: dict[str, Any],
-    shared: dict[str, int],
+    cameras: dict[str, Any],
     threads: int,
     seed: int,
 ) -> dict[str, Any]:
@@ -154,7 +154,9 @@ def mapping(
         attempt: "mapper": "incremental" or "global"; "model": the camera model, or "auto" to choose it by
             cross-validation; "free": map with `FREE_LENS` before that choice; "per_photo": give every photo its own
             camera; "loose": use lower thresholds.
-        shared: For each replaced camera, the number of its replacement, which has the same aspect ratio.
+        cameras: "shared": for each replaced camera, the number of its replacement, which has the same aspect ratio.
+            "rig": for faces of panoramas, "rotations" and "panoramas" as for `with_rig`, else None; their intrinsics
+            stay as they are.
         threads: Number of threads, -1 for all.
         seed: Seed of all random draws.
 
@@ -167,9 +169,13 @@ def mapping(
     """
     pycolmap.set_random_seed(seed)
     lens = FREE_LENS if attempt["free"] else FIRST_LENS if attempt["model"] == "auto" else attempt["model"]
-    by_number = {int(camera): leader for camera, leader in shared.items()}
-    mapped = with_cameras(database, f"{out}/database.db", lens, attempt["per_photo"], by_number)
-    options = Options(bool(attempt["loose"]), threads, seed)
+    by_number = {int(camera): leader for camera, leader in cameras["shared"].items()}
+    rig, copy = cameras["rig"], f"{out}/database.db"
+    if rig is None:
+        mapped = with_cameras(database, copy, lens, attempt["per_photo"], by_number)
+    else:
+        mapped = with_rig(database, copy, [np.array(R) for R in rig["rotations"]], rig["panoramas"])
+    options = Options(bool(attempt["loose"]), threads, seed, known=rig is not None)
     if attempt["mapper"] == "global":
         found = all_at_once(mapped, photos, out, options)
     else:
@@ -197,6 +203,9 @@ def _judged(
     model = repaired(mapped_model, database, photos, folder, options)
     if model.num_reg_images() < 2 or not model.num_points3D():
         return None
+    if options.known:
+        lenses = dict.fromkeys(model.cameras, f"a rig of {len(model.cameras)} faces")
+        return _written(model, database, folder, (placed, unclear, lenses))
     if attempt["free"]:
         simplified(model, FIRST_LENS, options.threads)
     if not per_photo:
@@ -206,6 +215,24 @@ def _judged(
     without_doubtful(model, database)
     if not model.num_reg_images() or (per_photo and scattered(model)):
         return None
+    return _written(model, database, folder, (placed, unclear, lenses))
+
+
+def _written(
+    model: pycolmap.Reconstruction,
+    database: str,
+    folder: Path,
+    known: tuple[list[str], list[str], dict[int, str]],
+) -> dict[str, Any]:
+    """Write a model, and return its facts.
+
+    Args:
+        model: The model.
+        database: Database with the matches.
+        folder: Its folder.
+        known: The photos that the mapper placed, those of ambiguous focal length, and the lens of each camera.
+    """
+    placed, unclear, lenses = known
     model.write_binary(folder)
     return {
         "folder": folder.name,

@@ -49,17 +49,32 @@ class Agreement(NamedTuple):
         """Fraction of all matches that agree."""
         return sum(self.agree.values()) / max(1, sum(self.total.values()))
 
-    @property
-    def contradictory(self) -> set[int]:
-        """Photos with too few matches that fit their poses."""
-        return {image for image in self.total if self.agree[image] < CONTRADICTED * self.total[image]}
+    def contradictory(self, model: pycolmap.Reconstruction) -> set[int]:
+        """Return the photos with too few matches that fit their poses. Photos of one frame have one pose."""
+        found = set[int]()
+        for images in frames(model).values():
+            agree, total = (
+                sum(count.get(image, 0) for image in images) for count in (self.agree, self.total)
+            )
+            if agree < CONTRADICTED * total:
+                found |= set(images)
+        return found
+
+
+def frames(model: pycolmap.Reconstruction) -> dict[int, list[int]]:
+    """Return the registered photos of each frame, sorted: one, or the faces of a panorama."""
+    found = dict[int, list[int]]()
+    for image in sorted(model.reg_image_ids()):
+        found.setdefault(model.image(image).frame_id, []).append(image)
+    return found
 
 
 def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
     """Find the photos whose poses do not count.
 
-    A pose counts if the photo shares `SUPPORT` points, spread over the photo, with photos whose poses count; two such
-    photos have to see `STEADY` of them. The search starts with the two photos that share the most points.
+    Photos of one frame have one pose and count as one photo. A pose counts if the photo shares `SUPPORT` points, spread
+    over the photo, with photos whose poses count; two such photos have to see `STEADY` of them. The search starts with
+    the two photos that share the most points.
 
     Args:
         model: The model.
@@ -67,25 +82,31 @@ def unsupported(model: pycolmap.Reconstruction) -> dict[int, int]:
     Returns:
         For each of these photos, by number, how many points it shares with photos whose poses count.
     """
-    seen = {image: _observations(model, image) for image in sorted(model.reg_image_ids())}
+    photos = frames(model)
+    seen = {frame: _together(model, images) for frame, images in photos.items()}
+    longest = {frame: _longest(model, images[0]) for frame, images in photos.items()}
     size = 1 + max((int(points.max()) for points, _ in seen.values() if len(points)), default=0)
     best = set[int]()
     left = set(seen)
     while len(left) > len(best):
-        grown = _grown(seen, left, size, model)
+        grown = _grown(seen, left, size, longest)
         if len(grown) > len(best):
             best = grown
         if not grown:
             break
         left -= grown
     count = _counts(seen, best, size)
-    return {image: int((count[seen[image][0]] > 0).sum()) for image in sorted(set(seen) - best)}
+    return {
+        image: int((count[seen[frame][0]] > 0).sum())
+        for frame in sorted(set(seen) - best)
+        for image in photos[frame]
+    }
 
 
 def _grown(
-    seen: dict[int, tuple[np.ndarray, np.ndarray]], left: set[int], size: int, model: pycolmap.Reconstruction
+    seen: dict[int, tuple[np.ndarray, np.ndarray]], left: set[int], size: int, longest: dict[int, int]
 ) -> set[int]:
-    """Start with the two photos that share the most points, and repeatedly add the photos that they support."""
+    """Start with the two frames that share the most points, and repeatedly add the photos that they support."""
     first = max(sorted(left), key=lambda image: len(seen[image][0]))
     count = _counts(seen, {first}, size)
     shared = {image: int(count[seen[image][0]].sum()) for image in sorted(left - {first})}
@@ -98,7 +119,7 @@ def _grown(
         added = {
             image
             for image in sorted(left - grown)
-            if _supported(count[seen[image][0]], seen[image][1], _longest(model, image))
+            if _supported(count[seen[image][0]], seen[image][1], longest[image])
         }
         if not added:
             return grown
@@ -131,6 +152,17 @@ def _observations(model: pycolmap.Reconstruction, number: int) -> tuple[np.ndarr
     points, places, errors = residuals(model, number)
     good = errors < REPROJECTED
     return points[good], places[good]
+
+
+def _together(model: pycolmap.Reconstruction, images: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same for a frame, each point once; the photos of a frame lie side by side, in px."""
+    found = [_observations(model, image) for image in images]
+    if len(found) == 1:
+        return found[0]
+    points, first = np.unique(np.concatenate([points for points, _ in found]), return_index=True)
+    shifts = np.arange(len(found))[:, None] * [1.0, 0.0] * _longest(model, images[0])
+    places = np.concatenate([places + shift for (_, places), shift in zip(found, shifts, strict=True)])
+    return points, places[first]
 
 
 def residuals(model: pycolmap.Reconstruction, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -199,14 +231,14 @@ def _sampson(relative: pycolmap.Rigid3d, a: np.ndarray, b: np.ndarray) -> np.nda
 
 
 def take_out(model: pycolmap.Reconstruction, images: set[int]) -> None:
-    """Remove photos from a model, and the points that are no longer supported.
+    """Remove photos from a model, with the others of their frames, and the points that are no longer supported.
 
     Args:
         model: The model; changed in place.
         images: Numbers of the photos.
     """
-    for image in sorted(images):
-        model.deregister_frame(model.image(image).frame_id)
+    for frame in sorted({model.image(image).frame_id for image in images}):
+        model.deregister_frame(frame)
     if images and model.num_points3D():
         pycolmap.ObservationManager(model).filter_all_points3D(REPROJECTED, PARALLAX)
 

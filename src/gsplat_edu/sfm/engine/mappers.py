@@ -18,11 +18,12 @@ ROUNDS = 5
 
 
 class Options(NamedTuple):
-    """Options common to all mappers."""
+    """Options common to all mappers; `known` if intrinsics and the rig's rotations are exact, as for panoramas."""
 
     loose: bool
     threads: int
     seed: int
+    known: bool = False
 
 
 def incremental(
@@ -45,6 +46,9 @@ def incremental(
     options.num_threads, options.random_seed = common.threads, common.seed
     options.min_model_size = 3  # photos may be few, and the best model is used anyway
     options.multiple_models = not begin
+    if common.known:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.ba_refine_sensor_from_rig = False
     if common.loose:  # half the matches and a quarter of the angle that COLMAP requires
         options.min_num_matches = 10
         options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = 50, 15
@@ -74,10 +78,15 @@ def incremental(
 
 def all_at_once(database: str, photos: str, out: str, common: Options) -> dict[int, pycolmap.Reconstruction]:
     """Register all photos together (Pan et al. 2024, GLOMAP); arguments as for `incremental`."""
-    calibration = pycolmap.ViewGraphCalibrationOptions()
-    calibration.random_seed = common.seed
-    pycolmap.calibrate_view_graph(database, calibration)
     options = pycolmap.GlobalPipelineOptions()
+    if common.known:
+        adjustment = options.mapper.bundle_adjustment
+        adjustment.refine_focal_length = adjustment.refine_extra_params = False
+        adjustment.refine_sensor_from_rig = options.mapper.refine_sensor_from_rig = False
+    else:
+        calibration = pycolmap.ViewGraphCalibrationOptions()
+        calibration.random_seed = common.seed
+        pycolmap.calibrate_view_graph(database, calibration)
     options.num_threads = options.mapper.num_threads = common.threads
     options.random_seed = options.mapper.random_seed = common.seed
     options.min_num_matches = 10 if common.loose else options.min_num_matches
@@ -123,7 +132,8 @@ def without_doubtful(model: pycolmap.Reconstruction, database: str) -> int:
     """
     before = model.num_reg_images()
     for _ in range(ROUNDS):
-        doubtful = agreement(model, database).contradictory | set(unsupported(model))
+        contradictory = agreement(model, database).contradictory(model)
+        doubtful = contradictory | set(unsupported(model))
         if not doubtful:
             break
         take_out(model, doubtful)

@@ -1,0 +1,88 @@
+"""The scale of a capture's coordinates, if it is known: scale.json beside images/ and sparse/."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.files import unreadable, written_aside
+from gsplat_edu.reading import parse_json, read_text
+
+SCALE_FILE = "scale.json"
+"""Name of the file in a capture's folder."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What one unit of the coordinates is, and how it is known.
+
+    Args:
+        unit: "m", "cm" or "mm"; one unit of the coordinates is one of these.
+        source: "GPS" or "a given distance".
+        detail: How well it is known, in words.
+        level: Whether up is known to be (0, -1, 0), from GPS; else it is what most photos show as up.
+    """
+
+    unit: str
+    source: str
+    detail: str = ""
+    level: bool = False
+
+    def __str__(self) -> str:
+        """Return the sentence for the user."""
+        return f"1 unit = 1 {self.unit}, from {self.source}" + f" ({self.detail})" * bool(self.detail)
+
+    def json(self) -> dict[str, str | bool]:
+        """Return the fields as JSON values."""
+        return asdict(self)
+
+    @classmethod
+    def of_json(cls, values: object) -> Scale | None:
+        """Read the fields; None if there are none.
+
+        Raises:
+            ValueError: a field is missing or no text.
+        """
+        if values is None:
+            return None
+        fields = ("unit", "source", "detail")
+        if not isinstance(values, dict) or not all(isinstance(values.get(name), str) for name in fields):
+            raise ValueError
+        unit, source, detail = (values[name] for name in fields)
+        return cls(unit, source, detail, values.get("level") is True)
+
+
+def read_scale(folder: Path) -> Scale | None:
+    """Read the scale of a capture; None if it is unknown.
+
+    Args:
+        folder: The capture.
+
+    Raises:
+        DatasetError: the file is damaged.
+    """
+    path = folder / SCALE_FILE
+    if not path.is_file():
+        return None
+    try:
+        return Scale.of_json(parse_json(read_text(path)))
+    except OSError as error:
+        raise DatasetError(unreadable(path, error)) from None
+    except ValueError:
+        raise DatasetError(f"{path}: is damaged; remove it, or make the capture again") from None
+
+
+def write_scale(folder: Path, scale: Scale) -> None:
+    """Write the scale of a capture.
+
+    Args:
+        folder: The capture.
+        scale: Its scale.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with written_aside(folder / SCALE_FILE) as aside:
+        aside.write_text(json.dumps(scale.json(), indent=1) + "\n", encoding="utf-8")

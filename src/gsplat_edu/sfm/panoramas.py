@@ -1,0 +1,237 @@
+"""360-degree panoramas among the input: recognise them, and cut each into the faces of a rig.
+
+The faces of one panorama share its centre, and their rotations are known. COLMAP maps them as one frame of a rig, whose
+intrinsics and rotations stay fixed: a panorama has six unknowns, as a photo does.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsplat_edu.data.images import (
+    decode,
+    decode_mask,
+    image_header,
+    image_orientation,
+    image_size,
+    turned,
+    upright_size,
+)
+from gsplat_edu.data.panorama import FACES, cut_face, face_rotations, face_side, is_panorama_size
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.files import written_aside
+from gsplat_edu.image_files import UNDECODABLE, opened_image
+from gsplat_edu.sfm.masks import find_masks
+from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts, taken_at
+
+EQUIRECTANGULAR = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular", re.IGNORECASE)
+"""What XMP says of a panorama, as attribute or as element (Google's Photo Sphere XMP)."""
+
+FACE_QUALITY = 95
+"""JPEG quality of the faces of lossy panoramas; those of the others are PNG."""
+
+
+@dataclass(frozen=True)
+class Panorama:
+    """A panorama that was cut.
+
+    Args:
+        name: Name of its file.
+        faces: Names of its faces, in the order of `face_rotations`.
+        place: Latitude and longitude in degrees and height in m from EXIF; None if unknown.
+    """
+
+    name: str
+    faces: tuple[str, ...]
+    place: tuple[float, float, float] | None
+
+
+def are_panoramas(files: Sequence[Path], choice: str, say: Callable[[str], None]) -> bool:
+    """Decide whether photos are panoramas: as the user says, or if the XMP of all of them says so.
+
+    The shape alone does not decide, because a plain photo may be cropped to 2:1; a note then names the option.
+
+    Args:
+        files: The photos, or some frames of a video; files that cannot be read do not count.
+        choice: "yes", "no", or "auto".
+        say: Receives a note if "auto" leaves doubt.
+
+    Raises:
+        DatasetError: the choice is "yes", and a photo is not 2:1.
+    """
+    if choice == "no":
+        return False
+    sizes, marked = dict[Path, tuple[int, int]](), list[Path]()
+    for path in files:
+        try:
+            sizes[path] = upright_size(image_size(path), image_orientation(path))
+            if is_panorama_size(*sizes[path]) and _says_so(path):
+                marked.append(path)
+        except DatasetError:
+            continue
+    others = [path for path, size in sizes.items() if not is_panorama_size(*size)]
+    if choice == "yes":
+        if others:
+            W, H = sizes[others[0]]
+            raise DatasetError(
+                f"{others[0]}: is {W}x{H}, but a 360-degree panorama is twice as wide as high (equirectangular, below "
+                "32,759 px); export it so, or give --panorama no"
+            )
+        return bool(sizes)
+    if marked and len(marked) == len(sizes):
+        return True
+    if marked:
+        say(
+            f"{len(marked)} of {len(sizes)} photos are 360-degree panoramas according to their XMP, first "
+            f"{marked[0].name}: used as plain photos; put them into a folder of their own"
+        )
+    elif sizes and not others:
+        say(
+            "all photos are twice as wide as high: used as plain photos; if they are 360-degree panoramas, give "
+            "--panorama yes"
+        )
+    return False
+
+
+def cut_panoramas(
+    files: Sequence[Path], folder: Path, largest: int | None, progress: Callable[[str, int, int], None]
+) -> tuple[list[Panorama], int, list[str]]:
+    """Cut panoramas, with their masks and alpha, into faces. Faces that exist are kept.
+
+    Args:
+        files: The panoramas.
+        folder: Folder for the faces; their masks go to masks/ in it.
+        largest: Largest side of a face, px; None for the default.
+        progress: Called with the number of panoramas done.
+
+    Returns:
+        The panoramas; the side of all faces, px; and name and reason for each panorama that cannot be decoded.
+
+    Raises:
+        DatasetError: the size of a mask differs from its panorama's.
+    """
+    sizes = dict[Path, tuple[int, int]]()
+    found, unreadable, masks = list[Panorama](), list[str](), find_masks(files)
+    for path in files:
+        try:
+            sizes[path] = upright_size(image_size(path), image_orientation(path))
+        except DatasetError as error:
+            unreadable.append(f"{path.name}: {error.reason or error}")
+    side = face_side(max((W for W, _ in sizes.values()), default=2), largest)
+    folder.mkdir(parents=True, exist_ok=True)
+    stems, taken = dict[Path, str](), set[str]()
+    for path in sizes:
+        stem = path.stem if path.stem.lower() not in taken else path.name.replace(".", "_")
+        taken.add(stem.lower())
+        stems[path] = stem
+    for number, path in enumerate(sizes, 1):
+        lossy = path.suffix.lower() in (*JPEG_ENDINGS, *HEIC_ENDINGS)
+        ending = ".jpg" if lossy else ".png"
+        names = tuple(f"{stems[path]}_{face}{ending}" for face in range(FACES))
+        try:
+            if not (folder / names[-1]).is_file():
+                _cut(path, masks.get(path), [folder / name for name in names], side)
+            found.append(Panorama(path.name, names, taken_at(path)))
+        except DatasetError as error:
+            unreadable.append(f"{path.name}: {error.reason or error}")
+        progress("cutting panoramas", number, len(sizes))
+    return found, side, unreadable
+
+
+def color_problems(files: Sequence[Path]) -> list[tuple[str, str]]:
+    """Return name and `gsplat_edu.data.images.ImageHeader.problem` of panoramas, whose faces are sRGB."""
+    found = []
+    for path in files:
+        try:
+            found.append((path.name, image_header(path).problem))
+        except DatasetError:
+            continue
+    return found
+
+
+def face_facts(photos: Sequence[PhotoFacts], panoramas: Sequence[Panorama]) -> list[PhotoFacts]:
+    """Complete the facts of the faces: where they were taken, and that their pixels are final.
+
+    Args:
+        photos: The faces, as found by `copy_photos`.
+        panoramas: Their panoramas.
+
+    Raises:
+        DatasetError: a face is missing.
+    """
+    by_name = {photo.name: photo for photo in photos}
+    for panorama in panoramas:
+        if missing := [name for name in panorama.faces if name not in by_name]:
+            raise DatasetError(
+                f"{missing[0]}: a face of {panorama.name} is damaged; remove the work folder sfm/"
+            )
+    return [
+        PhotoFacts(**asdict(by_name[name]) | {"place": panorama.place, "final": True})
+        for panorama in panoramas
+        for name in panorama.faces
+    ]
+
+
+def face_groups(photos: Sequence[PhotoFacts], longest: int) -> list[dict[str, Any]]:
+    """Group faces by number, a camera per face of the rig, as for `gsplat_edu.sfm.engine.jobs.features`."""
+    width, height = photos[0].copy_size(longest)
+    focal = width / 2  # 90 degrees
+    sizes = {"kind": "", "focal": focal, "width": width, "height": height}
+    return [sizes | {"names": [photo.copy for photo in photos[face::FACES]]} for face in range(FACES)]
+
+
+def rig_of(photos: Sequence[PhotoFacts]) -> dict[str, Any]:
+    """Return the rig of the faces, as for `gsplat_edu.sfm.mapping.Cameras`."""
+    copies = [photo.copy for photo in photos]
+    panoramas = [copies[start : start + FACES] for start in range(0, len(copies), FACES)]
+    return {"rotations": [R.tolist() for R in face_rotations()], "panoramas": panoramas}
+
+
+def _says_so(path: Path) -> bool:
+    """Return whether a file's XMP says that it is an equirectangular panorama."""
+    try:
+        with opened_image(path) as file:
+            said = file.info.get("xmp") or file.info.get("XML:com.adobe.xmp") or b""
+    except UNDECODABLE:
+        return False
+    raw = said.encode("utf-8", "replace") if isinstance(said, str) else bytes(said)
+    return EQUIRECTANGULAR.search(raw) is not None
+
+
+def _cut(path: Path, mask: Path | None, targets: Sequence[Path], side: int) -> None:
+    """Write the faces of one panorama, the last one last.
+
+    Raises:
+        DatasetError: the panorama or its mask cannot be decoded, or their sizes differ.
+    """
+    orientation = image_orientation(path)
+    image, alpha = decode(path, orientation)
+    counts = None if mask is None else decode_mask(mask)
+    if counts is not None and counts.shape != image.shape[:2]:
+        counts = turned(counts, orientation)
+    if counts is not None and counts.shape != image.shape[:2]:
+        H, W = counts.shape
+        raise DatasetError(
+            f"{mask}: the mask is {W}x{H} but its panorama {image.shape[1]}x{image.shape[0]}; make them the same size"
+        )
+    for R, target in zip(face_rotations(), targets, strict=True):
+        face, opacity, seen = cut_face(image, alpha, counts, R, side)
+        if seen is not None:
+            place = target.parent / "masks" / f"{target.name}.png"
+            place.parent.mkdir(exist_ok=True)
+            _write(Image.fromarray(np.where(seen, 255, 0).astype(np.uint8)), place, ".png")
+        pixels = face if opacity is None else np.concatenate([face, opacity[..., None]], axis=2)
+        _write(Image.fromarray(pixels), target, target.suffix)
+
+
+def _write(image: Image.Image, target: Path, ending: str) -> None:
+    options: dict[str, Any] = {"quality": FACE_QUALITY, "subsampling": 0} if ending == ".jpg" else {}
+    with written_aside(target) as aside:
+        image.save(aside, format="JPEG" if ending == ".jpg" else "PNG", **options)
