@@ -112,7 +112,12 @@ def test_config_json_has_the_flat_names_of_older_runs(tmp_path):
     }  # fmt: skip
     words = "--iterations 700 --strategy mcmc --max-gaussians 90 --mcmc-growth 1.1 --white-background"
     found = json.loads(json.dumps(document(options(*words.split()))))
-    newer = {name for name in found["train"] if name.startswith("fast_")} | {"appearance", "refine", "pose_rate", "lens_rate"}
+    newer = {name for name in found["train"] if name.startswith("fast_")} | {
+        "appearance",
+        "refine",
+        "pose_rate",
+        "lens_rate",
+    }
     assert {name: value for name, value in found["train"].items() if name not in newer} == older
     folder = RunFolder(tmp_path)
     folder.write_config(found | {"train": older})

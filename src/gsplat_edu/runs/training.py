@@ -43,6 +43,7 @@ from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
 from gsplat_edu.train.trainer import Callback, StepParts, Trainer
+from gsplat_edu.views import View
 
 
 def document(options: RunOptions) -> dict[str, Any]:
@@ -341,14 +342,16 @@ class CaptureRun:
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         if export is not None:
             facts["exports"] = export(open_source(path))
+        train: Sequence[View] = dataset.train
         if self._refinement is not None:
             views = refined_views(self._refinement, dataset)
+            train = views[0]
             write_refined(self.folder, views, dataset)
             self._say(f"wrote {self.folder.refined}: the capture with its refined cameras")
             facts |= aligned_score(views[1], gaussians, self.options, trainer.extent, self._say)
         return evaluate_run(
             self.folder,
-            Judged(dataset.test, dataset.train, self.options.config.background, dataset.notes),
+            Judged(dataset.test, train, self.options.config.background, dataset.notes),
             gaussians,
             self.options.renderer,
             facts,
