@@ -53,7 +53,12 @@ BUILD_ON = {
 }
 """Documents for developers; the two indices are written here."""
 
-PICTURES = ("docs/images/sphere.png", "docs/images/capture.jpg", "docs/images/recipes-snowmiku97.png")
+PICTURES = (
+    "docs/images/sphere.png",
+    "docs/images/capture.jpg",
+    "docs/images/exposure-before-after.jpg",
+    "docs/images/recipes-snowmiku97.png",
+)
 TILES = ("notebooks/11_tiles.ipynb", 0)
 """The chapter figure on the landing page: the notebook and the figure's index."""
 
