@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from gsplat_edu.clean.guard import Cleaning
+from gsplat_edu.clean.guard import Cleaning, clean
 from gsplat_edu.clean.judge import Reason
 from gsplat_edu.constants import C0, SH_OFFSET
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import FORMATS
+from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import capture_difference
@@ -85,6 +86,26 @@ def open_subject(path: Path, dataset: Path | None) -> Subject:
     return Subject(
         replace(source, scene=scene, cameras=cameras, origin=(x, y, z), held_out=held_out), capture
     )
+
+
+def cleaner(
+    dataset: Dataset, settings: RenderSettings, say: Callable[[str], None]
+) -> Callable[[Gaussians], tuple[Gaussians, dict[str, Any]]]:
+    """Return what cleans the scene at the end of a training; see `gsplat_edu.runs.training.CaptureRun.finish`.
+
+    Args:
+        dataset: The capture.
+        settings: The scene's render settings.
+        say: Receives the report, line by line.
+    """
+
+    def cleaned(gaussians: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
+        cleaning = clean(gaussians.to(torch.device("cpu")), dataset.train, dataset.test, settings)
+        for line in lines(cleaning):
+            say(line)
+        return cleaning.apply(gaussians), document(cleaning)
+
+    return cleaned
 
 
 def default_target(path: Path) -> Path:
