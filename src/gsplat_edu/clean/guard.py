@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
 
+from gsplat_edu.buffers import reused_buffers
 from gsplat_edu.clean.judge import Progress, Reason, Rules, judge
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import psnr
@@ -98,7 +99,8 @@ def clean(
         DatasetError: a photo cannot be read.
     """
     in_range("max_loss", max_loss, 0.0)
-    verdict = judge(gaussians, train, settings, rules, progress)
+    with reused_buffers():
+        verdict = judge(gaussians, train, settings, rules, progress)
     if len(gaussians) and verdict.removed.all():
         raise ArgumentError(
             f"scene: none of its {len(gaussians):,} splats is supported by the photos; check that the capture"

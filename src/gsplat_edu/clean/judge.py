@@ -52,33 +52,44 @@ SENTENCES = {
 
 @dataclass(frozen=True)
 class Rules:
-    """Thresholds, none of them in world units.
+    """Thresholds. Distances are fractions of the distance from the camera; errors are multiples of the average squared
+    error per splat: that of all photos divided by the number of splats.
 
     Args:
-        gap: A splat is in free space from this gap on, as a fraction of its distance (`Evidence.gap`).
-        views: It has to be seen by at least so many views.
-        against: z above which the photos do not miss a splat in free space.
-        refuted: z above which the photos refute a splat.
-        share: Share of the squared error of all photos that a refuted splat causes by itself, at least.
-        missed: z below which the last round takes a splat back.
-        harm: Share of the squared error of all photos that no removed splat may add by itself.
+        gap: A splat is in free space from this gap on, as a fraction of the distance (`Evidence.gap`).
+        against: z below which the photos miss a splat in free space; it then stays.
+        missed: The same for the last round, which knows less, because a splat is in a quarter of its views.
+        harm: A splat that is missed stays if its removal alone would add this much error.
+        rare: A splat that at most this share of the views see is removed even if they miss it, provided that
+        rare_gap: its gap exceeds this: few views fit noise with splats right in front of them.
+        near_gap: A splat is refuted from this gap on if removing it alone lowers the error by
+        near_error: this much, with a z above
+        near_z: this one.
+        error: A splat is refuted, wherever it is, if removing it alone lowers the error by this much, with a z above
+        agreement: this one.
+        least_views: Fewer views than this cannot tell where free space is.
         rounds: Most rounds of removal.
-        settled: The rounds end when one removes less than this share of what is removed already.
-        work: Splats times views of a round, about; views are left out evenly to stay below it.
-        least_views: Views of a round, at least.
+        few: The rounds end once one removes at most this share of the splats.
+        work: Splats times views of a round; views are left out evenly to stay below it.
+        round_views: Views of a round, at least.
     """
 
     gap: float = 0.15
-    views: int = 3
     against: float = -1.0
-    refuted: float = 2.0
-    share: float = 2e-4
     missed: float = -1.5
-    harm: float = 1e-4
-    rounds: int = 3
-    settled: float = 0.02
-    work: float = 2e7
-    least_views: int = 24
+    harm: float = 10.0
+    rare: float = 0.05
+    rare_gap: float = 0.3
+    near_gap: float = 0.05
+    near_error: float = 5.0
+    near_z: float = 1.0
+    error: float = 20.0
+    agreement: float = 2.0
+    least_views: int = 3
+    rounds: int = 4
+    few: float = 1e-4
+    work: float = 6e6
+    round_views: int = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +98,7 @@ class Verdict:
 
     Args:
         reasons: (N,) a `Reason` for every splat.
-        certainty: (N,) `Evidence.gain` as a share of the squared error of all photos, at the time of the removal.
+        certainty: (N,) `Evidence.gain` as a multiple of the average error per splat, at the time of the removal.
         views: Number of views that judged.
     """
 
@@ -140,7 +151,7 @@ def judge(
 
 def _chosen(views: Sequence[View], rules: Rules, count: int) -> list[View]:
     """Return views spread evenly over the list, as many as the work of a round allows."""
-    most = max(rules.least_views, int(rules.work / max(count, 1)))
+    most = max(rules.round_views, int(rules.work / max(count, 1)))
     number = min(len(views), most)
     return [views[i * len(views) // number] for i in range(number)]
 
@@ -167,30 +178,42 @@ class _Rounds:
         rules, reasons = self._rules, self._reasons
         seen = np.zeros(len(reasons), dtype=bool)
         certainty = np.zeros(len(reasons))
+        rare = np.zeros(len(reasons), dtype=bool)
         for _ in range(rules.rounds):
             found = self._gathered()
             seen |= found.peak > ALPHA_MIN
-            kept, share, z = reasons == Reason.KEPT, found.gain / max(found.error, 1e-300), _agreement(found)
-            free = (found.gap > rules.gap) & (z > rules.against) & (found.views >= rules.views)
-            free &= share > -rules.harm
-            refuted = (share > rules.share) & (z > rules.refuted)
+            free, refuted = self._found(found)
+            kept = reasons == Reason.KEPT
+            rare |= kept & self._rare(found)
+            certainty[kept] = _errors(found)[kept]
+            reasons[kept & refuted] = Reason.REFUTED
             reasons[kept & free] = Reason.IN_FRONT
-            reasons[kept & refuted & ~free] = Reason.REFUTED
-            certainty[kept] = share[kept]
-            new, gone = int((kept & (free | refuted)).sum()), int((reasons != Reason.KEPT).sum())
-            if new <= rules.settled * gone:
+            if (kept & (free | refuted)).sum() <= rules.few * len(reasons):
                 break
         if (reasons != Reason.KEPT).any():
             found = self._gathered()
-            gone, share = reasons != Reason.KEPT, found.gain / max(found.error, 1e-300)
-            reasons[gone & ((_agreement(found) < rules.missed) | (share < -rules.harm))] = Reason.KEPT
             seen |= found.peak > ALPHA_MIN
+            missed = (_agreement(found) < rules.missed) | (_errors(found) < -rules.harm)
+            reasons[missed & ~rare] = Reason.KEPT
         if len(self._views) < len(self._everything) and not seen.all():
             rest = [view for view in self._everything if view not in self._views]
             seen |= peaks(self._gaussians, rest, self._settings) > ALPHA_MIN
         reasons[(reasons == Reason.KEPT) & ~seen] = Reason.UNSEEN
         self._progress(self._total, self._total)
         return reasons, certainty
+
+    def _found(self, found: Evidence) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+        """Return which splats are in free space, and which the photos refute."""
+        rules, errors, z = self._rules, _errors(found), _agreement(found)
+        free = (found.gap > rules.gap) & (z > rules.against) | self._rare(found)
+        free &= (found.views > 0) & (len(self._views) >= rules.least_views)
+        refuted = (errors > rules.error) & (z > rules.agreement)
+        refuted |= (found.gap > rules.near_gap) & (errors > rules.near_error) & (z > rules.near_z)
+        return free, refuted
+
+    def _rare(self, found: Evidence) -> Bool[np.ndarray, " N"]:
+        rare: Bool[np.ndarray, " N"] = found.views <= self._rules.rare * len(self._views)
+        return rare & (found.gap > self._rules.rare_gap) & (found.views > 0)
 
     def _gathered(self) -> Evidence:
         gone = self._reasons != Reason.KEPT
@@ -206,3 +229,11 @@ def _agreement(found: Evidence) -> Float64[np.ndarray, " N"]:
     spread = np.sqrt(found.spread)
     z: Float64[np.ndarray, " N"] = np.divide(found.gain, spread, out=np.zeros_like(spread), where=spread > 0)
     return z
+
+
+def _errors(found: Evidence) -> Float64[np.ndarray, " N"]:
+    """Return the gains as multiples of the average error per splat."""
+    errors: Float64[np.ndarray, " N"] = (
+        found.gain * len(found.gain) / max(found.error, np.finfo(np.float64).tiny)
+    )
+    return errors

@@ -112,10 +112,9 @@ def _run(
                 if view is not None:
                     view.update("evaluating")
 
-            backend = capture.options.backend
             result = capture.finish(
                 scored,
-                functools.partial(export_all, arguments.export, bar, backend, say)
+                functools.partial(export_all, arguments.export, bar, options.backend, say)
                 if arguments.export
                 else None,
                 cleaner(capture.dataset, options.render_settings, say) if arguments.clean else None,
