@@ -70,3 +70,11 @@ def rings() -> tuple[list[View], list[View]]:
 def planted(room, rings):
     """The room with 60 floaters, which come last."""
     return Gaussians.concatenated([room, floaters(room, rings[0], SETTINGS, 60, seed=3)])
+
+
+@pytest.fixture
+def set_threads():
+    """Set the number of threads; afterwards it is what it was."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)

@@ -1,7 +1,8 @@
 """Clean a scene: remove what the photos do not support, as long as held-out photos do not suffer.
 
 The views that judge are those the scene was trained on. The views that were held out limit what is removed: if their
-PSNR falls by more than the stated loss, only the more certain half of the splats goes, then a quarter, and so on.
+PSNR falls by more than the stated loss, only the more certain half of the floaters goes, then a quarter, and so on, and
+in the end only what no view sees, or nothing.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int64, UInt8
 
 from gsplat_edu.buffers import reused_buffers
-from gsplat_edu.clean.judge import Progress, Reason, Rules, judge
+from gsplat_edu.clean.judge import Progress, Reason, Rules, Verdict, judge
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.gaussians import Gaussians
@@ -28,7 +29,7 @@ MAX_LOSS = 0.05
 """dB: loss of PSNR that cleaning may cost by default."""
 
 LEAST = 8
-"""Fewer splats are not divided further; the scene then stays as it is."""
+"""Fewer floaters are not divided further; they all stay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +100,7 @@ def clean(
         DatasetError: a photo cannot be read.
     """
     in_range("max_loss", max_loss, 0.0)
+    gaussians = gaussians.map(lambda tensor: tensor.detach())
     with reused_buffers():
         verdict = judge(gaussians, train, settings, rules, progress)
     if len(gaussians) and verdict.removed.all():
@@ -111,20 +113,21 @@ def clean(
     reasons = verdict.reasons
     before = score(np.ones(len(gaussians), dtype=bool))
     whole = after = before if not verdict.removed.any() else score(reasons == Reason.KEPT)
-    ranked = _ranked(verdict.removed, verdict.certainty)
-    number = len(ranked)
+    ranked = _ranked(verdict)
     while before is not None and after is not None and before - after > max_loss:
-        number = number // 2 if number >= 2 * LEAST else 0
-        reasons = np.full_like(verdict.reasons, Reason.KEPT)
-        reasons[ranked[:number]] = verdict.reasons[ranked[:number]]
-        after = score(reasons == Reason.KEPT) if number else before
+        stay = ranked[len(ranked) // 2 if len(ranked) >= 2 * LEAST else 0 :]
+        reasons = reasons.copy()
+        reasons[stay if len(ranked) else slice(None)] = Reason.KEPT
+        ranked = ranked[: len(ranked) - len(stay)]
+        after = score(reasons == Reason.KEPT)
     return Cleaning(reasons, verdict.reasons, before, after, whole, bool(test), len(guards), verdict.views)
 
 
-def _ranked(removed: Bool[np.ndarray, " N"], certainty: np.ndarray) -> np.ndarray:
-    """Return the indices of the removed splats, the most certain first; ties by index."""
-    ids = np.flatnonzero(removed)
-    return ids[np.argsort(-certainty[ids], kind="stable")]
+def _ranked(verdict: Verdict) -> Int64[np.ndarray, " M"]:
+    """Return the indices of the floaters, the most certain first; ties by index."""
+    ids = np.flatnonzero(verdict.removed & (verdict.reasons != Reason.UNSEEN))
+    ranked: Int64[np.ndarray, " M"] = ids[np.argsort(-verdict.certainty[ids], kind="stable")]
+    return ranked
 
 
 def _rows(gaussians: Gaussians, kept: Bool[np.ndarray, " N"]) -> Gaussians:

@@ -52,8 +52,10 @@ SENTENCES = {
 
 @dataclass(frozen=True)
 class Rules:
-    """Thresholds. Distances are fractions of the distance from the camera; errors are multiples of the average squared
-    error per splat: that of all photos divided by the number of splats.
+    """Thresholds of a judgement.
+
+    Distances are fractions of the distance from the camera. Errors are multiples of the average squared error per
+    splat: that of all photos divided by the number of splats.
 
     Args:
         gap: A splat is in free space from this gap on, as a fraction of the distance (`Evidence.gap`).
@@ -66,7 +68,8 @@ class Rules:
         near_error: this much, with a z above
         near_z: this one.
         error: A splat is refuted, wherever it is, if removing it alone lowers the error by this much, with a z above
-        agreement: this one.
+        agreement: this one;
+        gross_error: or by this much, with a z above `near_z`.
         least_views: Fewer views than this cannot tell where free space is.
         rounds: Most rounds of removal.
         few: The rounds end once one removes at most this share of the splats.
@@ -75,7 +78,7 @@ class Rules:
     """
 
     gap: float = 0.15
-    against: float = -1.0
+    against: float = -0.9
     missed: float = -1.5
     harm: float = 10.0
     rare: float = 0.05
@@ -85,6 +88,7 @@ class Rules:
     near_z: float = 1.0
     error: float = 20.0
     agreement: float = 2.0
+    gross_error: float = 100.0
     least_views: int = 3
     rounds: int = 4
     few: float = 1e-4
@@ -208,6 +212,7 @@ class _Rounds:
         free = (found.gap > rules.gap) & (z > rules.against) | self._rare(found)
         free &= (found.views > 0) & (len(self._views) >= rules.least_views)
         refuted = (errors > rules.error) & (z > rules.agreement)
+        refuted |= (errors > rules.gross_error) & (z > rules.near_z)
         refuted |= (found.gap > rules.near_gap) & (errors > rules.near_error) & (z > rules.near_z)
         return free, refuted
 
