@@ -80,7 +80,10 @@ def test_weights_and_gaps_are_those_of_the_reference(scene, photo):
     passed = transmittance < 0.5
     depth = np.where(passed.any(axis=0), ordered[passed.argmax(axis=0)], np.inf)
     z = scene.means[:, 2].numpy() + 3.0
-    gaps = [np.average(1.0 - z[i] / depth, weights=weights[i]) for i in range(COUNT)]
+    gaps = [
+        np.average(np.where(passed.any(axis=0), 1.0 - z[i] / depth, 0.0), weights=weights[i])
+        for i in range(COUNT)
+    ]
     np.testing.assert_allclose(found.gap, gaps, atol=1e-9)
 
 
@@ -110,7 +113,7 @@ def test_a_splat_that_is_removed_is_judged_by_what_it_would_add(scene, photo):
     images = [render(g, CAMERA, settings=SETTINGS, backend="cpu").image for g in (scene, without(scene, 7))]
     square = float((images[0] - images[1]).square().sum())
     linear = present - absent - square
-    assert found.views[7] == REPEATS
+    assert found.weight[7] > 0
     allowed = 0.25 * abs(linear) + 0.04 * square + 5 * 0.1415 * square
     assert found.gain[7] / REPEATS == pytest.approx(present - absent, abs=allowed)
     assert FAINT < MOST_OPAQUE
@@ -125,8 +128,8 @@ def test_masked_pixels_say_nothing(scene, photo):
     for field in dataclasses.fields(one):
         assert np.array_equal(getattr(one, field.name), getattr(two, field.name)), field.name
     weights = reference_weights(scene)
-    np.testing.assert_allclose(one.weight, (weights * mask).sum(axis=(1, 2)), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(one.peak, weights.max(axis=(1, 2)), rtol=1e-6)  # masked pixels included
+    np.testing.assert_allclose(one.weight, weights.sum(axis=(1, 2)), rtol=1e-9)  # masked pixels included
+    np.testing.assert_allclose(one.peak, weights.max(axis=(1, 2)), rtol=1e-6)
     assert one.error == pytest.approx(squared_error(scene, photo, mask))
 
 

@@ -45,13 +45,13 @@ class Evidence:
     """Sums over the views, for N splats.
 
     Args:
-        weight: (N,) sum of w over the pixels that count.
+        weight: (N,) sum of w over all pixels.
         peak: (N,) largest w in any pixel, masked ones included.
         gap: (N,) mean of 1 - z/D, weighted by w: how far the splat lies in front of what the views see, as a fraction
-            of D. 1 where there is nothing else to see, negative behind the surface.
+            of D; negative behind the surface. Pixels that are masked or see nothing solid add 0.
         gain: (N,) squared error of the photos with the splat minus that without it, all others unchanged.
         spread: (N,) sum of the squares of the parts of `gain` that come from each view.
-        views: (N,) number of views in which the splat has a weight.
+        views: (N,) number of views in which the splat has a weight in a pixel that adds to `gap`.
         error: Squared error of all photos, summed over pixels and channels.
     """
 
@@ -150,10 +150,11 @@ class _Sums:
         residual = _residual(output, photo.over(settings.background)) * counts[..., None]
         self.error += float(np.square(residual.double().numpy()).sum())
         signs = np.random.default_rng(index).integers(0, 2, output.image.shape, dtype=np.int8)
-        weight = _collected(output, counts, "error_sum", "weight_max")
+        inverse = counts * _inverse_depth(output)
+        weight = output.collect("error_sum", "weight_sum", "weight_max", errors=(inverse > 0).to(counts))
         second = _gradient(output, logits, torch.from_numpy(2 * signs - 1).to(residual) * counts[..., None])
         weight_of = weight()
-        near = _collected(output, counts * _inverse_depth(output), "error_sum")
+        near = output.collect("error_sum", errors=inverse)
         first = _gradient(output, logits, 2.0 * residual)
         near_of = near()
         change, square = -first / (1.0 - shown), np.square(second / (1.0 - shown))
@@ -164,7 +165,7 @@ class _Sums:
         ids = drawn[output.visible.numpy()]
         z = (gaussians.means[torch.from_numpy(ids)].double().numpy() - view.camera.eye) @ view.camera.R[2]
         w = weight_of["error_sum"].double().numpy()
-        self.weight[ids] += w
+        self.weight[ids] += weight_of["weight_sum"].double().numpy()
         self.near[ids] += w - z * near_of["error_sum"].double().numpy()
         self.peak[ids] = np.maximum(self.peak[ids], weight_of["weight_max"].numpy())
         self.views[ids] += w > 0.0
@@ -176,14 +177,10 @@ def _residual(output: RenderOutput, truth: np.ndarray) -> Float[Tensor, "H W 3"]
 
 
 def _inverse_depth(output: RenderOutput) -> Float[Tensor, "H W"]:
-    """Return 1 / median depth; 0 where the view sees nothing, as at an infinite depth."""
+    """Return 1 / median depth; 0 where the view sees nothing solid."""
     depth = output.median_depth
     assert depth is not None, "gather asks for it"
     return torch.where(depth > 0, 1.0 / torch.where(depth > 0, depth, 1.0), 0.0)
-
-
-def _collected(output: RenderOutput, values: Tensor, *names: str) -> Callable[[], dict[str, Tensor]]:
-    return output.collect(*names, errors=values)
 
 
 def _gradient(output: RenderOutput, logits: Tensor, image: Tensor) -> Float64[np.ndarray, " M"]:
