@@ -62,7 +62,7 @@ def room() -> Gaussians:
 @pytest.fixture(scope="session")
 def rings() -> tuple[list[View], list[View]]:
     """The cameras of training and of held-out views."""
-    cameras = [camera(k, 20) for k in range(20)]
+    cameras = [camera(k, 40) for k in range(40)]
     return [c for k, c in enumerate(cameras) if k % 5], cameras[::5]
 
 

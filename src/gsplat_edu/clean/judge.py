@@ -60,17 +60,24 @@ class Rules:
     Args:
         gap: A splat is in free space from this gap on, as a fraction of the distance (`Evidence.gap`).
         against: z below which the photos miss a splat in free space; it then stays.
-        missed: The same for the last round, which knows less, because a splat is in a quarter of its views.
-        harm: A splat that is missed stays if its removal alone would add this much error.
-        rare: A splat that at most this share of the views see is removed even if they miss it, provided that
-        rare_gap: its gap exceeds this: few views fit noise with splats right in front of them.
+        far_gap: From this gap on, it takes more to keep a splat:
+        far_against: z below which the photos miss it.
+        rare: With such a gap, a splat that at most this share of the views see goes even if they miss it: few views fit
+            their noise with splats right in front of them.
         near_gap: A splat is refuted from this gap on if removing it alone lowers the error by
         near_error: this much, with a z above
         near_z: this one.
         error: A splat is refuted, wherever it is, if removing it alone lowers the error by this much, with a z above
         agreement: this one;
-        gross_error: or by this much, with a z above `near_z`.
-        least_views: Fewer views than this cannot tell where free space is.
+        gross_error: or by this much, with a z above
+        gross_z: this one.
+        missed: z below which the last round takes a splat back,
+        missed_gap: if its gap is below this,
+        missed_error: and its absence adds this much error.
+        harm: Whatever its gap and z, a splat is also taken back if its absence adds this much error, unless its removal
+            lowered the error by `gross_error`;
+        behind: and below this gap, behind what the views see, unless its absence still lowers the error by `error`.
+        least_views: Fewer views than this do not find floaters, only what they do not see.
         rounds: Most rounds of removal.
         few: The rounds end once one removes at most this share of the splats.
         work: Splats times views of a round; views are left out evenly to stay below it.
@@ -79,16 +86,21 @@ class Rules:
 
     gap: float = 0.15
     against: float = -0.9
-    missed: float = -1.5
-    harm: float = 10.0
+    far_gap: float = 0.3
+    far_against: float = -2.0
     rare: float = 0.05
-    rare_gap: float = 0.3
     near_gap: float = 0.05
-    near_error: float = 5.0
-    near_z: float = 1.0
+    near_error: float = 10.0
+    near_z: float = 0.3
     error: float = 20.0
     agreement: float = 2.0
     gross_error: float = 100.0
+    gross_z: float = 1.0
+    missed: float = -1.0
+    missed_gap: float = 0.4
+    missed_error: float = 1.0
+    harm: float = 10.0
+    behind: float = -0.03
     least_views: int = 3
     rounds: int = 4
     few: float = 1e-4
@@ -197,8 +209,7 @@ class _Rounds:
         if (reasons != Reason.KEPT).any():
             found = self._gathered()
             seen |= found.peak > ALPHA_MIN
-            missed = (_agreement(found) < rules.missed) | (_errors(found) < -rules.harm)
-            reasons[missed & ~rare] = Reason.KEPT
+            reasons[self._missed(found, certainty) & ~rare] = Reason.KEPT
         if len(self._views) < len(self._everything) and not seen.all():
             rest = [view for view in self._everything if view not in self._views]
             seen |= peaks(self._gaussians, rest, self._settings) > ALPHA_MIN
@@ -209,16 +220,27 @@ class _Rounds:
     def _found(self, found: Evidence) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
         """Return which splats are in free space, and which the photos refute."""
         rules, errors, z = self._rules, _errors(found), _agreement(found)
-        free = (found.gap > rules.gap) & (z > rules.against) | self._rare(found)
-        free &= (found.views > 0) & (len(self._views) >= rules.least_views)
-        refuted = (errors > rules.error) & (z > rules.agreement)
-        refuted |= (errors > rules.gross_error) & (z > rules.near_z)
-        refuted |= (found.gap > rules.near_gap) & (errors > rules.near_error) & (z > rules.near_z)
-        return free, refuted
+        free = (found.gap > rules.gap) & (z > rules.against)
+        free |= (found.gap > rules.far_gap) & (z > rules.far_against) | self._rare(found)
+        free &= found.views > 0
+        refuted = (found.gap > rules.near_gap) & (errors > rules.near_error) & (z > rules.near_z)
+        refuted |= (errors > rules.error) & (z > rules.agreement)
+        refuted |= (errors > rules.gross_error) & (z > rules.gross_z)
+        enough = len(self._views) >= rules.least_views
+        return free & enough, refuted & enough
+
+    def _missed(self, found: Evidence, certainty: Float64[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+        """Return which removed splats the photos miss after all."""
+        rules, errors = self._rules, _errors(found)
+        missed: Bool[np.ndarray, " N"] = (_agreement(found) < rules.missed) & (errors < -rules.missed_error)
+        missed &= found.gap < rules.missed_gap
+        missed |= (errors < -rules.harm) & (certainty < rules.gross_error)
+        missed |= (found.gap < rules.behind) & (errors < rules.error)
+        return missed
 
     def _rare(self, found: Evidence) -> Bool[np.ndarray, " N"]:
         rare: Bool[np.ndarray, " N"] = found.views <= self._rules.rare * len(self._views)
-        return rare & (found.gap > self._rules.rare_gap) & (found.views > 0)
+        return rare & (found.gap > self._rules.far_gap) & (found.views > 0)
 
     def _gathered(self) -> Evidence:
         gone = self._reasons != Reason.KEPT
