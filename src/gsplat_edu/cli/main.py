@@ -20,6 +20,7 @@ COMMANDS = {
     "eval": "score a run's latest scene on its test and training views; write metrics, renders and a report",
     "render": "render images or a video of a run or a scene file, along a path or from a capture's cameras",
     "convert": "write a scene in another format, or as a web page; filter, transform, merge and verify it",
+    "clean": "remove floaters, and splats that no camera supports, from a scene",
     "view": "show a scene or a run in the browser",
     "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",
     "info": "summarise a capture, a run or a scene file on one screen",

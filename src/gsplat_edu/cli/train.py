@@ -30,6 +30,7 @@ from gsplat_edu.doctor.remedies import appearance_for
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
+from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
@@ -112,12 +113,12 @@ def _run(
                 if view is not None:
                     view.update("evaluating")
 
-            backend = capture.options.backend
             result = capture.finish(
                 scored,
-                functools.partial(export_all, arguments.export, bar, backend, say)
+                functools.partial(export_all, arguments.export, bar, options.backend, say)
                 if arguments.export
                 else None,
+                cleaner(capture.dataset, options.render_settings, say) if arguments.clean else None,
             )
         _report(capture, result, say)
         if view is not None and view.watched:

@@ -70,6 +70,9 @@ WITHOUT_ALPHA = (".jpg", ".jpeg")
 Export = Callable[[Source], list[dict[str, Any]]]
 """Writes a scene in further formats and returns a record of each file: "path", "psnr" and more."""
 
+Clean = Callable[[Gaussians], tuple[Gaussians, dict[str, Any]]]
+"""Removes splats from a scene, and returns the others and a record of the removal."""
+
 
 def _checked_folder(options: RunOptions) -> RunOptions:
     """Check the folder against the options; return them with the start scene of a resumed run filled in."""
@@ -326,20 +329,25 @@ class CaptureRun:
         """Write a checkpoint; see `gsplat_edu.train.checkpoint.save_checkpoint`."""
         return save_checkpoint(self.folder.checkpoints, self.trainer, self._elapsed())
 
-    def finish(self, progress: Progress | None = None, export: Export | None = None) -> Evaluation:
+    def finish(
+        self, progress: Progress | None = None, export: Export | None = None, clean: Clean | None = None
+    ) -> Evaluation:
         """Write the scene, in other formats too if `export` is given, and score it on the test and training views.
 
         Args:
             progress: Called for every scored view.
             export: Called with the written scene; metrics.json and the report get its result as "exports".
+            clean: Called with the scene first; metrics.json gets its record as "cleaning".
         """
         trainer, dataset = self.trainer, self.dataset
         gaussians = trainer.gaussians.map(lambda tensor: tensor[trainer.gaussians.finite_rows()])
         if lost := len(trainer.gaussians) - len(gaussians):
             self._say(f"{lost} Gaussians are NaN or infinite and are left out of the scene")
+        facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
+        if clean is not None:
+            gaussians, facts["cleaning"] = clean(gaussians)
         path = self.folder.scene(trainer.iteration)
         save_ply(path, gaussians, dataset.origin, self.options.render_settings.antialiased)
-        facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         if export is not None:
             facts["exports"] = export(open_source(path))
         train: Sequence[View] = dataset.train

@@ -59,7 +59,7 @@ COMMON = (
         "backend",
         "debug",
     ),
-    *("eval_every", "save_every", "export", "view"),
+    *("eval_every", "save_every", "clean", "export", "view"),
 )
 """What `--help` shows; `--help-all` shows the other options too."""
 
@@ -179,6 +179,11 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
         ("--save-every", "checkpoints", RunOptions.save_every),
     ):
         _add_number(group, flag, f"iterations between {what}; 0 for the end only (default: {every})", every)
+    group.add_argument(
+        "--clean",
+        action="store_true",
+        help="remove floaters and splats that no camera sees from the trained scene, as `gsplat-edu clean` does",
+    )
     group.add_argument(
         "--export",
         type=Path,

@@ -1,0 +1,190 @@
+"""What a capture's photos say about each splat of a scene.
+
+In one view, w is the weight (alpha times transmittance) of a splat in a pixel, z the splat's depth, D the median depth
+of the scene there, I the render and P the photo. Without the splat, the pixel changes by
+
+    d = -alpha dI/dalpha = w (behind - color),
+
+exactly, because a pixel is linear in the alpha of each splat. Its squared error therefore changes by 2 (I - P) d + d².
+Summed over pixels, the first term follows from the gradient of the squared error in the splat's opacity. The second is
+the mean of (sum of s d)² over random signs s; one draw per view suffices, because many views are added. Two backward
+passes per view thus measure, for every splat at once, how much better the photos fit without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from torch import Tensor
+
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.views import View
+
+MOST_OPAQUE = 0.985
+"""Opacities are lowered to this for the measurement: below the clamp of alpha, so that every pixel has a gradient."""
+
+FAINT = 0.02
+"""Opacity at which a removed splat is shown to the photos again: it hides nothing, and still counts in its core."""
+
+TURNS = 4
+"""A removed splat is shown again in every fourth view, so that few of them lie over each other."""
+
+Progress = Callable[[], None]
+"""Called after every view."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Sums over the views, for N splats.
+
+    Args:
+        weight: (N,) sum of w over all pixels.
+        peak: (N,) largest w in any pixel, masked ones included.
+        gap: (N,) mean of 1 - z/D, weighted by w: how far the splat lies in front of what the views see, as a fraction
+            of D; negative behind the surface. Pixels that are masked or see nothing solid add 0.
+        gain: (N,) squared error of the photos with the splat minus that without it, all others unchanged.
+        spread: (N,) sum of the squares of the parts of `gain` that come from each view.
+        views: (N,) number of views in which the splat has a weight in a pixel that adds to `gap`.
+        error: Squared error of all photos, summed over pixels and channels.
+    """
+
+    weight: Float64[np.ndarray, " N"]
+    peak: Float32[np.ndarray, " N"]
+    gap: Float64[np.ndarray, " N"]
+    gain: Float64[np.ndarray, " N"]
+    spread: Float64[np.ndarray, " N"]
+    views: np.ndarray
+    error: float
+
+
+def gather(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    settings: RenderSettings,
+    removed: Bool[np.ndarray, " N"] | None = None,
+    progress: Progress = lambda: None,
+) -> Evidence:
+    """Measure every splat in the capture's views; two backward passes per view.
+
+    Args:
+        gaussians: N Gaussians on the CPU.
+        views: Cameras and photos.
+        settings: The scene's render settings.
+        removed: (N,) splats that are removed already: they are drawn faintly, each in a quarter of the views, and
+            their `gain` is scaled to their own opacity. None for none.
+        progress: Called after every view.
+
+    Raises:
+        DatasetError: a photo cannot be read.
+    """
+    count = len(gaussians)
+    sums = _Sums(count)
+    gone = np.zeros(count, dtype=bool) if removed is None else removed
+    ids = np.arange(count)
+    for index, view in enumerate(views):
+        drawn = ~gone if not gone.any() else ~gone | ((ids + index) % TURNS == 0)
+        sums.add(gaussians, np.flatnonzero(drawn), gone, view, settings, index)
+        progress()
+    return sums.evidence()
+
+
+def peaks(gaussians: Gaussians, views: Sequence[View], settings: RenderSettings) -> Float32[np.ndarray, " N"]:
+    """Return the largest weight of each splat in any pixel of any view; photos are not read.
+
+    Args:
+        gaussians: N Gaussians on the CPU.
+        views: The cameras.
+        settings: The scene's render settings.
+    """
+    found: Float32[np.ndarray, " N"] = np.zeros(len(gaussians), dtype=np.float32)
+    for view in views:
+        some = replace(gaussians, logit_opacities=gaussians.logit_opacities.detach().clone().requires_grad_())
+        output = render(some, view.camera, settings=settings, backend="cpu")
+        weights = output.collect("weight_max")
+        torch.autograd.grad(output.image, some.logit_opacities, torch.zeros_like(output.image))
+        ids = output.visible.numpy()
+        found[ids] = np.maximum(found[ids], weights()["weight_max"].numpy())
+    return found
+
+
+class _Sums:
+    """Running sums of the evidence."""
+
+    def __init__(self, count: int) -> None:
+        self.weight, self.near, self.gain, self.spread = (np.zeros(count) for _ in range(4))
+        self.peak: Float32[np.ndarray, " N"] = np.zeros(count, dtype=np.float32)
+        self.views = np.zeros(count, dtype=np.int32)
+        self.error = 0.0
+
+    def evidence(self) -> Evidence:
+        gap = np.divide(self.near, self.weight, out=np.zeros_like(self.near), where=self.weight > 0)
+        return Evidence(self.weight, self.peak, gap, self.gain, self.spread, self.views, self.error)
+
+    def add(
+        self,
+        gaussians: Gaussians,
+        drawn: Int64[np.ndarray, " M"],
+        gone: Bool[np.ndarray, " N"],
+        view: View,
+        settings: RenderSettings,
+        index: int,
+    ) -> None:
+        """Add what one view says about the splats `drawn`, of which those in `gone` are faint."""
+        rows = torch.from_numpy(drawn)
+        some = gaussians if len(drawn) == len(gaussians) else gaussians.map(lambda tensor: tensor[rows])
+        full = np.minimum(some.opacities.double().numpy(), MOST_OPAQUE)
+        shown = np.where(gone[drawn], np.minimum(full, FAINT), full)
+        logits = torch.from_numpy(np.log(shown / (1.0 - shown))).to(some.means).requires_grad_()
+        output = render(replace(some, logit_opacities=logits), view.camera, settings=settings, backend="cpu")
+        photo = view.read()
+        counts = torch.ones_like(output.transmittance)
+        if photo.mask is not None:
+            counts = torch.from_numpy(photo.mask).to(counts)
+        residual = _residual(output, photo.over(settings.background)) * counts[..., None]
+        self.error += float(np.square(residual.double().numpy()).sum())
+        signs = np.random.default_rng(index).integers(0, 2, output.image.shape, dtype=np.int8)
+        inverse = counts * _inverse_depth(output)
+        weight = output.collect("error_sum", "weight_sum", "weight_max", errors=(inverse > 0).to(counts))
+        second = _gradient(output, logits, torch.from_numpy(2 * signs - 1).to(residual) * counts[..., None])
+        weight_of = weight()
+        near = output.collect("error_sum", errors=inverse)
+        first = _gradient(output, logits, 2.0 * residual)
+        near_of = near()
+        change, square = -first / (1.0 - shown), np.square(second / (1.0 - shown))
+        scale = full / shown
+        gain = (scale * scale - 2.0 * scale) * square - scale * change
+        self.gain[drawn] += gain
+        self.spread[drawn] += np.square(gain)
+        ids = drawn[output.visible.numpy()]
+        z = (gaussians.means[torch.from_numpy(ids)].double().numpy() - view.camera.eye) @ view.camera.R[2]
+        w = weight_of["error_sum"].double().numpy()
+        self.weight[ids] += weight_of["weight_sum"].double().numpy()
+        self.near[ids] += w - z * near_of["error_sum"].double().numpy()
+        self.peak[ids] = np.maximum(self.peak[ids], weight_of["weight_max"].numpy())
+        self.views[ids] += w > 0.0
+
+
+def _residual(output: RenderOutput, truth: np.ndarray) -> Float[Tensor, "H W 3"]:
+    image = output.image.detach().clamp(0.0, 1.0)
+    return image - torch.from_numpy(truth).to(image) / (255.0 if truth.dtype == np.uint8 else 1.0)
+
+
+def _inverse_depth(output: RenderOutput) -> Float[Tensor, "H W"]:
+    """Return 1 / median depth; 0 where the view sees nothing solid."""
+    depth = output.median_depth
+    assert depth is not None, "gather asks for it"
+    return torch.where(depth > 0, 1.0 / torch.where(depth > 0, depth, 1.0), 0.0)
+
+
+def _gradient(output: RenderOutput, logits: Tensor, image: Tensor) -> Float64[np.ndarray, " M"]:
+    """Return the gradient in the logits of the sum of the image times `image`."""
+    (found,) = torch.autograd.grad(output.image, logits, image, retain_graph=True)
+    gradient: Float64[np.ndarray, " M"] = found.double().numpy()
+    return gradient

@@ -1,0 +1,150 @@
+"""Clean a scene: remove what the photos do not support, as long as held-out photos do not suffer.
+
+The views that judge are those the scene was trained on. The views that were held out limit what is removed: if their
+PSNR falls by more than the stated loss, only the more certain half of the floaters goes, then a quarter, and so on, and
+in the end only what no view sees, or nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int64, UInt8
+
+from gsplat_edu.buffers import reused_buffers
+from gsplat_edu.clean.judge import Progress, Reason, Rules, Verdict, judge
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.validation import in_range
+from gsplat_edu.views import View
+
+MAX_LOSS = 0.05
+"""dB: loss of PSNR that cleaning may cost by default."""
+
+LEAST = 8
+"""Fewer floaters are not divided further; they all stay."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaning:
+    """The result of `clean`.
+
+    Args:
+        reasons: (N,) a `Reason` for every splat of the scene; not KEPT: removed.
+        judged: (N,) the same before the guard.
+        before: Mean PSNR of the guard's views, dB, of the scene; None if no view has a pixel that counts.
+        after: The same without the removed splats.
+        all_removed: The same without all splats that were judged; equal to `after` if the guard took nothing back.
+        held_out: Whether the guard's views were held out; otherwise the scene was trained on them.
+        guards: Number of the guard's views.
+        views: Number of views that judged.
+    """
+
+    reasons: UInt8[np.ndarray, " N"]
+    judged: UInt8[np.ndarray, " N"]
+    before: float | None
+    after: float | None
+    all_removed: float | None
+    held_out: bool
+    guards: int
+    views: int
+
+    @property
+    def kept(self) -> Bool[np.ndarray, " N"]:
+        """Splats that stay."""
+        kept: Bool[np.ndarray, " N"] = self.reasons == Reason.KEPT
+        return kept
+
+    def counts(self) -> dict[Reason, int]:
+        """Return the number of removed splats by reason."""
+        return {reason: int((self.reasons == reason).sum()) for reason in Reason if reason != Reason.KEPT}
+
+    def apply(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians that stay, in their order.
+
+        Args:
+            gaussians: The Gaussians that were judged.
+        """
+        return _rows(gaussians, self.kept)
+
+
+def clean(
+    gaussians: Gaussians,
+    train: Sequence[View],
+    test: Sequence[View],
+    settings: RenderSettings,
+    max_loss: float = MAX_LOSS,
+    rules: Rules | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Cleaning:
+    """Find the splats that the photos do not support, and how many of them can go.
+
+    Args:
+        gaussians: N Gaussians on the CPU, in the frame of the cameras.
+        train: The views that the scene was trained on; they judge.
+        test: The views that were held out; they guard. If there are none, the training views do.
+        settings: The scene's render settings.
+        max_loss: Largest loss of the guard's mean PSNR, dB.
+        rules: Thresholds of the judgement; None takes the defaults.
+        progress: Called after every view that judges.
+
+    Raises:
+        ArgumentError: there are no training views, no splat would be left, or `max_loss` is negative.
+        DatasetError: a photo cannot be read.
+    """
+    in_range("max_loss", max_loss, 0.0)
+    gaussians = gaussians.map(lambda tensor: tensor.detach())
+    with reused_buffers():
+        verdict = judge(gaussians, train, settings, rules, progress)
+    if len(gaussians) and verdict.removed.all():
+        raise ArgumentError(
+            f"scene: none of its {len(gaussians):,} splats is supported by the photos; check that the capture"
+            " is that of the scene"
+        )
+    guards = test or train
+    score = functools.partial(_score, gaussians, views=guards, settings=settings)
+    reasons = verdict.reasons
+    before = score(np.ones(len(gaussians), dtype=bool))
+    whole = after = before if not verdict.removed.any() else score(reasons == Reason.KEPT)
+    ranked = _ranked(verdict)
+    while before is not None and after is not None and before - after > max_loss:
+        stay = ranked[len(ranked) // 2 if len(ranked) >= 2 * LEAST else 0 :]
+        reasons = reasons.copy()
+        reasons[stay if len(ranked) else slice(None)] = Reason.KEPT
+        ranked = ranked[: len(ranked) - len(stay)]
+        after = score(reasons == Reason.KEPT)
+    return Cleaning(reasons, verdict.reasons, before, after, whole, bool(test), len(guards), verdict.views)
+
+
+def _ranked(verdict: Verdict) -> Int64[np.ndarray, " M"]:
+    """Return the indices of the floaters, the most certain first; ties by index."""
+    ids = np.flatnonzero(verdict.removed & (verdict.reasons != Reason.UNSEEN))
+    ranked: Int64[np.ndarray, " M"] = ids[np.argsort(-verdict.certainty[ids], kind="stable")]
+    return ranked
+
+
+def _rows(gaussians: Gaussians, kept: Bool[np.ndarray, " N"]) -> Gaussians:
+    rows = torch.from_numpy(kept).to(gaussians.means.device)
+    return gaussians.map(lambda tensor: tensor[rows])
+
+
+def _score(
+    gaussians: Gaussians, kept: Bool[np.ndarray, " N"], views: Sequence[View], settings: RenderSettings
+) -> float | None:
+    """Return the mean PSNR over the views, dB; None if no view has a pixel that counts."""
+    some, scores = _rows(gaussians, kept), []
+    for view in views:
+        photo = view.read()
+        if photo.mask is not None and not photo.mask.any():
+            continue
+        with torch.no_grad():
+            image = render(some, view.camera, settings=settings, backend="cpu").image
+        scores.append(psnr(image, photo.over(settings.background), photo.mask))
+    return float(np.mean(scores)) if scores else None

@@ -1,0 +1,266 @@
+"""Which splats of a scene its photos do not support, and why.
+
+Rounds of evidence (`gsplat_edu.clean.evidence`) find splats to remove. A floater hides those behind it, so that each
+round sees more than the one before. A last round draws the removed splats faintly and takes back those that the photos
+miss.
+
+    z = sum over views of gain / sqrt(sum over views of gain²)
+
+measures how well the views agree that a splat should go: at most 1 in size if a single view has an opinion, and the
+square root of their number if all agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, UInt8
+
+from gsplat_edu.clean.evidence import Evidence, gather, peaks
+from gsplat_edu.constants import ALPHA_MIN
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.views import View
+
+
+class Reason(IntEnum):
+    """Why a splat is removed."""
+
+    KEPT = 0
+    UNSEEN = 1
+    IN_FRONT = 2
+    REFUTED = 3
+
+    @property
+    def sentence(self) -> str:
+        """The reason in words."""
+        return SENTENCES[self]
+
+
+SENTENCES = {
+    Reason.KEPT: "kept",
+    Reason.UNSEEN: "visible in no view",
+    Reason.IN_FRONT: "in free space: in front of what the views see, and the photos do not miss it",
+    Reason.REFUTED: "refuted: the photos fit better without it",
+}
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Thresholds of a judgement.
+
+    Distances are fractions of the distance from the camera. Errors are multiples of the average squared error per
+    splat: that of all photos divided by the number of splats.
+
+    Args:
+        gap: A splat is in free space from this gap on, as a fraction of the distance (`Evidence.gap`).
+        against: z below which the photos miss a splat in free space; it then stays.
+        far_gap: From this gap on, it takes more to keep a splat:
+        far_against: z below which the photos miss it.
+        rare: With such a gap, a splat that at most this share of the views see goes even if they miss it: few views fit
+            their noise with splats right in front of them.
+        near_gap: A splat is refuted from this gap on if removing it alone lowers the error by
+        near_error: this much, with a z above
+        near_z: this one.
+        error: A splat is refuted, wherever it is, if removing it alone lowers the error by this much, with a z above
+        agreement: this one;
+        gross_error: or by this much, with a z above
+        gross_z: this one.
+        missed: z below which the last round takes a splat back,
+        missed_gap: if its gap is below this,
+        missed_error: and its absence adds this much error.
+        harm: Whatever its gap and z, a splat is also taken back if its absence adds this much error, unless its removal
+            lowered the error by `gross_error`;
+        behind: and below this gap, behind what the views see, unless its absence still lowers the error by `error`.
+        least_views: Fewer views than this do not find floaters, only what they do not see.
+        rounds: Most rounds of removal.
+        few: The rounds end once one removes at most this share of the splats.
+        work: Splats times views of a round; views are left out evenly to stay below it.
+        round_views: Views of a round, at least.
+    """
+
+    gap: float = 0.15
+    against: float = -0.9
+    far_gap: float = 0.3
+    far_against: float = -2.0
+    rare: float = 0.05
+    near_gap: float = 0.05
+    near_error: float = 10.0
+    near_z: float = 0.3
+    error: float = 20.0
+    agreement: float = 2.0
+    gross_error: float = 100.0
+    gross_z: float = 1.0
+    missed: float = -1.0
+    missed_gap: float = 0.4
+    missed_error: float = 1.0
+    harm: float = 10.0
+    behind: float = -0.03
+    least_views: int = 3
+    rounds: int = 4
+    few: float = 1e-4
+    work: float = 6e6
+    round_views: int = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What `judge` decided.
+
+    Args:
+        reasons: (N,) a `Reason` for every splat.
+        certainty: (N,) `Evidence.gain` as a multiple of the average error per splat, at the time of the removal.
+        views: Number of views that judged.
+    """
+
+    reasons: UInt8[np.ndarray, " N"]
+    certainty: Float64[np.ndarray, " N"]
+    views: int
+
+    @property
+    def removed(self) -> Bool[np.ndarray, " N"]:
+        """Splats to remove."""
+        removed: Bool[np.ndarray, " N"] = self.reasons != Reason.KEPT
+        return removed
+
+
+Progress = Callable[[int, int], None]
+"""Called with (views done, most views)."""
+
+
+def judge(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    settings: RenderSettings,
+    rules: Rules | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Verdict:
+    """Decide which splats the photos do not support.
+
+    Args:
+        gaussians: N Gaussians on the CPU, in the frame of the cameras.
+        views: The views that the scene was trained on.
+        settings: The scene's render settings; photos that are not opaque are judged over their background.
+        rules: Thresholds; None takes the defaults.
+        progress: Called after every view.
+
+    Raises:
+        ArgumentError: there are no views.
+        DatasetError: a photo cannot be read.
+    """
+    rules = rules or Rules()
+    if not views:
+        raise ArgumentError("views: there are none; a scene can only be judged by photos")
+    finite = gaussians.finite_rows().numpy()
+    some = gaussians if finite.all() else gaussians.map(lambda tensor: tensor[torch.from_numpy(finite)])
+    reasons = np.full(len(gaussians), Reason.UNSEEN, dtype=np.uint8)
+    certainty = np.zeros(len(gaussians))
+    chosen = _chosen(views, rules, len(some))
+    reasons[finite], certainty[finite] = _Rounds(some, views, chosen, settings, rules, progress).result()
+    return Verdict(reasons, certainty, len(chosen))
+
+
+def _chosen(views: Sequence[View], rules: Rules, count: int) -> list[View]:
+    """Return views spread evenly over the list, as many as the work of a round allows."""
+    most = max(rules.round_views, int(rules.work / max(count, 1)))
+    number = min(len(views), most)
+    return [views[i * len(views) // number] for i in range(number)]
+
+
+class _Rounds:
+    """The rounds of `judge` on finite Gaussians."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        everything: Sequence[View],
+        views: Sequence[View],
+        settings: RenderSettings,
+        rules: Rules,
+        progress: Progress,
+    ) -> None:
+        self._gaussians, self._views, self._rules, self._progress = gaussians, views, rules, progress
+        self._everything = everything
+        self._settings = replace(settings, depth=False, median_depth=True)
+        self._done, self._total = 0, (rules.rounds + 1) * len(views)
+        self._reasons: UInt8[np.ndarray, " N"] = np.zeros(len(gaussians), dtype=np.uint8)
+
+    def result(self) -> tuple[UInt8[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+        rules, reasons = self._rules, self._reasons
+        seen = np.zeros(len(reasons), dtype=bool)
+        certainty = np.zeros(len(reasons))
+        rare = np.zeros(len(reasons), dtype=bool)
+        for _ in range(rules.rounds):
+            found = self._gathered()
+            seen |= found.peak > ALPHA_MIN
+            free, refuted = self._found(found)
+            kept = reasons == Reason.KEPT
+            rare |= kept & self._rare(found)
+            certainty[kept] = _errors(found)[kept]
+            reasons[kept & refuted] = Reason.REFUTED
+            reasons[kept & free] = Reason.IN_FRONT
+            if (kept & (free | refuted)).sum() <= rules.few * len(reasons):
+                break
+        if (reasons != Reason.KEPT).any():
+            found = self._gathered()
+            seen |= found.peak > ALPHA_MIN
+            reasons[self._missed(found, certainty) & ~rare] = Reason.KEPT
+        if len(self._views) < len(self._everything) and not seen.all():
+            rest = [view for view in self._everything if view not in self._views]
+            seen |= peaks(self._gaussians, rest, self._settings) > ALPHA_MIN
+        reasons[(reasons == Reason.KEPT) & ~seen] = Reason.UNSEEN
+        self._progress(self._total, self._total)
+        return reasons, certainty
+
+    def _found(self, found: Evidence) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+        """Return which splats are in free space, and which the photos refute."""
+        rules, errors, z = self._rules, _errors(found), _agreement(found)
+        free = (found.gap > rules.gap) & (z > rules.against)
+        free |= (found.gap > rules.far_gap) & (z > rules.far_against) | self._rare(found)
+        free &= found.views > 0
+        refuted = (found.gap > rules.near_gap) & (errors > rules.near_error) & (z > rules.near_z)
+        refuted |= (errors > rules.error) & (z > rules.agreement)
+        refuted |= (errors > rules.gross_error) & (z > rules.gross_z)
+        enough = len(self._views) >= rules.least_views
+        return free & enough, refuted & enough
+
+    def _missed(self, found: Evidence, certainty: Float64[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+        """Return which removed splats the photos miss after all."""
+        rules, errors = self._rules, _errors(found)
+        missed: Bool[np.ndarray, " N"] = (_agreement(found) < rules.missed) & (errors < -rules.missed_error)
+        missed &= found.gap < rules.missed_gap
+        missed |= (errors < -rules.harm) & (certainty < rules.gross_error)
+        missed |= (found.gap < rules.behind) & (errors < rules.error)
+        return missed
+
+    def _rare(self, found: Evidence) -> Bool[np.ndarray, " N"]:
+        rare: Bool[np.ndarray, " N"] = found.views <= self._rules.rare * len(self._views)
+        return rare & (found.gap > self._rules.far_gap) & (found.views > 0)
+
+    def _gathered(self) -> Evidence:
+        gone = self._reasons != Reason.KEPT
+        return gather(self._gaussians, self._views, self._settings, gone, self._step)
+
+    def _step(self) -> None:
+        self._done += 1
+        self._progress(self._done, self._total)
+
+
+def _agreement(found: Evidence) -> Float64[np.ndarray, " N"]:
+    """Return z; 0 for a splat about which no view has an opinion."""
+    spread = np.sqrt(found.spread)
+    z: Float64[np.ndarray, " N"] = np.divide(found.gain, spread, out=np.zeros_like(spread), where=spread > 0)
+    return z
+
+
+def _errors(found: Evidence) -> Float64[np.ndarray, " N"]:
+    """Return the gains as multiples of the average error per splat."""
+    errors: Float64[np.ndarray, " N"] = (
+        found.gain * len(found.gain) / max(found.error, np.finfo(np.float64).tiny)
+    )
+    return errors
