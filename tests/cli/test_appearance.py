@@ -93,3 +93,13 @@ def test_transparent_photos_and_unknown_names_are_refused(tmp_path, capsys):
     assert main([*words, "brighter"]) == 2
     assert "--appearance" in capsys.readouterr().err
     assert main([*words, "auto"]) == 0
+
+
+def test_doctor_compares_a_corrected_run_at_the_exposure_of_each_photo(uneven, tmp_path, capsys):
+    run = tmp_path / "run"
+    assert main(["train", str(uneven), "--out", str(run), "--iterations", "40", "--resolution", "2"]) == 0
+    capsys.readouterr()
+    assert main(["doctor", str(run)]) == 0
+    said = capsys.readouterr().out
+    assert "each render was given its photo's exposure first" in said
+    assert "brighter or darker" not in said and "--appearance" not in said

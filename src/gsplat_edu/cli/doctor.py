@@ -101,18 +101,19 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         device_of(backend)
     )  # in the coordinate frame of the cameras
     renderer = functools.partial(render, settings=settings, backend=backend)
+    section = config.get("train")
+    corrected = isinstance(section, dict) and section.get("appearance", "none") != "none"
     with _bar(console) as bar:
         task = bar.add_task("views", total=len(dataset.train) + len(dataset.test))
         train, test = (
-            residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task))
+            residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task), corrected)
             for views in (dataset.train, dataset.test)
         )
     extent = scene_extent([view.camera for view in dataset.train])
-    section = config.get("train")
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
     capture = arguments.dataset or Path(config["data"]["path"])
-    beforehand, uncompared = _exposure_beforehand(capture, console)
+    beforehand, uncompared = ([], "") if corrected else _exposure_beforehand(capture, console)
     trained = Trained(
         folder.path,
         gaussians,
@@ -127,6 +128,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         beforehand=beforehand,
         uncompared=uncompared,
         strategy=_strategy(section),
+        corrected=corrected,
     )
     return examine_run(trained), view_lines(trained) if arguments.all_views else ()
 

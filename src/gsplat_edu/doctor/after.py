@@ -72,6 +72,8 @@ class Trained:
         beforehand: Findings about exposure from the photos alone.
         uncompared: Why the exposure of the photos was not compared; empty if it was.
         strategy: The run's recipe.
+        corrected: Whether the training corrected exposures; then the residuals are those of corrected renders, and
+            there are no findings beforehand.
     """
 
     path: Path
@@ -87,6 +89,7 @@ class Trained:
     beforehand: Sequence[Finding] = ()
     uncompared: str = ""
     strategy: str = "adc"
+    corrected: bool = False
 
     @property
     def usual(self) -> int:
@@ -205,7 +208,9 @@ def _facts(run: Trained) -> tuple[tuple[str, str], ...]:
             low = sorted(views, key=lambda view: view.psnr)[:NAMED]
             worst = ", ".join(f"{view.name} {view.psnr:.1f}" for view in low)
             facts.append((name, f"{len(views)} views, PSNR {_mean(views):.2f} dB; worst {worst}"))
-    if run.uncompared:
+    if run.corrected:
+        facts.append(("exposure", "each render was given its photo's exposure first, as in the training"))
+    elif run.uncompared:
         facts.append(("exposure", f"compared with the scene only, not between photos: {run.uncompared}"))
     return tuple(facts)
 
@@ -286,9 +291,7 @@ def _exposure(run: Trained) -> list[Finding]:
     names = tuple(view.name for view in off)
     stops = tuple(f"{view.stops - usual:+.1f}" for view in off)
     what = f"{counted(len(off), 'photo')} brighter or darker than the scene, in stops"
-    advice = (
-        "remove the photos whose exposure jumps, or equalise them: the scene reproduces the jumps with fog"
-    )
+    advice = "train with --appearance exposure, or remove the photos: the scene reproduces the jumps with fog"
     found = [Finding(EXPOSURE, Severity.WARNING, what, advice, names, stops)] if off else []
     # A scene that fits photos of differing exposure hides the difference, so findings from the photos alone count too.
     hidden = "the scene fits them nevertheless, with fog or view-dependent colours"

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float64
 
 from gsplat_edu.doctor.photos import BRIGHT, DARK, GAMMA
-from gsplat_edu.evaluate.metrics import Renderer, psnr
+from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, psnr
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.validation import ArrayLike
@@ -52,6 +52,7 @@ def residuals(
     render: Renderer,
     background: ArrayLike,
     progress: Callable[[], None] = lambda: None,
+    corrected: bool = False,
 ) -> list[Residual]:
     """Render views and compare them with their photos.
 
@@ -61,6 +62,7 @@ def residuals(
         render: Renders Gaussians from a camera, with depth, over `background`.
         background: (3,) RGB behind transparent photos.
         progress: Called after every view.
+        corrected: Give each render the exposure of its photo first, as the training did.
 
     Returns:
         In the order of the views.
@@ -77,8 +79,9 @@ def residuals(
                 veiled = _veiled(gaussians, view, output, render)
             truth = photo.over(background)
             pixels = truth / 255.0 if truth.dtype == np.uint8 else np.asarray(truth, dtype=np.float64)
-            stops = _stops(pixels, output.image.double().numpy(force=True), photo.mask)
-            found.append(Residual(view.name, psnr(output.image, truth, photo.mask), stops, veiled))
+            image = at_exposure_of(truth, output.image, photo.mask) if corrected else output.image
+            stops = _stops(pixels, image.double().numpy(force=True), photo.mask)
+            found.append(Residual(view.name, psnr(image, truth, photo.mask), stops, veiled))
         progress()
     return found
 

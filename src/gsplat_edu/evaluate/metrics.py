@@ -21,13 +21,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.exposure import color_matrix, measured_gains
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import l1_ssim
+from gsplat_edu.recolor import recolored
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.validation import ArrayLike, check_shape, float64_array
 from gsplat_edu.views import Photo, View
@@ -107,6 +108,24 @@ def psnr_fitted(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = Non
         dB; None if no pixel of the right half counts.
     """
     return _Pair(image, truth, mask).psnr_fitted()
+
+
+def at_exposure_of(
+    photo: UInt8[np.ndarray, "H W 3"] | Float[np.ndarray, "H W 3"],
+    image: Float[torch.Tensor, "H W 3"],
+    mask: Bool[np.ndarray, "H W"] | None = None,
+) -> Float[torch.Tensor, "H W 3"]:
+    """Return a render with the exposure and white balance of a photo: one gain per channel, measured on all pixels.
+
+    Args:
+        photo: (H, W, 3) uint8, or float from 0 to 1.
+        image: (H, W, 3) render.
+        mask: (H, W) true for pixels that count; None if all do.
+    """
+    truth = torch.from_numpy(np.ascontiguousarray(photo)).to(image.device)
+    counts = None if mask is None else torch.from_numpy(mask).to(image.device)
+    matrix = color_matrix(measured_gains(image, truth, counts))
+    return recolored(image, matrix, truth if truth.dtype == torch.uint8 else None)
 
 
 def mean_absolute_error(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:

@@ -45,7 +45,7 @@ class Exposure(Identity):
 
     Args:
         count: Number of views.
-        iterations: Length of the run.
+        iterations: Length of the schedule.
         like: A tensor of the renders' dtype and device.
     """
 

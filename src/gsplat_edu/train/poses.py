@@ -34,7 +34,7 @@ TWISTS, LENSES = "twists", "lenses"
 """Names of the parameters."""
 
 FINAL = 0.01
-"""The rates fall log-linearly to this share over the run."""
+"""The rates fall log-linearly to this share, over as many iterations as that of the means; then they are constant."""
 
 
 class Refinement(Identity):
@@ -42,7 +42,7 @@ class Refinement(Identity):
 
     Args:
         cameras: The cameras of the training views, at their full size.
-        config: The settings: which of the two, rates, and the length of the run.
+        config: The settings: which of the two, rates, and the length of the schedule.
         extent: Size of the scene, world units.
     """
 
@@ -56,8 +56,10 @@ class Refinement(Identity):
         self._lenses = torch.zeros(len(self._lenses_by_key), 4, dtype=torch.float64).requires_grad_()
         # Each view is drawn once in as many steps as there are views. The root of Adam's second moment is smaller than
         # the view's gradient by the root of their number, so its steps are larger than the rate by that factor.
-        of_poses = functools.partial(_rate, config.pose_rate / math.sqrt(len(cameras)), config.iterations)
-        of_lenses = functools.partial(_rate, config.lens_rate, config.iterations)
+        of_poses = functools.partial(
+            _rate, config.pose_rate / math.sqrt(len(cameras)), config.means_rate_iterations
+        )
+        of_lenses = functools.partial(_rate, config.lens_rate, config.means_rate_iterations)
         self._groups = {
             TWISTS: ParameterGroup(of_poses, eps=config.adam_eps, per_gaussian=False),
             LENSES: ParameterGroup(of_lenses, eps=config.adam_eps, per_gaussian=False),
