@@ -32,7 +32,7 @@ from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
-from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
+from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import needs_poses
 from gsplat_edu.train.events import Event, StepEvent
@@ -118,12 +118,17 @@ def _run(
                 functools.partial(export_all, arguments.export, bar, options.backend, say)
                 if arguments.export
                 else None,
-                cleaner(capture.dataset, options.render_settings, say) if arguments.clean else None,
+                _cleaner(capture, say) if arguments.clean else None,
             )
         _report(capture, result, say)
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
             view.stay()
+
+
+def _cleaner(capture: CaptureRun, say: Callable[[str], None]) -> Clean:
+    options = capture.options
+    return cleaner(capture.dataset, options.render_settings, say, options.config.appearance != "none")
 
 
 def _with_poses(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +17,10 @@ from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import FORMATS
+from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.dataset import run_dataset
+from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import capture_difference
 from gsplat_edu.runs.source import NamedCamera, Source, open_source, relative_to, run_of, scene_up
@@ -78,6 +81,9 @@ def open_subject(path: Path, dataset: Path | None) -> Subject:
         if found := capture_difference(run, capture):
             raise ArgumentError(f"{capture.path} is not the capture of {run.path}: {found}")
         gaussians = source.scene.gaussians
+        section = run.read_config().get("train")
+        if isinstance(section, dict) and section.get("appearance", "none") != "none":
+            capture = _at_exposure(capture, gaussians, source.settings)
     cameras = _cameras(capture)
     up = source.scene.up or scene_up([camera for _, camera in cameras])
     x, y, z = capture.origin.tolist()
@@ -88,8 +94,13 @@ def open_subject(path: Path, dataset: Path | None) -> Subject:
     )
 
 
+def _at_exposure(dataset: Dataset, gaussians: Gaussians, settings: RenderSettings) -> Dataset:
+    shown = functools.partial(render, settings=settings, backend="cpu")
+    return at_exposure_of_scene(dataset, gaussians, shown, settings.background)
+
+
 def cleaner(
-    dataset: Dataset, settings: RenderSettings, say: Callable[[str], None]
+    dataset: Dataset, settings: RenderSettings, say: Callable[[str], None], corrected: bool = False
 ) -> Callable[[Gaussians], tuple[Gaussians, dict[str, Any]]]:
     """Return what cleans the scene at the end of a training; see `gsplat_edu.runs.training.CaptureRun.finish`.
 
@@ -97,10 +108,13 @@ def cleaner(
         dataset: The capture.
         settings: The scene's render settings.
         say: Receives the report, line by line.
+        corrected: Compare the scene with photos of its own exposure, because the training corrected exposures.
     """
 
     def cleaned(gaussians: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
-        cleaning = clean(gaussians.to(torch.device("cpu")), dataset.train, dataset.test, settings)
+        here = gaussians.to(torch.device("cpu"))
+        photos = _at_exposure(dataset, here, settings) if corrected else dataset
+        cleaning = clean(here, photos.train, photos.test, settings)
         for line in lines(cleaning):
             say(line)
         return cleaning.apply(gaussians), document(cleaning)

@@ -1,0 +1,72 @@
+"""Photos at the exposure of the scene, to judge the scene of a run that corrected exposures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.exposure import color_matrix, measured_gains
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.recolor import recolored
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.validation import ArrayLike
+from gsplat_edu.views import Photo, View
+
+Render = Callable[[Gaussians, Camera], RenderOutput]
+"""Renders Gaussians from a camera."""
+
+
+def at_exposure_of_scene(
+    dataset: Dataset, gaussians: Gaussians, render: Render, background: ArrayLike
+) -> Dataset:
+    """Return the capture with photos whose exposure and white balance are those of the scene.
+
+    The gains are measured here, once per view; the photos are converted whenever they are read.
+
+    Args:
+        dataset: The capture.
+        gaussians: The scene.
+        render: Renders Gaussians from a camera, over `background`.
+        background: (3,) colour behind photos that are not opaque.
+
+    Raises:
+        DatasetError: a photo cannot be read.
+    """
+
+    def converted(views: Sequence[View]) -> tuple[View, ...]:
+        return tuple(
+            _converted(view, _log_gains(view, gaussians, render, background), background) for view in views
+        )
+
+    return replace(dataset, train=converted(dataset.train), test=converted(dataset.test))
+
+
+def _log_gains(view: View, gaussians: Gaussians, render: Render, background: ArrayLike) -> Float[Tensor, "3"]:
+    photo = view.read()
+    with torch.no_grad():
+        image = render(gaussians, view.camera).image
+    mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(image.device)
+    truth = torch.from_numpy(np.ascontiguousarray(photo.over(background))).to(image.device)
+    return measured_gains(image, truth, mask).cpu()
+
+
+def _converted(view: View, log_gains: Float[Tensor, "3"], background: ArrayLike) -> View:
+    """Return the view with its photo divided by the gains: y becomes y / g + 0.055 (1 / g - 1)."""
+
+    def read() -> Photo:
+        photo = view.read()
+        pixels = np.asarray(photo.over(background))
+        values = torch.from_numpy(np.ascontiguousarray(pixels)).float() / (
+            255.0 if pixels.dtype == np.uint8 else 1.0
+        )
+        found = recolored(values, color_matrix(-log_gains.float())).clamp(0.0, 1.0)
+        return Photo(found.numpy(), mask=photo.mask)
+
+    return View.stored(view.camera, read, view.name)

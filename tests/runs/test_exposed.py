@@ -1,0 +1,77 @@
+"""Photos at the exposure of the scene: a scaled photo comes back, masks count, and `clean` judges by them."""
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.cli.main import main
+from gsplat_edu.data.dataset import load_dataset
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.runs.cleaning import open_subject
+from gsplat_edu.runs.exposed import at_exposure_of_scene
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.initialize import from_points
+from gsplat_edu.views import View
+from test_exposure import photographed
+
+
+def shows(image):
+    """A renderer that shows this image, with everything opaque."""
+    seen = torch.from_numpy(image).float()
+
+    def render(gaussians, camera):
+        none = torch.zeros(0, dtype=torch.int64)
+        return RenderOutput(
+            seen, torch.zeros(seen.shape[:2]), None, none, torch.zeros(0, 2), None, lambda: none
+        )
+
+    return render
+
+
+def test_a_photo_comes_back_at_the_exposure_of_the_scene(tmp_path):
+    views, points, colors = procedural_capture(24, 4, splats=60)
+    camera = views[0].camera
+    image = np.random.default_rng(0).uniform(0.15, 0.6, (camera.H, camera.W, 3))
+    darker = photographed(image, np.array([0.6, 0.7, 0.8]))
+    write_colmap(tmp_path, [View(v.camera, darker, name=v.name) for v in views], points, colors)
+    dataset = load_dataset(tmp_path)
+    gaussians = from_points(points, colors, recipe(1))
+    found = at_exposure_of_scene(dataset, gaussians, shows(image), (0.0, 0.0, 0.0))
+    assert len(found.train) == len(dataset.train) and len(found.test) == len(dataset.test)
+    # A byte is 1/255, which dividing by the gain enlarges by up to a quarter; the gains are good to 1 %.
+    np.testing.assert_allclose(found.train[0].read().image, image, atol=0.012)
+    assert found.train[0].camera is dataset.train[0].camera
+
+
+@pytest.mark.parametrize("appearance", ["none", "exposure"])
+def test_clean_judges_a_corrected_run_at_its_exposure(tmp_path, appearance, capsys):
+    """The photos that judge a run are converted if its training corrected exposures, and only then."""
+    views, points, colors = procedural_capture(32, 8, splats=120)
+    rng = np.random.default_rng(1)
+    scales = 2.0 ** rng.uniform(-0.7, 0.7, (8, 1)) * np.ones(3)
+    uneven = [
+        View(v.camera, photographed(v.read().image / 255.0, s), name=v.name)
+        for v, s in zip(views, scales, strict=True)
+    ]
+    write_colmap(tmp_path / "capture", uneven, points, colors)
+    run = tmp_path / "run"
+    words = [
+        "train",
+        str(tmp_path / "capture"),
+        "--out",
+        str(run),
+        "--iterations",
+        "60",
+        "--appearance",
+        appearance,
+    ]
+    assert main([*words, "--max-gaussians", "400"]) == 0
+    photos = [view.read().image for view in open_subject(run, None).dataset.train]
+    given = [view.read().image for view in load_dataset(tmp_path / "capture").train]
+    same = all(np.array_equal(a, b) for a, b in zip(photos, given, strict=True))
+    assert same == (appearance == "none")
+    capsys.readouterr()
+    assert main(["clean", str(run), "--dry-run"]) == 0
+    assert "dry run: no scene was written" in capsys.readouterr().out
