@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, UInt8
 
-from gsplat_edu.clean.evidence import Evidence, gather, peaks
+from gsplat_edu.clean.evidence import Evidence, gather, peak_weights
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
@@ -212,7 +212,7 @@ class _Rounds:
             reasons[self._missed(found, certainty) & ~rare] = Reason.KEPT
         if len(self._views) < len(self._everything) and not seen.all():
             rest = [view for view in self._everything if view not in self._views]
-            seen |= peaks(self._gaussians, rest, self._settings) > ALPHA_MIN
+            seen |= peak_weights(self._gaussians, rest, self._settings) > ALPHA_MIN
         reasons[(reasons == Reason.KEPT) & ~seen] = Reason.UNSEEN
         self._progress(self._total, self._total)
         return reasons, certainty

@@ -101,7 +101,7 @@ def cleaner(
 
     def cleaned(gaussians: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
         cleaning = clean(gaussians.to(torch.device("cpu")), dataset.train, dataset.test, settings)
-        for line in lines(cleaning):
+        for line in report_lines(cleaning):
             say(line)
         return cleaning.apply(gaussians), document(cleaning)
 
@@ -119,7 +119,7 @@ def default_target(path: Path) -> Path:
     return path.with_name(f"{name[: len(name) - len(suffix)]}.clean.ply")
 
 
-def lines(cleaning: Cleaning) -> list[str]:
+def report_lines(cleaning: Cleaning) -> list[str]:
     """Describe a cleaning: counts by reason, PSNR before and after, and what the guard took back.
 
     Args:
