@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_edu.camera import Camera
-from gsplat_edu.clean.evidence import FAINT, MOST_OPAQUE, TURNS, gather, peaks
+from gsplat_edu.clean.evidence import FAINT, MOST_OPAQUE, TURNS, gather, peak_weights
 from gsplat_edu.constants import C0
 from gsplat_edu.gaussian_math import build_cov3d_batch, quat_to_R_batch
 from gsplat_edu.gaussians import Gaussians
@@ -133,6 +133,6 @@ def test_masked_pixels_say_nothing(scene, photo):
     assert one.error == pytest.approx(squared_error(scene, photo, mask))
 
 
-def test_peaks_are_those_of_the_evidence(scene, photo):
+def test_peak_weights_are_those_of_the_evidence(scene, photo):
     found = gather(scene, [View(CAMERA, photo)], SETTINGS)
-    np.testing.assert_allclose(peaks(scene, [View(CAMERA, photo)], SETTINGS), found.peak, rtol=1e-6)
+    np.testing.assert_allclose(peak_weights(scene, [View(CAMERA, photo)], SETTINGS), found.peak, rtol=1e-6)

@@ -28,6 +28,7 @@ NEEDED = {
     "eval": "a",
     "render": "a",
     "convert": "a b.ply",
+    "clean": "a",
     "view": "a",
     "doctor": "a",
     "info": "a",
@@ -47,6 +48,8 @@ OUT_OF_RANGE = [
     "render a --backend gpu",
     "sfm a b --matcher none",
     "sfm a b --frames 0",
+    "clean a --max-loss -1",
+    "clean a --dry-run --out b.ply",
 ]
 
 

@@ -95,7 +95,9 @@ def gather(
     return sums.evidence()
 
 
-def peaks(gaussians: Gaussians, views: Sequence[View], settings: RenderSettings) -> Float32[np.ndarray, " N"]:
+def peak_weights(
+    gaussians: Gaussians, views: Sequence[View], settings: RenderSettings
+) -> Float32[np.ndarray, " N"]:
     """Return the largest weight of each splat in any pixel of any view; photos are not read.
 
     Args:

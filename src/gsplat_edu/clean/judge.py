@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, UInt8
 
-from gsplat_edu.clean.evidence import Evidence, gather, peaks
+from gsplat_edu.clean.evidence import Evidence, gather, peak_weights
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
@@ -74,9 +74,9 @@ class Rules:
         missed: z below which the last round takes a splat back,
         missed_gap: if its gap is below this,
         missed_error: and its absence adds this much error.
-        harm: Whatever its gap and z, a splat is also taken back if its absence adds this much error, unless its removal
-            lowered the error by `gross_error`;
-        behind: and below this gap, behind what the views see, unless its absence still lowers the error by `error`.
+        harm: The last round also takes back, whatever z is, a splat below that gap whose absence adds this much error,
+            unless its removal lowered the error by `gross_error`; and a splat that turns out to lie behind what the
+            views see, unless its absence still lowers the error by `error`.
         least_views: Fewer views than this do not find floaters, only what they do not see.
         rounds: Most rounds of removal.
         few: The rounds end once one removes at most this share of the splats.
@@ -100,12 +100,11 @@ class Rules:
     missed_gap: float = 0.4
     missed_error: float = 1.0
     harm: float = 10.0
-    behind: float = -0.03
     least_views: int = 3
     rounds: int = 4
     few: float = 1e-4
     work: float = 6e6
-    round_views: int = 20
+    round_views: int = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +211,7 @@ class _Rounds:
             reasons[self._missed(found, certainty) & ~rare] = Reason.KEPT
         if len(self._views) < len(self._everything) and not seen.all():
             rest = [view for view in self._everything if view not in self._views]
-            seen |= peaks(self._gaussians, rest, self._settings) > ALPHA_MIN
+            seen |= peak_weights(self._gaussians, rest, self._settings) > ALPHA_MIN
         reasons[(reasons == Reason.KEPT) & ~seen] = Reason.UNSEEN
         self._progress(self._total, self._total)
         return reasons, certainty
@@ -233,9 +232,9 @@ class _Rounds:
         """Return which removed splats the photos miss after all."""
         rules, errors = self._rules, _errors(found)
         missed: Bool[np.ndarray, " N"] = (_agreement(found) < rules.missed) & (errors < -rules.missed_error)
-        missed &= found.gap < rules.missed_gap
         missed |= (errors < -rules.harm) & (certainty < rules.gross_error)
-        missed |= (found.gap < rules.behind) & (errors < rules.error)
+        missed &= found.gap < rules.missed_gap
+        missed |= (found.gap < 0.0) & (errors < rules.error)
         return missed
 
     def _rare(self, found: Evidence) -> Bool[np.ndarray, " N"]:

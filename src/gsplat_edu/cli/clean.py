@@ -13,7 +13,7 @@ from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.formats import format_of
 from gsplat_edu.io.ply import ORIGIN, save_ply
-from gsplat_edu.runs.cleaning import SIGNALS, default_target, lines, open_subject, preview
+from gsplat_edu.runs.cleaning import SIGNALS, default_target, open_subject, preview, report_lines
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.viewer import export
 
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> None:
             arguments.max_loss,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    console.print(*lines(cleaning), sep="\n", soft_wrap=True)
+    console.print(*report_lines(cleaning), sep="\n", soft_wrap=True)
     if arguments.preview is not None:
         export.write(arguments.preview, preview(source, cleaning))
         colors = ", ".join(

@@ -115,7 +115,7 @@ def cleaner(
         here = gaussians.to(torch.device("cpu"))
         photos = _at_exposure(dataset, here, settings) if corrected else dataset
         cleaning = clean(here, photos.train, photos.test, settings)
-        for line in lines(cleaning):
+        for line in report_lines(cleaning):
             say(line)
         return cleaning.apply(gaussians), document(cleaning)
 
@@ -133,7 +133,7 @@ def default_target(path: Path) -> Path:
     return path.with_name(f"{name[: len(name) - len(suffix)]}.clean.ply")
 
 
-def lines(cleaning: Cleaning) -> list[str]:
+def report_lines(cleaning: Cleaning) -> list[str]:
     """Describe a cleaning: counts by reason, PSNR before and after, and what the guard took back.
 
     Args:
