@@ -80,3 +80,10 @@ def test_a_run_without_test_views_is_evaluated(capture, folder):
     }
     assert result.metrics["train"]["num_images"] == 1
     assert folder.report.is_file() and not folder.renders.exists()
+
+
+def test_metrics_json_is_checked_for_every_score():
+    from gsplat_edu.evaluate import metrics
+    from gsplat_edu.runs import fields
+
+    assert fields.MEASURES == metrics.MEASURES

@@ -14,7 +14,7 @@ import numpy as np
 from gsplat_edu.doctor.appearance import Gains
 from gsplat_edu.doctor.survey import Survey, prepare
 
-STEP = 0.25
+UNLIKE = 0.25
 """A photo counts if its brightness or a channel's tint differs from its neighbours' by more than this, stops."""
 
 SHARE = 0.1
@@ -49,7 +49,7 @@ def appearance_of(survey: Survey) -> Remedy:
     if len(survey.shots) < 2 or any(shot.stats.transparent for shot in survey.shots):
         return Remedy("none")
     gains = Gains(survey)
-    differ = (np.abs(gains.light) > STEP) | (gains.tint > STEP)
+    differ = (np.abs(gains.light) > UNLIKE) | (gains.tint > UNLIKE)
     if np.mean(differ) < SHARE:
         return Remedy("none")
     largest = float(np.abs(gains.light).max())

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from gsplat_edu.errors import CheckpointError
-from gsplat_edu.evaluate.metrics import MEASURES
 
 LARGEST_WHOLE = 2**63
 """Integers must be smaller than this in absolute value."""
@@ -72,6 +71,9 @@ LOG: Mapping[str, Check] = {
     "terms": _numbers,
     **dict.fromkeys(("loss", "psnr", "ssim", "ms", "seconds"), _number),
 }
+
+MEASURES = ("psnr", "psnr_8bit", "ssim", "l1", "psnr_fitted")
+"""The scores of a split: those of `gsplat_edu.evaluate.metrics.ImageScore`, which imports torch."""
 
 METRICS: Mapping[str, Check] = {
     "iterations": _whole,

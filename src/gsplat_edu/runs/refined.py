@@ -39,14 +39,14 @@ def write_refined(folder: RunFolder, views: tuple[list[View], list[View]], datas
         OSError: a file cannot be written.
     """
     every = [
-        View.stored(moved(view.camera, dataset), view.read, name)
+        View.stored(in_capture_frame(view.camera, dataset), view.read, name)
         for part in views
         for view, name in zip(part, png_names(part), strict=True)
     ]
     write_colmap(folder.refined, every, dataset.points + dataset.origin, dataset.colors)
 
 
-def moved(camera: Camera, dataset: Dataset) -> Camera:
+def in_capture_frame(camera: Camera, dataset: Dataset) -> Camera:
     """Return a camera of the dataset in the capture's own coordinates."""
     return Camera.posed(camera.R, camera.eye + dataset.origin, camera.intrinsics)
 

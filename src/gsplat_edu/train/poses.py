@@ -85,7 +85,7 @@ class Refinement(Identity):
             twist: Tensor = _Anchored.apply(self._twists, self._gauge, index)  # type: ignore[no-untyped-call]
             given = given.moved(torch.cat([twist[:3], self._extent * twist[3:]]))
         if LENSES in self._names():
-            given = given.with_intrinsics(changed(given, self._lenses[self._lens_of[index]]))
+            given = given.with_intrinsics(refined_intrinsics(given, self._lenses[self._lens_of[index]]))
         return given
 
     def refined(self, index: int, camera: Camera) -> Camera:
@@ -100,7 +100,7 @@ class Refinement(Identity):
             return camera
         with torch.no_grad():
             given = CameraTensors.of(camera)
-            return given.with_intrinsics(changed(given, self._lenses[index])).value()
+            return given.with_intrinsics(refined_intrinsics(given, self._lenses[index])).value()
 
 
 def lens_key(camera: Camera) -> tuple[float, ...]:
@@ -108,7 +108,7 @@ def lens_key(camera: Camera) -> tuple[float, ...]:
     return camera.fx, camera.fy, camera.cx, camera.cy, float(camera.W), float(camera.H)
 
 
-def changed(camera: CameraTensors, lens: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
+def refined_intrinsics(camera: CameraTensors, lens: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
     """Return the intrinsics of a camera after the change (a, b, c, d) of its lens."""
     fx, fy, cx, cy = camera.intrinsics.unbind()
     a, b, c, d = lens.unbind()
