@@ -170,7 +170,8 @@ def _planned(
     """Find poses if necessary, and choose the options that the limits leave open."""
     options = _with_poses(options_from(arguments), arguments, console, say)
     if chooses_appearance(arguments):
-        remedy = appearance_for(options.data)
+        with _bar(console, "") as bar:
+            remedy = appearance_for(options.data, _photos(bar, lambda: False))
         options = replace(options, config=options.config.changed(appearance=remedy.value))
         if remedy.reason:
             say(f"--appearance {remedy.value}: {remedy.reason}")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsplat_edu.doctor.appearance import Gains
-from gsplat_edu.doctor.survey import Survey, prepare
+from gsplat_edu.doctor.survey import Progress, Survey, prepare
 
 UNLIKE = 0.25
 """A photo counts if its brightness or a channel's tint differs from its neighbours' by more than this, stops."""
@@ -35,13 +35,17 @@ class Remedy:
     reason: str = ""
 
 
-def appearance_for(path: Path) -> Remedy:
+def appearance_for(path: Path, progress: Progress | None = None) -> Remedy:
     """Choose `--appearance` for a capture from its photos.
+
+    Args:
+        path: Folder or transforms.json of the capture.
+        progress: Called with (photos done, total) in the calling thread.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
-    return appearance_of(prepare(path, sharpness=False))
+    return appearance_of(prepare(path, progress, sharpness=False))
 
 
 def appearance_of(survey: Survey) -> Remedy:
