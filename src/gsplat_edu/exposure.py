@@ -43,8 +43,8 @@ def measured_gains(
 ) -> Float[Tensor, "3"]:
     """Return the natural logarithm of each channel's gain from an image to a photo of the same scene.
 
-    The median over pixels of log((y + 0.055) / (x + 0.055)). A mean would take every dark gap of an unfinished scene
-    for a bright photo, and the scene would then learn to be darker still.
+    The median over pixels of log((y + 0.055) / (x + 0.055)). Unlike the mean, it ignores dark gaps of an
+    unfinished scene.
 
     Args:
         image: (H, W, 3) render; values below 0 count as 0.

@@ -35,6 +35,24 @@ def test_a_run_writes_the_refined_capture_and_an_aligned_score(capture, tmp_path
     assert main(["train", str(run / "refined"), "--out", str(tmp_path / "again"), "--iterations", "2"]) == 0
 
 
+def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
+    """With `--refine`, the scene stands where the refined cameras see it."""
+    from gsplat_edu.runs import cleaning
+
+    judged, original = [], cleaning.clean
+
+    def noted(gaussians, train, *others, **more):
+        judged.extend(train)
+        return original(gaussians, train, *others, **more)
+
+    monkeypatch.setattr(cleaning, "clean", noted)
+    run = tmp_path / "run"
+    words = ["train", str(capture), "--out", str(run), "--iterations", "12", "--refine", "poses", "--clean"]
+    assert main(words) == 0
+    refined = {view.name: view.camera for view in load_dataset(run / "refined").train}
+    assert judged and all(abs(view.camera.eye - refined[view.name].eye).max() < 1e-9 for view in judged)
+
+
 def test_unknown_names_are_refused(capture, tmp_path, capsys):
     assert main(["train", str(capture), "--out", str(tmp_path / "run"), "--refine", "everything"]) == 2
     assert "refine" in capsys.readouterr().err

@@ -128,7 +128,7 @@ def _run(
 
 def _cleaner(capture: CaptureRun, say: Callable[[str], None]) -> Clean:
     options = capture.options
-    return cleaner(capture.dataset, options.render_settings, say, options.config.appearance != "none")
+    return cleaner(options.render_settings, say, options.config.appearance != "none")
 
 
 def _with_poses(

@@ -100,18 +100,17 @@ def _at_exposure(dataset: Dataset, gaussians: Gaussians, settings: RenderSetting
 
 
 def cleaner(
-    dataset: Dataset, settings: RenderSettings, say: Callable[[str], None], corrected: bool = False
-) -> Callable[[Gaussians], tuple[Gaussians, dict[str, Any]]]:
+    settings: RenderSettings, say: Callable[[str], None], corrected: bool = False
+) -> Callable[[Gaussians, Dataset], tuple[Gaussians, dict[str, Any]]]:
     """Return what cleans the scene at the end of a training; see `gsplat_edu.runs.training.CaptureRun.finish`.
 
     Args:
-        dataset: The capture.
         settings: The scene's render settings.
         say: Receives the report, line by line.
         corrected: Compare the scene with photos of its own exposure, because the training corrected exposures.
     """
 
-    def cleaned(gaussians: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
+    def cleaned(gaussians: Gaussians, dataset: Dataset) -> tuple[Gaussians, dict[str, Any]]:
         here = gaussians.to(torch.device("cpu"))
         photos = _at_exposure(dataset, here, settings) if corrected else dataset
         cleaning = clean(here, photos.train, photos.test, settings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -17,14 +18,14 @@ from gsplat_edu.train.poses import Refinement
 from gsplat_edu.views import View
 
 
-def refined_views(refinement: Refinement, dataset: Dataset) -> tuple[list[View], list[View]]:
-    """Return the training views with refined cameras, and the test views with refined intrinsics.
+def with_refined_cameras(refinement: Refinement, dataset: Dataset) -> Dataset:
+    """Return the capture with the refined cameras of its training views, and refined intrinsics of its test views.
 
     The poses of test views are never refined.
     """
     train = [with_camera(view, refinement.refined(i, view.camera)) for i, view in enumerate(dataset.train)]
     test = [with_camera(view, refinement.with_refined_lens(view.camera)) for view in dataset.test]
-    return train, test
+    return replace(dataset, train=tuple(train), test=tuple(test))
 
 
 def with_camera(view: View, camera: Camera) -> View:
@@ -32,7 +33,7 @@ def with_camera(view: View, camera: Camera) -> View:
     return View.stored(camera, view.read, view.name)
 
 
-def write_refined(folder: RunFolder, views: tuple[list[View], list[View]], dataset: Dataset) -> None:
+def write_refined(folder: RunFolder, dataset: Dataset) -> None:
     """Write RUN/refined: the photos as they were trained on, as PNG, with the refined cameras in COLMAP's layout.
 
     Raises:
@@ -40,7 +41,7 @@ def write_refined(folder: RunFolder, views: tuple[list[View], list[View]], datas
     """
     every = [
         View.stored(in_capture_frame(view.camera, dataset), view.read, name)
-        for part in views
+        for part in (dataset.train, dataset.test)
         for view, name in zip(part, png_names(part), strict=True)
     ]
     write_colmap(folder.refined, every, dataset.points + dataset.origin, dataset.colors)

@@ -16,7 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.data.dataset import load_dataset, scene_extent
+from gsplat_edu.data.dataset import Dataset, load_dataset, scene_extent
 from gsplat_edu.data.images import decode
 from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.evaluate.metrics import score_views, summarize
@@ -30,7 +30,7 @@ from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_ru
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
-from gsplat_edu.runs.refined import aligned_score, refined_views, write_refined
+from gsplat_edu.runs.refined import aligned_score, with_refined_cameras, write_refined
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
 from gsplat_edu.train.checkpoint import (
@@ -43,7 +43,6 @@ from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
 from gsplat_edu.train.trainer import Callback, StepParts, Trainer
-from gsplat_edu.views import View
 
 
 def document(options: RunOptions) -> dict[str, Any]:
@@ -70,7 +69,7 @@ WITHOUT_ALPHA = (".jpg", ".jpeg")
 Export = Callable[[Source], list[dict[str, Any]]]
 """Writes a scene in further formats and returns a record of each file: "path", "psnr" and more."""
 
-Clean = Callable[[Gaussians], tuple[Gaussians, dict[str, Any]]]
+Clean = Callable[[Gaussians, Dataset], tuple[Gaussians, dict[str, Any]]]
 """Removes splats from a scene, and returns the others and a record of the removal."""
 
 
@@ -337,29 +336,28 @@ class CaptureRun:
         Args:
             progress: Called for every scored view.
             export: Called with the written scene; metrics.json and the report get its result as "exports".
-            clean: Called with the scene first; metrics.json gets its record as "cleaning".
+            clean: Called with the scene and the capture first; metrics.json gets its record as "cleaning".
         """
         trainer, dataset = self.trainer, self.dataset
+        refinement = self._refinement
+        refined = None if refinement is None else with_refined_cameras(refinement, dataset)
         gaussians = trainer.gaussians.map(lambda tensor: tensor[trainer.gaussians.finite_rows()])
         if lost := len(trainer.gaussians) - len(gaussians):
             self._say(f"{lost} Gaussians are NaN or infinite and are left out of the scene")
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         if clean is not None:
-            gaussians, facts["cleaning"] = clean(gaussians)
+            gaussians, facts["cleaning"] = clean(gaussians, refined or dataset)
         path = self.folder.scene(trainer.iteration)
         save_ply(path, gaussians, dataset.origin, self.options.render_settings.antialiased)
         if export is not None:
             facts["exports"] = export(open_source(path))
-        train: Sequence[View] = dataset.train
-        if self._refinement is not None:
-            views = refined_views(self._refinement, dataset)
-            train = views[0]
-            write_refined(self.folder, views, dataset)
+        if refined is not None:
+            write_refined(self.folder, refined)
             self._say(f"wrote {self.folder.refined}: the capture with its refined cameras")
-            facts |= aligned_score(views[1], gaussians, self.options, trainer.extent, self._say)
+            facts |= aligned_score(refined.test, gaussians, self.options, trainer.extent, self._say)
         return evaluate_run(
             self.folder,
-            Judged(dataset.test, train, self.options.config.background, dataset.notes),
+            Judged(dataset.test, (refined or dataset).train, self.options.config.background, dataset.notes),
             gaussians,
             self.options.renderer,
             facts,

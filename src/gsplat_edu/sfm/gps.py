@@ -70,7 +70,7 @@ class GpsFit(NamedTuple):
 
 
 def east_north_up(places: Sequence[tuple[float, float, float]]) -> Float64[np.ndarray, "n 3"]:
-    """Convert positions to metres east, north and up of the first one's ellipsoid normal, around their mean.
+    """Convert positions to metres east, north and up (along the ellipsoid's normal at the first one), about their mean.
 
     Args:
         places: Latitude and longitude in degrees, and height in m, one per photo; at least one.
