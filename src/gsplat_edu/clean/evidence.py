@@ -116,6 +116,32 @@ def peak_weights(
     return found
 
 
+def residual_of(
+    output: RenderOutput, view: View, settings: RenderSettings
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+    """Return the render minus the photo where pixels count, and which do.
+
+    Args:
+        output: A render of the view's camera.
+        view: The view; its photo is read.
+        settings: The scene's render settings; photos that are not opaque are seen over their background.
+
+    Returns:
+        (H, W, 3) the difference, 0 where the pixel does not count, and (H, W) 1 where it counts.
+
+    Raises:
+        DatasetError: the photo cannot be read.
+    """
+    photo = view.read()
+    image = output.image.detach().clamp(0.0, 1.0)
+    counts = torch.ones_like(output.transmittance)
+    if photo.mask is not None:
+        counts = torch.from_numpy(photo.mask).to(counts)
+    truth = photo.over(settings.background)
+    difference = image - torch.from_numpy(truth).to(image) / (255.0 if truth.dtype == np.uint8 else 1.0)
+    return difference * counts[..., None], counts
+
+
 class _Sums:
     """Running sums of the evidence."""
 
@@ -145,11 +171,7 @@ class _Sums:
         shown = np.where(gone[drawn], np.minimum(full, FAINT), full)
         logits = torch.from_numpy(np.log(shown / (1.0 - shown))).to(some.means).requires_grad_()
         output = render(replace(some, logit_opacities=logits), view.camera, settings=settings, backend="cpu")
-        photo = view.read()
-        counts = torch.ones_like(output.transmittance)
-        if photo.mask is not None:
-            counts = torch.from_numpy(photo.mask).to(counts)
-        residual = _residual(output, photo.over(settings.background)) * counts[..., None]
+        residual, counts = residual_of(output, view, settings)
         self.error += float(np.square(residual.double().numpy()).sum())
         signs = np.random.default_rng(index).integers(0, 2, output.image.shape, dtype=np.int8)
         inverse = counts * _inverse_depth(output)
@@ -171,11 +193,6 @@ class _Sums:
         self.near[ids] += w - z * near_of["error_sum"].double().numpy()
         self.peak[ids] = np.maximum(self.peak[ids], weight_of["weight_max"].numpy())
         self.views[ids] += w > 0.0
-
-
-def _residual(output: RenderOutput, truth: np.ndarray) -> Float[Tensor, "H W 3"]:
-    image = output.image.detach().clamp(0.0, 1.0)
-    return image - torch.from_numpy(truth).to(image) / (255.0 if truth.dtype == np.uint8 else 1.0)
 
 
 def _inverse_depth(output: RenderOutput) -> Float[Tensor, "H W"]:

@@ -1,8 +1,7 @@
 """Which splats of a scene its photos do not support, and why.
 
-Rounds of evidence (`gsplat_edu.clean.evidence`) find splats to remove. A floater hides those behind it, so that each
-round sees more than the one before. A last round draws the removed splats faintly and takes back those that the photos
-miss.
+Rounds of evidence (`gsplat_edu.clean.evidence`) find the doubtful splats. A floater hides those behind it, so that each
+round sees more than the one before. Then all doubtful splats are judged together (`gsplat_edu.clean.settle`).
 
     z = sum over views of gain / sqrt(sum over views of gain²)
 
@@ -21,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float64, UInt8
 
 from gsplat_edu.clean.evidence import Evidence, gather, peak_weights
+from gsplat_edu.clean.settle import settle
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
@@ -71,14 +71,13 @@ class Rules:
         agreement: this one;
         gross_error: or by this much, with a z above
         gross_z: this one.
-        missed: z below which the last round takes a splat back,
-        missed_gap: if its gap is below this,
-        missed_error: and its absence adds this much error.
-        harm: The last round also takes back, whatever z is, a splat below that gap whose absence adds this much error,
-            unless its removal lowered the error by `gross_error`; and a splat that turns out to lie behind what the
-            views see, unless its absence still lowers the error by `error`.
+        doubt: From this gap on, a splat that the rounds kept is doubtful, unless it changes the error by less than the
+        price: a doubtful splat goes if its absence adds less than this much error. One whose removal lowers the error
+            by `gross_error` is doubtful wherever it is.
+        passes: The doubtful splats are judged together in this many steps for each view of a round,
+        least_steps: and in at least this many.
         least_views: Fewer views than this do not find floaters, only what they do not see.
-        rounds: Most rounds of removal.
+        rounds: Most rounds of evidence.
         few: The rounds end once one removes at most this share of the splats.
         work: Splats times views of a round; views are left out evenly to stay below it.
         round_views: Views of a round, at least.
@@ -96,10 +95,10 @@ class Rules:
     agreement: float = 2.0
     gross_error: float = 100.0
     gross_z: float = 1.0
-    missed: float = -1.0
-    missed_gap: float = 0.4
-    missed_error: float = 1.0
-    harm: float = 10.0
+    doubt: float = 0.1
+    price: float = 0.01
+    passes: int = 2
+    least_steps: int = 40
     least_views: int = 3
     rounds: int = 4
     few: float = 1e-4
@@ -113,7 +112,8 @@ class Verdict:
 
     Args:
         reasons: (N,) a `Reason` for every splat.
-        certainty: (N,) `Evidence.gain` as a multiple of the average error per splat, at the time of the removal.
+        certainty: (N,) how sure it is that a doubtful splat should go; 0 at the border, and for all that are not
+            doubtful.
         views: Number of views that judged.
     """
 
@@ -186,35 +186,60 @@ class _Rounds:
         self._gaussians, self._views, self._rules, self._progress = gaussians, views, rules, progress
         self._everything = everything
         self._settings = replace(settings, depth=False, median_depth=True)
-        self._done, self._total = 0, (rules.rounds + 1) * len(views)
+        self._steps = max(rules.least_steps, rules.passes * len(views))
+        self._done, self._total = 0, rules.rounds * len(views) + self._steps
         self._reasons: UInt8[np.ndarray, " N"] = np.zeros(len(gaussians), dtype=np.uint8)
 
     def result(self) -> tuple[UInt8[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
         rules, reasons = self._rules, self._reasons
-        seen = np.zeros(len(reasons), dtype=bool)
-        certainty = np.zeros(len(reasons))
-        rare = np.zeros(len(reasons), dtype=bool)
+        seen, doubtful, rare = (np.zeros(len(reasons), dtype=bool) for _ in range(3))
+        error = 0.0
         for _ in range(rules.rounds):
-            found = self._gathered()
+            found = gather(self._gaussians, self._views, self._settings, reasons != Reason.KEPT, self._step)
             seen |= found.peak > ALPHA_MIN
             free, refuted = self._found(found)
             kept = reasons == Reason.KEPT
             rare |= kept & self._rare(found)
-            certainty[kept] = _errors(found)[kept]
             reasons[kept & refuted] = Reason.REFUTED
             reasons[kept & free] = Reason.IN_FRONT
+            doubtful |= (reasons != Reason.KEPT) | self._doubtful(found)
+            error = found.error
             if (kept & (free | refuted)).sum() <= rules.few * len(reasons):
                 break
-        if (reasons != Reason.KEPT).any():
-            found = self._gathered()
-            seen |= found.peak > ALPHA_MIN
-            reasons[self._missed(found, certainty) & ~rare] = Reason.KEPT
+        certainty = self._settled(doubtful, rare, error)
         if len(self._views) < len(self._everything) and not seen.all():
             rest = [view for view in self._everything if view not in self._views]
             seen |= peak_weights(self._gaussians, rest, self._settings) > ALPHA_MIN
         reasons[(reasons == Reason.KEPT) & ~seen] = Reason.UNSEEN
         self._progress(self._total, self._total)
         return reasons, certainty
+
+    def _settled(
+        self, doubtful: Bool[np.ndarray, " N"], rare: Bool[np.ndarray, " N"], error: float
+    ) -> Float64[np.ndarray, " N"]:
+        """Judge the doubtful splats together, and return how certain their removal is; rare ones stay removed."""
+        certainty = np.zeros(len(doubtful))
+        if not doubtful.any() or len(self._views) < self._rules.least_views:
+            return certainty
+        ids = np.flatnonzero(doubtful)
+        start = np.where(self._reasons[ids] == Reason.KEPT, 1.0, -1.0)
+        unit = max(error / len(doubtful) / len(self._views), np.finfo(np.float64).tiny)
+        logits = settle(
+            self._gaussians,
+            ids,
+            start,
+            self._views,
+            self._settings,
+            unit=unit,
+            price=self._rules.price,
+            steps=self._steps,
+            progress=self._step,
+        )
+        certainty[ids] = -logits
+        goes = certainty[ids] > 0.0
+        self._reasons[ids[~goes & ~rare[ids]]] = Reason.KEPT
+        self._reasons[ids[goes & (self._reasons[ids] == Reason.KEPT)]] = Reason.IN_FRONT
+        return certainty
 
     def _found(self, found: Evidence) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
         """Return which splats are in free space, and which the photos refute."""
@@ -228,22 +253,15 @@ class _Rounds:
         enough = len(self._views) >= rules.least_views
         return free & enough, refuted & enough
 
-    def _missed(self, found: Evidence, certainty: Float64[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
-        """Return which removed splats the photos miss after all."""
+    def _doubtful(self, found: Evidence) -> Bool[np.ndarray, " N"]:
+        """Return which splats may have to go, if the photos agree to it."""
         rules, errors = self._rules, _errors(found)
-        missed: Bool[np.ndarray, " N"] = (_agreement(found) < rules.missed) & (errors < -rules.missed_error)
-        missed |= (errors < -rules.harm) & (certainty < rules.gross_error)
-        missed &= found.gap < rules.missed_gap
-        missed |= (found.gap < 0.0) & (errors < rules.error)
-        return missed
+        doubtful: Bool[np.ndarray, " N"] = (np.abs(errors) > rules.price) & (found.gap > rules.doubt)
+        return (doubtful | (errors > rules.gross_error)) & (found.views > 0)
 
     def _rare(self, found: Evidence) -> Bool[np.ndarray, " N"]:
         rare: Bool[np.ndarray, " N"] = found.views <= self._rules.rare * len(self._views)
         return rare & (found.gap > self._rules.far_gap) & (found.views > 0)
-
-    def _gathered(self) -> Evidence:
-        gone = self._reasons != Reason.KEPT
-        return gather(self._gaussians, self._views, self._settings, gone, self._step)
 
     def _step(self) -> None:
         self._done += 1

@@ -1,0 +1,107 @@
+"""How opaque the photos want the doubtful splats of a scene, all at once.
+
+The gain of a splat (`gsplat_edu.clean.evidence`) holds all others fixed. Where several splats could fill the same hole,
+each of them seems to be missed while all are gone, and none while all are there. So every doubtful splat gets a factor
+f on its opacity, and all factors are fitted together, by Adam, one view per step:
+
+    minimise  sum over views of the squared error  +  price * sum of f,    0 < f < 1.
+
+The price decides where the photos say nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from gsplat_edu.clean.evidence import MOST_OPAQUE, residual_of
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.views import View
+
+RATE = 0.25
+"""Adam's step, in logits of a factor."""
+
+BETAS = (0.9, 0.99)
+"""Decay of Adam's two moments."""
+
+LAST = 0.5
+"""In this last part of the steps the rate is a third."""
+
+Progress = Callable[[], None]
+"""Called after every step."""
+
+
+def settle(
+    gaussians: Gaussians,
+    doubtful: Int64[np.ndarray, " D"],
+    start: Float64[np.ndarray, " D"],
+    views: Sequence[View],
+    settings: RenderSettings,
+    unit: float,
+    price: float,
+    steps: int,
+    progress: Progress = lambda: None,
+) -> Float64[np.ndarray, " D"]:
+    """Fit the factors of the doubtful splats.
+
+    Args:
+        gaussians: N Gaussians on the CPU.
+        doubtful: (D,) indices of the doubtful splats.
+        start: (D,) logits of their factors to start from.
+        views: Cameras and photos; each pass takes them in a new random order, always the same one.
+        settings: The scene's render settings.
+        unit: Average squared error per splat and view. It is added to Adam's denominator, so that gradients far below
+            it, the price's included, hardly move a factor.
+        price: Squared error per view that a splat has to be worth, in units.
+        steps: Number of steps.
+        progress: Called after every step.
+
+    Returns:
+        (D,) logits of the factors: below 0, the photos do without the splat.
+
+    Raises:
+        DatasetError: a photo cannot be read.
+    """
+    rng = np.random.default_rng(0)
+    logits = start.astype(np.float64)
+    first, second = np.zeros_like(logits), np.zeros_like(logits)
+    order: list[int] = []
+    for step in range(1, steps + 1):
+        order = order or rng.permutation(len(views)).tolist()
+        slope = _slope(gaussians, doubtful, logits, views[order.pop()], settings, price * unit)
+        first += (1.0 - BETAS[0]) * (slope - first)
+        second += (1.0 - BETAS[1]) * (np.square(slope) - second)
+        rate = RATE if step <= (1.0 - LAST) * steps else RATE / 3.0
+        spread = np.sqrt(second / (1.0 - BETAS[1] ** step)) + unit
+        logits -= rate * first / (1.0 - BETAS[0] ** step) / spread
+        progress()
+    return logits
+
+
+def _slope(
+    gaussians: Gaussians,
+    doubtful: Int64[np.ndarray, " D"],
+    logits: Float64[np.ndarray, " D"],
+    view: View,
+    settings: RenderSettings,
+    price: float,
+) -> Float64[np.ndarray, " D"]:
+    """Return the gradient of one view's part of the sum in the logits of the factors."""
+    factor = 1.0 / (1.0 + np.exp(-logits))
+    opacity = np.minimum(gaussians.opacities.double().numpy(), MOST_OPAQUE)
+    opacity[doubtful] *= factor
+    shown = torch.from_numpy(np.log(opacity / (1.0 - opacity))).to(gaussians.means).requires_grad_()
+    output = render(replace(gaussians, logit_opacities=shown), view.camera, settings=settings, backend="cpu")
+    residual, _ = residual_of(output, view, settings)
+    (found,) = torch.autograd.grad(output.image, shown, 2.0 * residual)
+    # d logit(f o) = (1 - f) / (1 - f o) d logit(f)
+    chain = (1.0 - factor) / (1.0 - opacity[doubtful])
+    photo: Float64[np.ndarray, " D"] = found.double().numpy()[doubtful] * chain
+    slope: Float64[np.ndarray, " D"] = photo + price * factor * (1.0 - factor)
+    return slope

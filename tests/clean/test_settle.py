@@ -1,0 +1,78 @@
+"""The opacities of doubtful splats, fitted together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.clean.settle import _slope, settle
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+
+from .conftest import SETTINGS, photographed
+
+UNIT = 1e-6
+
+
+def error(gaussians, doubtful, logits, view):
+    """Return the squared error of one view with these factors on the opacities."""
+    opacity = gaussians.opacities.numpy().copy()
+    opacity[doubtful] /= 1.0 + np.exp(-logits)
+    shown = replace(gaussians, logit_opacities=torch.from_numpy(np.log(opacity / (1.0 - opacity))))
+    with torch.no_grad():
+        image = render(shown, view.camera, settings=SETTINGS, backend="cpu").image.numpy()
+    return float(np.square(image - view.image / 255.0).sum())
+
+
+def test_the_gradient_is_that_of_the_error(planted, rings):
+    """Smooth: no alpha reaches the clamp, and so small a step moves hardly any alpha across 1/255."""
+    some = planted.map(lambda tensor: tensor.double())
+    faint = replace(some, logit_opacities=some.logit_opacities.clamp(max=1.0))
+    view = photographed(planted, rings[0][:1])[0]
+    doubtful = np.r_[np.arange(40), np.arange(1300, 1360)]
+    logits = np.random.default_rng(0).normal(size=len(doubtful))
+    # The price's part is added by a closed form, so that it cancels here.
+    price = 0.3
+    factor = 1.0 / (1.0 + np.exp(-logits))
+    found = _slope(faint, doubtful, logits, view, SETTINGS, price) - price * factor * (1.0 - factor)
+    direction = np.random.default_rng(1).normal(size=len(doubtful))
+    step = 1e-6
+    up, down = (error(faint, doubtful, logits + s * step * direction, view) for s in (1, -1))
+    # Differences of an error of about 100 carry rounding of 100 * 2^-52 / 2e-6 = 1e-8.
+    assert float(found @ direction) == pytest.approx((up - down) / (2 * step), rel=1e-5, abs=1e-6)
+    assert np.abs(found).max() > 1e-2
+
+
+def test_of_two_that_fill_one_hole_the_one_that_the_photos_show_stays(room, rings):
+    """Alone, each would be missed while both are gone."""
+    views = photographed(room, rings[0])
+    hole = 25
+    red = torch.zeros(1, 1, 3)
+    red[..., 0] = 1.7
+    other = replace(
+        room.map(lambda tensor: tensor[hole : hole + 1]), sh0=-room.sh0[hole : hole + 1] + 0.2 * red
+    )
+    both = Gaussians.concatenated([room, other])
+    doubtful, start = np.array([hole, len(room)]), np.array([-1.0, -1.0])
+    logits = settle(both, doubtful, start, views, SETTINGS, UNIT, 0.01, 80)
+    assert logits[0] > 1.0
+    assert logits[1] < -1.5
+
+
+def test_what_no_photo_shows_stays_where_it_was(room, rings):
+    """The price alone moves it, by less than its own share of a unit per step."""
+    one = room.map(lambda tensor: tensor[:1])
+    far = replace(one, means=one.means + torch.tensor([0.0, 1e3, 0.0]))
+    both = Gaussians.concatenated([room, far])
+    start = np.array([1.0])
+    found = settle(both, np.array([len(room)]), start, photographed(room, rings[0]), SETTINGS, UNIT, 0.01, 40)
+    assert 0.9 < found[0] < 1.0
+
+
+def test_masked_pixels_do_not_count(room, planted, rings):
+    mask = np.zeros((rings[0][0].H, rings[0][0].W), dtype=bool)
+    views = photographed(room, rings[0], mask)
+    start = np.full(60, -1.0)
+    found = settle(planted, np.arange(1300, 1360), start, views, SETTINGS, UNIT, 0.0, 40)
+    assert np.array_equal(found, start)
