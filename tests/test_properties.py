@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -37,7 +37,14 @@ def splats(scene):
     return means, build_cov3d_batch(scales, quat_to_R_batch(quats)), colors, opacities
 
 
+SUBNORMAL = tuple(
+    np.array(each) for each in ([[0, 0, 1.0]], [[1.04e-161, 0, 0]], [[0.5, 1, 1, 1]], [[0.0, 0, 0]], [0.0])
+)
+"""A splat whose covariance is subnormal, so that rounding makes it skew."""
+
+
 @given(scenes(), unit_quats(4), floats(3, -10.0, 10.0))
+@example(SUBNORMAL, np.ones(4), np.zeros(3))
 def test_moving_the_world_and_the_camera_together_changes_nothing(scene, quat, shift):
     """x -> Q x + t for the means, Sigma -> Q Sigma Q', R -> R Q', eye -> Q eye + t.
 

@@ -118,10 +118,11 @@ def _checked(
     with np.errstate(over="ignore"):
         trace = np.abs(np.trace(cov3ds, axis1=1, axis2=2))
     skew = np.abs(cov3ds - np.swapaxes(cov3ds, 1, 2)).max(axis=(1, 2), initial=0.0)
-    # The covariance divided by its trace neither overflows nor prevents convergence.
-    unit = np.where(trace > 0, trace, 1.0)
+    # The covariance divided by its trace neither overflows nor prevents convergence. A subnormal trace has no digits to
+    # judge by: rounding alone makes such a matrix skew.
+    unit = np.maximum(trace, np.finfo(np.float64).tiny / COV_TOLERANCE)
     smallest = np.linalg.eigvalsh(cov3ds / unit[:, None, None])[:, 0]
-    if np.any(improper := (skew > COV_TOLERANCE * trace) | (smallest < -COV_TOLERANCE)):
+    if np.any(improper := (skew > COV_TOLERANCE * unit) | (smallest < -COV_TOLERANCE)):
         raise ArgumentError(f"cov3ds{first_index(improper)}: is not symmetric and positive semi-definite")
     return means, cov3ds, colors, opacities
 
