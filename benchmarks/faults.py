@@ -1,9 +1,10 @@
 """How much of what a fault of the photos costs does its remedy bring back?
 
-    python benchmarks/faults.py [CAPTURE] [--fault exposure|poses] [--resolution R] [--iterations N] [--out FILE]
+    python benchmarks/faults.py [CAPTURE] [--fault exposure|poses|transients] [--resolution R] [--iterations N]
+        [--seeds N] [--every N] [--test-every N] [--out FILE]
 
-Plants a fault with known truth into a copy of a capture, and trains four times with the fast recipe: the capture and
-the copy, each without and with the remedy. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data unless given;
+Plants a fault with known truth into a copy of a capture, and trains with the fast recipe: the capture and the copy,
+each without and with the remedy. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data unless given;
 the word "traced" stands for 60 photos of 400 x 400 px, traced here, whose own exposure does not vary.
 
 exposure: linear light times 2^u for u from -0.7 to 0.7, and its red and blue times 0.85 to 1.15 in addition, rounded
@@ -12,6 +13,11 @@ fit on the left half. Gains are compared with the truth beyond those found in th
 
 poses: every camera turned by 0.5 degrees and shifted by 1 % of the extent, in random directions. Held-out cameras have
 it too, so scenes are compared by the PSNR of the photos' right half after their poses are aligned on the left half.
+
+transients: one or two blobs in 30 % of the training photos, 5 % of the pixels of each, cut from other photos, mirrored
+and tinted. Held-out photos are clean. A fifth run gets the true masks; what the remedy regains is a share of what these
+regain. With few photos a fault costs more: --every 2 takes every second photo, --test-every 3 holds out every third of
+these.
 """
 
 from __future__ import annotations
@@ -29,7 +35,7 @@ import hardware
 import numpy as np
 import torch
 from captures import capture
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from traced import traced_capture
 
 from gsplat_edu.budget.plan import Limits, plan
@@ -37,6 +43,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
 from gsplat_edu.data.dataset import load_dataset, scene_extent
+from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
 from gsplat_edu.evaluate.metrics import score_views, summarize
@@ -45,6 +52,7 @@ from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.poses import Refinement
+from gsplat_edu.train.transients import resized_mask
 from gsplat_edu.validation import ArrayLike
 from gsplat_edu.views import View
 
@@ -60,7 +68,11 @@ STOPS, TINT = 0.7, 0.15
 DEGREES, SHIFT = 0.5, 0.01
 """Planted errors of the poses: degrees, and fraction of the extent."""
 
+SHARE, AREA = 0.3, 0.05
+"""Planted passers-by: share of the training photos, and share of the pixels of each."""
+
 SEED = 7
+"""Seed of the faults; it is counted up with the seed of the training."""
 
 
 def linear(encoded: ArrayLike) -> Float64[np.ndarray, "..."]:
@@ -75,9 +87,11 @@ def encoded(light: ArrayLike) -> Float64[np.ndarray, "..."]:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055)
 
 
-def uneven(views: Sequence[View]) -> tuple[list[View], Float64[np.ndarray, "V 3"]]:
+def uneven(
+    views: Sequence[View], held_out: Sequence[bool], seed: int
+) -> tuple[list[View], Float64[np.ndarray, "V 3"]]:
     """Return the views with other exposures, and the factors on their linear light."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(seed)
     scales = 2.0 ** rng.uniform(-STOPS, STOPS, (len(views), 1)) * np.ones(3)
     scales[:, ::2] *= rng.uniform(1 - TINT, 1 + TINT, (len(views), 2))
     changed = []
@@ -107,9 +121,9 @@ def png_name(name: str) -> str:
     return str(Path(name).with_suffix(".png"))
 
 
-def misplaced(views: Sequence[View]) -> tuple[list[View], list[Camera]]:
+def misplaced(views: Sequence[View], held_out: Sequence[bool], seed: int) -> tuple[list[View], list[Camera]]:
     """Return the views with wrong poses, and their true cameras."""
-    rng, extent = np.random.default_rng(SEED), scene_extent([view.camera for view in views])
+    rng, extent = np.random.default_rng(seed), scene_extent([view.camera for view in views])
     changed = []
     for view in views:
         directions = rng.normal(size=(2, 3))
@@ -120,10 +134,88 @@ def misplaced(views: Sequence[View]) -> tuple[list[View], list[Camera]]:
     return changed, [view.camera for view in views]
 
 
-def trained(folder: Path, words: Sequence[str], arguments: argparse.Namespace) -> CaptureRun:
+def blob(rng: np.random.Generator, H: int, W: int, area: float) -> Bool[np.ndarray, "H W"]:
+    """Return the pixels of a lobed ellipse of about this area, px, taller than wide."""
+    aspect = rng.uniform(1.0, 2.5)
+    ry = np.sqrt(area * aspect / np.pi)
+    rx = ry / aspect
+    y, x = (
+        np.mgrid[:H, :W] - np.array([rng.uniform(0.15, 0.85) * H, rng.uniform(0.15, 0.85) * W])[:, None, None]
+    )
+    angle = np.arctan2(y, x)
+    lobes = [0.15 * np.sin(3 * angle + rng.uniform(0, 6)), 0.1 * np.sin(5 * angle + rng.uniform(0, 6))]
+    inside: Bool[np.ndarray, "H W"] = (y / ry) ** 2 + (x / rx) ** 2 < (1 + sum(lobes)) ** 2
+    return inside
+
+
+def with_passers_by(
+    views: Sequence[View], held_out: Sequence[bool], seed: int
+) -> tuple[list[View], list[Any]]:
+    """Return the views with pasted blobs in a share of those that are not held out, and the blobs' pixels."""
+    rng = np.random.default_rng(seed)
+    free = rng.permutation(np.flatnonzero(~np.asarray(held_out)))
+    struck = set(free[: round(SHARE * len(free))].tolist())
+    changed, truths = [], []
+    for i, view in enumerate(views):
+        image = np.array(view.read().over((0.0, 0.0, 0.0)))
+        covered = np.zeros(image.shape[:2], dtype=bool)
+        if i in struck:
+            count = int(rng.integers(1, 3))
+            for _ in range(count):
+                covered |= blob(rng, *covered.shape, AREA * covered.size / count)
+            other = views[int(rng.choice(free))].read().over((0.0, 0.0, 0.0))
+            other = np.resize(other[:, ::-1], image.shape)
+            other = np.roll(other, (int(rng.integers(len(image))), int(rng.integers(image.shape[1]))), (0, 1))
+            tint = rng.uniform(0.4, 1.6, 3)
+            image[covered] = np.clip(other[covered] * tint, 0, 255).astype(np.uint8)
+        changed.append(View(view.camera, image, mask=view.read().mask, name=view.name))
+        truths.append(covered)
+    return changed, truths
+
+
+def without_pixels(views: Sequence[View], covered: Sequence[Any]) -> list[View]:
+    """Return the views with masks that exclude these pixels."""
+    found = []
+    for view, pixels in zip(views, covered, strict=True):
+        photo = view.read()
+        mask = ~pixels if photo.mask is None else photo.mask & ~pixels
+        found.append(View(view.camera, photo.image, mask=mask, name=view.name))
+    return found
+
+
+def mask_errors(clean: CaptureRun, faulty: CaptureRun, truth: dict[str, Any]) -> dict[str, float]:
+    """Return precision and recall of the masks, in pixels, and the share of the clean run's pixels that is masked."""
+    hits = masked = covered = total = excluded = 0
+    for run in (clean, faulty):
+        found = run.trainer.transients
+        assert found is not None, "the remedy finds masks"
+        for view, mask in zip(run.dataset.train, found.masks, strict=True):
+            size = view.camera.H, view.camera.W
+            total += size[0] * size[1] if run is clean else 0
+            pixels = np.zeros(size, dtype=bool) if mask is None else resized_mask(mask, *size)
+            if run is clean:
+                excluded += int(pixels.sum())
+                continue
+            true = resized_mask(truth[view.name], *size)
+            hits, masked, covered = (
+                hits + int((pixels & true).sum()),
+                masked + int(pixels.sum()),
+                covered + int(true.sum()),
+            )
+    return {
+        "precision of the masks": hits / max(masked, 1),
+        "recall of the masks": hits / max(covered, 1),
+        "share of the clean photos that is masked": excluded / max(total, 1),
+    }
+
+
+def trained(folder: Path, words: Sequence[str], arguments: argparse.Namespace, seed: int) -> CaptureRun:
     """Train a capture with further options of `gsplat-edu train`."""
     words = ["--iterations", str(arguments.iterations), "--eval-every", "0", "--save-every", "0", *words]
-    if arguments.resolution is not None:
+    words += ["--seed", str(seed)]
+    if arguments.test_every is not None:
+        words += ["--test-every", str(arguments.test_every)]
+    if arguments.resolution is not None and not FAULTS[arguments.fault].reduced:
         words += ["--resolution", str(arguments.resolution)]
     parser = OneLineParser(prog="faults.py")
     command.add_arguments(parser)
@@ -202,18 +294,23 @@ class Fault:
     """A fault and its remedy.
 
     Args:
-        plant: Returns the views with the fault, and the truth of each view.
+        plant: Returns the views with the fault, and the truth of each view, from the views, which of them are held out,
+            and a seed.
         without: Options of `gsplat-edu train` without the remedy.
         remedy: Options with it.
         score: The score of the held-out views that the fault itself does not change.
         errors: Returns how well the remedy found the truth.
+        cured: Returns the views without what the truth says is wrong; None if the clean views are the measure.
+        reduced: Whether --resolution reduces the photos before the fault is planted, instead of in the training.
     """
 
-    plant: Callable[[Sequence[View]], tuple[list[View], Sequence[Any]]]
+    plant: Callable[[Sequence[View], Sequence[bool], int], tuple[list[View], Sequence[Any]]]
     without: tuple[str, ...]
     remedy: tuple[str, ...]
     score: str
     errors: Callable[[CaptureRun, CaptureRun, dict[str, Any]], dict[str, float]]
+    cured: Callable[[Sequence[View], Sequence[Any]], list[View]] | None = None
+    reduced: bool = False
 
 
 PLAIN = ("--appearance", "none", "--refine", "none")
@@ -225,37 +322,59 @@ FAULTS = {
     "poses": Fault(
         misplaced, PLAIN, ("--appearance", "none", "--refine", "poses"), "psnr_aligned", pose_errors
     ),
+    "transients": Fault(
+        with_passers_by, PLAIN, (*PLAIN, "--transients", "mask"), "psnr", mask_errors, without_pixels, True
+    ),
 }
 """The faults by name."""
 
 
-def compare(folder: Path, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Train the four runs; return their scores, what was regained, and how well the truth was found."""
-    dataset, fault = load_dataset(folder), FAULTS[arguments.fault]
-    views = sorted((*dataset.train, *dataset.test), key=lambda view: view.name)
+def compare(folder: Path, arguments: argparse.Namespace, seed: int) -> dict[str, Any]:
+    """Train the runs of one seed; return their scores, what was regained, and how well the truth was found."""
+    fault = FAULTS[arguments.fault]
+    dataset = load_dataset(folder, DataSettings(resolution=arguments.resolution if fault.reduced else None))
+    views = sorted((*dataset.train, *dataset.test), key=lambda view: view.name)[:: arguments.every]
     found: dict[str, dict[str, Any]] = {}
-    cured = []
+    kept = []
     with tempfile.TemporaryDirectory() as scratch:
-        changed, truths = fault.plant(views)
-        for state, given in (("clean", views), ("faulty", changed)):
-            place = stored(Path(scratch) / state, given, dataset.points, dataset.colors)
-            for kind, words in (("without", fault.without), ("with", fault.remedy)):
+        place = stored(Path(scratch) / "clean", views, dataset.points, dataset.colors)
+        test = {view.name for view in load_dataset(place, DataSettings(test_every=arguments.test_every)).test}
+        held_out = [png_name(view.name) in test for view in views]
+        changed, truths = fault.plant(views, held_out, SEED + seed)
+        states = {"clean": (views, ("without", "with")), "faulty": (changed, ("without", "with"))}
+        if fault.cured is not None:
+            states["true masks"] = fault.cured(changed, truths), ("without",)
+        for state, (given, kinds) in states.items():
+            if state != "clean":
+                place = stored(Path(scratch) / state, given, dataset.points, dataset.colors)
+            for kind in kinds:
                 before = time.process_time()
-                run = trained(place, words, arguments)
+                run = trained(place, fault.remedy if kind == "with" else fault.without, arguments, seed)
                 seconds = time.process_time() - before
                 found[f"{state}, {kind}"] = {**scores(run), "processor_seconds": seconds}
-                print(f"{state}, {kind}: {line(found[f'{state}, {kind}'])}", flush=True)
+                print(f"seed {seed}, {state}, {kind}: {line(found[f'{state}, {kind}'])}", flush=True)
                 if kind == "with":
-                    cured.append(run)
+                    kept.append(run)
     truth = dict(zip([png_name(view.name) for view in views], truths, strict=True))
-    best, lost, back = (
-        found[name][fault.score] for name in ("clean, without", "faulty, without", "faulty, with")
-    )
+    return {"fault": arguments.fault, "runs": found, "errors": fault.errors(kept[0], kept[1], truth)}
+
+
+def summary(results: Sequence[dict[str, Any]], fault: Fault) -> dict[str, Any]:
+    """Return means over the seeds: scores, the share that is regained, and the errors."""
+
+    def mean(name: str) -> float:
+        return float(np.mean([result["runs"][name][fault.score] for result in results]))
+
+    best = mean("clean, without" if fault.cured is None else "true masks, without")
+    lost, back = mean("faulty, without"), mean("faulty, with")
     return {
-        "fault": arguments.fault,
-        "runs": found,
+        "scores": {name: mean(name) for name in results[0]["runs"]},
         "regained": (back - lost) / (best - lost),
-        "errors": fault.errors(cured[0], cured[1], truth),
+        "clean lost": mean("clean, without") - mean("clean, with"),
+        "errors": {
+            name: float(np.mean([result["errors"][name] for result in results]))
+            for name in results[0]["errors"]
+        },
     }
 
 
@@ -279,15 +398,17 @@ def measure(arguments: argparse.Namespace) -> None:
             folder = stored(
                 Path(scratch) / TRACED, opaque((*train, *test)), points, np.full(points.shape, 0.5)
             )
-            result = compare(folder, arguments)
+            results = [compare(folder, arguments, seed) for seed in range(arguments.seeds)]
     else:
         with capture(arguments.capture, arguments.smoke) as folder:
-            result = compare(folder, arguments)
-    print(
-        f"regained: {100 * result['regained']:.0f} % of the {FAULTS[arguments.fault].score} that the fault costs"
-    )
+            results = [compare(folder, arguments, seed) for seed in range(arguments.seeds)]
+    fault = FAULTS[arguments.fault]
+    result = summary(results, fault)
+    print(*(f"{name}: {value:.3f} dB" for name, value in result["scores"].items()), sep="\n")
+    print(f"regained: {100 * result['regained']:.0f} % of the {fault.score} that the fault costs")
+    print(f"the remedy costs a clean capture {result['clean lost']:.3f} dB")
     print(*(f"{name}: {value:.3f}" for name, value in result["errors"].items()), sep="\n")
-    hardware.report(result, arguments.out)
+    hardware.report({"seeds": results, **result}, arguments.out)
 
 
 def main() -> int:
@@ -299,6 +420,9 @@ def main() -> int:
     )
     parser.add_argument("--resolution", type=float, help="divisor of the photos' size, as in train")
     parser.add_argument("--iterations", type=int, default=3_000, help="length of each run (default: 3000)")
+    parser.add_argument("--seeds", type=int, default=1, help="number of seeds to average (default: 1)")
+    parser.add_argument("--every", type=int, default=1, help="take every N-th photo only (default: 1)")
+    parser.add_argument("--test-every", type=int, help="hold out every N-th of these, as in train")
     arguments = parser.parse_args()
     if arguments.smoke:
         arguments.iterations = 20

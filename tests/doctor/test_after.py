@@ -70,6 +70,7 @@ def test_a_good_run_gets_no_warning(scene):
         "length",
         "training views",
         "outliers",
+        "things that moved",
         "test views",
         "exposure",
         "floaters",
@@ -353,3 +354,10 @@ def test_the_report_says_if_exposure_was_not_compared(scene, tmp_path):
     (line,) = [line for line in said if line.startswith("exposure ")]
     assert line.endswith(f"not between photos: {why}")
     assert not any("not between" in line for line in diagnosis_lines(examine_run(trained(gaussians, views))))
+
+
+def test_photos_that_show_what_others_do_not_are_named_with_the_option(scene):
+    assert "moved" not in warnings(trained(*scene))
+    found = warnings(trained(*scene, moved=(("b.png", 0.123), ("a.png", 0.02))))["moved"]
+    assert found.labels == ("b.png (12.3 %)", "a.png (2.0 %)") and "2 photos" in found.sentence
+    assert "--transients mask" in found.advice

@@ -1,10 +1,11 @@
 """What `--appearance auto` chooses, and why."""
 
 import numpy as np
+import pytest
 
 from doctor.rooms import replaced, room, with_photo
 from gsplat_edu.data.writers import write_blender, write_colmap
-from gsplat_edu.doctor.remedies import appearance_for
+from gsplat_edu.doctor.remedies import appearance_for, transients_for
 from gsplat_edu.views import View
 
 
@@ -56,3 +57,9 @@ def test_transparent_photos_are_not_corrected(tmp_path):
 def test_one_photo_alone_cannot_be_compared(tmp_path):
     views, points = room("orbit", 64)
     assert appearance_for(written(tmp_path, views[:1], points)).value == "none"
+
+
+@pytest.mark.parametrize(("count", "value"), [(5, "none"), (11, "none"), (12, "mask"), (300, "mask")])
+def test_things_that_move_are_looked_for_where_there_are_enough_photos(count, value):
+    remedy = transients_for(count)
+    assert remedy.value == value and f"{count} training photos" in remedy.reason

@@ -18,6 +18,7 @@ from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.appearance import check_exposure
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosis_lines, table_lines
+from gsplat_edu.doctor.moving import moved_parts
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.errors import ArgumentError, DatasetError
@@ -109,6 +110,12 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
             residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task), corrected)
             for views in (dataset.train, dataset.test)
         )
+    masked = isinstance(section, dict) and section.get("transients", "none") != "none"
+    moved = (
+        []
+        if masked
+        else moved_parts(gaussians, dataset.train, functools.partial(render, backend=backend), settings)
+    )
     extent = scene_extent([view.camera for view in dataset.train])
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
@@ -129,6 +136,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         uncompared=uncompared,
         strategy=_strategy(section),
         corrected=corrected,
+        moved=moved,
     )
     return examine_run(trained), view_lines(trained) if arguments.all_views else ()
 
@@ -151,6 +159,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--from": (data.get("scene"),),
         "--strategy": (None if strategy == DEFAULT_STRATEGY else strategy,),
         "--max-gaussians": (train.get("max_gaussians"),),
+        "--transients": (None if train.get("transients", "none") == "none" else train["transients"],),
         "--background": background if any(background) else (None,),
     }
     words = []

@@ -20,13 +20,14 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.cli.options.train import chooses_appearance, options_from
+from gsplat_edu.cli.options.train import chooses_appearance, chooses_transients, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.colmap import find_model
+from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.points import read_points_ply
-from gsplat_edu.doctor.remedies import appearance_for
+from gsplat_edu.doctor.remedies import appearance_for, transients_for
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
@@ -175,6 +176,10 @@ def _planned(
         options = replace(options, config=options.config.changed(appearance=remedy.value))
         if remedy.reason:
             say(f"--appearance {remedy.value}: {remedy.reason}")
+    if chooses_transients(arguments):
+        remedy = transients_for(len(load_dataset(options.data, options.data_settings).train))
+        options = replace(options, config=options.config.changed(transients=remedy.value))
+        say(f"--transients {remedy.value}: {remedy.reason}")
     limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
     given += ["iterations"] if arguments.quality is not None else []

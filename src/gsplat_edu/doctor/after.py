@@ -74,6 +74,8 @@ class Trained:
         strategy: The run's recipe.
         corrected: Whether the training corrected exposures; then the residuals are those of corrected renders, and
             there are no findings beforehand.
+        moved: Name and share of each training photo of which a part shows what other photos do not; empty if the
+            training masked such parts.
     """
 
     path: Path
@@ -90,6 +92,7 @@ class Trained:
     uncompared: str = ""
     strategy: str = "adc"
     corrected: bool = False
+    moved: Sequence[tuple[str, float]] = ()
 
     @property
     def usual(self) -> int:
@@ -141,6 +144,7 @@ def examine_run(run: Trained) -> Diagnosis:
         ("length", _length),
         ("training views", _fit),
         ("outliers", _outliers),
+        ("things that moved", _moved),
         ("test views", _gap),
         ("exposure", _exposure),
         ("floaters", _floaters),
@@ -270,6 +274,16 @@ def _far_below(views: Sequence[Residual]) -> list[Residual]:
     spread = SPREAD_TO_NORMAL * float(np.median(np.abs(values - median)))
     limit = median - max(UNEXPLAINED, UNEXPLAINED_SPREAD * spread)
     return [view for view in views if view.psnr < limit]
+
+
+def _moved(run: Trained) -> list[Finding]:
+    if not run.moved:
+        return []
+    names = tuple(name for name, _ in run.moved)
+    shares = tuple(f"{100 * share:.1f} %" for _, share in run.moved)
+    what = f"{counted(len(names), 'photo')} show things or shadows that the others do not, in per cent of their pixels"
+    advice = f"train with --transients mask, which masks what moved; compare {names[0]} with its render first"
+    return [Finding("moved", Severity.WARNING, what, advice, names, shares)]
 
 
 def _gap(run: Trained) -> list[Finding]:

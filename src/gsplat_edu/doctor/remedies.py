@@ -1,4 +1,4 @@
-"""Which remedies a capture needs: what `--appearance auto` of `gsplat-edu train` chooses.
+"""Which remedies a capture needs: what `auto` of `gsplat-edu train` chooses for `--appearance` and `--transients`.
 
 The checks of `gsplat_edu.doctor.appearance` name photos that a user should look at. This module decides whether the
 training should correct all photos.
@@ -20,6 +20,10 @@ UNLIKE = 0.25
 SHARE = 0.1
 """Exposures are corrected if at least this share of the photos counts. snowmiku97 has 0.05, whose phone drifts from
 photo to photo (the scene follows as view-dependent colour); gains drawn from +-0.7 stops give 0.4."""
+
+ENOUGH = 12
+"""Training photos from which `--transients auto` looks for things that move: with fewer, most places are seen in less
+than four, and a photo of them cannot be told to differ from the others."""
 
 
 @dataclass(frozen=True)
@@ -61,4 +65,17 @@ def appearance_of(survey: Survey) -> Remedy:
         "exposure",
         f"{int(differ.sum())} of {len(differ)} photos differ in brightness or tint from neighbours that see the same,"
         f" by up to {largest:.1f} stops",
+    )
+
+
+def transients_for(count: int) -> Remedy:
+    """Choose `--transients` for a number of training photos. Whether something moved shows only in the training."""
+    if count < ENOUGH:
+        return Remedy(
+            "none",
+            f"{count} training photos are too few to tell what moved; from {ENOUGH} on, they are compared",
+        )
+    return Remedy(
+        "mask",
+        f"{count} training photos are enough to tell what moved; a photo where nothing did keeps every pixel",
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -14,6 +15,11 @@ from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.evaluate.video import encode_video
 from gsplat_edu.files import remove_leftovers, written_aside
 from gsplat_edu.validation import ArrayLike, check_shape, in_range
+
+PICTURE_SIDE = 640
+"""Pictures of a report are shrunk until their longer side has this many px."""
+
+JPEG_QUALITY = 88
 
 SEPARATOR_WIDTH = 4
 """Width of the line between two images side by side, px."""
@@ -68,6 +74,19 @@ def save_png(path: Path, image: ArrayLike) -> None:
     picture = Image.fromarray(to_bytes(image))
     with written_aside(path) as aside:
         picture.save(aside, format="PNG")
+
+
+def small_jpeg(image: RgbBytes) -> bytes:
+    """Return an image as a JPEG for a report, shrunk to `PICTURE_SIDE`.
+
+    Args:
+        image: (H, W, 3) uint8.
+    """
+    picture = Image.fromarray(image)
+    picture.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+    buffer = io.BytesIO()
+    picture.save(buffer, format="JPEG", quality=JPEG_QUALITY)
+    return buffer.getvalue()
 
 
 def side_by_side(images: Sequence[ArrayLike]) -> RgbBytes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 import json
 import math
 import os
@@ -19,21 +18,17 @@ from urllib.parse import quote
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from PIL import Image
 
 from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
+from gsplat_edu.evaluate.images import small_jpeg
+from gsplat_edu.evaluate.masked import MaskedPicture, masked_figures
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
 from gsplat_edu.files import written_aside
 from gsplat_edu.text import write_text
 
 PICTURES = 8
 """Most test views shown in a report."""
-
-PICTURE_SIDE = 640
-"""Pictures are shrunk until their longer side has this many px."""
-
-JPEG_QUALITY = 88
 
 SCORES = (
     ("psnr", "PSNR (dB)"),
@@ -151,7 +146,7 @@ class Picture:
         bright = np.minimum(times * difference, 255).astype(np.uint8)
         title = "difference" if times == 1 else f"difference, {times}x amplified"
         panels = (("render", render), ("photo", truth), (title, bright))
-        return cls(name, tuple((title, _jpeg(panel)) for title, panel in panels))
+        return cls(name, tuple((title, small_jpeg(panel)) for title, panel in panels))
 
 
 @dataclass(frozen=True)
@@ -166,6 +161,7 @@ class Report:
         config: The run's configuration.
         scores: Scores of the test views.
         pictures: Pictures of test views. At most 8 are shown, the best and the worst among them.
+        masked: Pictures of photos of which a part was masked because it moved.
         notes: Notes for the reader, one sentence each.
         machine: Facts about the machine; by default, this one.
     """
@@ -176,6 +172,7 @@ class Report:
     config: Mapping[str, Any] = field(default_factory=dict)
     scores: Sequence[ImageScore] = ()
     pictures: Sequence[Picture] = ()
+    masked: Sequence[MaskedPicture] = ()
     notes: Sequence[str] = ()
     machine: Mapping[str, str] = field(default_factory=machine_facts)
 
@@ -206,6 +203,7 @@ def write_report(path: Path, report: Report) -> None:
         _headline(report.metrics),
         _section("Curves", f'<div class="curves">{curves}</div>\n' if curves else ""),
         _views(report.scores, report.pictures),
+        _section("Masked things that moved", masked_figures(report.masked)),
         _exports(report.metrics.get("exports")),
         _section("Notes", _list(report.notes)),
         _section("Configuration", _folded("all settings of this run", _facts(_flat(config)))),
@@ -391,14 +389,6 @@ def _figure(picture: Picture, score: ImageScore | None) -> str:
 def _image(title: str, data: bytes) -> str:
     source = base64.b64encode(data).decode("ascii")
     return f'<img alt="{html.escape(title)}" src="data:image/jpeg;base64,{source}">'
-
-
-def _jpeg(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    picture = Image.fromarray(image)
-    picture.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
-    buffer = io.BytesIO()
-    picture.save(buffer, format="JPEG", quality=JPEG_QUALITY)
-    return buffer.getvalue()
 
 
 def _section(title: str, body: str) -> str:

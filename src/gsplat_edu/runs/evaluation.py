@@ -15,6 +15,7 @@ from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summa
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.runs.folder import RunFolder, image_file_names
+from gsplat_edu.runs.transients import masked_pictures
 from gsplat_edu.validation import ArrayLike
 from gsplat_edu.views import View
 
@@ -109,11 +110,10 @@ def evaluate_run(
         **(facts or {}),
         "test_views": [dataclasses.asdict(score) for score in test],
     }
+    masked = masked_pictures(folder, metrics, judged.train, gaussians, render, judged.background)
     title = f"{folder.path.resolve().name}: 3D Gaussian Splatting"
-    write_report(
-        into.report,
-        Report(title, metrics, log, config, scores=test, pictures=gallery.pictures, notes=judged.notes),
-    )
+    report = Report(title, metrics, log, config, test, gallery.pictures, masked, judged.notes)
+    write_report(into.report, report)
     gallery.remove_others(before)
     into.write_metrics(metrics)  # last: its presence marks the run as evaluated
     return Evaluation(test, train, metrics)

@@ -86,6 +86,11 @@ class RunFolder:
         return self.path / "refined"
 
     @property
+    def transients(self) -> Path:
+        """Folder of the masks of things that move, if the run finds any."""
+        return self.path / "transients"
+
+    @property
     def checkpoints(self) -> Path:
         """Folder of the states to resume from."""
         return self.path / "checkpoints"

@@ -33,6 +33,7 @@ from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.refined import aligned_score, with_refined_cameras, write_refined
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
+from gsplat_edu.runs.transients import write_masks
 from gsplat_edu.train.checkpoint import (
     list_checkpoints,
     load_checkpoint,
@@ -41,8 +42,9 @@ from gsplat_edu.train.checkpoint import (
 )
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
-from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
+from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
 from gsplat_edu.train.trainer import Callback, StepParts, Trainer
+from gsplat_edu.train.transients import check_enough
 
 
 def document(options: RunOptions) -> dict[str, Any]:
@@ -161,6 +163,8 @@ class CaptureRun:
             say(note)
         self.dataset.preload(progress)
         self._check_opaque()
+        if options.config.transients != "none":
+            check_enough(len(self.dataset.train))
         gaussians = self._begin()
         self._log = LogWriter(self.folder.log_file)
         self.trainer = self._trainer(gaussians)
@@ -203,15 +207,18 @@ class CaptureRun:
         gaussians = gaussians.to(device_of(options.backend))
         cameras = [view.camera for view in dataset.train]
         model, self._refinement = make_view_model(options.config, cameras, extent, gaussians)
+        renderer = functools.partial(render, backend=options.backend)
         return Trainer(
             gaussians,
             dataset.train,
             options.config,
-            render=functools.partial(render, backend=options.backend),
+            render=renderer,
             extent=extent,
             density=make_strategy(options.config, extent, gaussians),
             callbacks=[self._record],
-            parts=StepParts(view_model=model),
+            parts=StepParts(
+                view_model=model, transients=make_transients(options.config, dataset.train, renderer)
+            ),
         )
 
     def _check_opaque(self) -> None:
@@ -347,6 +354,9 @@ class CaptureRun:
         facts: dict[str, Any] = {"iterations": trainer.iteration, "seconds": round(self.seconds, 3)}
         if clean is not None:
             gaussians, facts["cleaning"] = clean(gaussians, refined or dataset)
+        if trainer.transients is not None:
+            sentence, facts["transients"] = write_masks(self.folder, dataset, trainer.transients)
+            self._say(sentence)
         path = self.folder.scene(trainer.iteration)
         save_ply(path, gaussians, dataset.origin, self.options.render_settings.antialiased)
         if export is not None:

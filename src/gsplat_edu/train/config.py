@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 from gsplat_edu.constants import SH_MAX_DEGREE
-from gsplat_edu.train.setting import Check
+from gsplat_edu.train.setting import TRANSIENTS, Check
 from gsplat_edu.train.setting import Setting as Setting
 from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
 
@@ -318,6 +318,11 @@ class TrainConfig:
         "none",
         _one_of(REFINEMENTS),
         "Which numbers of the cameras are learned with the scene: poses, intrinsics, both or none.",
+    )
+    transients: str = _number(
+        "none",
+        _one_of(TRANSIENTS),
+        '"mask": find and mask what only single photos show; "none": use all pixels.',
     )
     pose_rate: float = _number(
         2e-3,

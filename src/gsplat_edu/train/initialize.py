@@ -20,8 +20,11 @@ from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.poses import Refinement
+from gsplat_edu.train.transient_masks import FeatureRenderer
+from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import Identity, InTurn, ViewModel
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
+from gsplat_edu.views import View
 
 START_SCALE = 0.09
 """Standard deviation of every start Gaussian, world units; a few hundred of them fill the unit ball."""
@@ -164,6 +167,17 @@ def make_view_model(
         models.append(Exposure(len(cameras), config.means_rate_iterations, gaussians.means))
     model = models[0] if len(models) == 1 else InTurn(models) if models else Identity()
     return model, refinement
+
+
+def make_transients(config: TrainConfig, views: Sequence[View], render: FeatureRenderer) -> Transients | None:
+    """Make what finds things that move in the training views; None if the configuration asks for none.
+
+    Raises:
+        ArgumentError: there are too few views.
+    """
+    if config.transients == "none":
+        return None
+    return Transients(views, config.means_rate_iterations, render)
 
 
 def random_ball(count: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Gaussians:

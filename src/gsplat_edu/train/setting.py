@@ -9,6 +9,9 @@ from typing import Any
 Check = Callable[[str, Any], object]
 """Raises an `ArgumentError` that names the setting if a value is out of range."""
 
+TRANSIENTS = ("none", "mask")
+"""What to do about things that move."""
+
 
 @dataclass(frozen=True)
 class Setting:

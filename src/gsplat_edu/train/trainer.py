@@ -32,6 +32,7 @@ from gsplat_edu.train.objective import PHOTO, Objective, Rendered, make_objectiv
 from gsplat_edu.train.optimizer import MOMENTS, Adam
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_tensor_kind, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
+from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import Identity, Seen, ViewModel
 from gsplat_edu.views import View
 
@@ -50,7 +51,7 @@ class Renderer(Protocol):
 Callback = Callable[["Trainer", Event], None]
 """Called after every step and every change of the Gaussians, with the trainer and the event."""
 
-PARTS = ("gaussians", "view_model", *MOMENTS, "density")
+PARTS = ("gaussians", "view_model", *MOMENTS, "density", "transients")
 """Groups of a checkpoint's tensors: the first word of their names."""
 
 BACKGROUND_STREAM = 1
@@ -79,6 +80,7 @@ class StepParts:
         view_model: Corrects the camera and the image of a view before the loss compares it.
         reduce: Combines the gradients of a step's views before they are applied.
         adam: Updates one tensor by Adam's rule; by default the fastest kernel that supports it.
+        transients: Finds and applies masks of things that move; None for none.
         fused: Takes Adam's step for the Gaussians in the backward pass where that gives the same bits, so that their
             gradients need no memory; see `Trainer.fuses`.
     """
@@ -87,6 +89,7 @@ class StepParts:
     view_model: ViewModel = field(default_factory=Identity)
     reduce: Reduce = mean_over_views
     adam: AdamKernel = adam_step
+    transients: Transients | None = None
     fused: bool = True
 
 
@@ -226,6 +229,10 @@ class Trainer:
         """Take one step: gradients of the views, reduce, apply."""
         factor = photo_factor(self.config, self.iteration)
         self._feed.use_factor(factor)
+        transients = self._parts.transients
+        if transients is not None and transients.is_due(self.iteration):
+            settings = self._settings(self.config.background)
+            transients.find(self.gaussians, settings, self._parts.view_model.camera, factor)
         iteration, draws = self.iteration, self._draw()
         if len(draws) == 1 and self.fuses:
             terms = self._fused_step(draws[0])
@@ -239,6 +246,11 @@ class Trainer:
     def view_model(self) -> ViewModel:
         """The view model of the run's steps."""
         return self._parts.view_model
+
+    @property
+    def transients(self) -> Transients | None:
+        """The masks of things that move, if the run finds any."""
+        return self._parts.transients
 
     @property
     def fuses(self) -> bool:
@@ -302,19 +314,26 @@ class Trainer:
         config, background = self.config, self.config.background
         if config.random_background:
             background = tuple(self._backgrounds.uniform(size=3).tolist())
-        settings = RenderSettings(
+        settings = self._settings(background)
+        target = self._feed.target(draw, background)
+        if self._parts.transients is not None:
+            target = self._parts.transients.applied(draw.index, target)
+        model = self._parts.view_model
+        output = self._render(self.gaussians, model.camera(draw.index, draw.view.camera), settings=settings)
+        seen = Seen(output.image, output.transmittance.detach())
+        image = model.image(draw.index, seen, target, self.iteration)
+        return Rendered(self.gaussians, draw, output, image, target, self.iteration)
+
+    def _settings(self, background: tuple[float, float, float]) -> RenderSettings:
+        """Return the render settings of the iteration."""
+        config = self.config
+        return RenderSettings(
             background=background,
             sh_degree=sh_degree(config, self.iteration),
             antialiased=config.antialiased,
             jacobian_limit=config.jacobian_limit,
             depth=self._objective.needs_depth,
         )
-        target = self._feed.target(draw, background)
-        model = self._parts.view_model
-        output = self._render(self.gaussians, model.camera(draw.index, draw.view.camera), settings=settings)
-        seen = Seen(output.image, output.transmittance.detach())
-        image = model.image(draw.index, seen, target, self.iteration)
-        return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 
     def apply(self, in_backward: AdamInBackward | None = None) -> None:
         """Take an optimiser step with the stored gradients at the rates of the iteration, then clear them.
@@ -346,6 +365,8 @@ class Trainer:
         }
         if self.density is not None:
             parts["density"], numbers["density"] = self.density.state()
+        if self._parts.transients is not None:
+            parts["transients"] = self._parts.transients.state()
         flat = {
             f"{part}.{name}": t.detach() for part, tensors in parts.items() for name, t in tensors.items()
         }
@@ -376,6 +397,11 @@ class Trainer:
         learned = check_entries("view_model", parts["view_model"], tuple(self._learned))
         for name, like in self._learned.items():
             check_tensor_kind(f"view_model.{name}", learned[name], like.dtype, like.shape)
+        transients = self._parts.transients
+        if transients is not None:
+            transients.check_state(parts["transients"])
+        elif parts["transients"]:
+            raise ArgumentError("transients: are present, but this run has none")
         parameters = gaussians.tensors() | self._learned
         optimizer = Adam(parameters, self._groups, self._parts.adam)
         optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, parameters)
@@ -394,6 +420,8 @@ class Trainer:
         with torch.no_grad():
             for name, parameter in self._learned.items():
                 parameter.copy_(learned[name])
+        if transients is not None:
+            transients.load_state(parts["transients"])
         self._feed.load_state(given["feed"])
         self._backgrounds.bit_generator.state = given["backgrounds"]
 

@@ -30,6 +30,7 @@ from gsplat_edu.train.config import (
     TrainConfig,
     recipe,
 )
+from gsplat_edu.train.setting import TRANSIENTS
 from gsplat_edu.validation import one_of
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
@@ -53,6 +54,7 @@ COMMON = (
         "resolution",
         "test_every",
         "appearance",
+        "transients",
         "white_background",
         "antialiased",
         "seed",
@@ -64,9 +66,12 @@ COMMON = (
 """What `--help` shows; `--help-all` shows the other options too."""
 
 AUTO = "auto"
-"""The appearance that stands for a choice by the photos."""
+"""The appearance, and the treatment of things that move, that stands for a choice by the photos."""
 
-NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background", "appearance")
+NAMED = (
+    *("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background", "appearance"),
+    "transients",
+)
 """Settings whose options are declared below; those of the others come from `SETTINGS`."""
 
 
@@ -239,6 +244,12 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         help='"exposure" corrects the exposure and white balance of each photo; "none" does not; "auto" lets the photos'
         " decide (default: auto for the strategy fast, none for the others)",
     )
+    group.add_argument(
+        "--transients",
+        metavar="NAME",
+        help='"mask" finds what moved from photo to photo, such as passers-by, and masks it; "none" does not; "auto"'
+        " does if there are enough photos (default: none)",
+    )
     behind = group.add_mutually_exclusive_group()
     behind.add_argument("--white-background", action="store_true", help="white background (default: black)")
     behind.add_argument(
@@ -336,7 +347,8 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         given = getattr(arguments, name, None)
         if given is not None and name not in ("iterations", "background"):
             changes[name] = None if name == "jacobian_limit" and given == "none" else given
-    changes["appearance"] = _appearance(arguments)
+    changes["appearance"] = _stored_or_given(arguments, "appearance", APPEARANCES)
+    changes["transients"] = _stored_or_given(arguments, "transients", TRANSIENTS)
     if arguments.white_background or arguments.background:
         changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
     for only, names in ONLY_FOR.items():
@@ -370,16 +382,16 @@ def _strategy(arguments: argparse.Namespace) -> str:
     return DEFAULT_STRATEGY if found is None else str(found)
 
 
-def _appearance(arguments: argparse.Namespace) -> str:
-    """Return the appearance: that given, that of the run to resume, or "none" (see `chooses_appearance`)."""
-    given = arguments.appearance
+def _stored_or_given(arguments: argparse.Namespace, name: str, names: tuple[str, ...]) -> str:
+    """Return an option that may be "auto": as given, that of the run to resume, or "none" until it is chosen."""
+    given = getattr(arguments, name)
     if given is not None:
-        one_of("--appearance", given, (*APPEARANCES, AUTO))
+        one_of(f"--{name}", given, (*names, AUTO))
     if given not in (None, AUTO):
         return str(given)
     folder = RunFolder(arguments.out)
     stored = folder.read_config().get("train") if arguments.resume and folder.exists() else None
-    return str(stored.get("appearance", "none")) if isinstance(stored, dict) else "none"
+    return str(stored.get(name, "none")) if isinstance(stored, dict) else "none"
 
 
 def chooses_appearance(arguments: argparse.Namespace) -> bool:
@@ -387,6 +399,12 @@ def chooses_appearance(arguments: argparse.Namespace) -> bool:
     if arguments.resume and RunFolder(arguments.out).exists():
         return False
     return arguments.appearance == AUTO or (arguments.appearance is None and _strategy(arguments) == "fast")
+
+
+def chooses_transients(arguments: argparse.Namespace) -> bool:
+    """Say whether --transients auto was given for a new run."""
+    resumes = arguments.resume and RunFolder(arguments.out).exists()
+    return arguments.transients == AUTO and not resumes
 
 
 def _length(arguments: argparse.Namespace, strategy: str) -> int:

@@ -1,0 +1,43 @@
+"""Which photos of a run show what the others do not, found as `gsplat-edu train --transients mask` finds them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.transient_masks import Compared, FeatureRenderer, find_masks
+from gsplat_edu.train.transients import FEWEST, reduced
+from gsplat_edu.views import View
+
+NOTABLE = 0.01
+"""Photos of which less than this share differs are not reported."""
+
+
+def moved_parts(
+    gaussians: Gaussians, views: Sequence[View], render: FeatureRenderer, settings: RenderSettings
+) -> list[tuple[str, float]]:
+    """Return the names of the training photos that show what others do not, and which share of each that is.
+
+    Args:
+        gaussians: The trained scene, in the cameras' world coordinates.
+        views: The training views.
+        render: Renders features.
+        settings: The run's render settings.
+
+    Returns:
+        The largest share first; empty if there are too few views to compare.
+
+    Raises:
+        DatasetError: a photo cannot be read.
+    """
+    if len(views) < FEWEST:
+        return []
+    small = [reduced(view) for view in views]
+    found = find_masks(gaussians, small, Compared(render, settings, lambda index, camera: camera))
+    shares = [
+        (view.name, float(one.mask.mean()))
+        for view, one in zip(views, found, strict=True)
+        if one.mask.mean() >= NOTABLE
+    ]
+    return sorted(shares, key=lambda entry: (-entry[1], entry[0]))
