@@ -57,6 +57,7 @@ PICTURES = (
     "docs/images/sphere.png",
     "docs/images/capture.jpg",
     "docs/images/exposure-before-after.jpg",
+    "docs/images/sky-before-after.jpg",
     "docs/images/recipes-snowmiku97.png",
 )
 TILES = ("notebooks/11_tiles.ipynb", 0)

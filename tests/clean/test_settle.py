@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.clean.settle import _slope, settle
+from gsplat_edu.clean.settle import Doubtful, _slope, settle
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 
@@ -54,8 +54,8 @@ def test_of_two_that_fill_one_hole_the_one_that_the_photos_show_stays(room, ring
         room.map(lambda tensor: tensor[hole : hole + 1]), sh0=-room.sh0[hole : hole + 1] + 0.2 * red
     )
     both = Gaussians.concatenated([room, other])
-    doubtful, start = np.array([hole, len(room)]), np.array([-1.0, -1.0])
-    logits = settle(both, doubtful, start, views, SETTINGS, UNIT, 0.01, 80)
+    doubtful = Doubtful(np.array([hole, len(room)]), np.array([-1.0, -1.0]))
+    logits = settle(both, doubtful, views, SETTINGS, UNIT, 0.01, 80)
     assert logits[0] > 1.0
     assert logits[1] < -1.5
 
@@ -66,7 +66,9 @@ def test_what_no_photo_shows_stays_where_it_was(room, rings):
     far = replace(one, means=one.means + torch.tensor([0.0, 1e3, 0.0]))
     both = Gaussians.concatenated([room, far])
     start = np.array([1.0])
-    found = settle(both, np.array([len(room)]), start, photographed(room, rings[0]), SETTINGS, UNIT, 0.01, 40)
+    found = settle(
+        both, Doubtful(np.array([len(room)]), start), photographed(room, rings[0]), SETTINGS, UNIT, 0.01, 40
+    )
     assert 0.9 < found[0] < 1.0
 
 
@@ -74,5 +76,5 @@ def test_masked_pixels_do_not_count(room, planted, rings):
     mask = np.zeros((rings[0][0].H, rings[0][0].W), dtype=bool)
     views = photographed(room, rings[0], mask)
     start = np.full(60, -1.0)
-    found = settle(planted, np.arange(1300, 1360), start, views, SETTINGS, UNIT, 0.0, 40)
+    found = settle(planted, Doubtful(np.arange(1300, 1360), start), views, SETTINGS, UNIT, 0.0, 40)
     assert np.array_equal(found, start)

@@ -8,6 +8,7 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.runs import pilot
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,19 @@ def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
     assert main(words) == 0
     refined = {view.name: view.camera for view in load_dataset(run / "refined").train}
     assert judged and all(abs(view.camera.eye - refined[view.name].eye).max() < 1e-9 for view in judged)
+
+
+def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pilot, "ITERATIONS", 20)
+    run = tmp_path / "run"
+    words = ["train", str(capture), "--out", str(run), "--refine", "auto"]
+    assert main([*words, "--iterations", "6"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    chosen = json.loads((run / "config.json").read_text())["train"]["refine"]
+    assert f"--refine {chosen}: short trainings score the held-out photos" in said
+    assert main([*words, "--iterations", "9", "--resume"]) == 0
+    assert "short trainings" not in capsys.readouterr().out
+    assert json.loads((run / "config.json").read_text())["train"]["refine"] == chosen
 
 
 def test_unknown_names_are_refused(capture, tmp_path, capsys):

@@ -209,6 +209,16 @@ def test_splats_larger_than_the_scene(scene, share, is_named):
     assert ("huge splats" in warnings(run)) == is_named
 
 
+def test_a_far_sky_is_neither_haze_nor_makes_floaters_of_the_scene(scene):
+    gaussians, views = scene
+    sky = gaussians.map(lambda tensor: tensor[: len(gaussians) // 2])
+    directions = sky.means / sky.means.norm(dim=1, keepdim=True)
+    far = replace(sky, means=400 * directions, log_scales=torch.full_like(sky.log_scales, 3.0))
+    far = replace(far, logit_opacities=torch.full_like(far.logit_opacities, 3.0))
+    found = warnings(trained(Gaussians.concatenated([gaussians, far]), views))
+    assert "huge splats" not in found and "floaters" not in found
+
+
 @pytest.mark.parametrize(
     ("reached", "planned", "is_named"), [(30_000, 30_000, False), (30_000, None, False), (70, 7000, True)]
 )

@@ -54,3 +54,14 @@ def test_resizing_keeps_the_view():
     point = (0.13, -0.07, 1.9)
     (u, v, _), (su, sv, _) = image_of(camera, point), image_of(small, point)
     assert (su + 0.5, sv + 0.5) == pytest.approx(((u + 0.5) / 2, (v + 0.5) / 2))
+
+
+def test_a_far_sky_does_not_move_the_orbit():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(2000, 3)) + np.array([4, 5, 6])
+    sky = rng.normal(size=(1500, 3)) * (1, -1, 1)
+    sky[:, 1] = -abs(sky[:, 1])
+    sky = 400 * sky / np.linalg.norm(sky, axis=1, keepdims=True)
+    alone, both = (orbit_of_scene(scene(means, 2.0), 3, 50) for means in (ball, np.concatenate([sky, ball])))
+    for one, other in zip(alone, both, strict=True):
+        np.testing.assert_allclose(one.eye, other.eye)

@@ -23,7 +23,9 @@ def test_every_kernel_compiles_with_few_spills(capability, variant, kernels, cou
     environment = os.environ | {"TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, str(Path(__file__).with_name("compile_kernels.py"))]
     command += [str(capability), variant, kernels]
-    done = subprocess.run(command, env=environment, check=False, capture_output=True, text=True, timeout=1_800)
+    done = subprocess.run(
+        command, env=environment, check=False, capture_output=True, text=True, timeout=1_800
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     spills = [line.split() for line in done.stdout.splitlines()]
     assert len(spills) == count

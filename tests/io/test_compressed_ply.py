@@ -459,3 +459,22 @@ def test_a_scene_without_sh():
 )
 def test_real_files_that_are_not_compressed_are_refused(name):
     refused(shared(name))
+
+
+@pytest.mark.parametrize("near", [2_000, 2_048, 2_050])
+def test_a_far_sky_does_not_coarsen_the_scene(tmp_path, near):
+    """A chunk with splats of both would place the near ones to 600 / 2047 world units at best."""
+    scene, rng = random_scene(near, rest=0), np.random.default_rng(0)
+    away = rng.normal(size=(700, 3))
+    away = 300.0 * away / np.linalg.norm(away, axis=1, keepdims=True)
+    sky = replace(random_scene(700, rest=0).gaussians, means=torch.tensor(away, dtype=torch.float32))
+    both = replace(scene, gaussians=type(sky).concatenated([sky, scene.gaussians]))
+    errors = {}
+    for name, one in (("alone", scene), ("with a sky", both)):
+        write(tmp_path / "x.compressed.ply", one)
+        found = read(tmp_path / "x.compressed.ply").gaussians.means.numpy()
+        distances, _ = cKDTree(found).query(scene.gaussians.means.numpy())
+        errors[name] = distances
+    assert np.quantile(errors["with a sky"], 0.85) < 1.5 * np.quantile(errors["alone"], 0.85)
+    centre = np.linalg.norm(scene.gaussians.means.numpy(), axis=1) < 1.0
+    assert errors["with a sky"][centre].max() < 2 * errors["alone"].max()

@@ -5,6 +5,7 @@ import gzip
 import hashlib
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -17,7 +18,8 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.viewer import page, page_data
-from gsplat_edu.viewer.page_start import first_camera, pivot_of
+from gsplat_edu.viewer.page_start import first_camera, pivot_of, start_of
+from scene_files import random_scene
 
 NASTY = 'a </script><script>alert(1)</script> {{facts}} "&" äöü 兎 🐕'
 
@@ -368,3 +370,24 @@ def test_a_flight_or_an_arc_starts_in_the_middle_and_a_ring_at_its_first_camera(
             for a in np.linspace(0, turn, 12)
         ]
         assert first_camera(around, range(1, 12)) in (chosen, 11 - chosen if chosen == 5 else chosen)
+
+
+def test_a_page_opens_on_the_scene_and_not_on_its_sky():
+    """Cameras that look one way at a wall of few splats under a sky of many."""
+    cameras = [Camera.looking_at((x, 0.0, 0.0), (x, 0.0, 5.0), 50, 50, 60, 60) for x in (-0.2, 0.0, 0.2)]
+    rng = np.random.default_rng(0)
+    wall = np.c_[rng.uniform(-3, 3, (900, 2)), np.full(900, 5.0)]
+    sky = rng.normal(size=(800, 3))
+    sky = np.c_[0.2 * sky[:, :2], 1 + abs(sky[:, 2])]  # mostly in the middle of the image
+    sky = 300 * sky / np.linalg.norm(sky, axis=1, keepdims=True)
+    starts = []
+    for means in (wall, np.concatenate([wall, sky])):
+        gaussians = random_scene(len(means), rest=0).gaussians
+        gaussians = replace(
+            gaussians,
+            means=torch.tensor(means, dtype=torch.float32),
+            logit_opacities=torch.ones(len(means)),
+        )
+        starts.append(start_of(Scene(gaussians, False, (0.0, -1.0, 0.0)), cameras, 1))
+    np.testing.assert_allclose(starts[0].pivot, (0, 0, 5), atol=1e-6)
+    np.testing.assert_allclose(starts[1].pivot, starts[0].pivot)

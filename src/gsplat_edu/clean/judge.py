@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float64, UInt8
 
 from gsplat_edu.clean.evidence import Evidence, gather, peak_weights
-from gsplat_edu.clean.settle import settle
+from gsplat_edu.clean.settle import Doubtful, settle
 from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
@@ -226,8 +226,7 @@ class _Rounds:
         unit = max(error / len(doubtful) / len(self._views), np.finfo(np.float64).tiny)
         logits = settle(
             self._gaussians,
-            ids,
-            start,
+            Doubtful(ids, start),
             self._views,
             self._settings,
             unit=unit,

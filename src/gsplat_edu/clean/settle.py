@@ -12,7 +12,7 @@ The price decides where the photos say nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -37,10 +37,22 @@ Progress = Callable[[], None]
 """Called after every step."""
 
 
+@dataclass(frozen=True, eq=False)
+class Doubtful:
+    """Splats to judge.
+
+    Args:
+        ids: (D,) their indices.
+        start: (D,) logits of their factors to start from.
+    """
+
+    ids: Int64[np.ndarray, " D"]
+    start: Float64[np.ndarray, " D"]
+
+
 def settle(
     gaussians: Gaussians,
-    doubtful: Int64[np.ndarray, " D"],
-    start: Float64[np.ndarray, " D"],
+    doubtful: Doubtful,
     views: Sequence[View],
     settings: RenderSettings,
     unit: float,
@@ -52,8 +64,7 @@ def settle(
 
     Args:
         gaussians: N Gaussians on the CPU.
-        doubtful: (D,) indices of the doubtful splats.
-        start: (D,) logits of their factors to start from.
+        doubtful: The doubtful splats, D of them.
         views: Cameras and photos; each pass takes them in a new random order, always the same one.
         settings: The scene's render settings.
         unit: Average squared error per splat and view. It is added to Adam's denominator, so that gradients far below
@@ -69,12 +80,12 @@ def settle(
         DatasetError: a photo cannot be read.
     """
     rng = np.random.default_rng(0)
-    logits = start.astype(np.float64)
+    logits = doubtful.start.copy()
     first, second = np.zeros_like(logits), np.zeros_like(logits)
     order: list[int] = []
     for step in range(1, steps + 1):
         order = order or rng.permutation(len(views)).tolist()
-        slope = _slope(gaussians, doubtful, logits, views[order.pop()], settings, price * unit)
+        slope = _slope(gaussians, doubtful.ids, logits, views[order.pop()], settings, price * unit)
         first += (1.0 - BETAS[0]) * (slope - first)
         second += (1.0 - BETAS[1]) * (np.square(slope) - second)
         rate = RATE if step <= (1.0 - LAST) * steps else RATE / 3.0

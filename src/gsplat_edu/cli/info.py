@@ -20,6 +20,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import SOG_META, format_of, read_scene, stored_bytes
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.shells import far_shell
 from gsplat_edu.text import short_number
 
 PERCENTILES = (1, 25, 50, 75, 99)
@@ -103,6 +104,10 @@ def _splat_facts(gaussians: Gaussians) -> list[Fact]:
         ("scale", f"{_percentiles(scales)}   world units"),
         ("", _log_histogram(scales)),
     ]
+    if (far := far_shell(means)).any():
+        facts.insert(
+            1, ("", f"all but the {int(far.sum()):,} of a far shell, such as a sky: {_bounds(means[~far])}")
+        )
     diagonal = float(np.linalg.norm(inner[1] - inner[0]))
     for number, what in (
         (

@@ -35,6 +35,7 @@ from gsplat_edu.render.settings import MAPS, RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
 from gsplat_edu.runs.source import file_settings, relative_to
+from gsplat_edu.shells import far_shell
 from gsplat_edu.validation import whole_number
 
 MOST_FRAMES = 100_000
@@ -238,8 +239,9 @@ def _settings(settings: RenderSettings, arguments: argparse.Namespace) -> Render
 
 
 def _depth(gaussians: Gaussians, camera: Camera) -> float:
-    """Return the median depth of the Gaussians in front of a camera, an estimate of its subject's distance."""
-    depths = camera.world_to_cam(gaussians.means.numpy(force=True))[:, 2]
+    """Return the median depth of the Gaussians in front of a camera, not of a sky: about its subject's distance."""
+    means = gaussians.means.numpy(force=True)
+    depths = camera.world_to_cam(means[~far_shell(means)])[:, 2]
     ahead = depths[depths > 0]
     return float(np.median(ahead)) if ahead.size else 1.0
 

@@ -20,19 +20,20 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.cli.options.train import chooses_appearance, chooses_transients, options_from
+from gsplat_edu.cli.options.train import left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.points import read_points_ply
-from gsplat_edu.doctor.remedies import appearance_for, transients_for
+from gsplat_edu.doctor.remedies import Remedy, remedies_for, transients_for
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
+from gsplat_edu.runs.pilot import ITERATIONS, ORDER, refinement_for
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import needs_poses
@@ -170,16 +171,7 @@ def _planned(
 ) -> Plan:
     """Find poses if necessary, and choose the options that the limits leave open."""
     options = _with_poses(options_from(arguments), arguments, console, say)
-    if chooses_appearance(arguments):
-        with _bar(console, "") as bar:
-            remedy = appearance_for(options.data, _photos(bar, lambda: False))
-        options = replace(options, config=options.config.changed(appearance=remedy.value))
-        if remedy.reason:
-            say(f"--appearance {remedy.value}: {remedy.reason}")
-    if chooses_transients(arguments):
-        remedy = transients_for(len(load_dataset(options.data, options.data_settings).train))
-        options = replace(options, config=options.config.changed(transients=remedy.value))
-        say(f"--transients {remedy.value}: {remedy.reason}")
+    options = _with_choices(options, left_open(arguments), console, say)
     limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
     given += ["iterations"] if arguments.quality is not None else []
@@ -187,6 +179,32 @@ def _planned(
     for sentence in chosen.sentences:
         say(sentence)
     return chosen
+
+
+def _with_choices(
+    options: RunOptions, names: tuple[str, ...], console: Console, say: Callable[[str], None]
+) -> RunOptions:
+    """Choose the settings whose option is auto, and say which were chosen and why."""
+
+    def take(options: RunOptions, name: str, remedy: Remedy) -> RunOptions:
+        if remedy.reason:
+            say(f"--{name} {remedy.value}: {remedy.reason}")
+        return replace(options, config=options.config.changed(**{name: remedy.value}))
+
+    if by_photos := [name for name in names if name in ("appearance", "sky")]:
+        with _bar(console, "") as bar:
+            remedies = remedies_for(options.data, by_photos, _photos(bar, lambda: False))
+        for name, remedy in remedies.items():
+            options = take(options, name, remedy)
+    if "transients" in names:
+        count = len(load_dataset(options.data, options.data_settings).train)
+        options = take(options, "transients", transients_for(count))
+    if "refine" in names:
+        with _bar(console, "") as bar:
+            task = bar.add_task("short trainings", total=len(ORDER) * ITERATIONS)
+            chosen = refinement_for(options, progress=lambda: bar.advance(task))
+        options = take(options, "refine", Remedy(*chosen))
+    return options
 
 
 def _either(first: Callable[[], bool], second: Callable[[], bool]) -> bool:

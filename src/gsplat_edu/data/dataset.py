@@ -69,6 +69,7 @@ class Dataset:
         images: The photo cache.
         files: Name and files of each photo, sorted by name.
         scale: What a unit of the coordinates is; None if unknown.
+        measured: Whether the points come from a capture or a file; otherwise they are random.
     """
 
     path: Path
@@ -82,6 +83,7 @@ class Dataset:
     images: ImageStore
     files: tuple[tuple[str, PhotoFile], ...] = ()
     scale: Scale | None = None
+    measured: bool = True
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Decode every photo once, several in parallel, and keep those within the budget.
@@ -167,6 +169,7 @@ def load_dataset(
         store,
         files,
         capture.scale,
+        cloud is not None,
     )
 
 

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from gsplat_edu.doctor.appearance import EXPOSURE
 from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, command, counted, new_run
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.shells import far_shell
 from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import DEFAULT_QUALITY, QUALITIES, RECIPE_ITERATIONS
 
@@ -350,9 +352,13 @@ def _splats(run: Trained) -> list[Finding]:
         )
         found.append(Finding("faint splats", Severity.NOTE, what, advice))
     sizes = run.gaussians.scales.amax(dim=1)
-    huge = float(((sizes > run.extent) & (run.gaussians.opacities >= FAINT)).double().mean())
+    sky = torch.from_numpy(far_shell(run.gaussians.means.numpy(force=True))).to(sizes.device)
+    huge = float(((sizes > run.extent) & (run.gaussians.opacities >= FAINT) & ~sky).double().mean())
     if huge > HUGE_SHARE:
         what = f"{100 * huge:.1f} % of the splats are larger than the cameras' extent and look like haze"
-        advice = "check the photos for exposure jumps and sky; distant start points become such splats too"
+        advice = (
+            "check the photos for exposure jumps, and train with --sky shell if they show sky; distant start points"
+            " become such splats too"
+        )
         found.append(Finding("huge splats", Severity.WARNING, what, advice))
     return found

@@ -20,6 +20,7 @@ from gsplat_edu.doctor.cameras import (
 from gsplat_edu.doctor.cloud import check_cloud
 from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
 from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
+from gsplat_edu.doctor.remedies import check_sky
 from gsplat_edu.doctor.survey import Survey
 from gsplat_edu.text import short_number
 
@@ -41,6 +42,7 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("coverage", check_coverage),
     ("duplicates", check_duplicates),
     ("cloud", check_cloud),
+    ("sky", check_sky),
 )
 """Checks that compare views; they need at least two."""
 

@@ -51,11 +51,13 @@ class PhotoStats:
         detail: (8,) natural logarithm of the energy of fine gradients over that of coarse ones, by direction; zero if
             it was not measured.
         transparent: Whether a pixel is not opaque.
+        masked: Whether the photo has a mask.
     """
 
     thumbnail: UInt8[np.ndarray, "h w 3"]
     detail: Float64[np.ndarray, "8"]
     transparent: bool = False
+    masked: bool = False
 
 
 def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
@@ -81,7 +83,7 @@ def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
         columns, rows, _ = undistortion(lens.scaled(w, h), slice(0, h))
         small = cv2.remap(small, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     detail = detail_of(pixels) if sharpness else np.zeros(len(ANGLES))
-    return PhotoStats(np.asarray(small, dtype=np.uint8), detail, transparent)
+    return PhotoStats(np.asarray(small, dtype=np.uint8), detail, transparent, source.mask is not None)
 
 
 def detail_of(pixels: UInt8[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "8"]:

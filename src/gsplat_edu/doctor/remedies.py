@@ -1,18 +1,21 @@
-"""Which remedies a capture needs: what `auto` of `gsplat-edu train` chooses for `--appearance` and `--transients`.
+"""Which remedies a capture needs: what the options of `gsplat-edu train` choose whose value is auto.
 
 The checks of `gsplat_edu.doctor.appearance` name photos that a user should look at. This module decides whether the
-training should correct all photos.
+training should correct all photos, and whether it should start with a sky.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsplat_edu.doctor.appearance import Gains
+from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.survey import Progress, Survey, prepare
+from gsplat_edu.sky.find import Sky, find_sky
 
 UNLIKE = 0.25
 """A photo counts if its brightness or a channel's tint differs from its neighbours' by more than this, stops."""
@@ -39,17 +42,19 @@ class Remedy:
     reason: str = ""
 
 
-def appearance_for(path: Path, progress: Progress | None = None) -> Remedy:
-    """Choose `--appearance` for a capture from its photos.
+def remedies_for(path: Path, names: Sequence[str], progress: Progress | None = None) -> dict[str, Remedy]:
+    """Choose settings for a capture from its photos, which are read once.
 
     Args:
         path: Folder or transforms.json of the capture.
+        names: The settings: "appearance", "sky".
         progress: Called with (photos done, total) in the calling thread.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
-    return appearance_of(prepare(path, progress, sharpness=False))
+    survey = prepare(path, progress, sharpness=False)
+    return {name: {"appearance": appearance_of, "sky": sky_of}[name](survey) for name in names}
 
 
 def appearance_of(survey: Survey) -> Remedy:
@@ -78,4 +83,43 @@ def transients_for(count: int) -> Remedy:
     return Remedy(
         "mask",
         f"{count} training photos are enough to tell what moved; a photo where nothing did keeps every pixel",
+    )
+
+
+def sky_of(survey: Survey) -> Remedy:
+    """Choose `--sky` for a surveyed capture: "shell" if something at infinity fills enough of its photos."""
+    if len(survey.shots) < 2:
+        return Remedy("none")
+    for kind, some in (
+        ("transparent", any(shot.stats.transparent for shot in survey.shots)),
+        ("masked", any(shot.stats.masked for shot in survey.shots)),
+    ):
+        if some:
+            return Remedy("none", f"photos are {kind}, and a sky may be cut out of them")
+    sky = _sky(survey)
+    return Remedy("shell", _seen(sky, survey)) if sky.is_certain else Remedy("none")
+
+
+def check_sky(survey: Survey) -> list[Finding]:
+    """Find a sky, which needs splats far away."""
+    if sky_of(survey).value == "none":
+        return []
+    advice = "train with --sky shell, which --sky auto of the recipe fast chooses by itself"
+    return [Finding("sky", Severity.NOTE, _seen(_sky(survey), survey), advice)]
+
+
+def _sky(survey: Survey) -> Sky:
+    shots = survey.shots
+    return find_sky([shot.camera for shot in shots], [shot.stats.thumbnail for shot in shots], survey.points)
+
+
+def _seen(sky: Sky, survey: Survey) -> str:
+    """Say where the sky is and how that is known."""
+    where = f"{100 * sky.share:.0f} % of the pixels, in {sky.photos} of {len(survey.shots)} photos"
+    blind = "" if len(survey.points) else ", as far as photos without points tell"
+    if not sky.moves:
+        return f"{where}, are one white above the horizon{blind}"
+    return (
+        f"{where}, lie at infinity{blind}: in one direction, photos differ by {sky.spread:.1f} %,"
+        f" at any finite distance by {sky.spread_near:.1f} % or more"
     )

@@ -13,6 +13,7 @@ from gsplat_edu.doctor.photos import BRIGHT, DARK, GAMMA
 from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, psnr
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.shells import far_shell
 from gsplat_edu.validation import ArrayLike
 from gsplat_edu.views import View
 
@@ -71,12 +72,15 @@ def residuals(
         DatasetError: a photo cannot be read.
     """
     found = []
+    sky = torch.from_numpy(far_shell(gaussians.means.numpy(force=True))).to(gaussians.means.device)
+    subject = gaussians.map(lambda tensor: tensor[~sky]) if bool(sky.any()) else gaussians
     for view in views:
         photo = view.read()
         if photo.mask is None or photo.mask.any():
             with torch.no_grad():
                 output = render(gaussians, view.camera)
-                veiled = _veiled(gaussians, view, output, render)
+                alone = output if subject is gaussians else render(subject, view.camera)
+                veiled = _veiled(subject, view, alone, render)
             truth = photo.over(background)
             pixels = truth / 255.0 if truth.dtype == np.uint8 else np.asarray(truth, dtype=np.float64)
             image = at_exposure_of(truth, output.image, photo.mask) if corrected else output.image

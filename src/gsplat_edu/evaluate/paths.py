@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from gsplat_edu.camera import WORLD_UP, Camera, as_camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.shells import far_shell
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 
 Vector = Float64[np.ndarray, "3"]
@@ -46,7 +47,8 @@ def orbit_of_scene(gaussians: Gaussians, frames: int, size: int, up: ArrayLike =
 
     The centre is the middle of the box that holds 10 to 90 % of the opacity along each axis. The extent is the radius
     of the sphere that holds 95 % of the opacity, at most twice the radius of the one that holds half. The orbit's
-    radius lets this sphere fill a field of view of 50 degrees, with a margin of 10 %.
+    radius lets this sphere fill a field of view of 50 degrees, with a margin of 10 %. A far shell, such as a sky,
+    counts for nothing.
 
     Args:
         gaussians: N Gaussians, at least one.
@@ -62,7 +64,8 @@ def orbit_of_scene(gaussians: Gaussians, frames: int, size: int, up: ArrayLike =
         raise ArgumentError("gaussians: is empty; there is nothing to look at")
     frames, size = whole_number("frames", frames, 1), whole_number("size", size, 1)
     means = gaussians.means.double().numpy(force=True)
-    weights = gaussians.opacities.double().numpy(force=True)
+    near = ~far_shell(means)
+    means, weights = means[near], gaussians.opacities.double().numpy(force=True)[near]
     centre = np.array([sum(_weighted_quantile(column, weights, q) for q in BOX) / 2 for column in means.T])
     distances = np.linalg.norm(means - centre, axis=1)
     outer, middle = (_weighted_quantile(distances, weights, q) for q in (EXTENT_QUANTILE, 0.5))

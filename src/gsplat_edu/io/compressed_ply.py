@@ -38,6 +38,7 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.morton import morton_codes
 from gsplat_edu.ply_table import Element, Header, read_elements, read_rows
 from gsplat_edu.reading import open_file
+from gsplat_edu.shells import far_shell
 
 CHUNK = 256
 """Splats per chunk; the last chunk may have fewer."""
@@ -286,9 +287,26 @@ def _header(scene: Scene, splats: int, chunks: int, sh: int) -> bytes:
 
 def _order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     """Return the order in which to write the splats."""
-    order, own = _morton_order(means), np.arange(len(means))
+    order, own = _order_in_groups(means), np.arange(len(means))
     settled = np.count_nonzero(order // CHUNK == own // CHUNK)
     return own if settled >= SETTLED * len(means) else order
+
+
+def _order_in_groups(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """Return the order along a Morton curve, a far shell last.
+
+    A chunk with splats of both would be as large as the shell, and place the near ones as coarsely. Of these, only
+    the farthest share a chunk with the shell: those that do not fill one.
+    """
+    far = far_shell(means)
+    if not far.any():
+        return _morton_order(means)
+    near = np.flatnonzero(~far)
+    away = np.square(means[near] - np.median(means[near], axis=0)).sum(axis=1)
+    rest = len(near) % CHUNK
+    near = near[np.argsort(away, kind="stable")]
+    groups = [np.sort(near[: len(near) - rest]), near[len(near) - rest :], np.flatnonzero(far)]
+    return np.concatenate([group[_morton_order(means[group])] for group in groups])
 
 
 def _morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:

@@ -31,6 +31,7 @@ from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, 
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
 from gsplat_edu.runs.refined import aligned_score, with_refined_cameras, write_refined
+from gsplat_edu.runs.skies import shell_around, start_sky, with_room_for
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
 from gsplat_edu.runs.transients import write_masks
@@ -43,6 +44,7 @@ from gsplat_edu.train.checkpoint import (
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
+from gsplat_edu.train.objective import make_objective
 from gsplat_edu.train.trainer import Callback, StepParts, Trainer
 from gsplat_edu.train.transients import check_enough
 
@@ -165,11 +167,18 @@ class CaptureRun:
         self._check_opaque()
         if options.config.transients != "none":
             check_enough(len(self.dataset.train))
+        # a scene to start from may have a sky; a resumed run need not say --from again
+        self._shell = shell_around(self.dataset) if self._is_from_scene() else None
         gaussians = self._begin()
         self._log = LogWriter(self.folder.log_file)
         self.trainer = self._trainer(gaussians)
         self._take_up()
         self._extend()
+
+    def _is_from_scene(self) -> bool:
+        stored = self.folder.read_config().get("data") if self.folder.exists() else None
+        given = self.options.scene is not None
+        return given or (isinstance(stored, dict) and stored.get("scene") is not None)
 
     def _say_what_is_resumed(self) -> None:
         folder, options = self.folder, self.options
@@ -214,10 +223,12 @@ class CaptureRun:
             options.config,
             render=renderer,
             extent=extent,
-            density=make_strategy(options.config, extent, gaussians),
+            density=make_strategy(options.config, extent, gaussians, self._shell),
             callbacks=[self._record],
             parts=StepParts(
-                view_model=model, transients=make_transients(options.config, dataset.train, renderer)
+                make_objective(options.config, self._shell),
+                model,
+                transients=make_transients(options.config, dataset.train, renderer),
             ),
         )
 
@@ -240,12 +251,18 @@ class CaptureRun:
             for note in notes:
                 self._say(note)
             return gaussians, scene_digest(gaussians)
-        gaussians = from_points(dataset.points, dataset.colors, options.config)
+        config, sky = options.config, None
+        if config.sky != "none":
+            sky, self._shell = start_sky(dataset, config)
+            config = with_room_for(len(sky), config)
+            if not self.folder.exists():
+                self._say(f"{len(sky)} splats of the sky lie {self._shell.radius:.3g} world units away")
+        gaussians = from_points(dataset.points, dataset.colors, config)
         if len(gaussians) < len(dataset.points) and not self.folder.exists():
             self._say(
                 f"the capture has {len(dataset.points)} start points; {len(gaussians)} of them are used (the cap)"
             )
-        return gaussians, None
+        return gaussians if sky is None else Gaussians.concatenated([gaussians, sky]), None
 
     def _extend(self) -> None:
         """Record in config.json that the run was extended, before the first additional iteration."""

@@ -28,6 +28,7 @@ STRATEGIES = ("adc", "mcmc", "fast", "none")
 OVER_CAP = ("strongest", "cut")
 VIEW_ORDERS = ("shuffled", "random")
 APPEARANCES = ("none", "exposure")
+SKIES = ("none", "shell")
 REFINEMENTS = ("none", "poses", "intrinsics", "both")
 
 FROM_SCENE = {"means_rate": 1.6e-5, "sh_every": 0}
@@ -314,6 +315,7 @@ class TrainConfig:
         ' them before it is compared; "none": compare the render itself.',
         "ours",
     )
+    sky: str = _number("none", _one_of(SKIES), '"shell": start with far splats where photos show sky.')
     refine: str = _number(
         "none",
         _one_of(REFINEMENTS),

@@ -19,6 +19,7 @@ from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC
 from gsplat_edu.train.exposure import Exposure
+from gsplat_edu.train.far import Shell
 from gsplat_edu.train.poses import Refinement
 from gsplat_edu.train.transient_masks import FeatureRenderer
 from gsplat_edu.train.transients import Transients
@@ -131,23 +132,26 @@ def from_gaussians(gaussians: Gaussians, config: TrainConfig) -> tuple[Gaussians
     return Gaussians(**(kept.tensors() | {"sh_rest": rest})), notes
 
 
-def make_strategy(config: TrainConfig, extent: float, gaussians: Gaussians) -> DensityStrategy | None:
+def make_strategy(
+    config: TrainConfig, extent: float, gaussians: Gaussians, shell: Shell | None = None
+) -> DensityStrategy | None:
     """Make the density strategy of a configuration; None for the strategy "none".
 
     Args:
         config: The configuration; its seed also seeds the strategy.
         extent: Size of the scene, world units.
         gaussians: The start Gaussians.
+        shell: Where far splats lie; None if there are none.
 
     Raises:
         ArgumentError: the strategy is mcmc or fast and there is no cap.
     """
     generator = torch.Generator().manual_seed(config.seed)
     if config.strategy == "adc":
-        return AdaptiveDensityControl(config, extent, generator, gaussians)
+        return AdaptiveDensityControl(config, extent, generator, gaussians, shell)
     if config.strategy == "fast":
-        return PlannedDensity(config, gaussians)
-    return MCMC(config, generator) if config.strategy == "mcmc" else None
+        return PlannedDensity(config, gaussians, shell)
+    return MCMC(config, generator, shell) if config.strategy == "mcmc" else None
 
 
 def make_view_model(

@@ -22,6 +22,7 @@ from gsplat_edu.losses import photo_loss
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.far import Shell
 from gsplat_edu.train.feed import Draw, Target
 
 PHOTO = "photo"
@@ -93,17 +94,21 @@ def sum_of_scalars(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
     return first
 
 
-def make_objective(config: TrainConfig) -> Objective:
+def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale)
+
+    Args:
+        config: The configuration.
+        shell: Where far splats lie, whose scale is not regularised; None if there are none.
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
     terms: dict[str, Term] = {PHOTO: PhotoTerm(config.ssim_weight)}
     if config.strategy == "mcmc":
         terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
-        terms["scale"] = MeanScale(config.mcmc.scale_weight)
+        terms["scale"] = MeanScale(config.mcmc.scale_weight, shell)
     if config.strategy == "fast" and config.fast.opacity_weight > 0:
         terms["opacity"] = MeanOpacity(config.fast.opacity_weight, until=config.fast.stop)
     return Objective(terms)
@@ -153,15 +158,17 @@ class MeanScale:
 
     Args:
         weight: lambda_Sigma.
+        shell: Where far splats lie, which count as having no scale; None if there are none.
     """
 
     weight: float
+    shell: Shell | None = None
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight mean(scale)."""
-        value: Tensor = _MeanScale.apply(  # type: ignore[no-untyped-call]
-            rendered.gaussians.log_scales, self.weight
-        )
+        gaussians = rendered.gaussians
+        far = None if self.shell is None else self.shell.holds(gaussians.means)
+        value: Tensor = _MeanScale.apply(gaussians.log_scales, self.weight, far)  # type: ignore[no-untyped-call]
         return value
 
 
@@ -192,18 +199,20 @@ class _MeanScale(torch.autograd.Function):
     """Compute weight mean(exp(l)), with the gradient weight exp(l) / N; on one thread, as above."""
 
     @staticmethod
-    def forward(ctx: Any, log_scales: Tensor, weight: float) -> Tensor:  # noqa: ANN401
+    def forward(ctx: Any, log_scales: Tensor, weight: float, far: Tensor | None) -> Tensor:  # noqa: ANN401
         with one_thread():
             scales = torch.exp(log_scales, out=reusable_tensor(log_scales.shape, log_scales))
+            if far is not None:
+                scales[far] = 0.0
             gradient = scales.mul_(weight).div_(max(log_scales.numel(), 1))
             ctx.save_for_backward(gradient)
             return gradient.sum()
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        return _scaled(gradient, grad), None
+        return _scaled(gradient, grad), None, None
 
 
 def _scaled(gradient: Tensor, grad: Tensor) -> Tensor:

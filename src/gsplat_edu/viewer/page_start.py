@@ -12,6 +12,7 @@ from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
 from gsplat_edu.evaluate.paths import common_up, orbit_of_scene
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.shells import far_shell
 
 SIDE = 800
 """Size of the initial image if there is no camera, px; the page replaces it by the window's size."""
@@ -86,7 +87,8 @@ def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
     if cameras:
         opaque = scene.gaussians.logit_opacities > 0
         means = scene.gaussians.means[opaque].double().numpy(force=True)
-        return Start(cameras[index], pivot_of(cameras, index, means), up, index)
+        near = means[~far_shell(means)]  # a sky is no subject
+        return Start(cameras[index], pivot_of(cameras, index, near), up, index)
     if len(scene.gaussians):
         orbit = orbit_of_scene(scene.gaussians, ORBIT, SIDE, up)
     else:

@@ -24,7 +24,9 @@ from gsplat_edu.train.config import (
     ONLY_FOR,
     QUALITIES,
     RECIPE_ITERATIONS,
+    REFINEMENTS,
     SETTINGS,
+    SKIES,
     STRATEGIES,
     Setting,
     TrainConfig,
@@ -35,7 +37,7 @@ from gsplat_edu.validation import one_of
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
 
-FOR_POINTS = ("start_opacity", "start_scale", "mcmc_start_opacity", "mcmc_start_scale")
+FOR_POINTS = ("start_opacity", "start_scale", "mcmc_start_opacity", "mcmc_start_scale", "sky")
 """Settings that only a start from points uses."""
 
 COMMON = (
@@ -55,6 +57,8 @@ COMMON = (
         "test_every",
         "appearance",
         "transients",
+        "sky",
+        "refine",
         "white_background",
         "antialiased",
         "seed",
@@ -66,12 +70,15 @@ COMMON = (
 """What `--help` shows; `--help-all` shows the other options too."""
 
 AUTO = "auto"
-"""The appearance, and the treatment of things that move, that stands for a choice by the photos."""
+"""The value of an option that stands for a choice by the photos."""
 
-NAMED = (
-    *("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background", "appearance"),
-    "transients",
-)
+OPEN = {"appearance": APPEARANCES, "sky": SKIES, "transients": TRANSIENTS, "refine": REFINEMENTS}
+"""Settings that can be left open by `AUTO`, and their other values."""
+
+OPEN_FOR_FAST = ("appearance", "sky")
+"""Those that the strategy fast leaves open unless they are given."""
+
+NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background", *OPEN)
 """Settings whose options are declared below; those of the others come from `SETTINGS`."""
 
 
@@ -250,6 +257,18 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         help='"mask" finds what moved from photo to photo, such as passers-by, and masks it; "none" does not; "auto"'
         " does if there are enough photos (default: none)",
     )
+    group.add_argument(
+        "--refine",
+        metavar="NAME",
+        help='"poses", "intrinsics" or "both" are learned with the scene; "none" are not; "auto" decides by short'
+        " trainings (default: none)",
+    )
+    group.add_argument(
+        "--sky",
+        metavar="NAME",
+        help='"shell" places splats far away wherever photos show the sky; "none" does not; "auto" lets the photos'
+        " decide (default: auto for the strategy fast, none for the others)",
+    )
     behind = group.add_mutually_exclusive_group()
     behind.add_argument("--white-background", action="store_true", help="white background (default: black)")
     behind.add_argument(
@@ -347,8 +366,7 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         given = getattr(arguments, name, None)
         if given is not None and name not in ("iterations", "background"):
             changes[name] = None if name == "jacobian_limit" and given == "none" else given
-    changes["appearance"] = _stored_or_given(arguments, "appearance", APPEARANCES)
-    changes["transients"] = _stored_or_given(arguments, "transients", TRANSIENTS)
+    changes |= {name: _given_or_stored(arguments, name) for name in OPEN}
     if arguments.white_background or arguments.background:
         changes["background"] = tuple(arguments.background or (1.0, 1.0, 1.0))
     for only, names in ONLY_FOR.items():
@@ -361,7 +379,7 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         arguments.time_limit is not None and arguments.iterations is None
     )
     if _starts_from_scene(arguments):
-        if idle := [name for name in FOR_POINTS if name in changes]:
+        if idle := [name for name in FOR_POINTS if changes.get(name, "none") != "none"]:
             flag = f"--{idle[0].replace('_', '-')}"
             raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
         changes = FROM_SCENE | (FAST_FROM_SCENE if strategy == "fast" else {}) | changes
@@ -382,11 +400,11 @@ def _strategy(arguments: argparse.Namespace) -> str:
     return DEFAULT_STRATEGY if found is None else str(found)
 
 
-def _stored_or_given(arguments: argparse.Namespace, name: str, names: tuple[str, ...]) -> str:
-    """Return an option that may be "auto": as given, that of the run to resume, or "none" until it is chosen."""
+def _given_or_stored(arguments: argparse.Namespace, name: str) -> str:
+    """Return the value of one of `OPEN`: given, of the run to resume, or "none" (see `left_open`)."""
     given = getattr(arguments, name)
     if given is not None:
-        one_of(f"--{name}", given, (*names, AUTO))
+        one_of(f"--{name}", given, (*OPEN[name], AUTO))
     if given not in (None, AUTO):
         return str(given)
     folder = RunFolder(arguments.out)
@@ -394,17 +412,18 @@ def _stored_or_given(arguments: argparse.Namespace, name: str, names: tuple[str,
     return str(stored.get(name, "none")) if isinstance(stored, dict) else "none"
 
 
-def chooses_appearance(arguments: argparse.Namespace) -> bool:
-    """Say whether the photos decide on the appearance of a new run: by --appearance auto, the default for fast."""
+def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return which of `OPEN` have to be chosen for a new run: those that are auto, some by default for fast.
+
+    A run that starts from a scene has the sky of that scene.
+    """
     if arguments.resume and RunFolder(arguments.out).exists():
-        return False
-    return arguments.appearance == AUTO or (arguments.appearance is None and _strategy(arguments) == "fast")
-
-
-def chooses_transients(arguments: argparse.Namespace) -> bool:
-    """Say whether --transients auto was given for a new run."""
-    resumes = arguments.resume and RunFolder(arguments.out).exists()
-    return arguments.transients == AUTO and not resumes
+        return ()
+    default = OPEN_FOR_FAST if _strategy(arguments) == "fast" else ()
+    names = [
+        name for name in OPEN if (getattr(arguments, name) or (AUTO if name in default else None)) == AUTO
+    ]
+    return tuple(name for name in names if name != "sky" or arguments.scene is None)
 
 
 def _length(arguments: argparse.Namespace, strategy: str) -> int:

@@ -20,6 +20,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import replace, split_children
 from gsplat_edu.train.events import Change, DensifyEvent, ResetEvent
+from gsplat_edu.train.far import Shell
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.saved import check_entries, check_flag, check_statistics, check_torch_generator
 
@@ -39,6 +40,7 @@ class AdaptiveDensityControl:
         extent: Size of the scene, world units.
         generator: Source of the split children's positions.
         gaussians: The start Gaussians.
+        shell: Where far splats lie, which may be large; None if there are none.
 
     Source: Kerbl et al. 2023, section 5.2.
     """
@@ -46,9 +48,14 @@ class AdaptiveDensityControl:
     observes_renders_only = True
 
     def __init__(
-        self, config: TrainConfig, extent: float, generator: torch.Generator, gaussians: Gaussians
+        self,
+        config: TrainConfig,
+        extent: float,
+        generator: torch.Generator,
+        gaussians: Gaussians,
+        shell: Shell | None = None,
     ) -> None:
-        self.config, self.extent, self.generator = config, extent, generator
+        self.config, self.extent, self.generator, self.shell = config, extent, generator, shell
         self.is_over = False
         self._forget(gaussians)
 
@@ -89,11 +96,15 @@ class AdaptiveDensityControl:
         size = gaussians.scales.amax(dim=-1)
         keep = gaussians.finite_rows() & (gaussians.opacities >= config.min_opacity)
         if config.adc.reset_every and iteration > config.adc.reset_every:
+            right = torch.ones_like(keep)
             if config.adc.prune_scale:
-                keep &= size <= config.adc.prune_scale * self.extent
+                right &= size <= config.adc.prune_scale * self.extent
             if config.adc.prune_screen_size:
-                keep &= self.largest_radii <= config.adc.prune_screen_size
+                right &= self.largest_radii <= config.adc.prune_screen_size
+            keep &= right if self.shell is None else right | self.shell.holds(gaussians.means)
         selected = keep & (mean_norms > config.adc.grad_threshold)
+        if self.shell is not None:
+            selected = self.shell.spared(selected, mean_norms, gaussians.means)
         if config.adc.over_cap == "strongest":
             selected = self._within_cap(mean_norms, selected, int(keep.sum()))
         large = size > config.adc.percent_dense * self.extent

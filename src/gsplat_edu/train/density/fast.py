@@ -24,6 +24,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import long_axis_children, replace
 from gsplat_edu.train.events import Change, DensifyEvent
+from gsplat_edu.train.far import Shell
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.saved import (
     check_entries,
@@ -45,6 +46,7 @@ class PlannedDensity:
     Args:
         config: Window, interval and cap.
         gaussians: The start Gaussians.
+        shell: Where far splats lie, whose number is limited; None if there are none.
 
     Raises:
         ArgumentError: there is no cap.
@@ -52,12 +54,12 @@ class PlannedDensity:
 
     observes_renders_only = True
 
-    def __init__(self, config: TrainConfig, gaussians: Gaussians) -> None:
+    def __init__(self, config: TrainConfig, gaussians: Gaussians, shell: Shell | None = None) -> None:
         if config.max_gaussians is None:
             raise ArgumentError(
                 "max_gaussians: the strategy fast grows to a planned number and needs it, for example 100000"
             )
-        self.config, self.cap = config, config.max_gaussians
+        self.config, self.cap, self.shell = config, config.max_gaussians, shell
         self.start_count, self.is_over = len(gaussians), False
         self._forget(gaussians)
 
@@ -82,7 +84,8 @@ class PlannedDensity:
         keep = gaussians.finite_rows() & (gaussians.opacities >= least)
         planned = int(planned_counts(config, self.start_count, self.cap, np.array([iteration]))[0])
         room = planned - int(keep.sum()) if growing else 0
-        split = self._highest(keep, room)
+        may = keep if self.shell is None else self.shell.spared(keep, self._score(), gaussians.means)
+        split = self._highest(may, room)
         children = long_axis_children(gaussians.map(lambda tensor: tensor[split]))
         replaced = replace(gaussians, optimizer, keep & ~split, children)
         self._forget(replaced)

@@ -25,6 +25,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import replace
 from gsplat_edu.train.events import Change, RelocateEvent
+from gsplat_edu.train.far import Shell
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.saved import check_entries, check_torch_generator
 
@@ -44,6 +45,7 @@ class MCMC:
     Args:
         config: Window, growth and noise; `max_gaussians` has to be set.
         generator: Source of the draws and of the noise.
+        shell: Where far splats lie, which get no noise; None if there are none.
 
     Raises:
         ArgumentError: there is no cap.
@@ -51,10 +53,11 @@ class MCMC:
 
     observes_renders_only = True
 
-    def __init__(self, config: TrainConfig, generator: torch.Generator) -> None:
+    def __init__(self, config: TrainConfig, generator: torch.Generator, shell: Shell | None = None) -> None:
         if config.max_gaussians is None:
             raise ArgumentError("max_gaussians: mcmc grows up to a cap and needs one, for example 200000")
         self.config, self.generator, self.cap = config, generator, config.max_gaussians
+        self.shell = shell
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
         """Do nothing: neither relocation nor growth depends on the renders."""
@@ -120,11 +123,18 @@ class MCMC:
         optimizer.forget_rows(hosts)
 
     def _add_noise(self, gaussians: Gaussians, rate: float) -> None:
-        """Means += rate noise sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I)."""
+        """Means += rate noise sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I).
+
+        Splats of a shell stay: their covariance, hundreds of world units squared, would throw them out of the scene.
+        """
+        far = None if self.shell is None else self.shell.holds(gaussians.means)
+        places = None if far is None else gaussians.means[far]
         seed = int(torch.randint(2**62, (1,), generator=self.generator))  # checkpoints store the generator
         add_noise(
             gaussians, NoiseNumbers(seed, rate * self.config.mcmc.noise, NOISE_SHARPNESS, NOISE_THRESHOLD)
         )
+        if far is not None and places is not None:
+            gaussians.means[far] = places
 
     def state(self) -> State:
         """Return the generator."""

@@ -1,0 +1,119 @@
+"""Short trainings that decide whether the cameras of a capture should be refined: `--refine auto`.
+
+A small scene is trained on small photos three times: without refinement, with poses, and with poses and intrinsics.
+Each is judged by the held-out photos at aligned poses (`gsplat_edu.evaluate.alignment`). More is refined only if that
+helps clearly.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+
+from gsplat_edu.data.dataset import Dataset, load_dataset, scene_extent
+from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import device_of
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.runs.refined import with_refined_cameras
+from gsplat_edu.train.config import TrainConfig, recipe
+from gsplat_edu.train.density.surgery import sorted_in_space
+from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
+from gsplat_edu.train.trainer import StepParts, Trainer
+
+SIDE = 240
+"""Longest side of the photos of a pilot, px."""
+
+ITERATIONS, GAUSSIANS = 600, 10_000
+"""Length and cap of a pilot."""
+
+CLEARLY = 0.3
+"""dB that refining more has to gain. Where nothing was wrong, pilots differed by less (benchmarks/RESULTS.md)."""
+
+ORDER = ("none", "poses", "both")
+
+
+def refinement_for(options: RunOptions, progress: Callable[[], None] = lambda: None) -> tuple[str, str]:
+    """Choose `--refine` for a run by pilots.
+
+    Args:
+        options: Options of the run; its strategy does not matter, since pilots use the recipe fast.
+        progress: Called after every iteration.
+
+    Returns:
+        What to refine, and why, as a clause.
+
+    Raises:
+        ArgumentError: the capture has no training photos.
+        DatasetError: the capture or one of its photos cannot be read.
+    """
+    size = options.data_settings.resolution
+    small = SIDE if size is None or not 32 <= size <= SIDE else size
+    settings = replace(options.data_settings, resolution=small)
+    dataset = load_dataset(options.data, settings, points=options.points)
+    if not dataset.test:
+        return "none", "no photos are held out to judge by"
+    dataset.preload()
+    scores: dict[str, float] = {}
+    for refine in ORDER:
+        score = _pilot(dataset, options, refine, progress)
+        if score is None:
+            return "none", "no pixel of the held-out photos counts"
+        scores[refine] = score
+    return _choice(scores)
+
+
+def _choice(scores: dict[str, float]) -> tuple[str, str]:
+    """Return the least refinement that none beats clearly, and the scores as a clause."""
+    best = max(scores.values())
+    chosen = next(refine for refine in ORDER if scores[refine] > best - CLEARLY)
+    figures = ", ".join(f"{scores[refine]:.2f} dB with {refine}" for refine in ORDER)
+    return chosen, f"short trainings score the held-out photos, poses aligned, at {figures}"
+
+
+def _pilot(dataset: Dataset, options: RunOptions, refine: str, progress: Callable[[], None]) -> float | None:
+    """Train a pilot and return its score, dB; None if no pixel counts."""
+    config = _config(options.config, refine)
+    cameras = [view.camera for view in dataset.train]
+    extent = scene_extent(cameras)
+    start = sorted_in_space(from_points(dataset.points, dataset.colors, config))
+    gaussians = start.to(device_of(options.backend))
+    model, refinement = make_view_model(config, cameras, extent, gaussians)
+    trainer = Trainer(
+        gaussians,
+        dataset.train,
+        config,
+        render=functools.partial(render, backend=options.backend),
+        extent=extent,
+        density=make_strategy(config, extent, gaussians),
+        parts=StepParts(view_model=model),
+    )
+
+    def step(trainer: Trainer, event: Event) -> None:
+        if isinstance(event, StepEvent):
+            progress()
+
+    trainer.run(callbacks=[step])
+    shown = dataset if refinement is None else with_refined_cameras(refinement, dataset)
+    renderer = replace(options, config=config).renderer
+    scores = [
+        aligned_psnr(trainer.gaussians, view, renderer, config.background, extent) for view in shown.test
+    ]
+    return mean_aligned_psnr(scores)
+
+
+def _config(config: TrainConfig, refine: str) -> TrainConfig:
+    cap = min(config.max_gaussians or GAUSSIANS, GAUSSIANS)
+    return recipe(
+        ITERATIONS,
+        strategy="fast",
+        max_gaussians=cap,
+        refine=refine,
+        appearance=config.appearance,
+        background=config.background,
+        jacobian_limit=config.jacobian_limit,
+        antialiased=config.antialiased,
+        seed=config.seed,
+    )

@@ -1,0 +1,60 @@
+"""The sphere that far splats lie on, and which splats belong to it.
+
+Density control adds, removes and sorts splats, so those of the sky are known by their distance, not by their index.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+MOST = 0.4
+"""Largest share of all Gaussians to which splits may raise those of the shell. Without it, adc splits the sky of
+`benchmarks/sky.py` into 62 % of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """A sphere around the cameras, far behind the scene.
+
+    Args:
+        centre: (3,) world units.
+        radius: World units.
+    """
+
+    centre: Float64[np.ndarray, "3"]
+    radius: float
+
+    def holds(self, means: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """Return which means lie nearer to the sphere than to its centre, or beyond it.
+
+        Args:
+            means: (N, 3) world units.
+        """
+        away = means.detach() - torch.from_numpy(self.centre).to(means)
+        x, y, z = away.unbind(dim=1)
+        return x * x + y * y + z * z > (self.radius / 2) ** 2
+
+    def spared(
+        self, selected: Bool[Tensor, " N"], scores: Float[Tensor, " N"], means: Float[Tensor, "N 3"]
+    ) -> Bool[Tensor, " N"]:
+        """Leave out the splats of the shell with the lowest scores, so that it does not outgrow the scene.
+
+        Args:
+            selected: (N,) which Gaussians could be split, each into two.
+            scores: (N,) how much they need it.
+            means: (N, 3) world units.
+        """
+        far = self.holds(means)
+        room = max(int(MOST * len(means)) - int(far.sum()), 0)
+        candidates = torch.nonzero(selected & far)[:, 0]
+        if len(candidates) <= room:
+            return selected
+        order = torch.argsort(scores[candidates], descending=True, stable=True)
+        chosen = selected.clone()
+        chosen[candidates[order[room:]]] = False
+        return chosen

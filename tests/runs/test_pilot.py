@@ -1,0 +1,73 @@
+"""What `--refine auto` chooses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.render.camera_tensors import CameraTensors
+from gsplat_edu.runs import pilot
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.runs.pilot import CLEARLY, refinement_for
+from gsplat_edu.train.config import recipe
+from gsplat_edu.views import View
+
+
+def options(folder, tmp_path, **data):
+    return RunOptions(folder, tmp_path / "run", recipe(100, strategy="fast"), DataSettings(**data))
+
+
+def shaken(view, rng):
+    """Return a view whose pose is wrong by about 2 degrees and 2 % of the distance."""
+    twist = torch.from_numpy(rng.normal(size=6) * ([0.02] * 3 + [0.05] * 3))
+    return View(CameraTensors.of(view.camera).moved(twist).value(), view.image, name=view.name)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
+    monkeypatch.setattr(pilot, "ITERATIONS", 250)
+    views, points, colors = procedural_capture(48, 24, splats=150)
+    rng = np.random.default_rng(0)
+    views = [shaken(view, rng) for view in views] if wrong else views
+    write_colmap(tmp_path / "capture", views, points, colors)
+    steps = []
+    chosen, reason = refinement_for(options(tmp_path / "capture", tmp_path), lambda: steps.append(1))
+    assert len(steps) == 3 * 250
+    assert (chosen != "none") == wrong, reason
+    assert "dB with none" in reason and "dB with both" in reason
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_least_that_none_beats_clearly_is_chosen():
+    def chosen(none, poses, both):
+        return pilot._choice({"none": none, "poses": poses, "both": both})[0]
+
+    assert chosen(20.0, 20.0 + 0.9 * CLEARLY, 20.0) == "none"
+    assert chosen(20.0, 20.0 + 1.1 * CLEARLY, 20.0) == "poses"
+    assert chosen(20.0, 20.0 + 1.1 * CLEARLY, 20.0 + 1.9 * CLEARLY) == "poses"
+    assert chosen(20.0, 20.0, 20.0 + 1.1 * CLEARLY) == "both"
+    assert chosen(20.0, 19.0, 19.0) == "none"
+
+
+def test_without_held_out_photos_nothing_is_refined(tmp_path):
+    write_colmap(tmp_path / "capture", *procedural_capture(24, 6, splats=60))
+    assert refinement_for(options(tmp_path / "capture", tmp_path, test_every=0)) == (
+        "none",
+        "no photos are held out to judge by",
+    )
+
+
+def test_the_pilots_take_over_what_the_run_looks_like():
+    config = replace(recipe(100), background=(1.0, 1.0, 1.0), antialiased=True, max_gaussians=500, seed=3)
+    made = pilot._config(config, "poses")
+    assert (made.background, made.antialiased, made.max_gaussians, made.seed) == (
+        (1.0, 1.0, 1.0),
+        True,
+        500,
+        3,
+    )
+    assert (made.strategy, made.refine, made.iterations) == ("fast", "poses", pilot.ITERATIONS)
