@@ -55,7 +55,7 @@ def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
 
 
 def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(pilot, "ITERATIONS", 20)
+    monkeypatch.setattr(pilot, "PILOT_STEPS", 20)
     run = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run), "--refine", "auto"]
     assert main([*words, "--iterations", "6"]) == 0

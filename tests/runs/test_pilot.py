@@ -29,7 +29,7 @@ def shaken(view, rng):
 
 @pytest.mark.parametrize("wrong", [False, True])
 def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
-    monkeypatch.setattr(pilot, "ITERATIONS", 250)
+    monkeypatch.setattr(pilot, "PILOT_STEPS", 250)
     views, points, colors = procedural_capture(48, 24, splats=150)
     rng = np.random.default_rng(0)
     views = [shaken(view, rng) for view in views] if wrong else views
@@ -70,4 +70,4 @@ def test_the_pilots_take_over_what_the_run_looks_like():
         500,
         3,
     )
-    assert (made.strategy, made.refine, made.iterations) == ("fast", "poses", pilot.ITERATIONS)
+    assert (made.strategy, made.refine, made.iterations) == ("fast", "poses", pilot.PILOT_STEPS)

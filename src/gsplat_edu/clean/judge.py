@@ -74,6 +74,7 @@ class Rules:
         doubt: From this gap on, a splat that the rounds kept is doubtful, unless it changes the error by less than the
         price: a doubtful splat goes if its absence adds less than this much error. One whose removal lowers the error
             by `gross_error` is doubtful wherever it is.
+        missed: The photos miss a splat whose absence adds more than this error.
         passes: The doubtful splats are judged together in this many steps for each view of a round,
         least_steps: and in at least this many.
         least_views: Fewer views than this do not find floaters, only what they do not see.
@@ -97,6 +98,7 @@ class Rules:
     gross_z: float = 1.0
     doubt: float = 0.1
     price: float = 0.01
+    missed: float = 1.0
     passes: int = 2
     least_steps: int = 40
     least_views: int = 3
@@ -193,7 +195,6 @@ class _Rounds:
     def result(self) -> tuple[UInt8[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
         rules, reasons = self._rules, self._reasons
         seen, doubtful, rare = (np.zeros(len(reasons), dtype=bool) for _ in range(3))
-        error = 0.0
         for _ in range(rules.rounds):
             found = gather(self._gaussians, self._views, self._settings, reasons != Reason.KEPT, self._step)
             seen |= found.peak > ALPHA_MIN
@@ -203,10 +204,9 @@ class _Rounds:
             reasons[kept & refuted] = Reason.REFUTED
             reasons[kept & free] = Reason.IN_FRONT
             doubtful |= (reasons != Reason.KEPT) | self._doubtful(found)
-            error = found.error
             if (kept & (free | refuted)).sum() <= rules.few * len(reasons):
                 break
-        certainty = self._settled(doubtful, rare, error)
+        certainty = self._settled(doubtful, rare, found)
         if len(self._views) < len(self._everything) and not seen.all():
             rest = [view for view in self._everything if view not in self._views]
             seen |= peak_weights(self._gaussians, rest, self._settings) > ALPHA_MIN
@@ -215,15 +215,19 @@ class _Rounds:
         return reasons, certainty
 
     def _settled(
-        self, doubtful: Bool[np.ndarray, " N"], rare: Bool[np.ndarray, " N"], error: float
+        self, doubtful: Bool[np.ndarray, " N"], rare: Bool[np.ndarray, " N"], last: Evidence
     ) -> Float64[np.ndarray, " N"]:
-        """Judge the doubtful splats together, and return how certain their removal is; rare ones stay removed."""
+        """Judge the doubtful splats together, and return how certain their removal is; rare ones stay removed.
+
+        Those that the rounds kept, and those that the photos miss in the last round, start as needed.
+        """
         certainty = np.zeros(len(doubtful))
         if not doubtful.any() or len(self._views) < self._rules.least_views:
             return certainty
         ids = np.flatnonzero(doubtful)
-        start = np.where(self._reasons[ids] == Reason.KEPT, 1.0, -1.0)
-        unit = max(error / len(doubtful) / len(self._views), np.finfo(np.float64).tiny)
+        needed = (self._reasons == Reason.KEPT) | (_errors(last) < -self._rules.missed)
+        start = np.where(needed[ids], 1.0, -1.0)
+        unit = max(last.error / len(doubtful) / len(self._views), np.finfo(np.float64).tiny)
         logits = settle(
             self._gaussians,
             Doubtful(ids, start),

@@ -33,7 +33,7 @@ from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
-from gsplat_edu.runs.pilot import ITERATIONS, ORDER, refinement_for
+from gsplat_edu.runs.pilot import ORDER, PILOT_STEPS, refinement_for
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import needs_poses
@@ -201,7 +201,7 @@ def _with_choices(
         options = take(options, "transients", transients_for(count))
     if "refine" in names:
         with _bar(console, "") as bar:
-            task = bar.add_task("short trainings", total=len(ORDER) * ITERATIONS)
+            task = bar.add_task("short trainings", total=len(ORDER) * PILOT_STEPS)
             chosen = refinement_for(options, progress=lambda: bar.advance(task))
         options = take(options, "refine", Remedy(*chosen))
     return options

@@ -26,7 +26,7 @@ from gsplat_edu.train.trainer import StepParts, Trainer
 SIDE = 240
 """Longest side of the photos of a pilot, px."""
 
-ITERATIONS, GAUSSIANS = 600, 10_000
+PILOT_STEPS, PILOT_CAP = 600, 10_000
 """Length and cap of a pilot."""
 
 CLEARLY = 0.3
@@ -105,9 +105,9 @@ def _pilot(dataset: Dataset, options: RunOptions, refine: str, progress: Callabl
 
 
 def _config(config: TrainConfig, refine: str) -> TrainConfig:
-    cap = min(config.max_gaussians or GAUSSIANS, GAUSSIANS)
+    cap = min(config.max_gaussians or PILOT_CAP, PILOT_CAP)
     return recipe(
-        ITERATIONS,
+        PILOT_STEPS,
         strategy="fast",
         max_gaussians=cap,
         refine=refine,
