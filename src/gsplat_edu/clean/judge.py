@@ -76,7 +76,8 @@ class Rules:
             by `gross_error` is doubtful wherever it is.
         missed: The photos miss a splat whose absence adds more than this error.
         passes: The doubtful splats are judged together in this many steps for each view of a round,
-        least_steps: and in at least this many.
+        joint_work: in fewer if splats times steps would be more than this,
+        least_steps: but then in at least this many.
         least_views: Fewer views than this do not find floaters, only what they do not see.
         rounds: Most rounds of evidence.
         few: The rounds end once one removes at most this share of the splats.
@@ -99,7 +100,8 @@ class Rules:
     doubt: float = 0.1
     price: float = 0.01
     missed: float = 1.0
-    passes: int = 2
+    passes: int = 8
+    joint_work: float = 6e7
     least_steps: int = 40
     least_views: int = 3
     rounds: int = 4
@@ -188,7 +190,8 @@ class _Rounds:
         self._gaussians, self._views, self._rules, self._progress = gaussians, views, rules, progress
         self._everything = everything
         self._settings = replace(settings, depth=False, median_depth=True)
-        self._steps = max(rules.least_steps, rules.passes * len(views))
+        most = max(rules.least_steps, int(rules.joint_work / max(len(gaussians), 1)))
+        self._steps = min(rules.passes * len(views), most)
         self._done, self._total = 0, rules.rounds * len(views) + self._steps
         self._reasons: UInt8[np.ndarray, " N"] = np.zeros(len(gaussians), dtype=np.uint8)
 
