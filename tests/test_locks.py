@@ -63,11 +63,14 @@ def test_a_forked_child_does_not_keep_the_lock(tmp_path):
     try:
         with pytest.raises(ArgumentError, match=f"process {process.pid} "):
             lock(tmp_path / "run")
-        kill(process)
-        os.kill(child, 0)  # the child is alive
+        process.kill()
+        process.wait()
+        os.kill(child, 0)  # the child is alive, and stays so: it reads from a pipe that is open
         assert lock(tmp_path / "run")
     finally:
         os.kill(child, signal.SIGKILL)
+        process.stdin.close()
+        process.stdout.close()
 
 
 def test_a_process_cannot_lock_a_folder_twice(tmp_path):
