@@ -25,8 +25,8 @@ SHARE = 0.1
 photo to photo (the scene follows as view-dependent colour); gains drawn from +-0.7 stops give 0.4."""
 
 ENOUGH = 12
-"""Training photos from which `--transients auto` looks for things that move: with fewer, most places are seen in less
-than four, and a photo of them cannot be told to differ from the others."""
+"""Fewest training photos with which `--transients auto` looks for things that move. With fewer, fewer than four photos
+show most places, which is too little to compare a photo with."""
 
 
 @dataclass(frozen=True)

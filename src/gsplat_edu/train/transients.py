@@ -31,7 +31,7 @@ LONGEST = 192
 """Photos are compared at a size whose longer side is at most this, px, and at most that of the step's photos."""
 
 FEWEST = 5
-"""Fewest training views: of fewer, none can be told to differ from the others."""
+"""Fewest training views; with fewer, there is too little to compare a photo with."""
 
 MASKS, TOO_LARGE = "masks", "too_large"
 """Names of the state's tensors."""
