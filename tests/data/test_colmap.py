@@ -3,6 +3,7 @@
 import os
 import shutil
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from gsplat_edu.data.colmap import MODELS, find_model, read_cameras, read_colmap, read_images, read_points
+from gsplat_edu.data import colmap_files
+from gsplat_edu.data.colmap import find_model, read_cameras, read_colmap, read_images, read_points
+from gsplat_edu.data.colmap_files import MODELS
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import DatasetError
@@ -233,6 +236,41 @@ def test_tracks_and_observations_are_skipped(tmp_path):
     np.testing.assert_allclose(cloud.colors, [[1, 0, 0.2]] * 2, atol=1e-15)
     poses = read_images(tmp_path / "images.bin")
     assert [(p.name, p.camera, p.shift) for p in poses] == [("4.jpg", 5, (4, 2, 3)), ("8.jpg", 5, (8, 2, 3))]
+
+
+def test_observations_are_never_held_in_memory(tmp_path):
+    """Thousands of photos bring gigabytes of them. The file here has a hole of 3 GiB in their place."""
+    observed = 2**27
+    with (tmp_path / "images.bin").open("wb") as file:
+        for i in (4, 8):
+            file.write(struct.pack("<Q", 2) if i == 4 else b"")
+            file.write(struct.pack("<I7dI", i, 1, 0, 0, 0, i, 2, 3, 5) + f"{i}.jpg".encode() + b"\0")
+            file.write(struct.pack("<Q", observed if i == 4 else 0))
+            file.seek(24 * observed if i == 4 else 0, os.SEEK_CUR)
+    tracemalloc.start()
+    poses = read_images(tmp_path / "images.bin")
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert [pose.name for pose in poses] == ["4.jpg", "8.jpg"]
+    assert most < 2**20, "the buffer of a file, and two poses"
+
+
+@pytest.mark.parametrize("name", ["points3D", "images"])
+def test_a_line_or_a_name_without_end_is_refused(tmp_path, monkeypatch, name):
+    monkeypatch.setattr(colmap_files, "LONGEST_LINE", 1_000)
+    read = {"points3D": lambda path: read_points(path.parent), "images": read_images}[name]
+    (tmp_path / f"{name}.txt").write_text(f"# first\n{'1 ' * 600}\n")
+    with pytest.raises(DatasetError, match=rf"{name}\.txt, line 2: expected lines shorter than 1,000"):
+        read(tmp_path / f"{name}.txt")
+    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 1, 2, 3, 5)
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 1) + image + b"x" * 70_000 + b"\0" + bytes(8))
+    with pytest.raises(DatasetError, match=r"images\.bin: image 1 of 1 has a name of more than 65,536 bytes"):
+        read_images(tmp_path / "images.bin")
+
+
+def test_a_text_file_without_points_is_a_model_without_points(tmp_path):
+    (tmp_path / "points3D.txt").write_text("# no points\n")
+    assert read_points(tmp_path) is None
 
 
 @pytest.mark.parametrize("stem", [".png.png", ".png"])

@@ -9,12 +9,9 @@ Source: COLMAP's documentation, "Output Format" and "Camera Models".
 
 from __future__ import annotations
 
-import os
-import struct
 from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -33,36 +30,22 @@ from gsplat_edu.data.capture import (
     is_outside,
     unit_colors,
 )
+from gsplat_edu.data.colmap_files import (
+    MODELS,
+    Pose,
+    cameras_bin,
+    cameras_txt,
+    images_bin,
+    images_txt,
+    points_bin,
+    points_txt,
+)
 from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels, UnclearMasks
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import unreadable
 from gsplat_edu.gaussian_math import quat_to_R
-from gsplat_edu.reading import read_bytes, read_text
 from gsplat_edu.text import legible
-
-MODELS: tuple[tuple[str, str], ...] = (
-    ("SIMPLE_PINHOLE", "f cx cy"),
-    ("PINHOLE", "fx fy cx cy"),
-    ("SIMPLE_RADIAL", "f cx cy k1"),
-    ("RADIAL", "f cx cy k1 k2"),
-    ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
-    ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
-    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
-    ("FOV", "fx fy cx cy omega"),
-    ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
-    ("RADIAL_FISHEYE", "f cx cy k1 k2"),
-    ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
-    ("SIMPLE_DIVISION", "f cx cy k"),
-    ("DIVISION", "fx fy cx cy k"),
-    ("SIMPLE_FISHEYE", "f cx cy"),
-    ("FISHEYE", "fx fy cx cy"),
-    ("EUCM", "fx fy cx cy alpha beta"),
-    ("EQUIRECTANGULAR", "w h"),
-)
-"""COLMAP's camera models by number, with their parameters."""
 
 SPHERE = "EQUIRECTANGULAR"
 """The model whose images show all directions; they are read as several faces."""
@@ -82,15 +65,6 @@ PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 capture itself are searched."""
 
 SUFFIXES = (".bin", ".txt")
-
-
-class Pose(NamedTuple):
-    """An image of a model."""
-
-    name: str
-    camera: int
-    quat: tuple[float, ...]  # (w, x, y, z), world to camera
-    shift: tuple[float, ...]  # world units
 
 
 def find_model(folder: Path) -> Path | None:
@@ -168,11 +142,8 @@ def read_points(model: Path) -> Cloud | None:
     path = points_file(model)
     if path is None:
         return None
-    rows = _points_bin(path) if path.suffix == ".bin" else _points_txt(path)
-    if not rows:
-        return None
-    table = np.array(rows, dtype=np.float64)
-    return Cloud(table[:, :3], unit_colors(table[:, 3:] / 255.0))
+    points, colors = points_bin(path) if path.suffix == ".bin" else points_txt(path)
+    return Cloud(points, unit_colors(colors / 255.0)) if len(points) else None
 
 
 def read_cameras(path: Path, used: Container[int] | None = None) -> dict[int, Lens]:
@@ -187,7 +158,7 @@ def read_cameras(path: Path, used: Container[int] | None = None) -> dict[int, Le
     """
     lenses = {}
     for where, camera, model, W, H, values in (
-        _cameras_bin(path) if path.suffix == ".bin" else _cameras_txt(path)
+        cameras_bin(path) if path.suffix == ".bin" else cameras_txt(path)
     ):
         if used is not None and camera not in used:
             continue
@@ -207,7 +178,7 @@ def read_images(path: Path) -> list[Pose]:
     Raises:
         DatasetError: the file is truncated or malformed.
     """
-    return _images_bin(path) if path.suffix == ".bin" else _images_txt(path)
+    return images_bin(path) if path.suffix == ".bin" else images_txt(path)
 
 
 def _suffix(model: Path) -> str:
@@ -310,11 +281,6 @@ def _masks(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Path]:
                 yield (folder / name).with_suffix(".png")
 
 
-def _name(raw: bytes) -> str:
-    """Decode a file name for the system's functions, with slashes."""
-    return os.fsdecode(raw).replace("\\", "/")
-
-
 def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
     shift = np.array(pose.shift)
     if not np.all(np.abs(shift) < 1e100):  # the rest is checked by checked_frame
@@ -342,153 +308,3 @@ def _lens(model: str, W: int, H: int, values: Sequence[float]) -> Lens:
         named["fx"] = named["fy"] = named.pop("f")
     plain = FISHEYE if model.endswith("FISHEYE") else PINHOLE_LIKE
     return lens_of(named, W, H, FORMULA_OF.get(model, plain))
-
-
-class _Binary:
-    """Reads little-endian numbers from a file that may be truncated."""
-
-    def __init__(self, path: Path, smallest: int) -> None:
-        self.path, self.at, self.where = path, 0, "its header"
-        try:
-            self.data = read_bytes(path)
-        except OSError as error:
-            raise DatasetError(unreadable(path, error)) from None
-        (self.count,) = self.take(struct.Struct("<Q"))
-        if self.count * smallest > len(self.data) - self.at:
-            raise self.corrupt(f"its header declares {self.count} entries, more than the file can contain")
-
-    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
-        """Read the numbers of a struct layout."""
-        if self.at + layout.size > len(self.data):
-            raise self.corrupt(f"it ends inside {self.where}")
-        self.at += layout.size
-        return layout.unpack_from(self.data, self.at - layout.size)
-
-    def skip(self, count: int, size: int) -> None:
-        """Skip `count` entries of `size` bytes."""
-        if count * size > len(self.data) - self.at:
-            raise self.corrupt(f"it ends inside {self.where}")
-        self.at += count * size
-
-    def word(self) -> str:
-        """Read a zero-terminated name."""
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise self.corrupt(f"it ends inside {self.where}")
-        raw, self.at = self.data[self.at : end], end + 1
-        return _name(raw)
-
-    def corrupt(self, what: str) -> DatasetError:
-        """Return the error for a damaged file."""
-        return DatasetError(f"{self.path}: {what}; the file is truncated or corrupt, copy it again")
-
-
-_CAMERA = struct.Struct("<IiQQ")
-_IMAGE = struct.Struct("<I7dI")
-_POINT = struct.Struct("<Q3d3BdQ")
-_COUNT = struct.Struct("<Q")
-_CameraRow = tuple[str, int, str, int, int, tuple[float, ...]]
-
-
-def _cameras_bin(path: Path) -> Iterator[_CameraRow]:
-    file = _Binary(path, _CAMERA.size)
-    for _ in range(file.count):
-        file.where = "a camera"
-        camera, kind, W, H = file.take(_CAMERA)
-        file.where = f"camera {camera}"
-        where = f"{path}, camera {camera}"
-        if not 0 <= kind < len(MODELS):
-            raise DatasetError(
-                f"{where}: camera model number {kind} is unknown; run `colmap image_undistorter` and load its output"
-            )
-        model, names = MODELS[kind]
-        values = file.take(struct.Struct(f"<{len(names.split())}d"))
-        yield where, camera, model, W, H, values
-
-
-def _images_bin(path: Path) -> list[Pose]:
-    file, poses = _Binary(path, _IMAGE.size + 1 + _COUNT.size), []
-    for number in range(file.count):
-        file.where = f"image {number + 1} of {file.count}"
-        _, *pose, camera = file.take(_IMAGE)
-        name = file.word()
-        file.skip(file.take(_COUNT)[0], 24)
-        poses.append(Pose(name, camera, tuple(pose[:4]), tuple(pose[4:])))
-    return poses
-
-
-def _points_bin(path: Path) -> list[tuple[float, ...]]:
-    file, rows = _Binary(path, _POINT.size), list[tuple[float, ...]]()
-    for number in range(file.count):
-        file.where = f"point {number + 1} of {file.count}"
-        row = file.take(_POINT)
-        file.skip(row[-1], 8)
-        rows.append(row[1:7])
-    return rows
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return read_text(path, errors="surrogateescape").split("\n")
-    except OSError as error:
-        raise DatasetError(unreadable(path, error)) from None
-
-
-def _malformed(path: Path, number: int, expected: str) -> DatasetError:
-    return DatasetError(f"{path}, line {number}: expected {expected}; the file is malformed, export it again")
-
-
-def _cameras_txt(path: Path) -> Iterator[_CameraRow]:
-    for number, line in enumerate(_lines(path), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            camera, model, W, H, *values = words
-            yield (
-                f"{path}, line {number}",
-                int(camera),
-                model,
-                int(W),
-                int(H),
-                tuple(float(v) for v in values),
-            )
-        except ValueError:
-            raise _malformed(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from None
-
-
-def _images_txt(path: Path) -> list[Pose]:
-    poses, lines = list[Pose](), enumerate(_lines(path), 1)
-    for number, line in lines:
-        words = line.split(maxsplit=9)
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            _, *pose, camera, name = words
-            values = [float(v) for v in pose]
-            if len(values) != 7:
-                raise ValueError
-            file = _name(name.strip().encode("utf-8", "surrogateescape"))
-            poses.append(Pose(file, int(camera), tuple(values[:4]), tuple(values[4:])))
-        except ValueError:
-            raise _malformed(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
-        # The image's 2D points follow on their own line, which may be empty but is always present.
-        _, observed = next(lines, (number + 1, ""))
-        if len(observed.split()) % 3:
-            raise _malformed(path, number + 1, "the image's points as X Y POINT3D_ID, or an empty line")
-    return poses
-
-
-def _points_txt(path: Path) -> list[tuple[float, ...]]:
-    rows = []
-    for number, line in enumerate(_lines(path), 1):
-        words = line.split(maxsplit=7)
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            if len(words) < 8:
-                raise ValueError
-            rows.append(tuple(float(v) for v in words[1:7]))
-        except ValueError:
-            raise _malformed(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK") from None
-    return rows
