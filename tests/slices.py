@@ -2,8 +2,9 @@
 
 A test marked `sliced(n)` has more cases than a change should wait for. A run draws n of them with the commit's hash as
 seed, so the choice varies between commits and is the same in all processes of a run. `sliced(n, by="is_named")` draws n
-for each value of that parameter. Fuzzers also derive the seed of their first damaged file from the commit. With
-GSPLAT_EDU_SOAK=1 (`make soak`) every case runs. conftest.py imports the hooks from here.
+for each value of that parameter, and tests marked `sliced(n, group="name")` share their n. Fuzzers also derive the seed
+of their first damaged file from the commit. With GSPLAT_EDU_SOAK=1 (`make soak`) every case runs. conftest.py imports
+the hooks from here.
 """
 
 import os
@@ -81,7 +82,8 @@ def split(items: list[pytest.Item], seed: int) -> tuple[list[pytest.Item], list[
     for item in items:
         if marker := item.get_closest_marker("sliced"):
             kind = item.callspec.params[marker.kwargs["by"]] if "by" in marker.kwargs else ""
-            cases.setdefault(f"{item.nodeid.partition('[')[0]} {kind}", []).append(item)
+            name = marker.kwargs.get("group", item.nodeid.partition("[")[0])
+            cases.setdefault(f"{name} {kind}", []).append(item)
     left_out: set[pytest.Item] = set()
     for name, group in cases.items():
         size = next(iter(group[0].get_closest_marker("sliced").args), len(group))

@@ -129,6 +129,7 @@ def trained(capture, out, threads, *words):
     return scene(out).read_bytes()
 
 
+@pytest.mark.sliced(1)
 @pytest.mark.parametrize("strategy", ["fast", "adc", "mcmc"])
 def test_threads_do_not_change_the_bits(outdoors, tmp_path, strategy):
     words = [*SHORT, "--strategy", strategy, "--sky", "shell", "--densify-start", "4", "--densify-every", "5"]

@@ -58,6 +58,14 @@ def test_every_value_of_a_parameter_keeps_its_share():
         assert sorted(item.callspec.params["value"] for item in slices.split(items, seed)[0]) == [False, True]
 
 
+def test_the_tests_of_a_group_share_what_is_drawn():
+    mark = pytest.mark.sliced(2, group="long")
+    items = [*cases("one", mark, range(1)), *cases("two", mark, range(2)), *cases("three", mark, range(1))]
+    drawn = [names(slices.split(items, seed)[0]) for seed in range(100)]
+    assert all(len(kept) == 2 for kept in drawn)
+    assert set().union(*drawn) == set(names(items))
+
+
 @pytest.mark.parametrize(("mark", "count"), [(pytest.mark.sliced(0), 0), (pytest.mark.sliced, 4)])
 def test_a_test_may_run_only_in_a_soak_or_always(mark, count):
     """sliced(0) runs only in a soak. A test sliced without a number selects its own files."""
