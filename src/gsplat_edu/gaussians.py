@@ -204,6 +204,15 @@ def check_tensor(name: str, value: Tensor, shape: Shape, sizes: dict[str, int]) 
         ArgumentError: an entry is NaN or infinite.
     """
     check_shape(name, value.shape, shape, sizes)
-    finite = torch.isfinite(value)
-    if not bool(finite.all()):
-        raise ArgumentError(f"{name}{first_index((~finite).numpy(force=True))}: is NaN or infinite")
+    if not is_finite(value):
+        raise ArgumentError(
+            f"{name}{first_index((~torch.isfinite(value)).numpy(force=True))}: is NaN or infinite"
+        )
+
+
+def is_finite(value: Tensor) -> bool:
+    """Return whether all entries are finite, without a tensor of answers: a scene may fill half the memory."""
+    if not value.numel():
+        return True
+    low, high = value.detach().aminmax()  # NaN if there is one
+    return bool(torch.isfinite(low) & torch.isfinite(high))

@@ -6,6 +6,7 @@ import itertools
 import os
 import sys
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -49,7 +50,10 @@ MOST_ROWS = 10**12
 """Most rows of an element; more indicate a damaged header or a malicious file."""
 
 COPIES = 3
-"""Peak number of copies of the rows when a scene is read: the table, its columns and the tensors."""
+"""Peak number of copies of the rows when they are read at once: the table, its columns and what is made of them."""
+
+BLOCK = 2**18
+"""Rows that are read at a time; those of a scene of SH degree 3 take 62 MiB."""
 
 LFS_POINTER = b"version https://git-lfs"
 
@@ -174,7 +178,19 @@ class _HeaderLines:
 
 
 def read_rows(path: Path, file: BinaryIO, header: Header, wanted: Element) -> np.ndarray[Any, np.dtype[Any]]:
-    """Read the rows of one element.
+    """Read the rows of one element; see `read_blocks`.
+
+    Returns:
+        (count,) structured array.
+    """
+    (rows,) = _blocks(path, file, header, wanted, max(wanted.count, 1), COPIES)
+    return rows
+
+
+def read_blocks(
+    path: Path, file: BinaryIO, header: Header, wanted: Element
+) -> Iterator[np.ndarray[Any, np.dtype[Any]]]:
+    """Yield the rows of one element in blocks, so that what is made of them is the only copy of all.
 
     Nothing is allocated for rows that do not fit into the file.
 
@@ -185,28 +201,42 @@ def read_rows(path: Path, file: BinaryIO, header: Header, wanted: Element) -> np
         wanted: The element, one of the header's.
 
     Returns:
-        (count,) structured array with the element's properties by name; all are float64 if the file is ASCII.
+        (n,) structured arrays with the element's properties by name; all are float64 if the file is ASCII, which is
+        read in one block.
 
     Raises:
         SceneFormatError: rows are missing or malformed; the message gives the number present.
     """
+    return _blocks(path, file, header, wanted, BLOCK, 1)
+
+
+def _blocks(
+    path: Path, file: BinaryIO, header: Header, wanted: Element, rows: int, copies: int
+) -> Iterator[np.ndarray[Any, np.dtype[Any]]]:
+    """Yield blocks of some rows if there is memory for so many copies of all of them."""
     order = FORMATS[header.format]
     before = header.elements[: header.elements.index(wanted)]
     dtype = wanted.dtype(path, order)
     if header.format == "ascii":
         # rows of an element without properties are blank lines, which are skipped
         skipped = sum(element.count for element in before if element.properties)
-        return _ascii_rows(path, file, skipped, wanted)
+        yield _ascii_rows(path, file, skipped, wanted)
+        return
     left = os.fstat(file.fileno()).st_size - file.tell()
     skipped = sum(element.count * element.dtype(path, order).itemsize for element in before)
     there = max(0, left - skipped) // dtype.itemsize if dtype.itemsize else 0
     if there < wanted.count:
         raise _truncated(path, wanted, there)
     if not wanted.count:  # the declared rows before it may exceed any file size
-        return np.empty(0, dtype)
-    require_memory(str(path), COPIES * wanted.count * dtype.itemsize, TOO_LARGE)
+        yield np.empty(0, dtype)
+        return
+    require_memory(str(path), copies * wanted.count * dtype.itemsize, TOO_LARGE)
     file.seek(skipped, os.SEEK_CUR)
-    return np.fromfile(file, dtype=dtype, count=wanted.count)
+    for start in range(0, wanted.count, rows):
+        block = np.fromfile(file, dtype=dtype, count=min(rows, wanted.count - start))
+        if len(block) < min(rows, wanted.count - start):  # the file was cut meanwhile
+            raise _truncated(path, wanted, start + len(block))
+        yield block
 
 
 def _ascii_rows(path: Path, file: BinaryIO, skipped: int, wanted: Element) -> np.ndarray[Any, np.dtype[Any]]:

@@ -1,13 +1,16 @@
 import os
 import resource
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from gsplat_edu import ply_table
 from gsplat_edu.errors import SceneFormatError, ShapeError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io import ply
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply, read, save_ply, write
 from gsplat_edu.io.scene import Scene
@@ -383,3 +386,37 @@ def test_infinite_logits_become_opaque_or_transparent(tmp_path):
     path.write_bytes(data)
     with pytest.raises(SceneFormatError, match="vertex 2: opacity is nan"):
         load_ply(path)
+
+
+@pytest.mark.parametrize("count", [0, 3, 6, 7])
+def test_files_of_several_blocks_are_those_of_one(tmp_path, monkeypatch, count):
+    gaussians, origin = random_gaussians(count, 8), (1e6, -2.0, 0.1)
+    save_ply(tmp_path / "one.ply", gaussians, origin)
+    one = load_ply(tmp_path / "one.ply", origin)
+    monkeypatch.setattr(ply, "BLOCK", 3)
+    monkeypatch.setattr(ply_table, "BLOCK", 3)
+    save_ply(tmp_path / "many.ply", gaussians, origin)
+    assert (tmp_path / "many.ply").read_bytes() == (tmp_path / "one.ply").read_bytes()
+    for name, tensor in load_ply(tmp_path / "one.ply", origin).tensors().items():
+        assert torch.equal(tensor, one.tensors()[name]), name
+
+
+def test_values_that_are_not_finite_are_counted_over_all_blocks(tmp_path, monkeypatch):
+    monkeypatch.setattr(ply_table, "BLOCK", 2)
+    table = shuffled_table(random_gaussians(9, 3), "f4")
+    table["f_dc_1"][4], table["rot_2"][8] = np.nan, np.inf
+    written(tmp_path / "a.ply", table, "binary_little_endian")
+    assert "vertex 4: f_dc_1 is nan (2 such vertices in all)" in refused(tmp_path / "a.ply")
+
+
+def test_opening_a_scene_takes_little_more_than_its_parameters(tmp_path):
+    """Blocks of rows, of their columns and of their float64 means come on top; three copies of all would be 140 MiB."""
+    save_ply(tmp_path / "large.ply", random_gaussians(200_000, 15))
+    rows = tmp_path / "large.ply"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ply_table, "BLOCK", 10_000)
+        tracemalloc.start()
+        read(rows)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert most < 1.25 * 200_000 * 59 * 4

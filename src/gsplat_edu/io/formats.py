@@ -8,6 +8,7 @@ from pathlib import Path
 
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.gaussians import is_finite
 from gsplat_edu.io.scene import Scene
 
 
@@ -111,7 +112,7 @@ def read_scene(path: str | Path) -> Scene:
         path = path / SOG_META
     found = format_of(path)
     scene = found.read(path)
-    if not all(bool(tensor.isfinite().all()) for tensor in scene.gaussians.tensors().values()):
+    if not all(is_finite(tensor) for tensor in scene.gaussians.tensors().values()):
         bad = int((~scene.gaussians.finite_rows()).sum())
         raise SceneFormatError(f"{path}: {bad} splats have NaN or infinite values; export the scene again")
     return scene

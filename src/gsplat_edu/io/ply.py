@@ -17,13 +17,13 @@ Chapter: 07_a_trained_scene.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32, Float64
 from numpy.lib.recfunctions import structured_to_unstructured
-from torch import Tensor
 
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import written_aside
@@ -31,7 +31,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io import compressed_ply
 from gsplat_edu.io.ply_comments import comments, read_comments
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.ply_table import Element, read_elements, read_rows
+from gsplat_edu.ply_table import BLOCK, Element, read_blocks, read_elements
 from gsplat_edu.reading import open_file
 from gsplat_edu.validation import ArrayLike, float64_array
 
@@ -94,26 +94,34 @@ def _write(path: Path, gaussians: Gaussians, origin: ArrayLike, extra: list[str]
     shift = float64_array("origin", origin, (3,))
     tensors = {name: tensor.numpy(force=True) for name, tensor in gaussians.tensors().items()}
     count = len(gaussians)
+    names = [*MEANS, "nx", "ny", "nz", *SH0, *_rest_names(3 * tensors["sh_rest"].shape[1])]
+    names += [*OPACITY, *SCALES, *QUATS]
+    header = ["ply", "format binary_little_endian 1.0", *extra, f"element vertex {count}"]
+    header += [f"property float {name}" for name in names] + ["end_header", ""]
+    with written_aside(path) as aside, aside.open("wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        for start in range(0, count, BLOCK):
+            rows = {name: values[start : start + BLOCK] for name, values in tensors.items()}
+            file.write(_table(rows, shift).data)
+
+
+def _table(
+    tensors: Mapping[str, Float[np.ndarray, "N ..."]], shift: Float64[np.ndarray, "3"]
+) -> Float32[np.ndarray, "N P"]:
+    """Return the rows of the file for some Gaussians."""
     means = tensors["means"]
     if shift.any():  # skip zero, because -0.0 + 0.0 is 0.0
         means = means.astype(np.float64) + shift
-    sh_rest = np.concatenate(np.moveaxis(tensors["sh_rest"], 2, 0), axis=1)  # channel-major
-    columns: list[tuple[tuple[str, ...], np.ndarray]] = [
-        (MEANS, means),
-        (("nx", "ny", "nz"), np.zeros((count, 3))),
-        (SH0, tensors["sh0"][:, 0]),
-        (_rest_names(sh_rest.shape[1]), sh_rest),
-        (OPACITY, tensors["logit_opacities"][:, None]),
-        (SCALES, tensors["log_scales"]),
-        (QUATS, tensors["quats"]),
-    ]
-    names = [name for group, _ in columns for name in group]
-    header = ["ply", "format binary_little_endian 1.0", *extra, f"element vertex {count}"]
-    header += [f"property float {name}" for name in names] + ["end_header", ""]
-    table = np.concatenate([values for _, values in columns], axis=1, dtype="<f4", casting="same_kind")
-    with written_aside(path) as aside, aside.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(table.data)
+    columns = (
+        means,
+        np.zeros((len(means), 3)),  # normals
+        tensors["sh0"][:, 0],
+        np.concatenate(np.moveaxis(tensors["sh_rest"], 2, 0), axis=1),  # channel-major
+        tensors["logit_opacities"][:, None],
+        tensors["log_scales"],
+        tensors["quats"],
+    )
+    return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
 
 
 def load_ply(path: str | Path, origin: ArrayLike = ORIGIN) -> Gaussians:
@@ -143,24 +151,34 @@ def _load(path: Path, origin: ArrayLike, finite: bool) -> Gaussians:
         rest = sum(name.startswith("f_rest_") for name in vertex.names)
         groups = (MEANS, SH0, _rest_names(rest), OPACITY, SCALES, QUATS)
         columns = [name for group in groups for name in group]
-        table = read_rows(path, file, header, vertex)
-    values = _floats(table, columns)
-    opacity = values[:, columns.index(OPACITY[0])]
-    np.copyto(opacity, np.copysign(LARGEST_LOGIT, opacity), where=np.isinf(opacity))
-    if finite:
-        _check_finite(path, values, columns)
-    ends = np.cumsum([len(group) for group in groups])[:-1]
-    means, sh0, sh_rest, opacity, scales, quats = np.split(values, ends, axis=1)
-    if shift.any():
-        means = (means.astype(np.float64) - shift).astype(np.float32)
-    return Gaussians(
-        means=_tensor(means),
-        quats=_tensor(quats),
-        log_scales=_tensor(scales),
-        sh0=_tensor(sh0[:, None, :]),
-        sh_rest=_tensor(np.moveaxis(sh_rest.reshape(len(values), 3, rest // 3), 1, 2)),
-        logit_opacities=_tensor(opacity[:, 0]),
-    )
+        found, start, spoiled = None, 0, _Spoiled(path, columns)
+        for table in read_blocks(path, file, header, vertex):
+            values = _floats(table, columns)
+            opacity = values[:, columns.index(OPACITY[0])]
+            np.copyto(opacity, np.copysign(LARGEST_LOGIT, opacity), where=np.isinf(opacity))
+            if finite:
+                spoiled.look(values, start)
+            if found is None:  # after the rows have been found to fit into the file and into memory
+                found = _empty(vertex.count, rest // 3)
+            ends = np.cumsum([len(group) for group in groups])[:-1]
+            means, sh0, sh_rest, opacity, scales, quats = np.split(values, ends, axis=1)
+            if shift.any():
+                means = (means.astype(np.float64) - shift).astype(np.float32)
+            rows = slice(start, start + len(values))
+            found["means"][rows], found["quats"][rows], found["log_scales"][rows] = means, quats, scales
+            found["sh0"][rows, 0], found["logit_opacities"][rows] = sh0, opacity[:, 0]
+            found["sh_rest"][rows] = np.moveaxis(sh_rest.reshape(len(values), 3, rest // 3), 1, 2)
+            start += len(values)
+    spoiled.check()
+    assert found is not None  # there is at least one block, which may be empty
+    return Gaussians(**{name: torch.from_numpy(values) for name, values in found.items()})
+
+
+def _empty(count: int, rest: int) -> dict[str, Float32[np.ndarray, "N ..."]]:
+    """Return room for the parameters of Gaussians."""
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3), "sh_rest": (rest, 3)}
+    shapes["logit_opacities"] = ()
+    return {name: np.empty((count, *shape), np.float32) for name, shape in shapes.items()}
 
 
 def _floats(table: np.ndarray, columns: list[str]) -> Float32[np.ndarray, "N P"]:
@@ -179,12 +197,6 @@ def _floats(table: np.ndarray, columns: list[str]) -> Float32[np.ndarray, "N P"]
 
 def _rest_names(count: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(count))
-
-
-def _tensor(values: Float32[np.ndarray, "..."]) -> Tensor:
-    return torch.from_numpy(
-        values.copy()
-    )  # contiguous memory: the columns of the file's table are interleaved
 
 
 def _splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
@@ -213,12 +225,32 @@ def _splat_vertex(path: Path, elements: tuple[Element, ...]) -> Element:
     return vertex
 
 
-def _check_finite(path: Path, values: Float32[np.ndarray, "N P"], columns: list[str]) -> None:
-    finite = np.isfinite(values)
-    if not finite.all():
-        row, column = np.argwhere(~finite)[0]
-        bad = int((~finite.all(axis=1)).sum())
-        raise SceneFormatError(
-            f"{path}: vertex {row}: {columns[column]} is {values[row, column]}"
-            f" ({bad} such vertices in all); remove them or export the scene again"
-        )
+class _Spoiled:
+    """NaN and infinite values of a file: the first, and how many vertices have one.
+
+    Args:
+        path: The file.
+        columns: Names of the columns.
+    """
+
+    def __init__(self, path: Path, columns: list[str]) -> None:
+        self._path, self._columns = path, columns
+        self._first, self._count = "", 0
+
+    def look(self, values: Float32[np.ndarray, "N P"], start: int) -> None:
+        """Look through some rows, of which the first is the file's row `start`."""
+        finite = np.isfinite(values)
+        if finite.all():
+            return
+        if not self._count:
+            row, column = np.argwhere(~finite)[0]
+            self._first = f"vertex {start + row}: {self._columns[column]} is {values[row, column]}"
+        self._count += int((~finite.all(axis=1)).sum())
+
+    def check(self) -> None:
+        """Raise a SceneFormatError if there are any."""
+        if self._count:
+            raise SceneFormatError(
+                f"{self._path}: {self._first} ({self._count} such vertices in all); remove them or export the scene"
+                " again"
+            )
