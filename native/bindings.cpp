@@ -276,45 +276,73 @@ void noise(nb::args positional, nb::kwargs given) {
              [&](int64_t task, int) { kernels<T>().noise(args, task * GRAIN, std::min(n, (task + 1) * GRAIN)); });
 }
 
-// What both passes take: image, matrix and photo. Returns the image's shape too.
+// What both passes of recolor take, and the shape of the image.
 template <class T>
-std::pair<RecolorArgs<T>, Shape> recolor_args(Arguments &a) {
+struct RecolorCall {
+    RecolorArgs<T> args{};
+    Shape shape;
+    double background[3];
+};
+
+// The colour of what is seen is A (x - T background) + (1 - T) b, before the background: A x + b + T s with the shift
+// s = background - A background - b. Without transmittance, the whole image is recoloured.
+template <class T>
+RecolorCall<T> recolor_call(Arguments &a) {
     const Array image = a.array("image", {KIND<T>}, {ANY, ANY, 3}), matrix = a.array("matrix", {KIND<T>}, {3, 4});
     const Array photo = a.array_or_none("photo", Kind::U8, image.shape);
-    RecolorArgs<T> args{};
+    const Array transmittance = a.array_or_none("transmittance", KIND<T>, {image.shape[0], image.shape[1]});
+    RecolorCall<T> call{{}, image.shape, {}};
+    a.numbers("background", call.background, 3);
+    RecolorArgs<T> &args = call.args;
     args.image = image.as<T>(), args.photo = photo.as<uint8_t>(), args.pixels = image.shape.size() / 3;
+    args.transmittance = transmittance.as<T>();
     std::copy_n(matrix.as<T>(), RECOLOR_NUMBERS, args.matrix);
-    return {args, image.shape};
+    for (int c = 0; c < 3; ++c) {
+        const T *row = args.matrix + 4 * c;
+        double shift = call.background[c] - row[3];
+        for (int k = 0; k < 3; ++k) shift -= row[k] * call.background[k];
+        args.shift[c] = T(shift);
+    }
+    return call;
 }
 
 template <class T>
 void recolor(nb::args positional, nb::kwargs given) {
     Arguments a("recolor", positional, given);
-    auto [args, shape] = recolor_args<T>(a);
-    args.out = a.array("out", {KIND<T>}, shape, true).template as<T>();
+    RecolorCall<T> call = recolor_call<T>(a);
+    RecolorArgs<T> &args = call.args;
+    args.out = a.array("out", {KIND<T>}, call.shape, true).template as<T>();
     const int threads = int(a.whole("threads", 1, MOST_THREADS));
     a.finish();
     nb::gil_scoped_release release;
-    parallel(threads, args.tasks(), [&args = args](int64_t task, int) { kernels<T>().recolor(args, task); });
+    parallel(threads, args.tasks(), [&](int64_t task, int) { kernels<T>().recolor(args, task); });
 }
 
-// Writes the gradient of the image, and that of the matrix unless it is None.
+// Writes the gradients of the image and of the transmittance if there is one, and that of the matrix unless it is None.
 template <class T>
 void recolor_backward(nb::args positional, nb::kwargs given) {
     Arguments a("recolor_backward", positional, given);
-    auto [args, shape] = recolor_args<T>(a);
-    args.grad = a.array("grad", {KIND<T>}, shape).template as<T>();
-    args.out = a.array("grad_image", {KIND<T>}, shape, true).template as<T>();
+    RecolorCall<T> call = recolor_call<T>(a);
+    RecolorArgs<T> &args = call.args;
+    const Shape plane = {call.shape[0], call.shape[1]};
+    args.grad = a.array("grad", {KIND<T>}, call.shape).template as<T>();
+    args.out = a.array("grad_image", {KIND<T>}, call.shape, true).template as<T>();
+    args.grad_transmittance = a.array_or_none("grad_transmittance", KIND<T>, plane, true).template as<T>();
+    if (!args.grad_transmittance != !args.transmittance) a.fail("grad_transmittance", "has to be given if transmittance is, and only then");
     T *grad_matrix = a.array_or_none("grad_matrix", KIND<T>, {3, 4}, true).template as<T>();
     const int threads = int(a.whole("threads", 1, MOST_THREADS));
     a.finish();
     nb::gil_scoped_release release;
-    std::vector<double> sums(size_t(args.tasks()) * RECOLOR_NUMBERS);
+    std::vector<double> sums(size_t(args.tasks()) * RECOLOR_SUMS);
     args.sums = grad_matrix ? sums.data() : nullptr;
-    parallel(threads, args.tasks(), [&args = args](int64_t task, int) { kernels<T>().recolor_backward(args, task); });
+    parallel(threads, args.tasks(), [&](int64_t task, int) { kernels<T>().recolor_backward(args, task); });
     if (!grad_matrix) return;
-    double total[RECOLOR_NUMBERS] = {};
-    for (size_t i = 0; i < sums.size(); ++i) total[i % RECOLOR_NUMBERS] += sums[i];
+    double total[RECOLOR_SUMS] = {};
+    for (size_t i = 0; i < sums.size(); ++i) total[i % RECOLOR_SUMS] += sums[i];
+    for (int c = 0; c < 3; ++c) {  // the shift depends on the matrix, too
+        for (int k = 0; k < 3; ++k) total[4 * c + k] -= total[RECOLOR_NUMBERS + c] * call.background[k];
+        total[4 * c + 3] -= total[RECOLOR_NUMBERS + c];
+    }
     std::copy(total, total + RECOLOR_NUMBERS, grad_matrix);
 }
 

@@ -204,6 +204,7 @@ struct NoiseArgs {
 
 constexpr int64_t RECOLOR_PIXELS = 4096;               // per task, so that the order of the sums depends on the image only
 constexpr int RECOLOR_NUMBERS = 12;                    // of a matrix 3 x 4, row by row
+constexpr int RECOLOR_SUMS = RECOLOR_NUMBERS + 3;      // and of the shift
 
 template <class T>
 struct RecolorArgs {
@@ -211,9 +212,12 @@ struct RecolorArgs {
     const uint8_t *photo;                              // pixels x 3, or null
     int64_t pixels;
     T matrix[RECOLOR_NUMBERS];
+    const T *transmittance;                            // pixels, or null
+    T shift[3];                                        // added to the corrected colour times the transmittance
     T *out;                                            // pixels x 3: the corrected image, or in the backward pass the image's gradient
     const T *grad;                                     // pixels x 3, only in the backward pass: the corrected image's gradient
-    double *sums;                                      // tasks x 12: each task's part of the matrix's gradient; or null
+    T *grad_transmittance;                             // pixels; null if transmittance is
+    double *sums;                                      // tasks x 15: each task's part of the gradients of matrix and shift; or null
 
     int64_t tasks() const { return (pixels + RECOLOR_PIXELS - 1) / RECOLOR_PIXELS; }
 };

@@ -1,4 +1,4 @@
-// recolor: an image through one matrix of colours, y = A x + b, and back.
+// recolor: an image through one matrix of colours, y = A x + b + T s, and back. T is the transmittance, s the shift; see bindings.cpp.
 //
 // Where the photo is saturated (255), y above 1 counts as 1 and has no gradient: such a pixel says only that the scene is at least
 // that bright, not how bright.
@@ -33,6 +33,14 @@ GSPLAT_INLINE void transform(const T *m, const Planes<T> &x, Planes<T> &y) {
         for (int i = 0; i < GROUP; ++i) y[c][i] = m[4 * c] * x[0][i] + m[4 * c + 1] * x[1][i] + m[4 * c + 2] * x[2][i] + m[4 * c + 3];
 }
 
+// The corrected colours of the pixels from `first`, before the saturated ones are cut.
+template <class T>
+GSPLAT_INLINE void correct(const RecolorArgs<T> &args, int64_t first, int count, const Planes<T> &x, Planes<T> &y) {
+    transform(args.matrix, x, y);
+    for (int c = 0; args.transmittance && c < 3; ++c)
+        for (int i = 0; i < count; ++i) y[c][i] += args.shift[c] * args.transmittance[first + i];
+}
+
 template <class T>
 void recolor(const RecolorArgs<T> &args, int64_t task) {
     const int64_t end = vmin(args.pixels, (task + 1) * RECOLOR_PIXELS);
@@ -40,7 +48,7 @@ void recolor(const RecolorArgs<T> &args, int64_t task) {
     for (int64_t first = task * RECOLOR_PIXELS; first < end; first += GROUP) {
         const int count = int(vmin<int64_t>(GROUP, end - first));
         split(args.image + 3 * first, count, x);
-        transform(args.matrix, x, y);
+        correct(args, first, count, x, y);
         T *out = args.out + 3 * first;
         join(y, count, out);
         if (!args.photo) continue;
@@ -56,29 +64,36 @@ void recolor_backward(const RecolorArgs<T> &args, int64_t task) {
     const int64_t end = vmin(args.pixels, (task + 1) * RECOLOR_PIXELS);
     const T *m = args.matrix;
     Planes<T> x = {}, y, g = {};
-    V sums[RECOLOR_NUMBERS] = {};
+    T through[GROUP] = {};
+    V sums[RECOLOR_SUMS] = {};
     for (int64_t first = task * RECOLOR_PIXELS; first < end; first += GROUP) {
         const int count = int(vmin<int64_t>(GROUP, end - first));
-        if (count < GROUP) memset(x, 0, sizeof(x)), memset(g, 0, sizeof(g));
+        if (count < GROUP) memset(x, 0, sizeof(x)), memset(g, 0, sizeof(g)), memset(through, 0, sizeof(through));
         split(args.image + 3 * first, count, x);
         split(args.grad + 3 * first, count, g);
         if (args.photo) {
             const uint8_t *photo = args.photo + 3 * first;
-            transform(m, x, y);
+            correct(args, first, count, x, y);
             for (int i = 0; i < count; ++i)
                 for (int c = 0; c < 3; ++c) g[c][i] = photo[3 * i + c] == 255 && y[c][i] > 1 ? 0 : g[c][i];
+        }
+        if (args.transmittance) {
+            memcpy(through, args.transmittance + first, size_t(count) * sizeof(T));
+            for (int i = 0; i < count; ++i)
+                args.grad_transmittance[first + i] = args.shift[0] * g[0][i] + args.shift[1] * g[1][i] + args.shift[2] * g[2][i];
         }
         for (int i = 0; args.sums && i < GROUP; i += LANES)
             for (int c = 0; c < 3; ++c) {
                 const V of_channel = load<V>(&g[c][i]);
                 for (int k = 0; k < 3; ++k) sums[4 * c + k] += of_channel * load<V>(&x[k][i]);
                 sums[4 * c + 3] += of_channel;
+                sums[RECOLOR_NUMBERS + c] += of_channel * load<V>(&through[i]);
             }
         for (int k = 0; k < 3; ++k)
             for (int i = 0; i < GROUP; ++i) y[k][i] = m[k] * g[0][i] + m[4 + k] * g[1][i] + m[8 + k] * g[2][i];
         join(y, count, args.out + 3 * first);
     }
-    for (int k = 0; args.sums && k < RECOLOR_NUMBERS; ++k) args.sums[task * RECOLOR_NUMBERS + k] = double(sum(sums[k]));
+    for (int k = 0; args.sums && k < RECOLOR_SUMS; ++k) args.sums[task * RECOLOR_SUMS + k] = double(sum(sums[k]));
 }
 
 template void recolor<float>(const RecolorArgs<float> &, int64_t);

@@ -1,11 +1,14 @@
-"""Colours through a matrix: the native kernel against torch, gradients in float64, saturated photos."""
+"""Colours through a matrix: the native kernel against torch, gradients in float64, saturated photos, backgrounds."""
 
+import numpy as np
 import pytest
 import torch
 
 from gsplat_edu import ArgumentError, kernels
 from gsplat_edu.errors import ShapeError
-from gsplat_edu.recolor import recolored
+from gsplat_edu.recolor import Behind, recolored
+
+BACKGROUND = (0.3, 0.9, 0.6)
 
 
 def scene(dtype, size=(9, 15), seed=0):
@@ -20,6 +23,12 @@ def scene(dtype, size=(9, 15), seed=0):
     return image.to(dtype), matrix.to(dtype), photo
 
 
+def behind(dtype, size=(9, 15)):
+    """What shows through: anything from nothing to all of the background."""
+    generator = torch.Generator().manual_seed(9)
+    return Behind(torch.rand(*size, generator=generator, dtype=torch.float64).to(dtype), BACKGROUND)
+
+
 def in_torch(monkeypatch, *arguments):
     monkeypatch.setattr(kernels, "REASON", "hidden by a test")
     return recolored(*arguments)
@@ -27,17 +36,21 @@ def in_torch(monkeypatch, *arguments):
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 21), (8, 8), (70, 130)])
 @pytest.mark.parametrize("with_photo", [False, True])
-def test_the_kernel_is_torchs_formula_in_value_and_gradients(monkeypatch, size, with_photo):
+@pytest.mark.parametrize("with_background", [False, True])
+def test_the_kernel_is_torchs_formula_in_value_and_gradients(monkeypatch, size, with_photo, with_background):
     """float64; a sum of 27,300 products of up to 2 rounds by less than 1e-11."""
     image, matrix, photo = scene(torch.float64, size)
     weights, results = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).reshape(image.shape), []
     for native in (True, False):
         x, m = image.clone().requires_grad_(), matrix.clone().requires_grad_()
-        arguments = (x, m, photo if with_photo else None)
+        given = behind(torch.float64, size) if with_background else None
+        t = given.transmittance.requires_grad_() if given else torch.ones((), requires_grad=True)
+        arguments = (x, m, photo if with_photo else None, given)
         out = recolored(*arguments) if native else in_torch(monkeypatch, *arguments)
         (out * weights).sum().backward()
-        results.append((out.detach(), x.grad, m.grad))
-    for ours, expected in zip(*results, strict=True):
+        results.append((out.detach(), x.grad, m.grad, t.grad))
+    assert (results[0][3] is None) == (not with_background)
+    for ours, expected in zip(*(found[: 3 + with_background] for found in results), strict=True):
         torch.testing.assert_close(ours, expected, rtol=1e-12, atol=1e-11)
 
 
@@ -49,6 +62,36 @@ def test_gradients_are_proven_by_finite_differences():
     x, m = image.requires_grad_(), matrix.requires_grad_()
     assert torch.autograd.gradcheck(lambda a, b: recolored(a, b, photo), (x, m))
     assert torch.autograd.gradcheck(lambda a: recolored(a, m.detach(), photo), (x,)), "without the matrix's"
+
+
+def test_gradients_before_a_background_are_proven_by_finite_differences():
+    """As above; linear in image and transmittance, bilinear with the matrix."""
+    image, matrix, photo = scene(torch.float64, (8, 11))
+    given = behind(torch.float64, (8, 11))
+    cut = recolored(image, matrix, None, given)[photo == 255]
+    assert (cut > 1).any() and (cut < 1).any() and ((cut - 1).abs() > 1e-3).all()
+    tensors = [tensor.requires_grad_() for tensor in (image, matrix, given.transmittance)]
+    assert torch.autograd.gradcheck(lambda a, b, t: recolored(a, b, photo, Behind(t, BACKGROUND)), tensors)
+
+
+def test_the_object_is_recoloured_and_the_background_stays():
+    """NumPy, float64: premultiplied colours and opacities, corrected, then composited; a few roundings."""
+    rng = np.random.default_rng(4)
+    colors, opacity = rng.uniform(size=(7, 9, 3)), rng.uniform(size=(7, 9))
+    opacity[0], opacity[1] = 0.0, 1.0
+    matrix, background = np.eye(3, 4) + 0.2 * rng.normal(size=(3, 4)), np.array(BACKGROUND)
+    premultiplied = colors * opacity[..., None]
+    image = premultiplied + background * (1 - opacity)[..., None]
+    corrected = premultiplied @ matrix[:, :3].T + opacity[..., None] * matrix[:, 3]
+    expected = corrected + background * (1 - opacity)[..., None]
+    found = recolored(
+        torch.from_numpy(image),
+        torch.from_numpy(matrix),
+        None,
+        Behind(torch.from_numpy(1 - opacity), BACKGROUND),
+    )
+    np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found[0].numpy(), np.broadcast_to(background, (9, 3)), rtol=0, atol=1e-12)
 
 
 def test_a_saturated_photo_asks_for_no_less_light():
@@ -63,16 +106,18 @@ def test_a_saturated_photo_asks_for_no_less_light():
     torch.testing.assert_close(image.grad, 1.25 * passes)
 
 
-def test_the_bits_do_not_depend_on_the_threads():
+@pytest.mark.parametrize("with_background", [False, True])
+def test_the_bits_do_not_depend_on_the_threads(with_background):
     image, matrix, photo = scene(torch.float32, (211, 157))
     found, before = [], torch.get_num_threads()
     try:
         for threads in (1, 2, 5):
             torch.set_num_threads(threads)
             x, m = image.clone().requires_grad_(), matrix.clone().requires_grad_()
-            out = recolored(x, m, photo)
+            t = behind(torch.float32, (211, 157)).transmittance.requires_grad_()
+            out = recolored(x, m, photo, Behind(t, BACKGROUND) if with_background else None)
             out.backward(torch.linspace(0, 1, out.numel()).reshape(out.shape))
-            found.append((out.detach(), x.grad, m.grad))
+            found.append((out.detach(), x.grad, m.grad, *([t.grad] if with_background else [])))
     finally:
         torch.set_num_threads(before)
     for others in found[1:]:
@@ -88,11 +133,17 @@ def test_wrong_arguments_are_named():
         recolored(image, matrix, photo[1:])
     with pytest.raises(ArgumentError, match="^matrix: is torch.float64"):
         recolored(image, matrix.double())
+    with pytest.raises(ShapeError, match="^transmittance"):
+        recolored(image, matrix, None, Behind(torch.zeros(3, 3), BACKGROUND))
+    with pytest.raises(ArgumentError, match="^transmittance: is torch.float64"):
+        recolored(image, matrix, None, behind(torch.float64))
 
 
 def test_the_native_border_refuses_what_does_not_fit():
     image, matrix, photo = scene(torch.float32)
-    fine = {"image": image, "matrix": matrix, "photo": photo, "out": torch.empty_like(image), "threads": 1}
+    given = {"image": image, "matrix": matrix, "photo": photo, "threads": 1}
+    given |= {"transmittance": image[..., 0].contiguous(), "background": BACKGROUND}
+    fine = {**given, "out": torch.empty_like(image)}
     call = kernels.kernel("recolor_f", torch.float32)
     call(**fine)
     for name, wrong in {
@@ -101,9 +152,18 @@ def test_the_native_border_refuses_what_does_not_fit():
         "image": image.double(),
         "out": torch.empty(3, 3, 3),
         "threads": 0,
+        "transmittance": torch.zeros(9, 14),
+        "background": (0.0, 0.0),
     }.items():
         with pytest.raises(ValueError, match=f"^recolor: {name}"):
             call(**{**fine, name: wrong})
-    back = {key: value for key, value in fine.items() if key != "out"} | {"grad": image, "grad_matrix": None}
+    back = kernels.kernel("recolor_backward_f", torch.float32)
+    given |= {"grad": image, "grad_matrix": None}
+    of_image, of_transmittance = torch.empty_like(image), torch.empty(9, 15)
+    back(**given, grad_image=of_image, grad_transmittance=of_transmittance)
     with pytest.raises(ValueError, match="^recolor_backward: grad_image"):
-        kernels.kernel("recolor_backward_f", torch.float32)(**back, grad_image=torch.empty(2, 2, 3))
+        back(**given, grad_image=torch.empty(2, 2, 3), grad_transmittance=of_transmittance)
+    with pytest.raises(ValueError, match="^recolor_backward: grad_transmittance"):
+        back(**given, grad_image=of_image, grad_transmittance=None)
+    with pytest.raises(ValueError, match="^recolor_backward: grad_transmittance"):
+        back(**given | {"transmittance": None}, grad_image=of_image, grad_transmittance=of_transmittance)

@@ -1,11 +1,15 @@
-"""An image through a matrix of colours, differentiably: y = A x + b for every pixel.
+"""An image through a matrix of colours, differentiably.
 
-A (3, 3) and b (3,) are passed as one matrix (3, 4).
+y = A x + b                             for an opaque image
+y = A (x - T c) + (1 - T) b + T c       for an object before the background c, seen through the transmittance T
+
+The second line recolours the object and leaves the background as it is: x - T c is the object's colour times its
+opacity 1 - T. A (3, 3) and b (3,) are passed as one matrix (3, 4).
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, UInt8
@@ -18,13 +22,28 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.threads import native_threads
 from gsplat_edu.validation import check_shape
 
+Color = tuple[float, float, float]
+
+
+class Behind(NamedTuple):
+    """What shows through an image.
+
+    Args:
+        transmittance: (H, W) fraction of the background's light in each pixel.
+        background: The background's colour.
+    """
+
+    transmittance: Float[Tensor, "H W"]
+    background: Color
+
 
 def recolored(
     image: Float[Tensor, "H W 3"],
     matrix: Float[Tensor, "3 4"],
     photo: UInt8[Tensor, "H W 3"] | None = None,
+    behind: Behind | None = None,
 ) -> Float[Tensor, "H W 3"]:
-    """Return the image with the colours A x + b.
+    """Return the image with the colours A x + b, or its object with them.
 
     On the CPU this is one native pass, the same to the bit on any number of threads; torch computes it on a GPU and
     without the native module.
@@ -35,26 +54,35 @@ def recolored(
         photo: (H, W, 3) the photo that the result is compared with. Where it is saturated (255), a result above 1
             becomes 1 and has no gradient: the photo does not tell how bright the scene is there. None if it is not
             stored in bytes.
+        behind: What shows through; None recolours every pixel completely. The transmittance has the image's dtype and
+            device.
 
     Returns:
-        (H, W, 3), differentiable in image and matrix.
+        (H, W, 3), differentiable in image, matrix and transmittance.
 
     Raises:
         ShapeError: a shape differs.
-        ArgumentError: the matrix has another dtype or device than the image.
+        ArgumentError: matrix or transmittance has another dtype or device than the image.
     """
     check_shape("image", image.shape, ("H", "W", 3), {})
     check_shape("matrix", matrix.shape, (3, 4), {})
     if photo is not None:
         check_shape("photo", photo.shape, image.shape, {})
-    if (matrix.dtype, matrix.device) != (image.dtype, image.device):
-        raise ArgumentError(
-            f"matrix: is {matrix.dtype} on {matrix.device}, but has to be {image.dtype} on {image.device}"
-        )
+    through, background = behind or (None, (0.0, 0.0, 0.0))
+    if through is not None:
+        check_shape("transmittance", through.shape, image.shape[:2], {})
+    for name, tensor in {"matrix": matrix, "transmittance": through}.items():
+        if tensor is not None and (tensor.dtype, tensor.device) != (image.dtype, image.device):
+            raise ArgumentError(
+                f"{name}: is {tensor.dtype} on {tensor.device}, but has to be {image.dtype} on {image.device}"
+            )
     if kernels.REASON is None and image.device.type == "cpu" and image.dtype in kernels.SUFFIXES:
-        found: Tensor = _Recolored.apply(image, matrix, photo)  # type: ignore[no-untyped-call]
+        found: Tensor = _Recolored.apply(image, matrix, through, photo, background)  # type: ignore[no-untyped-call]
         return found
     corrected = image @ matrix[:, :3].T + matrix[:, 3]
+    if through is not None:
+        color = image.new_tensor(background)
+        corrected = corrected + through[..., None] * (color - matrix[:, :3] @ color - matrix[:, 3])
     if photo is None:
         return corrected
     return torch.where((photo == 255) & (corrected > 1), torch.ones_like(corrected), corrected)
@@ -64,43 +92,57 @@ class _Recolored(torch.autograd.Function):
     """The native kernel and its gradient."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, matrix: Tensor, photo: Tensor | None) -> Tensor:  # noqa: ANN401
-        x, numbers = image.detach().contiguous(), matrix.detach().contiguous()
-        bytes_of_photo = None if photo is None else photo.contiguous()
-        out = reusable_tensor(x.shape, x)
-        kernels.kernel("recolor_f", x.dtype)(
-            **_arrays(x, numbers, bytes_of_photo), out=_array(out), **_threads()
-        )
-        ctx.save_for_backward(x, numbers, bytes_of_photo)
+    def forward(
+        ctx: Any,  # noqa: ANN401
+        image: Tensor,
+        matrix: Tensor,
+        transmittance: Tensor | None,
+        photo: Tensor | None,
+        background: Color,
+    ) -> Tensor:
+        given = [
+            None if tensor is None else tensor.detach().contiguous()
+            for tensor in (image, matrix, transmittance, photo)
+        ]
+        out = reusable_tensor(image.shape, image)
+        kernels.kernel("recolor_f", image.dtype)(**_arguments(*given, background), out=_array(out))
+        ctx.save_for_backward(*given)
+        ctx.background = background
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor | None, None]:  # noqa: ANN401
-        x, numbers, photo = ctx.saved_tensors
-        to_image = reusable_tensor(x.shape, x)
-        to_matrix = torch.empty_like(numbers) if ctx.needs_input_grad[1] else None
-        kernels.kernel("recolor_backward_f", x.dtype)(
-            **_arrays(x, numbers, photo),
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        image, matrix, through, photo = ctx.saved_tensors
+        to_image = reusable_tensor(image.shape, image)
+        to_matrix = torch.empty_like(matrix) if ctx.needs_input_grad[1] else None
+        to_through = None if through is None else reusable_tensor(through.shape, image)
+        kernels.kernel("recolor_backward_f", image.dtype)(
+            **_arguments(image, matrix, through, photo, ctx.background),
             grad=_array(grad.contiguous()),
             grad_image=_array(to_image),
-            grad_matrix=None if to_matrix is None else _array(to_matrix),
-            **_threads(),
+            grad_transmittance=_array(to_through),
+            grad_matrix=_array(to_matrix),
         )
-        return to_image, to_matrix, None
+        return to_image, to_matrix, to_through, None, None
 
 
-def _arrays(image: Tensor, matrix: Tensor, photo: Tensor | None) -> dict[str, Any]:
+def _arguments(
+    image: Tensor | None,
+    matrix: Tensor | None,
+    transmittance: Tensor | None,
+    photo: Tensor | None,
+    background: Color,
+) -> dict[str, Any]:
     return {
         "image": _array(image),
         "matrix": _array(matrix),
-        "photo": None if photo is None else _array(photo),
+        "photo": _array(photo),
+        "transmittance": _array(transmittance),
+        "background": background,
+        "threads": native_threads(),
     }
 
 
-def _array(tensor: Tensor) -> object:
-    return kernels.native_array(tensor)
-
-
-def _threads() -> dict[str, int]:
-    return {"threads": native_threads()}
+def _array(tensor: Tensor | None) -> object:
+    return None if tensor is None else kernels.native_array(tensor)

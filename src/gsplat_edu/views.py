@@ -16,6 +16,9 @@ from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_a
 Pixels = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
 
 
+OPAQUE = 243
+"""Pixels of at least this alpha, 95 %, count as opaque where colours are measured."""
+
 AT_ONCE = 8192
 """Pixels composited over a background at a time."""
 
@@ -66,6 +69,11 @@ class Photo:
     def nbytes(self) -> int:
         """Size of the pixels in bytes."""
         return sum(a.nbytes for a in (self.image, self.alpha, self.mask) if a is not None)
+
+    @property
+    def opaque(self) -> Bool[np.ndarray, "H W"] | None:
+        """Where the photo is opaque but for a twentieth, (H, W); None if it has no alpha."""
+        return None if self.alpha is None else self.alpha >= OPAQUE
 
     def over(self, background: ArrayLike) -> Pixels:
         """Composite the photo over a background: rgb alpha + background (1 - alpha).

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float64
 
 from gsplat_edu.doctor.photos import BRIGHT, DARK, GAMMA
-from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, psnr
+from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, psnr, through
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.shells import far_shell
@@ -83,7 +83,9 @@ def residuals(
                 veiled = _veiled(subject, view, alone, render)
             truth = photo.over(background)
             pixels = truth / 255.0 if truth.dtype == np.uint8 else np.asarray(truth, dtype=np.float64)
-            image = at_exposure_of(truth, output.image, photo.mask) if corrected else output.image
+            image = output.image
+            if corrected:
+                image = at_exposure_of(truth, image, photo.mask, through(photo, output, background))
             stops = _stops(pixels, image.double().numpy(force=True), photo.mask)
             found.append(Residual(view.name, psnr(image, truth, photo.mask), stops, veiled))
         progress()

@@ -2,7 +2,8 @@
 
 A training that refines its cameras may end with a scene in which a held-out photo, whose pose was never refined, looks
 misplaced. Its pose is therefore aligned on the left half of the photo, with the scene fixed, and scored on the right
-half, which the alignment has not seen.
+half, which the alignment has not seen. If the training corrected exposures too, the colours are fitted on the left half
+with the pose, as in `gsplat_edu.evaluate.metrics.psnr_fitted`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import torch
 
 from gsplat_edu.adam import adam_step
 from gsplat_edu.camera import Camera
-from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.evaluate.metrics import at_exposure_of, psnr, psnr_fitted, through
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import photo_loss
 from gsplat_edu.moments import AdamNumbers
@@ -42,7 +43,13 @@ class TensorRenderer(Protocol):
 
 
 def aligned_psnr(
-    gaussians: Gaussians, view: View, render: TensorRenderer, background: ArrayLike, extent: float
+    gaussians: Gaussians,
+    view: View,
+    render: TensorRenderer,
+    background: ArrayLike,
+    extent: float,
+    *,
+    colors: bool = False,
 ) -> float | None:
     """Return the PSNR of a view's right half after `STEPS` steps of its pose on the left half.
 
@@ -52,6 +59,7 @@ def aligned_psnr(
         render: Renders Gaussians from a camera, over `background`.
         background: (3,) colour behind photos that are not opaque.
         extent: Size of the scene, world units.
+        colors: Fit the exposure and white balance on the left half too, at every step.
 
     Returns:
         dB; None if no pixel counts in one of the halves.
@@ -73,12 +81,17 @@ def aligned_psnr(
     first, second = torch.zeros_like(twist), torch.zeros_like(twist)
     for step in range(STEPS):
         leaf = twist.clone().requires_grad_()
-        image = render(fixed, start.moved(leaf * units)).image
+        output = render(fixed, start.moved(leaf * units))
+        image = output.image
+        if colors:
+            image = at_exposure_of(truth, image, left, through(photo, output, background))
         (gradient,) = torch.autograd.grad(photo_loss(image, target, mask), leaf)
         adam_step(twist, first, second, gradient, _numbers(step))
     with torch.no_grad():
-        image = render(fixed, start.moved(twist * units).value()).image
-    return psnr(image, truth, right)
+        output = render(fixed, start.moved(twist * units).value())
+    if colors:
+        return psnr_fitted(output.image, truth, photo.mask, through(photo, output, background))
+    return psnr(output.image, truth, right)
 
 
 def _numbers(step: int) -> AdamNumbers:

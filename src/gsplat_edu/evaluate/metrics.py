@@ -6,7 +6,8 @@ number of threads. Renders are clamped to 0..1 first, as a screen would do. Defi
     psnr        10 log10(1 / MSE) of the floating-point render against the photo's bytes / 255
     psnr_8bit   the same with the render rounded to bytes, as in a PNG
     psnr_fitted the PSNR of the right half alone, after the render's exposure and white balance were fitted to the
-                photo's left half: a held-out photo may be brighter or darker than the scene
+                photo's left half: a held-out photo may be brighter or darker than the scene. Of a photo that is not
+                opaque, only the object is fitted, not the background
     ssim        mean SSIM over pixels and channels: Gaussian window of 11 taps, sigma 1.5, zero outside the image
 
 A mean over images averages the images' values. It is not the PSNR of the mean error.
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +30,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.exposure import color_matrix, measured_gains
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import l1_ssim
-from gsplat_edu.recolor import recolored
+from gsplat_edu.recolor import Behind, recolored
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.validation import ArrayLike, check_shape, float64_array
 from gsplat_edu.views import Photo, View
@@ -38,6 +40,18 @@ MSE_FLOOR = 1e-10
 
 Renderer = Callable[[Gaussians, Camera], RenderOutput]
 """Renders Gaussians from a camera."""
+
+
+class Through(NamedTuple):
+    """What a fit of colours has to know where the background shows through; see `through`.
+
+    Args:
+        behind: Transmittance of the render, and the background of render and photo.
+        opaque: (H, W) `Photo.opaque`, which is where colours are fitted.
+    """
+
+    behind: Behind
+    opaque: Bool[np.ndarray, "H W"]
 
 
 @dataclass(frozen=True)
@@ -95,7 +109,9 @@ def psnr_8bit(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None)
     return _Pair(image, truth, mask).psnr_8bit()
 
 
-def psnr_fitted(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float | None:
+def psnr_fitted(
+    image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None, through: Through | None = None
+) -> float | None:
     """Return the PSNR of the right half of an image after a fit of its colours on the left half.
 
     Each channel's gain is `gsplat_edu.exposure.measured_gains` of the left halves, which is applied to the right half.
@@ -104,28 +120,56 @@ def psnr_fitted(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = Non
 
     Arguments and errors are those of `psnr`.
 
+    Args:
+        image: As for `psnr`.
+        truth: As for `psnr`.
+        mask: As for `psnr`.
+        through: What `through` returns for the photo; None if it is opaque.
+
     Returns:
         dB; None if no pixel of the right half counts.
     """
-    return _Pair(image, truth, mask).psnr_fitted()
+    return _Pair(image, truth, mask, through).psnr_fitted()
+
+
+def through(photo: Photo, output: RenderOutput, background: ArrayLike) -> Through | None:
+    """Return what shows through a photo and its render; None if the photo is opaque.
+
+    Args:
+        photo: The photo.
+        output: The render, over `background`.
+        background: (3,) colour behind both.
+    """
+    if photo.opaque is None:
+        return None
+    red, green, blue = float64_array("background", background, (3,)).tolist()
+    return Through(Behind(output.transmittance, (red, green, blue)), photo.opaque)
 
 
 def at_exposure_of(
     photo: UInt8[np.ndarray, "H W 3"] | Float[np.ndarray, "H W 3"],
     image: Float[torch.Tensor, "H W 3"],
     mask: Bool[np.ndarray, "H W"] | None = None,
+    through: Through | None = None,
 ) -> Float[torch.Tensor, "H W 3"]:
-    """Return a render with the exposure and white balance of a photo: one gain per channel, measured on all pixels.
+    """Return a render with the exposure and white balance of a photo: one gain per channel.
 
     Args:
         photo: (H, W, 3) uint8, or float from 0 to 1.
         image: (H, W, 3) render.
-        mask: (H, W) true for pixels that count; None if all do.
+        mask: (H, W) true for pixels that the gains are measured on; None for all.
+        through: What `through` returns for the photo; None if it is opaque.
+
+    Returns:
+        (H, W, 3), differentiable in the image; the gains count as constants.
     """
     truth = torch.from_numpy(np.ascontiguousarray(photo)).to(image.device)
+    if through is not None:
+        mask = through.opaque if mask is None else mask & through.opaque
     counts = None if mask is None else torch.from_numpy(mask).to(image.device)
     matrix = color_matrix(measured_gains(image, truth, counts))
-    return recolored(image, matrix, truth if truth.dtype == torch.uint8 else None)
+    behind = None if through is None else through.behind
+    return recolored(image, matrix, truth if truth.dtype == torch.uint8 else None, behind)
 
 
 def mean_absolute_error(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
@@ -170,7 +214,13 @@ def to_bytes(image: ArrayLike) -> UInt8[np.ndarray, "H W 3"]:
     return rounded
 
 
-def score_image(name: str, image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> ImageScore:
+def score_image(
+    name: str,
+    image: ArrayLike,
+    truth: ArrayLike,
+    mask: ArrayLike | None = None,
+    through: Through | None = None,
+) -> ImageScore:
     """Compute all metrics of one image.
 
     Args:
@@ -178,12 +228,13 @@ def score_image(name: str, image: ArrayLike, truth: ArrayLike, mask: ArrayLike |
         image: As for `psnr`.
         truth: As for `psnr`.
         mask: As for `psnr`.
+        through: As for `psnr_fitted`.
 
     Raises:
         ShapeError, ArgumentError: as for `psnr`.
         BackendUnavailableError: as for `ssim`.
     """
-    pair = _Pair(image, truth, mask)
+    pair = _Pair(image, truth, mask, through)
     return ImageScore(name, pair.psnr(), pair.psnr_8bit(), pair.ssim(), pair.l1(), pair.psnr_fitted())
 
 
@@ -212,9 +263,9 @@ def score_views(
         if photo.mask is not None and not photo.mask.any():
             continue
         with torch.no_grad():
-            image = render(gaussians, view.camera).image
-        truth = photo.over(background)
-        score = score_image(view.name, image, truth, photo.mask)
+            output = render(gaussians, view.camera)
+        image, truth = output.image, photo.over(background)
+        score = score_image(view.name, image, truth, photo.mask, through(photo, output, background))
         scores.append(score)
         if on_image is not None:
             on_image(view, score, to_bytes(image), to_bytes(truth))
@@ -262,7 +313,14 @@ def _as_array(image: ArrayLike) -> np.ndarray:
 class _Pair:
     """A render and its photo after validation: float64, 0 to 1, and the mask (None: all pixels count)."""
 
-    def __init__(self, image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None) -> None:
+    def __init__(
+        self,
+        image: ArrayLike,
+        truth: ArrayLike,
+        mask: ArrayLike | None,
+        through: Through | None = None,
+    ) -> None:
+        self.through = through
         sizes: dict[str, int] = {}
         self.render = np.clip(float64_array("image", _as_array(image), ("H", "W", 3), sizes), 0.0, 1.0)
         given = _as_array(truth)
@@ -292,18 +350,19 @@ class _Pair:
 
     def psnr_fitted(self) -> float | None:
         middle = self.render.shape[1] // 2
-        left, right = np.s_[:, :middle], np.s_[:, middle:]
-        sides = (None, None) if self.counts is None else (self.counts[left], self.counts[right])
-        counts, tested = sides
-        if not self.render[right].size or (tested is not None and not tested.any()):
+        counts = np.ones(self.render.shape[:2], dtype=bool) if self.counts is None else self.counts
+        tested = counts[:, middle:]
+        if not tested.any():
             return None
-        x, y = (torch.from_numpy(plane[left].copy()) for plane in (self.render, self.photo))
-        matrix = color_matrix(
-            measured_gains(x, y, None if counts is None else torch.from_numpy(counts.copy()))
-        ).numpy()
-        gains, offset = np.diagonal(matrix), matrix[:, 3]
-        fitted = np.clip(self.render[right] * gains + offset, 0.0, 1.0)
-        return _Pair(fitted, self.photo[right], tested).psnr()
+        shown, behind = counts[:, :middle], None
+        if self.through is not None:
+            shown = shown & self.through.opaque[:, :middle]
+            transmittance = self.through.behind.transmittance.detach().cpu().double()
+            behind = Behind(transmittance[:, middle:], self.through.behind.background)
+        image, photo = torch.from_numpy(self.render), torch.from_numpy(self.photo)
+        gains = measured_gains(image[:, :middle], photo[:, :middle], torch.from_numpy(shown))
+        fitted = recolored(image[:, middle:], color_matrix(gains), None, behind)
+        return _Pair(fitted.numpy(), self.photo[:, middle:], tested).psnr()
 
     def l1(self) -> float:
         return self._mean(np.abs(self.render - self.photo))

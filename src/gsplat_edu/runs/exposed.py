@@ -41,9 +41,7 @@ def at_exposure_of_scene(
     """
 
     def converted(views: Sequence[View]) -> tuple[View, ...]:
-        return tuple(
-            _converted(view, _log_gains(view, gaussians, render, background), background) for view in views
-        )
+        return tuple(_converted(view, _log_gains(view, gaussians, render, background)) for view in views)
 
     return replace(dataset, train=converted(dataset.train), test=converted(dataset.test))
 
@@ -52,21 +50,24 @@ def _log_gains(view: View, gaussians: Gaussians, render: Render, background: Arr
     photo = view.read()
     with torch.no_grad():
         image = render(gaussians, view.camera).image
-    mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(image.device)
+    counts = photo.mask
+    if photo.opaque is not None:
+        counts = photo.opaque if counts is None else counts & photo.opaque
+    mask = None if counts is None else torch.from_numpy(counts).to(image.device)
     truth = torch.from_numpy(np.ascontiguousarray(photo.over(background))).to(image.device)
     return measured_gains(image, truth, mask).cpu()
 
 
-def _converted(view: View, log_gains: Float[Tensor, "3"], background: ArrayLike) -> View:
-    """Return the view with its photo divided by the gains: y becomes y / g + 0.055 (1 / g - 1)."""
+def _converted(view: View, log_gains: Float[Tensor, "3"]) -> View:
+    """Return the view with its photo divided by the gains: y becomes y / g + 0.055 (1 / g - 1); alpha stays."""
 
     def read() -> Photo:
         photo = view.read()
-        pixels = np.asarray(photo.over(background))
+        pixels = photo.image
         values = torch.from_numpy(np.ascontiguousarray(pixels)).float() / (
             255.0 if pixels.dtype == np.uint8 else 1.0
         )
         found = recolored(values, color_matrix(-log_gains.float())).clamp(0.0, 1.0)
-        return Photo(found.numpy(), mask=photo.mask)
+        return Photo(found.numpy(), photo.alpha, photo.mask)
 
     return View.stored(view.camera, read, view.name)

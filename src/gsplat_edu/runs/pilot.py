@@ -98,8 +98,10 @@ def _pilot(dataset: Dataset, options: RunOptions, refine: str, progress: Callabl
     trainer.run(callbacks=[step])
     shown = dataset if refinement is None else with_refined_cameras(refinement, dataset)
     renderer = replace(options, config=config).renderer
+    colors = config.appearance != "none"
     scores = [
-        aligned_psnr(trainer.gaussians, view, renderer, config.background, extent) for view in shown.test
+        aligned_psnr(trainer.gaussians, view, renderer, config.background, extent, colors=colors)
+        for view in shown.test
     ]
     return mean_aligned_psnr(scores)
 

@@ -76,11 +76,13 @@ def aligned_score(
         extent: Size of the scene, world units.
         say: Receives a sentence with the score.
     """
+    colors, background = options.config.appearance != "none", options.config.background
     scores = [
-        aligned_psnr(gaussians, view, options.renderer, options.config.background, extent) for view in views
+        aligned_psnr(gaussians, view, options.renderer, background, extent, colors=colors) for view in views
     ]
     mean = mean_aligned_psnr(scores)
     if mean is None:
         return {}
-    say(f"held-out photos, poses aligned on their left halves: {mean:.2f} dB PSNR of the right halves")
+    what = "poses aligned and colours fitted" if colors else "poses aligned"
+    say(f"held-out photos, {what} on their left halves: {mean:.2f} dB PSNR of the right halves")
     return {"psnr_aligned": round(mean, 4)}

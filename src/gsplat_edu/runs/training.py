@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.data.dataset import Dataset, load_dataset, scene_extent
-from gsplat_edu.data.images import decode
 from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
@@ -66,9 +65,6 @@ def document(options: RunOptions) -> dict[str, Any]:
         "machine": machine_facts(),
     }
 
-
-WITHOUT_ALPHA = (".jpg", ".jpeg")
-"""Endings of photos that are never transparent, so that they need not be decoded to know."""
 
 Export = Callable[[Source], list[dict[str, Any]]]
 """Writes a scene in further formats and returns a record of each file: "path", "psnr" and more."""
@@ -164,7 +160,6 @@ class CaptureRun:
         for note in self.dataset.notes:
             say(note)
         self.dataset.preload(progress)
-        self._check_opaque()
         if options.config.transients != "none":
             check_enough(len(self.dataset.train))
         # a scene to start from may have a sky; a resumed run need not say --from again
@@ -231,17 +226,6 @@ class CaptureRun:
                 transients=make_transients(options.config, dataset.train, renderer),
             ),
         )
-
-    def _check_opaque(self) -> None:
-        """Refuse to correct the exposure of photos with transparency: the background would be corrected with them."""
-        if self.options.config.appearance == "none" or self.folder.exists():
-            return
-        for name, source in self.dataset.files:
-            if source.path.suffix.lower() not in WITHOUT_ALPHA and decode(source.path)[1] is not None:
-                raise ArgumentError(
-                    f"--appearance: {name} is partly transparent, and exposures of such photos are not corrected;"
-                    " use --appearance none, or opaque photos with masks"
-                )
 
     def _start_cloud(self) -> tuple[Gaussians, str | None]:
         """Make the start Gaussians, and their digest if they come from a scene."""

@@ -6,6 +6,9 @@ The render x of the scene becomes y_i, which is compared with photo i. Subtracti
 geometric mean of the corrections is the identity, so the scene itself has the mean exposure of the capture, in any
 viewer.
 
+Of a photo that is not opaque, only the object is corrected, not the background before which it is compared; see
+`gsplat_edu.recolor`.
+
 The l_i are measured whenever photo i is drawn, not learned by gradient descent. There is no rate to choose, and one
 draw is enough to know them. docs/RECIPE.md has what else was tried.
 """
@@ -19,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.exposure import color_matrix, measured_gains
-from gsplat_edu.recolor import recolored
+from gsplat_edu.recolor import Behind, recolored
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
@@ -66,7 +69,10 @@ class Exposure(Identity):
         if iteration >= self._begin:
             self._measure(index, seen, target)
         matrix = color_matrix(self.log_gains()[index])
-        return recolored(seen.image, matrix, target.image if target.image.dtype == torch.uint8 else None)
+        behind = None if target.opaque is None else Behind(seen.transmittance, seen.background)
+        return recolored(
+            seen.image, matrix, target.image if target.image.dtype == torch.uint8 else None, behind
+        )
 
     def log_gains(self) -> Float[Tensor, "views 3"]:
         """Return the natural logarithm of every view's gains; their mean over the views is 0."""
@@ -77,8 +83,9 @@ class Exposure(Identity):
     @torch.no_grad()
     def _measure(self, index: int, seen: Seen, target: Target) -> None:
         counts = seen.transmittance < OPAQUE
-        if target.mask is not None:
-            counts &= target.mask
+        for plane in (target.mask, target.opaque):
+            if plane is not None:
+                counts &= plane
         row, mean = self._state[index], self._state[:, :3]
         with one_thread():
             mean = mean.mean(dim=0)

@@ -29,6 +29,9 @@ CPU = torch.device("cpu")
 
 Color = tuple[float, float, float]
 
+Ready = tuple[Photo, Bool[np.ndarray, "H W"] | None]
+"""A photo, composited if the background is fixed, and its `opaque` before that."""
+
 
 @dataclass(frozen=True, eq=False)
 class Draw:
@@ -37,12 +40,14 @@ class Draw:
     Args:
         index: Index into the feed's views.
         view: The view.
-        photo: Its photo; None if its target is cached on the GPU.
+        photo: Its photo, composited already if the background is fixed; None if its target is cached on the GPU.
+        opaque: (H, W) `Photo.opaque`.
     """
 
     index: int
     view: View
     photo: Photo | None
+    opaque: Bool[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +57,17 @@ class Target:
     Args:
         image: (H, W, 3) the photo over the background.
         mask: (H, W) true for pixels that count; None if all do.
+        opaque: (H, W) `Photo.opaque`; None if the photo has no alpha.
     """
 
     image: UInt8[Tensor, "H W 3"] | Float32[Tensor, "H W 3"]
     mask: Bool[Tensor, "H W"] | None
+    opaque: Bool[Tensor, "H W"] | None = None
 
     @property
     def nbytes(self) -> int:
         """Size in bytes."""
-        return sum(tensor.nbytes for tensor in (self.image, self.mask) if tensor is not None)
+        return sum(tensor.nbytes for tensor in (self.image, self.mask, self.opaque) if tensor is not None)
 
 
 class ViewFeed:
@@ -95,8 +102,8 @@ class ViewFeed:
         self._generator = np.random.default_rng(seed)
         self._queue: list[int] = []
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="photo")
-        self._ahead: tuple[int, Future[Photo]] | None = None
-        self._flat: dict[View, Photo] = {}
+        self._ahead: tuple[int, Future[Ready]] | None = None
+        self._flat: dict[View, Ready] = {}
         self._flat_room = 0
         self._kept: dict[View, Target] = {}
         self._room = _free_bytes(device) if room is None else room
@@ -124,29 +131,31 @@ class ViewFeed:
         index = self._following()
         ahead, self._ahead = self._ahead, None
         view = self.views[index]
-        photo = None
+        photo = opaque = None
         if view not in self._kept:
-            photo = ahead[1].result() if ahead and ahead[0] == index else self._read(view)
+            photo, opaque = ahead[1].result() if ahead and ahead[0] == index else self._read(view)
         self._queue.pop(0)  # only now, so that a view whose photo could not be read remains due
         following = self._following()
         after = self.views[following]
         if after.on_disk and after not in self._kept:
             self._ahead = following, self._reader.submit(self._read, after)
-        return Draw(index, view, photo)
+        return Draw(index, view, photo, opaque)
 
-    def _read(self, view: View) -> Photo:
+    def _read(self, view: View) -> Ready:
         """Read a photo and composite it over a fixed background; cache it if it was in memory or is of reduced size."""
         if view in self._flat:
             return self._flat[view]
         photo = view.read()
+        opaque = photo.opaque
         if photo.alpha is not None and self._background is not None:
             photo = Photo(photo.over(self._background), mask=photo.mask)
             if not view.on_disk:
-                self._flat[view] = photo
-        if self._factor > 1.0 and photo.nbytes <= self._flat_room:
-            self._flat[view] = photo
-            self._flat_room -= photo.nbytes
-        return photo
+                self._flat[view] = photo, opaque
+        nbytes = photo.nbytes + (0 if opaque is None else opaque.nbytes)
+        if self._factor > 1.0 and nbytes <= self._flat_room:
+            self._flat[view] = photo, opaque
+            self._flat_room -= nbytes
+        return photo, opaque
 
     def target(self, draw: Draw, background: Color) -> Target:
         """Move the target of a draw to the Gaussians' device; cache it there if it is constant and fits.
@@ -158,8 +167,11 @@ class ViewFeed:
         view, photo = draw.view, draw.photo
         if photo is None:
             return self._kept[view]
-        mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(self._device)
-        target = Target(torch.from_numpy(photo.over(background)).to(self._device), mask)
+        mask, opaque = (
+            None if plane is None else torch.from_numpy(plane).to(self._device)
+            for plane in (photo.mask, draw.opaque)
+        )
+        target = Target(torch.from_numpy(photo.over(background)).to(self._device), mask, opaque)
         if self._device.type != "cpu" and photo.alpha is None and target.nbytes <= self._room:
             self._kept[view] = target
             self._room -= target.nbytes

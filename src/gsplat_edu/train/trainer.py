@@ -320,7 +320,7 @@ class Trainer:
             target = self._parts.transients.applied(draw.index, target)
         model = self._parts.view_model
         output = self._render(self.gaussians, model.camera(draw.index, draw.view.camera), settings=settings)
-        seen = Seen(output.image, output.transmittance.detach())
+        seen = Seen(output.image, output.transmittance, background)
         image = model.image(draw.index, seen, target, self.iteration)
         return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 

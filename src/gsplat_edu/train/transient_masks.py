@@ -26,7 +26,7 @@ from torch import Tensor
 from gsplat_edu.camera import Camera
 from gsplat_edu.exposure import color_matrix, measured_gains
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.recolor import recolored
+from gsplat_edu.recolor import Behind, recolored
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
@@ -225,9 +225,13 @@ def _residual(
         )
     assert output.features is not None, "features were given"
     image = output.image.detach()
-    mask = None if photo.mask is None else torch.from_numpy(photo.mask).to(image.device)
+    counts, behind = photo.mask, None
+    if photo.opaque is not None:
+        counts = photo.opaque if counts is None else counts & photo.opaque
+        behind = Behind(output.transmittance.detach(), how.settings.background)
+    mask = None if counts is None else torch.from_numpy(counts).to(image.device)
     gains = measured_gains(image, torch.from_numpy(truth).to(image.device), mask)
-    image = recolored(image, color_matrix(gains))
+    image = recolored(image, color_matrix(gains), None, behind)
     pixels = truth.astype(np.float32) / (255.0 if truth.dtype == np.uint8 else 1.0)
     error = smoothed_difference(image.clamp(0.0, 1.0).float().numpy(force=True), pixels, photo.mask)
     known = np.isfinite(error)

@@ -7,6 +7,7 @@ masks exclude. Masks are found anew each time: where other views have explained 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -97,7 +98,8 @@ class Transients:
         if mask is None:
             return target
         counts = torch.from_numpy(~resized_mask(mask, *target.image.shape[:2])).to(target.image.device)
-        return Target(target.image, counts if target.mask is None else counts & target.mask)
+        counts = counts if target.mask is None else counts & target.mask
+        return replace(target, mask=counts)
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for a checkpoint: the bits of all masks, and which views are left alone."""

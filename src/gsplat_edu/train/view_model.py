@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.train.feed import Target
+from gsplat_edu.train.feed import Color, Target
 from gsplat_edu.train.optimizer import ParameterGroup
 
 
@@ -23,11 +23,13 @@ class Seen(NamedTuple):
 
     Args:
         image: (H, W, 3) the render, or what models before have made of it.
-        transmittance: (H, W) fraction of light that passes all Gaussians; without a gradient.
+        transmittance: (H, W) fraction of light that passes all Gaussians.
+        background: Colour behind the Gaussians.
     """
 
     image: Float[Tensor, "H W 3"]
     transmittance: Float[Tensor, "H W"]
+    background: Color
 
 
 @runtime_checkable
