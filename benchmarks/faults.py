@@ -1,7 +1,7 @@
 """How much of what a fault of the photos costs does its remedy bring back?
 
-    python benchmarks/faults.py [CAPTURE] [--fault exposure|poses|transients] [--resolution R] [--iterations N]
-        [--seeds N] [--every N] [--test-every N] [--out FILE]
+    python benchmarks/faults.py [CAPTURE] [--fault exposure|vignetting|poses|transients] [--resolution R]
+        [--iterations N] [--seeds N] [--every N] [--test-every N] [--out FILE]
 
 Plants a fault with known truth into a copy of a capture, and trains with the fast recipe: the capture and the copy,
 each without and with the remedy. CAPTURE is snowmiku97 in $GSPLAT_EDU_DATA or ../shared/data unless given;
@@ -10,6 +10,10 @@ the word "traced" stands for 60 photos of 400 x 400 px, traced here, whose own e
 exposure: linear light times 2^u for u from -0.7 to 0.7, and its red and blue times 0.85 to 1.15 in addition, rounded
 to bytes and clipped. Held-out photos have it too, so scenes are compared by the PSNR of the photos' right half after a
 fit on the left half. Gains are compared with the truth beyond those found in the capture itself.
+
+vignetting: linear light times 1 / (1 + t r^2)^2, the law of cos^4, with r = 1 in the corners, which lose 0 to 1.5
+stops, around a centre that is off by up to 5 % of a side. Held-out photos are clean; scenes are compared by the PSNR of
+their right half after a fit of exposure on the left half, and with a training that corrects exposure only.
 
 poses: every camera turned by 0.5 degrees and shifted by 1 % of the extent, in random directions. Held-out cameras have
 it too, so scenes are compared by the PSNR of the photos' right half after their poses are aligned on the left half.
@@ -54,7 +58,7 @@ from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.poses import Refinement
 from gsplat_edu.train.transients import resized_mask
 from gsplat_edu.validation import ArrayLike
-from gsplat_edu.views import View
+from gsplat_edu.views import Photo, View
 
 TRACED = "traced"
 """Name of the capture that is traced here."""
@@ -64,6 +68,9 @@ GREY = 0.4
 
 STOPS, TINT = 0.7, 0.15
 """Largest planted exposure, stops, and largest planted change of red and blue."""
+
+CORNER, OFF_CENTRE = 1.5, 0.05
+"""Largest planted vignetting, stops lost in the corners, and how far its centre is off, sides of the photo."""
 
 DEGREES, SHIFT = 0.5, 0.01
 """Planted errors of the poses: degrees, and fraction of the extent."""
@@ -101,6 +108,29 @@ def uneven(
         image = np.round(255 * np.clip(encoded(light), 0, 1)).astype(np.uint8)
         changed.append(View(view.camera, image, mask=photo.mask, name=view.name))
     return changed, scales
+
+
+def vignetted(
+    views: Sequence[View], held_out: Sequence[bool], seed: int
+) -> tuple[list[View], Float64[np.ndarray, " V"]]:
+    """Return the views with dark corners, but for those held out, and the logarithm of the corners' gain on bytes."""
+    rng, changed, truths = np.random.default_rng(seed), [], []
+    for view, clean in zip(views, held_out, strict=True):
+        stops_lost, (cy, cx) = rng.uniform(0, CORNER), rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)
+        photo, (H, W) = view.read(), (view.camera.H, view.camera.W)
+        y, x = np.mgrid[:H, :W]
+        r2 = (y - (0.5 + cy) * H) ** 2 + (x - (0.5 + cx) * W) ** 2
+        gain = (1 + (2.0 ** (stops_lost / 2) - 1) * r2 / (0.25 * (H * H + W * W))) ** -2.0
+        truths.append(-stops_lost * np.log(2.0) / 2.4)
+        changed.append(view if clean else relit(view, photo, gain))
+    return changed, np.array(truths)
+
+
+def relit(view: View, photo: Photo, gain: Float64[np.ndarray, "H W"]) -> View:
+    """Return a view whose linear light is multiplied, rounded to bytes."""
+    light = linear(np.asarray(photo.over((0.0, 0.0, 0.0))) / 255.0) * gain[..., None]
+    image = np.round(255 * np.clip(encoded(light), 0, 1)).astype(np.uint8)
+    return View(view.camera, image, mask=photo.mask, name=view.name)
 
 
 def opaque(views: Sequence[View]) -> list[View]:
@@ -252,6 +282,18 @@ def gain_errors(clean: CaptureRun, faulty: CaptureRun, truth: dict[str, Any]) ->
     }
 
 
+def vignetting_errors(clean: CaptureRun, faulty: CaptureRun, truth: dict[str, Any]) -> dict[str, float]:
+    """Return errors of k, of the faulty run beyond the clean one, in stops of light in the corners."""
+    before, after = (exposure_of(run).vignetting().double().numpy() for run in (clean, faulty))
+    wanted = np.array([truth[view.name] for view in faulty.dataset.train])
+    error = (after - before - wanted) * 2.4 / np.log(2.0)
+    return {
+        "mean error of the corners (stops)": float(error.mean()),
+        "rms error of the corners (stops)": float(np.sqrt(np.mean(error**2))),
+        "planted, standard deviation (stops)": float(wanted.std() * 2.4 / np.log(2.0)),
+    }
+
+
 def pose_errors(clean: CaptureRun, faulty: CaptureRun, truth: dict[str, Any]) -> dict[str, float]:
     """Return mean errors of the poses, degrees and per cent of the extent: planted, left, and of the clean run."""
     found: dict[str, float] = {}
@@ -318,6 +360,13 @@ PLAIN = ("--appearance", "none", "--refine", "none")
 FAULTS = {
     "exposure": Fault(
         uneven, PLAIN, ("--appearance", "exposure", "--refine", "none"), "psnr_fitted", gain_errors
+    ),
+    "vignetting": Fault(
+        vignetted,
+        ("--appearance", "exposure", "--refine", "none"),
+        ("--appearance", "vignetting", "--refine", "none"),
+        "psnr_fitted",
+        vignetting_errors,
     ),
     "poses": Fault(
         misplaced, PLAIN, ("--appearance", "none", "--refine", "poses"), "psnr_aligned", pose_errors

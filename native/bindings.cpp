@@ -285,18 +285,20 @@ struct RecolorCall {
 };
 
 // The colour of what is seen is A (x - T background) + (1 - T) b, before the background: A x + b + T s with the shift
-// s = background - A background - b. Without transmittance, the whole image is recoloured.
+// s = background - A background - b. Without transmittance, the whole image is recoloured. recolor.cpp says what a falloff does.
 template <class T>
 RecolorCall<T> recolor_call(Arguments &a) {
     const Array image = a.array("image", {KIND<T>}, {ANY, ANY, 3}), matrix = a.array("matrix", {KIND<T>}, {3, 4});
     const Array photo = a.array_or_none("photo", Kind::U8, image.shape);
     const Array transmittance = a.array_or_none("transmittance", KIND<T>, {image.shape[0], image.shape[1]});
+    const Array falloff = a.array_or_none("falloff", KIND<T>, {image.shape[0], image.shape[1]});
     RecolorCall<T> call{{}, image.shape, {}};
     a.numbers("background", call.background, 3);
     RecolorArgs<T> &args = call.args;
     args.image = image.as<T>(), args.photo = photo.as<uint8_t>(), args.pixels = image.shape.size() / 3;
-    args.transmittance = transmittance.as<T>();
+    args.transmittance = transmittance.as<T>(), args.falloff = falloff.as<T>();
     std::copy_n(matrix.as<T>(), RECOLOR_NUMBERS, args.matrix);
+    std::copy_n(call.background, 3, args.background);
     for (int c = 0; c < 3; ++c) {
         const T *row = args.matrix + 4 * c;
         double shift = call.background[c] - row[3];

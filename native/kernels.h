@@ -214,6 +214,8 @@ struct RecolorArgs {
     T matrix[RECOLOR_NUMBERS];
     const T *transmittance;                            // pixels, or null
     T shift[3];                                        // added to the corrected colour times the transmittance
+    const T *falloff;                                  // pixels, or null
+    T background[3];
     T *out;                                            // pixels x 3: the corrected image, or in the backward pass the image's gradient
     const T *grad;                                     // pixels x 3, only in the backward pass: the corrected image's gradient
     T *grad_transmittance;                             // pixels; null if transmittance is

@@ -1,5 +1,8 @@
 // recolor: an image through one matrix of colours, y = A x + b + T s, and back. T is the transmittance, s the shift; see bindings.cpp.
 //
+// A falloff v scales the light of the object: v (y + o - T (o + c)) - o + T (o + c), with o = 0.055 and the background c. These are the
+// premultiplied colours y - T c, with (1 - T) o added and subtracted as `gsplat_edu.exposure` does for opaque ones.
+//
 // Where the photo is saturated (255), y above 1 counts as 1 and has no gradient: such a pixel says only that the scene is at least
 // that bright, not how bright.
 #include "isa.h"
@@ -39,6 +42,11 @@ GSPLAT_INLINE void correct(const RecolorArgs<T> &args, int64_t first, int count,
     transform(args.matrix, x, y);
     for (int c = 0; args.transmittance && c < 3; ++c)
         for (int i = 0; i < count; ++i) y[c][i] += args.shift[c] * args.transmittance[first + i];
+    for (int i = 0; args.falloff && i < count; ++i)
+        for (int c = 0; c < 3; ++c) {
+            const T through = args.transmittance ? args.transmittance[first + i] * (T(SRGB_OFFSET) + args.background[c]) : T(0);
+            y[c][i] += (args.falloff[first + i] - 1) * (y[c][i] + T(SRGB_OFFSET) - through);
+        }
 }
 
 template <class T>
@@ -77,11 +85,18 @@ void recolor_backward(const RecolorArgs<T> &args, int64_t task) {
             for (int i = 0; i < count; ++i)
                 for (int c = 0; c < 3; ++c) g[c][i] = photo[3 * i + c] == 255 && y[c][i] > 1 ? 0 : g[c][i];
         }
-        if (args.transmittance) {
+        T *grad_through = args.grad_transmittance ? args.grad_transmittance + first : nullptr;
+        if (grad_through) {
             memcpy(through, args.transmittance + first, size_t(count) * sizeof(T));
-            for (int i = 0; i < count; ++i)
-                args.grad_transmittance[first + i] = args.shift[0] * g[0][i] + args.shift[1] * g[1][i] + args.shift[2] * g[2][i];
+            memset(grad_through, 0, size_t(count) * sizeof(T));
         }
+        for (int i = 0; args.falloff && i < count; ++i)
+            for (int c = 0; c < 3; ++c) {
+                if (grad_through) grad_through[i] += g[c][i] * (1 - args.falloff[first + i]) * (T(SRGB_OFFSET) + args.background[c]);
+                g[c][i] *= args.falloff[first + i];
+            }
+        for (int i = 0; grad_through && i < count; ++i)
+            grad_through[i] += args.shift[0] * g[0][i] + args.shift[1] * g[1][i] + args.shift[2] * g[2][i];
         for (int i = 0; args.sums && i < GROUP; i += LANES)
             for (int c = 0; c < 3; ++c) {
                 const V of_channel = load<V>(&g[c][i]);

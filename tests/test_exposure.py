@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.exposure import color_matrix, measured_gains, stops
+from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting, stops
 from gsplat_edu.recolor import recolored
 
 
@@ -82,3 +82,40 @@ def test_the_bits_do_not_depend_on_the_threads():
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(found[0], other) for other in found[1:]) and found[0].dtype == torch.float32
+
+
+@pytest.mark.parametrize("size", [(90, 120), (121, 80), (1, 1), (1, 50)])
+def test_vignetting_has_no_mean_and_is_radial(size):
+    """Its logarithm is k times the squared distance from the centre, less the mean over the pixels."""
+    H, W = size
+    logs = torch.log(falloff(torch.tensor(-0.4, dtype=torch.float64), H, W)).numpy()
+    y, x = np.mgrid[:H, :W]
+    q = ((y - (H - 1) / 2) ** 2 + (x - (W - 1) / 2) ** 2) / ((H * H + W * W) / 4)
+    np.testing.assert_allclose(logs, -0.4 * (q - q.mean()), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("k", "scales"), [(0.0, (1.0, 1.0, 1.0)), (-0.4, (1.2, 1.0, 0.9)), (0.2, (0.7, 0.8, 0.8))]
+)
+def test_vignetting_is_measured_beside_the_gains(k, scales):
+    """The photo is rounded to bytes and clipped; the render is off by noise, and a masked part of it is black."""
+    image, rng = 0.7 * texture() + 0.05, np.random.default_rng(0)
+    q = 2.4 * np.log(falloff(torch.tensor(k, dtype=torch.float64), 90, 120).numpy())[..., None]
+    photo = torch.from_numpy(photographed(image, np.array(scales) * np.exp(q)))
+    render = np.clip(image + 0.02 * rng.normal(size=image.shape), 0, 1)
+    found = measured_vignetting(torch.from_numpy(render), photo).numpy()
+    # 2,700 pixels whose ratios scatter by a tenth: medians of a third of them are good to 0.005, over 0.6 in q.
+    np.testing.assert_allclose(stops(torch.from_numpy(found[:3])).numpy(), np.log2(scales), atol=0.02)
+    assert abs(found[3] - k) < 0.02
+    render[:, 48:72] = 0.0
+    mask = torch.ones(90, 120, dtype=torch.bool)
+    mask[:, 48:72] = False
+    assert abs(measured_vignetting(torch.from_numpy(render), photo, mask).numpy()[3] - k) < 0.02
+
+
+def test_too_few_pixels_measure_no_vignetting():
+    image = torch.from_numpy(texture())
+    assert measured_vignetting(image, image, torch.zeros(90, 120, dtype=torch.bool)).tolist() == [0.0] * 4
+    ring = torch.zeros(90, 120, dtype=torch.bool)
+    ring[:, 0] = ring[:, -1] = True
+    assert torch.isfinite(measured_vignetting(image, image, ring)).all()

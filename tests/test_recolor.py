@@ -29,6 +29,12 @@ def behind(dtype, size=(9, 15)):
     return Behind(torch.rand(*size, generator=generator, dtype=torch.float64).to(dtype), BACKGROUND)
 
 
+def corners(dtype, size=(9, 15)):
+    """A falloff from 0.5 to 1.3."""
+    generator = torch.Generator().manual_seed(11)
+    return (0.5 + 0.8 * torch.rand(*size, generator=generator, dtype=torch.float64)).to(dtype)
+
+
 def in_torch(monkeypatch, *arguments):
     monkeypatch.setattr(kernels, "REASON", "hidden by a test")
     return recolored(*arguments)
@@ -37,7 +43,10 @@ def in_torch(monkeypatch, *arguments):
 @pytest.mark.parametrize("size", [(1, 1), (3, 21), (8, 8), (70, 130)])
 @pytest.mark.parametrize("with_photo", [False, True])
 @pytest.mark.parametrize("with_background", [False, True])
-def test_the_kernel_is_torchs_formula_in_value_and_gradients(monkeypatch, size, with_photo, with_background):
+@pytest.mark.parametrize("with_falloff", [False, True])
+def test_the_kernel_is_torchs_formula_in_value_and_gradients(
+    monkeypatch, size, with_photo, with_background, with_falloff
+):
     """float64; a sum of 27,300 products of up to 2 rounds by less than 1e-11."""
     image, matrix, photo = scene(torch.float64, size)
     weights, results = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).reshape(image.shape), []
@@ -45,7 +54,8 @@ def test_the_kernel_is_torchs_formula_in_value_and_gradients(monkeypatch, size, 
         x, m = image.clone().requires_grad_(), matrix.clone().requires_grad_()
         given = behind(torch.float64, size) if with_background else None
         t = given.transmittance.requires_grad_() if given else torch.ones((), requires_grad=True)
-        arguments = (x, m, photo if with_photo else None, given)
+        plane = corners(torch.float64, size) if with_falloff else None
+        arguments = (x, m, photo if with_photo else None, given, plane)
         out = recolored(*arguments) if native else in_torch(monkeypatch, *arguments)
         (out * weights).sum().backward()
         results.append((out.detach(), x.grad, m.grad, t.grad))
@@ -64,14 +74,19 @@ def test_gradients_are_proven_by_finite_differences():
     assert torch.autograd.gradcheck(lambda a: recolored(a, m.detach(), photo), (x,)), "without the matrix's"
 
 
-def test_gradients_before_a_background_are_proven_by_finite_differences():
+@pytest.mark.parametrize("with_falloff", [False, True])
+def test_gradients_before_a_background_are_proven_by_finite_differences(with_falloff):
     """As above; linear in image and transmittance, bilinear with the matrix."""
     image, matrix, photo = scene(torch.float64, (8, 11))
-    given = behind(torch.float64, (8, 11))
-    cut = recolored(image, matrix, None, given)[photo == 255]
+    given, plane = behind(torch.float64, (8, 11)), corners(torch.float64, (8, 11)) if with_falloff else None
+    cut = recolored(image, matrix, None, given, plane)[photo == 255]
     assert (cut > 1).any() and (cut < 1).any() and ((cut - 1).abs() > 1e-3).all()
     tensors = [tensor.requires_grad_() for tensor in (image, matrix, given.transmittance)]
-    assert torch.autograd.gradcheck(lambda a, b, t: recolored(a, b, photo, Behind(t, BACKGROUND)), tensors)
+    assert torch.autograd.gradcheck(
+        lambda a, b, t: recolored(a, b, photo, Behind(t, BACKGROUND), plane), tensors
+    )
+    if with_falloff:
+        assert torch.autograd.gradcheck(lambda a, b: recolored(a, b, photo, None, plane), tensors[:2])
 
 
 def test_the_object_is_recoloured_and_the_background_stays():
@@ -82,16 +97,15 @@ def test_the_object_is_recoloured_and_the_background_stays():
     matrix, background = np.eye(3, 4) + 0.2 * rng.normal(size=(3, 4)), np.array(BACKGROUND)
     premultiplied = colors * opacity[..., None]
     image = premultiplied + background * (1 - opacity)[..., None]
-    corrected = premultiplied @ matrix[:, :3].T + opacity[..., None] * matrix[:, 3]
-    expected = corrected + background * (1 - opacity)[..., None]
-    found = recolored(
-        torch.from_numpy(image),
-        torch.from_numpy(matrix),
-        None,
-        Behind(torch.from_numpy(1 - opacity), BACKGROUND),
-    )
-    np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found[0].numpy(), np.broadcast_to(background, (9, 3)), rtol=0, atol=1e-12)
+    straight = colors @ matrix[:, :3].T + matrix[:, 3]
+    falloff = rng.uniform(0.5, 1.2, size=(7, 9))
+    darker = falloff[..., None] * (straight + 0.055) - 0.055
+    given = Behind(torch.from_numpy(1 - opacity), BACKGROUND)
+    for corrected, plane in ((straight, None), (darker, torch.from_numpy(falloff))):
+        expected = corrected * opacity[..., None] + background * (1 - opacity)[..., None]
+        found = recolored(torch.from_numpy(image), torch.from_numpy(matrix), None, given, plane)
+        np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found[0].numpy(), np.broadcast_to(background, (9, 3)), rtol=0, atol=1e-12)
 
 
 def test_a_saturated_photo_asks_for_no_less_light():
@@ -115,7 +129,8 @@ def test_the_bits_do_not_depend_on_the_threads(with_background):
             torch.set_num_threads(threads)
             x, m = image.clone().requires_grad_(), matrix.clone().requires_grad_()
             t = behind(torch.float32, (211, 157)).transmittance.requires_grad_()
-            out = recolored(x, m, photo, Behind(t, BACKGROUND) if with_background else None)
+            given = Behind(t, BACKGROUND) if with_background else None
+            out = recolored(x, m, photo, given, corners(torch.float32, (211, 157)))
             out.backward(torch.linspace(0, 1, out.numel()).reshape(out.shape))
             found.append((out.detach(), x.grad, m.grad, *([t.grad] if with_background else [])))
     finally:
@@ -137,12 +152,16 @@ def test_wrong_arguments_are_named():
         recolored(image, matrix, None, Behind(torch.zeros(3, 3), BACKGROUND))
     with pytest.raises(ArgumentError, match="^transmittance: is torch.float64"):
         recolored(image, matrix, None, behind(torch.float64))
+    with pytest.raises(ShapeError, match="^falloff"):
+        recolored(image, matrix, falloff=torch.ones(9, 14))
+    with pytest.raises(ArgumentError, match="^falloff: is torch.float64"):
+        recolored(image, matrix, falloff=corners(torch.float64))
 
 
 def test_the_native_border_refuses_what_does_not_fit():
     image, matrix, photo = scene(torch.float32)
     given = {"image": image, "matrix": matrix, "photo": photo, "threads": 1}
-    given |= {"transmittance": image[..., 0].contiguous(), "background": BACKGROUND}
+    given |= {"transmittance": image[..., 0].contiguous(), "background": BACKGROUND, "falloff": None}
     fine = {**given, "out": torch.empty_like(image)}
     call = kernels.kernel("recolor_f", torch.float32)
     call(**fine)
@@ -154,6 +173,7 @@ def test_the_native_border_refuses_what_does_not_fit():
         "threads": 0,
         "transmittance": torch.zeros(9, 14),
         "background": (0.0, 0.0),
+        "falloff": torch.zeros(9, 15, dtype=torch.float64),
     }.items():
         with pytest.raises(ValueError, match=f"^recolor: {name}"):
             call(**{**fine, name: wrong})

@@ -29,6 +29,7 @@ NAMES = (
     "SH_OFFSET",
     "SSIM_C1",
     "SSIM_C2",
+    "SRGB_OFFSET",
 )
 SSIM_TAPS = 6
 """Taps of one half of SSIM's window: the central one and five on one side."""

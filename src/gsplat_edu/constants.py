@@ -101,3 +101,6 @@ Source: Kerbl et al. 2023, its code."""
 
 SH_MAX_DEGREE: Final = 3
 """Highest supported SH degree: 16 coefficients per channel."""
+
+SRGB_OFFSET: Final = 0.055
+"""Offset of the sRGB curve, of encoded colours: 1.055 l^(1/2.4) - 0.055. Source: IEC 61966-2-1."""

@@ -4,7 +4,8 @@ y = g x + 0.055 (g - 1) for every channel, with g = s^(1/2.4)
 
 Exposure and white balance scale linear light by s. Above its short linear start, the sRGB curve is
 1.055 l^(1/2.4) - 0.055, so on encoded colours the scale is this line, exactly. As a matrix (3, 4) of colours it has
-the three gains on its diagonal; see `gsplat_edu.recolor`.
+the three gains on its diagonal; see `gsplat_edu.recolor`. Vignetting scales light likewise, by a factor that depends on
+the distance from the photo's centre.
 
 Source of the curve: IEC 61966-2-1.
 """
@@ -14,23 +15,24 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
+from gsplat_edu.constants import SRGB_OFFSET
 from gsplat_edu.threads import one_thread
 from gsplat_edu.validation import check_shape
 
 SRGB_POWER = 2.4
 """Exponent of the sRGB curve."""
 
-SRGB_OFFSET = 0.055
-"""Its offset, of encoded colours."""
-
 SAMPLES = 1 << 12
 """Pixels on a grid that a gain is measured at. Where ratios scatter by a tenth, their median is good to 0.2 %."""
 
 FEWEST = 64
 """A gain from fewer pixels than this counts as 1."""
+
+NEAREST = 0.05
+"""Smallest difference of q that vignetting is measured over: in a mask, all pixels may be as far from the centre."""
 
 DARKEST, BRIGHTEST = 2.0 / 255.0, 253.0 / 255.0
 """Pixels of the photo outside this range may be clipped and do not count."""
@@ -57,6 +59,74 @@ def measured_gains(
     Raises:
         ShapeError: the sizes differ.
     """
+    found = _ratios(image, photo, mask)
+    if found is None:
+        return image.new_zeros(3)
+    with one_thread():
+        return torch.log(_medians(found[0])).to(image.dtype)
+
+
+def measured_vignetting(
+    image: Float[Tensor, "H W 3"],
+    photo: UInt8[Tensor, "H W 3"] | Float[Tensor, "H W 3"],
+    mask: Bool[Tensor, "H W"] | None = None,
+) -> Float[Tensor, "4"]:
+    """Return the logarithm of each channel's gain as `measured_gains` does, and k of the vignetting, see `falloff`.
+
+    k is the slope of a resistant line: medians of the outermost and of the innermost third of the pixels.
+
+    Arguments and errors are those of `measured_gains`.
+    """
+    found = _ratios(image, photo, mask)
+    if found is None:
+        return image.new_zeros(4)
+    ratios, counts, step = found
+    rows, columns = _squared_distances(image.shape[0], image.shape[1], step, ratios)
+    with one_thread():
+        distances, order = (rows[:, None] + columns).reshape(-1)[counts].sort(stable=True)
+        logs = torch.log(ratios)[order]
+        third = len(logs) // 3
+        level = (logs - _medians(logs)).mean(dim=1)
+        rise = level[-third:].median() - level[:third].median()
+        slope = rise / (distances[-third:].mean() - distances[:third].mean()).clamp_min(NEAREST)
+        return torch.cat([_medians(logs - slope * distances[:, None]), slope[None]]).to(image.dtype)
+
+
+def falloff(k: Float[Tensor, ""], height: int, width: int) -> Float[Tensor, "H W"]:
+    """Return the vignetting of a photo, exp(k q), whose geometric mean over the pixels is 1.
+
+    q is the squared distance from the photo's centre, 1 at the corners, minus its mean over the pixels.
+
+    Args:
+        k: Logarithm of the gain in the corners against that in the centre; negative where corners are darker.
+        height: H, px.
+        width: W, px.
+
+    Returns:
+        (H, W) factors for `gsplat_edu.recolor.recolored`.
+    """
+    rows, columns = _squared_distances(height, width, 1, k)
+    with one_thread():
+        return torch.exp(k * rows)[:, None] * torch.exp(k * columns)
+
+
+def _squared_distances(
+    height: int, width: int, step: int, like: Tensor
+) -> tuple[Float[Tensor, " h"], Float[Tensor, " w"]]:
+    """Return the parts of q that belong to each row and to each column of a grid of pixels; q is their sum."""
+    unit = (height * height + width * width) / 4.0
+    parts = []
+    with one_thread():
+        for side in (height, width):
+            place = torch.arange(0, side, step, dtype=torch.float64) - (side - 1) / 2.0
+            parts.append(((place * place - (side * side - 1) / 12.0) / unit).to(like))
+    return parts[0], parts[1]
+
+
+def _ratios(
+    image: Tensor, photo: Tensor, mask: Tensor | None
+) -> tuple[Float64[Tensor, "n 3"], Bool[Tensor, " pixels"], int] | None:
+    """Return (y + 0.055) / (x + 0.055), which pixels of a grid count, and the grid's step; None if too few count."""
     check_shape("image", image.shape, ("H", "W", 3), {})
     check_shape("photo", photo.shape, image.shape, {})
     step = max(1, math.isqrt(image.shape[0] * image.shape[1] // SAMPLES))
@@ -69,10 +139,12 @@ def measured_gains(
             check_shape("mask", mask.shape, image.shape[:2], {})
             counts &= mask[::step, ::step].reshape(-1)
         if int(counts.sum()) < FEWEST:
-            return image.new_zeros(3)
-        ratios = (y[counts] + SRGB_OFFSET) / (x[counts].clamp_min(0.0) + SRGB_OFFSET)
-        medians = torch.stack([channel.contiguous().median() for channel in ratios.unbind(dim=1)])
-        return torch.log(medians).to(image.dtype)
+            return None
+        return (y[counts] + SRGB_OFFSET) / (x[counts].clamp_min(0.0) + SRGB_OFFSET), counts, step
+
+
+def _medians(values: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    return torch.stack([channel.contiguous().median() for channel in values.unbind(dim=1)])
 
 
 def color_matrix(log_gains: Float[Tensor, "*views 3"]) -> Float[Tensor, "*views 3 4"]:

@@ -5,10 +5,14 @@ y = A (x - T c) + (1 - T) b + T c       for an object before the background c, s
 
 The second line recolours the object and leaves the background as it is: x - T c is the object's colour times its
 opacity 1 - T. A (3, 3) and b (3,) are passed as one matrix (3, 4).
+
+A falloff v, one number per pixel, then scales the object's light: y becomes v (y + o) - o with the offset o = 0.055 of
+the sRGB curve, or v (y - T c + (1 - T) o) - (1 - T) o + T c before a background.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -18,6 +22,7 @@ from torch.autograd.function import once_differentiable
 
 from gsplat_edu import kernels
 from gsplat_edu.buffers import reusable_tensor
+from gsplat_edu.constants import SRGB_OFFSET
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.threads import native_threads
 from gsplat_edu.validation import check_shape
@@ -42,6 +47,7 @@ def recolored(
     matrix: Float[Tensor, "3 4"],
     photo: UInt8[Tensor, "H W 3"] | None = None,
     behind: Behind | None = None,
+    falloff: Float[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """Return the image with the colours A x + b, or its object with them.
 
@@ -56,36 +62,50 @@ def recolored(
             stored in bytes.
         behind: What shows through; None recolours every pixel completely. The transmittance has the image's dtype and
             device.
+        falloff: (H, W) v, of the image's dtype and device; it counts as constant. None for 1.
 
     Returns:
         (H, W, 3), differentiable in image, matrix and transmittance.
 
     Raises:
         ShapeError: a shape differs.
-        ArgumentError: matrix or transmittance has another dtype or device than the image.
+        ArgumentError: matrix, transmittance or falloff has another dtype or device than the image.
     """
     check_shape("image", image.shape, ("H", "W", 3), {})
     check_shape("matrix", matrix.shape, (3, 4), {})
     if photo is not None:
         check_shape("photo", photo.shape, image.shape, {})
     through, background = behind or (None, (0.0, 0.0, 0.0))
-    if through is not None:
-        check_shape("transmittance", through.shape, image.shape[:2], {})
-    for name, tensor in {"matrix": matrix, "transmittance": through}.items():
+    for name, tensor in {"transmittance": through, "falloff": falloff}.items():
+        if tensor is not None:
+            check_shape(name, tensor.shape, image.shape[:2], {})
+    for name, tensor in {"matrix": matrix, "transmittance": through, "falloff": falloff}.items():
         if tensor is not None and (tensor.dtype, tensor.device) != (image.dtype, image.device):
             raise ArgumentError(
                 f"{name}: is {tensor.dtype} on {tensor.device}, but has to be {image.dtype} on {image.device}"
             )
     if kernels.REASON is None and image.device.type == "cpu" and image.dtype in kernels.SUFFIXES:
-        found: Tensor = _Recolored.apply(image, matrix, through, photo, background)  # type: ignore[no-untyped-call]
+        constants = _Constants(photo, falloff, background)
+        found: Tensor = _Recolored.apply(image, matrix, through, constants)  # type: ignore[no-untyped-call]
         return found
     corrected = image @ matrix[:, :3].T + matrix[:, 3]
+    color = image.new_tensor(background)
     if through is not None:
-        color = image.new_tensor(background)
         corrected = corrected + through[..., None] * (color - matrix[:, :3] @ color - matrix[:, 3])
+    if falloff is not None:
+        offset = SRGB_OFFSET if through is None else SRGB_OFFSET - through[..., None] * (SRGB_OFFSET + color)
+        corrected = falloff[..., None] * (corrected + offset) - offset
     if photo is None:
         return corrected
     return torch.where((photo == 255) & (corrected > 1), torch.ones_like(corrected), corrected)
+
+
+class _Constants(NamedTuple):
+    """Arguments without a gradient."""
+
+    photo: Tensor | None
+    falloff: Tensor | None
+    background: Color
 
 
 class _Recolored(torch.autograd.Function):
@@ -97,51 +117,40 @@ class _Recolored(torch.autograd.Function):
         image: Tensor,
         matrix: Tensor,
         transmittance: Tensor | None,
-        photo: Tensor | None,
-        background: Color,
+        constants: _Constants,
     ) -> Tensor:
         given = [
             None if tensor is None else tensor.detach().contiguous()
-            for tensor in (image, matrix, transmittance, photo)
+            for tensor in (image, matrix, transmittance, constants.photo, constants.falloff)
         ]
         out = reusable_tensor(image.shape, image)
-        kernels.kernel("recolor_f", image.dtype)(**_arguments(*given, background), out=_array(out))
+        kernels.kernel("recolor_f", image.dtype)(**_arguments(given, constants.background), out=_array(out))
         ctx.save_for_backward(*given)
-        ctx.background = background
+        ctx.background = constants.background
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        image, matrix, through, photo = ctx.saved_tensors
+        given = ctx.saved_tensors
+        image, matrix, through = given[:3]
         to_image = reusable_tensor(image.shape, image)
         to_matrix = torch.empty_like(matrix) if ctx.needs_input_grad[1] else None
         to_through = None if through is None else reusable_tensor(through.shape, image)
         kernels.kernel("recolor_backward_f", image.dtype)(
-            **_arguments(image, matrix, through, photo, ctx.background),
+            **_arguments(given, ctx.background),
             grad=_array(grad.contiguous()),
             grad_image=_array(to_image),
             grad_transmittance=_array(to_through),
             grad_matrix=_array(to_matrix),
         )
-        return to_image, to_matrix, to_through, None, None
+        return to_image, to_matrix, to_through, None
 
 
-def _arguments(
-    image: Tensor | None,
-    matrix: Tensor | None,
-    transmittance: Tensor | None,
-    photo: Tensor | None,
-    background: Color,
-) -> dict[str, Any]:
-    return {
-        "image": _array(image),
-        "matrix": _array(matrix),
-        "photo": _array(photo),
-        "transmittance": _array(transmittance),
-        "background": background,
-        "threads": native_threads(),
-    }
+def _arguments(given: Sequence[Tensor | None], background: Color) -> dict[str, Any]:
+    names = ("image", "matrix", "transmittance", "photo", "falloff")
+    arrays = {name: _array(tensor) for name, tensor in zip(names, given, strict=True)}
+    return {**arrays, "background": background, "threads": native_threads()}
 
 
 def _array(tensor: Tensor | None) -> object:

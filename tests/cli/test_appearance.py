@@ -9,6 +9,8 @@ from doctor.rooms import room, with_photo
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_blender, write_colmap
+from gsplat_edu.runs.dataset import run_dataset
+from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.views import View
 
 
@@ -73,7 +75,7 @@ def test_a_run_of_an_older_version_resumes(uneven, tmp_path):
     assert main([*words, "4", "--resume"]) == 0
 
 
-def test_transparent_photos_and_unknown_names_are_refused(tmp_path, capsys):
+def test_transparent_photos_are_corrected_and_unknown_names_are_refused(tmp_path, capsys):
     views, *_ = procedural_capture(24, 4, splats=60)
     alpha = np.full(views[0].image.shape[:2], 255, np.uint8)
     alpha[:3] = 0
@@ -88,16 +90,25 @@ def test_transparent_photos_and_unknown_names_are_refused(tmp_path, capsys):
         "2",
         "--appearance",
     ]
-    assert main([*words, "exposure"]) == 2
-    assert "is partly transparent" in capsys.readouterr().err and not (tmp_path / "run").exists()
     assert main([*words, "brighter"]) == 2
-    assert "--appearance" in capsys.readouterr().err
+    assert "--appearance" in capsys.readouterr().err and not (tmp_path / "run").exists()
     assert main([*words, "auto"]) == 0
+    assert stored(tmp_path / "run") == "none"
+    run = tmp_path / "corrected"
+    words[3] = str(run)
+    assert main([*words, "exposure"]) == 0
+    photo = run_dataset(RunFolder(run).read_config()).train[0].read()
+    assert photo.alpha is not None and photo.alpha.min() == 0, "the background is added after the correction"
+    assert main(["eval", str(run)]) == 0 and main(["doctor", str(run)]) == 0
+    assert main([*words, "exposure", "--resume"]) == 0
 
 
-def test_doctor_compares_a_corrected_run_at_the_exposure_of_each_photo(uneven, tmp_path, capsys):
+@pytest.mark.parametrize("appearance", ["auto", "vignetting"])
+def test_doctor_compares_a_corrected_run_at_the_exposure_of_each_photo(uneven, tmp_path, capsys, appearance):
     run = tmp_path / "run"
-    assert main(["train", str(uneven), "--out", str(run), "--iterations", "40", "--resolution", "2"]) == 0
+    words = ["train", str(uneven), "--out", str(run), "--iterations", "40", "--resolution", "2"]
+    assert main([*words, "--appearance", appearance]) == 0
+    assert stored(run) == ("exposure" if appearance == "auto" else appearance)
     capsys.readouterr()
     assert main(["doctor", str(run)]) == 0
     said = capsys.readouterr().out

@@ -8,6 +8,7 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.exposure import falloff
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.cleaning import open_subject
 from gsplat_edu.runs.exposed import at_exposure_of_scene
@@ -45,7 +46,25 @@ def test_a_photo_comes_back_at_the_exposure_of_the_scene(tmp_path):
     assert found.train[0].camera is dataset.train[0].camera
 
 
-@pytest.mark.parametrize("appearance", ["none", "exposure"])
+def test_a_photo_comes_back_without_its_vignetting(tmp_path):
+    views, points, colors = procedural_capture(24, 4, splats=60)
+    camera = views[0].camera
+    image = np.random.default_rng(0).uniform(0.2, 0.6, (camera.H, camera.W, 3))
+    plane = falloff(torch.tensor(-0.4, dtype=torch.float64), camera.H, camera.W).numpy()[..., None]
+    write_colmap(
+        tmp_path,
+        [View(v.camera, photographed(image, 0.8 * plane**2.4), name=v.name) for v in views],
+        points,
+        colors,
+    )
+    dataset = load_dataset(tmp_path)
+    gaussians = from_points(points, colors, recipe(1))
+    found = at_exposure_of_scene(dataset, gaussians, shows(image), (0.0, 0.0, 0.0), vignetting=True)
+    # As above; 144 pixels in a third of the photo measure k to 0.02.
+    np.testing.assert_allclose(found.train[0].read().image, image, atol=0.02)
+
+
+@pytest.mark.parametrize("appearance", ["none", "exposure", "vignetting"])
 def test_clean_judges_a_corrected_run_at_its_exposure(tmp_path, appearance, capsys):
     """The photos that judge a run are converted if its training corrected exposures, and only then."""
     views, points, colors = procedural_capture(32, 8, splats=120)

@@ -82,14 +82,14 @@ def test_the_mean_correction_is_the_identity(capture):
     assert model.log_gains().mean(dim=0).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("at", [1, 17])
-def test_a_resumed_run_has_the_same_bits_for_any_number_of_threads(capture, tmp_path, at):
+@pytest.mark.parametrize(("at", "appearance"), [(1, "exposure"), (17, "exposure"), (17, "vignetting")])
+def test_a_resumed_run_has_the_same_bits_for_any_number_of_threads(capture, tmp_path, at, appearance):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        whole = trainer(capture, capture[1], "exposure", 40)
+        whole = trainer(capture, capture[1], appearance, 40)
         whole.run()
-        first, second = (trainer(capture, capture[1], "exposure", 40) for _ in range(2))
+        first, second = (trainer(capture, capture[1], appearance, 40) for _ in range(2))
         torch.set_num_threads(5)
         first.run(lambda: first.iteration >= at)
         load_checkpoint(save_checkpoint(tmp_path, first, 1.0), second)

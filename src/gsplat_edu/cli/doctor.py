@@ -25,7 +25,7 @@ from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
-from gsplat_edu.runs.dataset import run_dataset
+from gsplat_edu.runs.dataset import appearance_of, run_dataset
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.train.config import DEFAULT_QUALITY, DEFAULT_STRATEGY, QUALITIES, TrainConfig, recipe
 
@@ -103,11 +103,11 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     )  # in the coordinate frame of the cameras
     renderer = functools.partial(render, settings=settings, backend=backend)
     section = config.get("train")
-    corrected = isinstance(section, dict) and section.get("appearance", "none") != "none"
+    appearance = appearance_of(config)
     with _bar(console) as bar:
         task = bar.add_task("views", total=len(dataset.train) + len(dataset.test))
         train, test = (
-            residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task), corrected)
+            residuals(gaussians, views, renderer, settings.background, lambda: bar.advance(task), appearance)
             for views in (dataset.train, dataset.test)
         )
     masked = isinstance(section, dict) and section.get("transients", "none") != "none"
@@ -120,7 +120,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
     capture = arguments.dataset or Path(config["data"]["path"])
-    beforehand, uncompared = ([], "") if corrected else _exposure_beforehand(capture, console)
+    beforehand, uncompared = ([], "") if appearance != "none" else _exposure_beforehand(capture, console)
     trained = Trained(
         folder.path,
         gaussians,
@@ -135,7 +135,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
         beforehand=beforehand,
         uncompared=uncompared,
         strategy=_strategy(section),
-        corrected=corrected,
+        corrected=appearance != "none",
         moved=moved,
     )
     return examine_run(trained), view_lines(trained) if arguments.all_views else ()

@@ -130,7 +130,7 @@ def _run(
 
 def _cleaner(capture: CaptureRun, say: Callable[[str], None]) -> Clean:
     options = capture.options
-    return cleaner(options.render_settings, say, options.config.appearance != "none")
+    return cleaner(options.render_settings, say, options.config.appearance)
 
 
 def _with_poses(

@@ -53,7 +53,7 @@ def residuals(
     render: Renderer,
     background: ArrayLike,
     progress: Callable[[], None] = lambda: None,
-    corrected: bool = False,
+    appearance: str = "none",
 ) -> list[Residual]:
     """Render views and compare them with their photos.
 
@@ -63,7 +63,8 @@ def residuals(
         render: Renders Gaussians from a camera, with depth, over `background`.
         background: (3,) RGB behind transparent photos.
         progress: Called after every view.
-        corrected: Give each render the exposure of its photo first, as the training did.
+        appearance: What the training corrected: each render is given the exposure of its photo first, or also its
+            vignetting.
 
     Returns:
         In the order of the views.
@@ -84,8 +85,9 @@ def residuals(
             truth = photo.over(background)
             pixels = truth / 255.0 if truth.dtype == np.uint8 else np.asarray(truth, dtype=np.float64)
             image = output.image
-            if corrected:
-                image = at_exposure_of(truth, image, photo.mask, through(photo, output, background))
+            if appearance != "none":
+                shown, vignetting = through(photo, output, background), appearance == "vignetting"
+                image = at_exposure_of(truth, image, photo.mask, shown, vignetting=vignetting)
             stops = _stops(pixels, image.double().numpy(force=True), photo.mask)
             found.append(Residual(view.name, psnr(image, truth, photo.mask), stops, veiled))
         progress()

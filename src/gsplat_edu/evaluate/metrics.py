@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Float64, UInt8
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.exposure import color_matrix, measured_gains
+from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import l1_ssim
 from gsplat_edu.recolor import Behind, recolored
@@ -151,6 +151,8 @@ def at_exposure_of(
     image: Float[torch.Tensor, "H W 3"],
     mask: Bool[np.ndarray, "H W"] | None = None,
     through: Through | None = None,
+    *,
+    vignetting: bool = False,
 ) -> Float[torch.Tensor, "H W 3"]:
     """Return a render with the exposure and white balance of a photo: one gain per channel.
 
@@ -159,17 +161,20 @@ def at_exposure_of(
         image: (H, W, 3) render.
         mask: (H, W) true for pixels that the gains are measured on; None for all.
         through: What `through` returns for the photo; None if it is opaque.
+        vignetting: Give it the photo's vignetting too.
 
     Returns:
-        (H, W, 3), differentiable in the image; the gains count as constants.
+        (H, W, 3), differentiable in the image; what is measured counts as constant.
     """
     truth = torch.from_numpy(np.ascontiguousarray(photo)).to(image.device)
     if through is not None:
         mask = through.opaque if mask is None else mask & through.opaque
     counts = None if mask is None else torch.from_numpy(mask).to(image.device)
-    matrix = color_matrix(measured_gains(image, truth, counts))
+    found = (measured_vignetting if vignetting else measured_gains)(image, truth, counts)
+    plane = falloff(found[3], *image.shape[:2]) if vignetting else None
     behind = None if through is None else through.behind
-    return recolored(image, matrix, truth if truth.dtype == torch.uint8 else None, behind)
+    compared = truth if truth.dtype == torch.uint8 else None
+    return recolored(image, color_matrix(found[:3]), compared, behind, plane)
 
 
 def mean_absolute_error(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:

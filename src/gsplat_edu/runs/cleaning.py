@@ -19,7 +19,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import FORMATS
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.runs.dataset import run_dataset
+from gsplat_edu.runs.dataset import appearance_of, run_dataset
 from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import capture_difference
@@ -81,9 +81,7 @@ def open_subject(path: Path, dataset: Path | None) -> Subject:
         if found := capture_difference(run, capture):
             raise ArgumentError(f"{capture.path} is not the capture of {run.path}: {found}")
         gaussians = source.scene.gaussians
-        section = run.read_config().get("train")
-        if isinstance(section, dict) and section.get("appearance", "none") != "none":
-            capture = _at_exposure(capture, gaussians, source.settings)
+        capture = _at_exposure(capture, gaussians, source.settings, appearance_of(run.read_config()))
     cameras = _cameras(capture)
     up = source.scene.up or scene_up([camera for _, camera in cameras])
     x, y, z = capture.origin.tolist()
@@ -94,25 +92,31 @@ def open_subject(path: Path, dataset: Path | None) -> Subject:
     )
 
 
-def _at_exposure(dataset: Dataset, gaussians: Gaussians, settings: RenderSettings) -> Dataset:
+def _at_exposure(
+    dataset: Dataset, gaussians: Gaussians, settings: RenderSettings, appearance: str
+) -> Dataset:
+    """Return the photos as the training saw the scene; as they are if it corrected nothing."""
+    if appearance == "none":
+        return dataset
     shown = functools.partial(render, settings=settings, backend="cpu")
-    return at_exposure_of_scene(dataset, gaussians, shown, settings.background)
+    vignetting = appearance == "vignetting"
+    return at_exposure_of_scene(dataset, gaussians, shown, settings.background, vignetting=vignetting)
 
 
 def cleaner(
-    settings: RenderSettings, say: Callable[[str], None], corrected: bool = False
+    settings: RenderSettings, say: Callable[[str], None], appearance: str = "none"
 ) -> Callable[[Gaussians, Dataset], tuple[Gaussians, dict[str, Any]]]:
     """Return what cleans the scene at the end of a training; see `gsplat_edu.runs.training.CaptureRun.finish`.
 
     Args:
         settings: The scene's render settings.
         say: Receives the report, line by line.
-        corrected: Compare the scene with photos of its own exposure, because the training corrected exposures.
+        appearance: What the training corrected; the scene is then compared with photos of its own exposure.
     """
 
     def cleaned(gaussians: Gaussians, dataset: Dataset) -> tuple[Gaussians, dict[str, Any]]:
         here = gaussians.to(torch.device("cpu"))
-        photos = _at_exposure(dataset, here, settings) if corrected else dataset
+        photos = _at_exposure(dataset, here, settings, appearance)
         cleaning = clean(here, photos.train, photos.test, settings)
         for line in report_lines(cleaning):
             say(line)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +11,22 @@ from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError, CheckpointError
 
 
+def appearance_of(config: Mapping[str, Any]) -> str:
+    """Return what a run's config.json says that its training corrected: one of `APPEARANCES`."""
+    section = config.get("train")
+    return str(section.get("appearance", "none")) if isinstance(section, Mapping) else "none"
+
+
+def as_trained(settings: DataSettings, appearance: str) -> DataSettings:
+    """Return the settings with which a training reads photos: with their alpha if it corrects colours.
+
+    Only the object of such a photo is corrected, so that it is composited after that.
+    """
+    return settings if appearance == "none" else replace(settings, background=None)
+
+
 def data_settings(config: dict[str, Any]) -> DataSettings:
-    """Build the data settings of a run from the section "data" of its config; missing keys get their defaults.
+    """Build the data settings of a run from its config; keys missing in the section "data" get their defaults.
 
     Raises:
         CheckpointError: the section is missing, or a value is out of range.
@@ -23,7 +39,7 @@ def data_settings(config: dict[str, Any]) -> DataSettings:
     if isinstance(values.get("background"), list):
         values["background"] = tuple(values["background"])
     try:
-        return DataSettings(**values)
+        return as_trained(DataSettings(**values), appearance_of(config))
     except (ArgumentError, TypeError) as error:
         raise CheckpointError(f"config.json: data: {error}; fix the file") from None
 

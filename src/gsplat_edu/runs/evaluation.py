@@ -14,6 +14,7 @@ from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.runs.transients import masked_pictures
 from gsplat_edu.validation import ArrayLike
@@ -121,8 +122,7 @@ def evaluate_run(
 
 def _appearance(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the report has to know of the photos' exposures: that they were corrected, if they were."""
-    train = config.get("train")
-    chosen = train.get("appearance", "none") if isinstance(train, Mapping) else "none"
+    chosen = appearance_of(config)
     return {} if chosen == "none" else {"appearance": chosen}
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.exposure import color_matrix, measured_gains
+from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.recolor import recolored
 from gsplat_edu.render.output import RenderOutput
@@ -24,7 +24,12 @@ Render = Callable[[Gaussians, Camera], RenderOutput]
 
 
 def at_exposure_of_scene(
-    dataset: Dataset, gaussians: Gaussians, render: Render, background: ArrayLike
+    dataset: Dataset,
+    gaussians: Gaussians,
+    render: Render,
+    background: ArrayLike,
+    *,
+    vignetting: bool = False,
 ) -> Dataset:
     """Return the capture with photos whose exposure and white balance are those of the scene.
 
@@ -35,18 +40,24 @@ def at_exposure_of_scene(
         gaussians: The scene.
         render: Renders Gaussians from a camera, over `background`.
         background: (3,) colour behind photos that are not opaque.
+        vignetting: Take off the photos' vignetting too.
 
     Raises:
         DatasetError: a photo cannot be read.
     """
+    measure = measured_vignetting if vignetting else measured_gains
 
     def converted(views: Sequence[View]) -> tuple[View, ...]:
-        return tuple(_converted(view, _log_gains(view, gaussians, render, background)) for view in views)
+        return tuple(
+            _converted(view, _measured(view, gaussians, render, background, measure)) for view in views
+        )
 
     return replace(dataset, train=converted(dataset.train), test=converted(dataset.test))
 
 
-def _log_gains(view: View, gaussians: Gaussians, render: Render, background: ArrayLike) -> Float[Tensor, "3"]:
+def _measured(
+    view: View, gaussians: Gaussians, render: Render, background: ArrayLike, measure: Callable[..., Tensor]
+) -> Float[Tensor, " numbers"]:
     photo = view.read()
     with torch.no_grad():
         image = render(gaussians, view.camera).image
@@ -55,11 +66,14 @@ def _log_gains(view: View, gaussians: Gaussians, render: Render, background: Arr
         counts = photo.opaque if counts is None else counts & photo.opaque
     mask = None if counts is None else torch.from_numpy(counts).to(image.device)
     truth = torch.from_numpy(np.ascontiguousarray(photo.over(background))).to(image.device)
-    return measured_gains(image, truth, mask).cpu()
+    return measure(image, truth, mask).cpu().float()
 
 
-def _converted(view: View, log_gains: Float[Tensor, "3"]) -> View:
-    """Return the view with its photo divided by the gains: y becomes y / g + 0.055 (1 / g - 1); alpha stays."""
+def _converted(view: View, found: Float[Tensor, " numbers"]) -> View:
+    """Return the view with its photo divided by gains and vignetting; alpha stays.
+
+    y becomes y / g + 0.055 (1 / g - 1), with g the product of both.
+    """
 
     def read() -> Photo:
         photo = view.read()
@@ -67,7 +81,8 @@ def _converted(view: View, log_gains: Float[Tensor, "3"]) -> View:
         values = torch.from_numpy(np.ascontiguousarray(pixels)).float() / (
             255.0 if pixels.dtype == np.uint8 else 1.0
         )
-        found = recolored(values, color_matrix(-log_gains.float())).clamp(0.0, 1.0)
-        return Photo(found.numpy(), photo.alpha, photo.mask)
+        plane = falloff(-found[3], *values.shape[:2]) if len(found) > 3 else None
+        image = recolored(values, color_matrix(-found[:3]), falloff=plane).clamp(0.0, 1.0)
+        return Photo(image.numpy(), photo.alpha, photo.mask)
 
     return View.stored(view.camera, read, view.name)

@@ -15,6 +15,7 @@ from gsplat_edu.data.dataset import Dataset, load_dataset, scene_extent
 from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
+from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.refined import with_refined_cameras
 from gsplat_edu.train.config import TrainConfig, recipe
@@ -51,7 +52,7 @@ def refinement_for(options: RunOptions, progress: Callable[[], None] = lambda: N
     """
     size = options.data_settings.resolution
     small = SIDE if size is None or not 32 <= size <= SIDE else size
-    settings = replace(options.data_settings, resolution=small)
+    settings = as_trained(replace(options.data_settings, resolution=small), options.config.appearance)
     dataset = load_dataset(options.data, settings, points=options.points)
     if not dataset.test:
         return "none", "no photos are held out to judge by"

@@ -25,6 +25,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
+from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
@@ -156,7 +157,8 @@ class CaptureRun:
         self._say_what_is_resumed()
         self.seconds = 0.0
         self._began: float | None = None  # during training: when the count of seconds started
-        self.dataset = load_dataset(options.data, options.data_settings, points=options.points)
+        settings = as_trained(options.data_settings, options.config.appearance)
+        self.dataset = load_dataset(options.data, settings, points=options.points)
         for note in self.dataset.notes:
             say(note)
         self.dataset.preload(progress)

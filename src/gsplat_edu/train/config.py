@@ -27,7 +27,7 @@ SHORT_RUN = 3_000
 STRATEGIES = ("adc", "mcmc", "fast", "none")
 OVER_CAP = ("strongest", "cut")
 VIEW_ORDERS = ("shuffled", "random")
-APPEARANCES = ("none", "exposure")
+APPEARANCES = ("none", "exposure", "vignetting")
 SKIES = ("none", "shell")
 REFINEMENTS = ("none", "poses", "intrinsics", "both")
 
@@ -312,7 +312,7 @@ class TrainConfig:
         "none",
         _one_of(APPEARANCES),
         '"exposure": measure the exposure and white balance of each photo while training, and correct the render by'
-        ' them before it is compared; "none": compare the render itself.',
+        ' them before it is compared; "vignetting": also its vignetting; "none": compare the render itself.',
         "ours",
     )
     sky: str = _number("none", _one_of(SKIES), '"shell": start with far splats where photos show sky.')

@@ -6,6 +6,10 @@ The render x of the scene becomes y_i, which is compared with photo i. Subtracti
 geometric mean of the corrections is the identity, so the scene itself has the mean exposure of the capture, in any
 viewer.
 
+Vignetting may be measured too: a factor exp(k_i q) of the light that depends on the distance from the photo's centre.
+Its geometric mean over the pixels of a photo is 1, so it does not touch the gauge. What all photos have in common is
+corrected as well: a place that is in the corner of one photo is in the middle of another.
+
 Of a photo that is not opaque, only the object is corrected, not the background before which it is compared; see
 `gsplat_edu.recolor`.
 
@@ -21,7 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu.exposure import color_matrix, measured_gains
+from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting
 from gsplat_edu.recolor import Behind, recolored
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.feed import Target
@@ -31,8 +35,9 @@ from gsplat_edu.train.view_model import Identity, Seen
 NAME = "exposures"
 """Name of the state, as in checkpoints."""
 
-WARM_UP = 0.015
-"""Share of the run before the first measurement: the scene has to show something."""
+WARM_UP, LATER = 0.015, 0.15
+"""Shares of the run before the first measurement of a gain, and of vignetting: the scene has to show something, and
+detail that it cannot show yet is not spread evenly over a photo."""
 
 OPAQUE = 0.05
 """Only pixels of a lower transmittance count: elsewhere the render is dark because the scene is not finished."""
@@ -41,23 +46,30 @@ NEWEST = 0.3
 """Weight of a measurement against those before it; 1, 1/2, 1/3 for the first ones of a photo."""
 
 
-class Exposure(Identity):
-    """Gains of the colour channels for each training photo, as a view model.
+SPREAD = 0.05
+"""Standard deviation of the k that are measured for photos of one vignetting (benchmarks/RESULTS.md)."""
 
-    Its state has four columns per view: the natural logarithms of the three gains, and the number of measurements.
+
+class Exposure(Identity):
+    """Gains of the colour channels for each training photo, and its vignetting if asked for, as a view model.
+
+    Its state has a row per view: the natural logarithms of the three gains, k if vignetting is corrected, and the
+    number of measurements.
 
     Args:
         count: Number of views.
         iterations: Length of the schedule.
         like: A tensor of the renders' dtype and device.
+        vignetting: Correct the vignetting too.
     """
 
-    def __init__(self, count: int, iterations: int, like: Tensor) -> None:
-        self._state = like.new_zeros(count, 4)
-        self._begin = WARM_UP * iterations
+    def __init__(self, count: int, iterations: int, like: Tensor, vignetting: bool = False) -> None:
+        self._state = like.new_zeros(count, 5 if vignetting else 4)
+        self._begin = (LATER if vignetting else WARM_UP) * iterations
+        self._vignetting = vignetting
 
     def parameters(self) -> Mapping[str, Tensor]:
-        """Return the state, (views, 4)."""
+        """Return the state, (views, 4) or (views, 5)."""
         return {NAME: self._state}
 
     def groups(self) -> Mapping[str, ParameterGroup]:
@@ -69,10 +81,10 @@ class Exposure(Identity):
         if iteration >= self._begin:
             self._measure(index, seen, target)
         matrix = color_matrix(self.log_gains()[index])
+        photo = target.image if target.image.dtype == torch.uint8 else None
         behind = None if target.opaque is None else Behind(seen.transmittance, seen.background)
-        return recolored(
-            seen.image, matrix, target.image if target.image.dtype == torch.uint8 else None, behind
-        )
+        plane = falloff(self.vignetting()[index], *seen.image.shape[:2]) if self._vignetting else None
+        return recolored(seen.image, matrix, photo, behind, plane)
 
     def log_gains(self) -> Float[Tensor, "views 3"]:
         """Return the natural logarithm of every view's gains; their mean over the views is 0."""
@@ -80,15 +92,32 @@ class Exposure(Identity):
         with one_thread():
             return logs - logs.mean(dim=0)
 
+    def vignetting(self) -> Float[Tensor, " views"]:
+        """Return k of every view, drawn towards the mean of the measured ones; 0 without `vignetting`.
+
+        k_i = m + f (k_i - m),  f = max(0, 1 - SPREAD^2 / var(k))
+
+        Photos of one lens differ by errors of the measurement only, and are then corrected alike.
+        """
+        k, measured = self._state[:, 3], self._state[:, -1] > 0
+        if not self._vignetting or not bool(measured.any()):
+            return torch.zeros_like(k)
+        with one_thread():
+            mean = k[measured].mean()
+            share = (1.0 - SPREAD**2 / k[measured].var(correction=0)).clamp_min(0.0)
+            return torch.where(measured, mean + share * (k - mean), mean)
+
     @torch.no_grad()
     def _measure(self, index: int, seen: Seen, target: Target) -> None:
         counts = seen.transmittance < OPAQUE
         for plane in (target.mask, target.opaque):
             if plane is not None:
                 counts &= plane
-        row, mean = self._state[index], self._state[:, :3]
+        measure = measured_vignetting if self._vignetting else measured_gains
+        row = self._state[index]
         with one_thread():
-            mean = mean.mean(dim=0)
-        weight = (1.0 / (1.0 + row[3])).clamp_min(NEWEST)
-        row[:3] += weight * (measured_gains(seen.image, target.image, counts) + mean - row[:3])
-        row[3] += 1.0
+            found = measure(seen.image, target.image, counts)
+            found[:3] += self._state[:, :3].mean(dim=0)
+        weight = (1.0 / (1.0 + row[-1])).clamp_min(NEWEST)
+        row[:-1] += weight * (found - row[:-1])
+        row[-1] += 1.0

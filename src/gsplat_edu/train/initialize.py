@@ -167,8 +167,9 @@ def make_view_model(
     """
     refinement = None if config.refine == "none" else Refinement(cameras, config, extent)
     models: list[ViewModel] = [] if refinement is None else [refinement]
-    if config.appearance == "exposure":
-        models.append(Exposure(len(cameras), config.means_rate_iterations, gaussians.means))
+    if config.appearance != "none":
+        vignetting = config.appearance == "vignetting"
+        models.append(Exposure(len(cameras), config.means_rate_iterations, gaussians.means, vignetting))
     model = models[0] if len(models) == 1 else InTurn(models) if models else Identity()
     return model, refinement
 

@@ -246,8 +246,9 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--appearance",
         metavar="NAME",
-        help='"exposure" corrects the exposure and white balance of each photo; "none" does not; "auto" lets the photos'
-        " decide (default: auto for the strategy fast, none for the others)",
+        help='"exposure" corrects the exposure and white balance of each photo; "vignetting" also its darker corners;'
+        ' "none" does not; "auto" lets the photos decide on exposure (default: auto for the strategy fast, none for the'
+        " others)",
     )
     group.add_argument(
         "--transients",
