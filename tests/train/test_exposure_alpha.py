@@ -145,6 +145,7 @@ def test_scores_fit_the_object_and_leave_the_background():
 
 def test_the_scene_is_judged_by_photos_of_its_exposure_with_their_alpha(tmp_path):
     from gsplat_edu.data.dataset import load_dataset
+    from gsplat_edu.data.settings import DataSettings
     from gsplat_edu.data.writers import write_blender
     from gsplat_edu.runs.exposed import at_exposure_of_scene
 
@@ -152,7 +153,7 @@ def test_the_scene_is_judged_by_photos_of_its_exposure_with_their_alpha(tmp_path
     camera = procedural._camera(0, 4, 40, 30)
     view = View(camera, photo.image, alpha=photo.alpha, name="a")
     write_blender(tmp_path, [view] * 2, [view])
-    dataset = load_dataset(tmp_path)
+    dataset = load_dataset(tmp_path, DataSettings(background=None))
     nothing = from_points(dataset.points, dataset.colors, recipe(1))
     found = at_exposure_of_scene(dataset, nothing, lambda *_: output, GREY).train[0].read()
     assert np.array_equal(found.alpha, photo.alpha)

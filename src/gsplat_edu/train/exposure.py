@@ -35,9 +35,10 @@ from gsplat_edu.train.view_model import Identity, Seen
 NAME = "exposures"
 """Name of the state, as in checkpoints."""
 
-WARM_UP, LATER = 0.015, 0.15
-"""Shares of the run before the first measurement of a gain, and of vignetting: the scene has to show something, and
-detail that it cannot show yet is not spread evenly over a photo."""
+WARM_UP, LATER = 0.015, 0.3
+"""Shares of the run before the first measurement of a gain, and of vignetting. The scene has to show something. An
+unfinished scene differs from the photos in their corners more than in their middle, and where all cameras look at one
+subject, a common vignetting that it seems to need would hardly be unlearned."""
 
 OPAQUE = 0.05
 """Only pixels of a lower transmittance count: elsewhere the render is dark because the scene is not finished."""
@@ -93,11 +94,12 @@ class Exposure(Identity):
             return logs - logs.mean(dim=0)
 
     def vignetting(self) -> Float[Tensor, " views"]:
-        """Return k of every view, drawn towards the mean of the measured ones; 0 without `vignetting`.
+        """Return k of every view, drawn towards the mean m of the measured ones; 0 without `vignetting`.
 
-        k_i = m + f (k_i - m),  f = max(0, 1 - SPREAD^2 / var(k))
+        min(0, m + f (k_i - m)),  f = max(0, 1 - SPREAD^2 / var(k))
 
-        Photos of one lens differ by errors of the measurement only, and are then corrected alike.
+        Photos of one lens differ by errors of the measurement only, and are then corrected alike. No lens makes corners
+        brighter.
         """
         k, measured = self._state[:, 3], self._state[:, -1] > 0
         if not self._vignetting or not bool(measured.any()):
@@ -105,7 +107,7 @@ class Exposure(Identity):
         with one_thread():
             mean = k[measured].mean()
             share = (1.0 - SPREAD**2 / k[measured].var(correction=0)).clamp_min(0.0)
-            return torch.where(measured, mean + share * (k - mean), mean)
+            return torch.where(measured, mean + share * (k - mean), mean).clamp_max(0.0)
 
     @torch.no_grad()
     def _measure(self, index: int, seen: Seen, target: Target) -> None:
