@@ -1,0 +1,70 @@
+"""Held-out poses that are aligned: with a photo of another exposure, colours are fitted on the same half."""
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.evaluate.alignment import aligned_psnr
+from gsplat_edu.render.api import render
+from gsplat_edu.render.camera_tensors import CameraTensors
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.initialize import from_points
+from gsplat_edu.views import View
+from test_exposure import photographed
+
+GREY, EXTENT = (0.55, 0.5, 0.45), 4.0
+EVEN, UNEVEN = np.ones(3), np.array([0.5, 0.6, 0.55])
+
+
+def shown(gaussians, camera):
+    return render(gaussians, camera, settings=RenderSettings(background=GREY))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """An opaque cloud of splats and one of its cameras."""
+    views, points, colors = procedural_capture(64, 3, splats=300)
+    return from_points(points, 0.2 + 0.5 * colors, recipe(1, start_opacity=0.9, start_scale=1.5)), views[
+        0
+    ].camera
+
+
+def photo_of(scene, scales):
+    """The scene's own render as a photo with alpha, of another exposure, with a camera off by half a degree."""
+    gaussians, camera = scene
+    with torch.no_grad():
+        seen = shown(gaussians, camera)
+    opacity = 1 - seen.transmittance.double().numpy()[..., None]
+    image = seen.image.double().numpy() - np.array(GREY) * (1 - opacity)
+    straight = np.clip(image / np.maximum(opacity, 1e-6), 0, 1)
+    twist = torch.tensor([0.005, -0.006, 0.004, 0.02, -0.02, 0.02], dtype=torch.float64)
+    off = CameraTensors.of(camera).moved(twist).value()
+    alpha = np.round(255 * opacity[..., 0]).astype(np.uint8)
+    return View(off, photographed(straight, scales), alpha=alpha, name="a")
+
+
+@pytest.mark.parametrize("transparent", [True, False])
+def test_a_photo_of_another_exposure_is_scored_at_its_own(scene, transparent):
+    """The scene is the truth, so what the pose and the gains leave is rounding to bytes: more than 40 dB."""
+    scores = {}
+    for name, scales in (("even", EVEN), ("uneven", UNEVEN)):
+        view = photo_of(scene, scales)
+        if not transparent:  # the background counts as part of the object, and darkens with it
+            even = photo_of(scene, EVEN).read().over(GREY) / 255.0
+            view = View(view.camera, photographed(even, scales), name="a")
+        for colors in (False, True):
+            scores[name, colors] = aligned_psnr(scene[0], view, shown, GREY, EXTENT, colors=colors)
+    assert scores["even", False] > 38 and scores["even", True] > 38
+    assert scores["uneven", False] < 25
+    assert scores["uneven", True] > 38
+
+
+def test_no_pixel_in_a_half_gives_no_score(scene):
+    view = photo_of(scene, EVEN)
+    mask = np.ones(view.image.shape[:2], dtype=bool)
+    mask[:, :32] = False
+    masked = View(view.camera, view.image, mask=mask, name="a")
+    for colors in (False, True):
+        assert aligned_psnr(scene[0], masked, shown, GREY, EXTENT, colors=colors) is None
