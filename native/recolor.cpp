@@ -90,11 +90,11 @@ void recolor_backward(const RecolorArgs<T> &args, int64_t task) {
             memcpy(through, args.transmittance + first, size_t(count) * sizeof(T));
             memset(grad_through, 0, size_t(count) * sizeof(T));
         }
-        for (int i = 0; args.falloff && i < count; ++i)
-            for (int c = 0; c < 3; ++c) {
-                if (grad_through) grad_through[i] += g[c][i] * (1 - args.falloff[first + i]) * (T(SRGB_OFFSET) + args.background[c]);
-                g[c][i] *= args.falloff[first + i];
-            }
+        for (int c = 0; args.falloff && c < 3; ++c) {
+            const T *falloff = args.falloff + first, of_transmittance = T(SRGB_OFFSET) + args.background[c];
+            for (int i = 0; grad_through && i < count; ++i) grad_through[i] += g[c][i] * (1 - falloff[i]) * of_transmittance;
+            for (int i = 0; i < count; ++i) g[c][i] *= falloff[i];
+        }
         for (int i = 0; grad_through && i < count; ++i)
             grad_through[i] += args.shift[0] * g[0][i] + args.shift[1] * g[1][i] + args.shift[2] * g[2][i];
         for (int i = 0; args.sums && i < GROUP; i += LANES)

@@ -31,8 +31,8 @@ SAMPLES = 1 << 12
 FEWEST = 64
 """A gain from fewer pixels than this counts as 1."""
 
-NEAREST = 0.05
-"""Smallest difference of q that vignetting is measured over: in a mask, all pixels may be as far from the centre."""
+INNER, OUTER = -0.13, 0.11
+"""Vignetting is measured between pixels whose q is below and above these, a third each of a 4:3 photo."""
 
 DARKEST, BRIGHTEST = 2.0 / 255.0, 253.0 / 255.0
 """Pixels of the photo outside this range may be clipped and do not count."""
@@ -73,7 +73,8 @@ def measured_vignetting(
 ) -> Float[Tensor, "4"]:
     """Return the logarithm of each channel's gain as `measured_gains` does, and k of the vignetting, see `falloff`.
 
-    k is the slope of a resistant line: medians of the outermost and of the innermost third of the pixels.
+    k is the slope of a resistant line, between the medians of about the outermost and the innermost third of the
+    pixels; 0 if too few of them count.
 
     Arguments and errors are those of `measured_gains`.
     """
@@ -83,12 +84,13 @@ def measured_vignetting(
     ratios, counts, step = found
     rows, columns = _squared_distances(image.shape[0], image.shape[1], step, ratios)
     with one_thread():
-        distances, order = (rows[:, None] + columns).reshape(-1)[counts].sort(stable=True)
-        logs = torch.log(ratios)[order]
-        third = len(logs) // 3
-        level = (logs - _medians(logs)).mean(dim=1)
-        rise = level[-third:].median() - level[:third].median()
-        slope = rise / (distances[-third:].mean() - distances[:third].mean()).clamp_min(NEAREST)
+        distances, logs = (rows[:, None] + columns).reshape(-1)[counts], torch.log(ratios)
+        inner, outer = distances < INNER, distances > OUTER
+        slope = distances.new_zeros(())
+        if min(int(inner.sum()), int(outer.sum())) >= FEWEST:
+            level = logs.mean(dim=1)
+            rise = level[outer].median() - level[inner].median()
+            slope = rise / (distances[outer].mean() - distances[inner].mean())
         return torch.cat([_medians(logs - slope * distances[:, None]), slope[None]]).to(image.dtype)
 
 
