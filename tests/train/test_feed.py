@@ -131,3 +131,16 @@ def test_compositing_in_rows_equals_the_formula_to_the_bit(H, W, kind):
     values = image.astype(np.float32) / (255.0 if kind is np.uint8 else 1.0)
     mixed = np.clip(values * share + np.asarray(color, np.float32) * (1.0 - share), 0.0, 1.0)
     assert np.array_equal(Photo(image, alpha).over(color), np.round(255.0 * mixed).astype(np.uint8))
+
+
+@pytest.mark.parametrize("background", [WHITE, None])
+def test_a_target_knows_where_its_photo_was_opaque(background):
+    """For photos in memory, composited once and drawn again, and for those that are read again; None without alpha."""
+    views = in_memory(2, alpha=True)
+    for given in (views, [View.stored(view.camera, view.read) for view in views]):
+        for view, target in drawn(ViewFeed(given, "shuffled", 0, background), 6):
+            assert np.array_equal(target.opaque.numpy(), view.read().alpha >= 0.95 * 255)
+            assert target.nbytes == target.image.nbytes + target.opaque.nbytes
+    assert all(
+        target.opaque is None for _, target in drawn(ViewFeed(in_memory(2), "shuffled", 0, background), 2)
+    )
