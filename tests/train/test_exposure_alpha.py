@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsplat_edu.data import procedural
-from gsplat_edu.evaluate.metrics import at_exposure_of, psnr_fitted, score_views, summarize, through
+from gsplat_edu.evaluate.metrics import at_exposure_of, psnr_fitted, score_views, seen_through, summarize
 from gsplat_edu.exposure import stops
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import RenderOutput
@@ -115,7 +115,7 @@ def test_gains_are_measured_where_photo_and_render_are_opaque():
     np.testing.assert_allclose(stops(model.log_gains())[0].numpy(), np.log2(1.5) / 2, atol=0.01)
 
 
-def seen_through(scale):
+def darker_render(scale):
     """A photo with alpha, a render of it at another exposure before a background, and what shows through."""
     rng = np.random.default_rng(6)
     straight, opacity = rng.uniform(0.2, 0.6, (30, 40, 3)), np.ones((30, 40))
@@ -132,15 +132,15 @@ def seen_through(scale):
 
 
 def test_scores_fit_the_object_and_leave_the_background():
-    photo, output = seen_through(1.6)
+    photo, output = darker_render(1.6)
     truth = photo.over(GREY)
-    given = through(photo, output, GREY)
+    given = seen_through(photo, output, GREY)
     # Rounded to bytes twice, by the camera and by compositing: 1/255 at most, so 48 dB at least.
     assert psnr_fitted(output.image, truth, None, given) > 48
     assert psnr_fitted(output.image, truth) < 30, "the background changes with the object"
     found = at_exposure_of(truth, output.image, None, given)
     np.testing.assert_allclose(found.numpy(), truth / 255.0, atol=1.5 / 255)
-    assert through(Photo(truth), output, GREY) is None
+    assert seen_through(Photo(truth), output, GREY) is None
 
 
 def test_the_scene_is_judged_by_photos_of_its_exposure_with_their_alpha(tmp_path):
@@ -149,7 +149,7 @@ def test_the_scene_is_judged_by_photos_of_its_exposure_with_their_alpha(tmp_path
     from gsplat_edu.data.writers import write_blender
     from gsplat_edu.runs.exposed import at_exposure_of_scene
 
-    photo, output = seen_through(1.6)
+    photo, output = darker_render(1.6)
     camera = procedural._camera(0, 4, 40, 30)
     view = View(camera, photo.image, alpha=photo.alpha, name="a")
     write_blender(tmp_path, [view] * 2, [view])

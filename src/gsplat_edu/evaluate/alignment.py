@@ -15,7 +15,7 @@ import torch
 
 from gsplat_edu.adam import adam_step
 from gsplat_edu.camera import Camera
-from gsplat_edu.evaluate.metrics import at_exposure_of, psnr, psnr_fitted, through
+from gsplat_edu.evaluate.metrics import at_exposure_of, psnr, psnr_fitted, seen_through
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import photo_loss
 from gsplat_edu.moments import AdamNumbers
@@ -84,13 +84,13 @@ def aligned_psnr(
         output = render(fixed, start.moved(leaf * units))
         image = output.image
         if colors:
-            image = at_exposure_of(truth, image, left, through(photo, output, background))
+            image = at_exposure_of(truth, image, left, seen_through(photo, output, background))
         (gradient,) = torch.autograd.grad(photo_loss(image, target, mask), leaf)
         adam_step(twist, first, second, gradient, _numbers(step))
     with torch.no_grad():
         output = render(fixed, start.moved(twist * units).value())
     if colors:
-        return psnr_fitted(output.image, truth, photo.mask, through(photo, output, background))
+        return psnr_fitted(output.image, truth, photo.mask, seen_through(photo, output, background))
     return psnr(output.image, truth, right)
 
 

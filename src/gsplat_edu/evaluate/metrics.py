@@ -43,7 +43,7 @@ Renderer = Callable[[Gaussians, Camera], RenderOutput]
 
 
 class Through(NamedTuple):
-    """What a fit of colours has to know where the background shows through; see `through`.
+    """What a fit of colours has to know where the background shows through; see `seen_through`.
 
     Args:
         behind: Transmittance of the render, and the background of render and photo.
@@ -124,7 +124,7 @@ def psnr_fitted(
         image: As for `psnr`.
         truth: As for `psnr`.
         mask: As for `psnr`.
-        through: What `through` returns for the photo; None if it is opaque.
+        through: What `seen_through` returns for the photo; None if it is opaque.
 
     Returns:
         dB; None if no pixel of the right half counts.
@@ -132,7 +132,7 @@ def psnr_fitted(
     return _Pair(image, truth, mask, through).psnr_fitted()
 
 
-def through(photo: Photo, output: RenderOutput, background: ArrayLike) -> Through | None:
+def seen_through(photo: Photo, output: RenderOutput, background: ArrayLike) -> Through | None:
     """Return what shows through a photo and its render; None if the photo is opaque.
 
     Args:
@@ -160,7 +160,7 @@ def at_exposure_of(
         photo: (H, W, 3) uint8, or float from 0 to 1.
         image: (H, W, 3) render.
         mask: (H, W) true for pixels that the gains are measured on; None for all.
-        through: What `through` returns for the photo; None if it is opaque.
+        through: What `seen_through` returns for the photo; None if it is opaque.
         vignetting: Give it the photo's vignetting too.
 
     Returns:
@@ -270,7 +270,7 @@ def score_views(
         with torch.no_grad():
             output = render(gaussians, view.camera)
         image, truth = output.image, photo.over(background)
-        score = score_image(view.name, image, truth, photo.mask, through(photo, output, background))
+        score = score_image(view.name, image, truth, photo.mask, seen_through(photo, output, background))
         scores.append(score)
         if on_image is not None:
             on_image(view, score, to_bytes(image), to_bytes(truth))
