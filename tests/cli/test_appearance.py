@@ -113,4 +113,5 @@ def test_doctor_compares_a_corrected_run_at_the_exposure_of_each_photo(uneven, t
     assert main(["doctor", str(run)]) == 0
     said = capsys.readouterr().out
     assert "each render was given its photo's exposure first" in said
-    assert "brighter or darker" not in said and "--appearance" not in said
+    assert "brighter or darker" not in said and "--appearance exposure" not in said
+    assert ("--appearance vignetting" in said) == (appearance == "vignetting"), "the advice repeats it"

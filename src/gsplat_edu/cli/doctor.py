@@ -160,6 +160,9 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--strategy": (None if strategy == DEFAULT_STRATEGY else strategy,),
         "--max-gaussians": (train.get("max_gaussians"),),
         "--transients": (None if train.get("transients", "none") == "none" else train["transients"],),
+        "--appearance": (
+            "vignetting" if appearance_of(config) == "vignetting" else None,
+        ),  # never chosen by auto
         "--background": background if any(background) else (None,),
     }
     words = []
