@@ -114,6 +114,7 @@ def test_config_json_has_the_flat_names_of_older_runs(tmp_path):
     found = json.loads(json.dumps(document(options(*words.split()))))
     newer = {name for name in found["train"] if name.startswith("fast_")} | {
         "appearance",
+        "batch",
         "sky",
         "refine",
         "pose_rate",

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.errors import ArgumentError
 from gsplat_edu.train.setting import TRANSIENTS, Check
 from gsplat_edu.train.setting import Setting as Setting
 from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
@@ -256,8 +257,9 @@ class TrainConfig:
     """
 
     iterations: int = _number(
-        RECIPE_ITERATIONS, _whole(1), "Number of training steps; each renders one view.", "2023"
+        RECIPE_ITERATIONS, _whole(1), "Number of images to train on; a step renders `batch` of them.", "2023"
     )
+    batch: int = _number(1, _whole(1, 4096), "Views of a step; rates grow with its root.", "Zhao et al. 2024")
     seed: int = _number(
         0,
         _whole(0, 2**63 - 1),
@@ -391,6 +393,9 @@ class TrainConfig:
         stop = {"adc": "densify_stop", "mcmc": "mcmc_stop", "fast": "fast_stop"}.get(self.strategy)
         if stop is not None:
             whole_number(stop, values[stop], self.densify_start)
+        if over := self.iterations % self.batch:
+            told = f"is {self.iterations}, but has to be a multiple of batch = {self.batch}"
+            raise ArgumentError(f"iterations: {told}, for example {self.iterations - over + self.batch}")
 
     def flat(self) -> dict[str, Any]:
         """Return every setting by its flat name, in the order of `SETTINGS`; config.json holds this."""

@@ -13,8 +13,8 @@ class StepEvent:
     """One step was taken.
 
     Args:
-        iteration: Counted from 0.
-        loss_tensor: () the objective's term "photo" before the step, on the Gaussians' device.
+        iteration: The last image of the step, counted from 0: a step has `TrainConfig.batch` of them.
+        loss_tensor: () the objective's term "photo" before the step, a mean over its views, on the Gaussians' device.
         num_gaussians: Gaussians that were rendered.
         terms: () every term of the objective before the step, by name, on the same device.
         photo_factor: Divisor of the photos' width and height; see `gsplat_edu.train.schedule.photo_factor`.
@@ -83,3 +83,30 @@ class RelocateEvent:
 
 Change = DensifyEvent | ResetEvent | RelocateEvent
 Event = StepEvent | Change
+
+
+class Losses:
+    """The losses of a run as numbers.
+
+    They are collected on the Gaussians' device and read in batches: reading synchronises with a GPU, and keeping a
+    tensor for every step would pin heap pages.
+    """
+
+    ROOM = 1024
+
+    def __init__(self, like: Tensor) -> None:
+        self._read: list[float] = []
+        self._waiting, self._count = like.new_empty(self.ROOM), 0
+
+    def add(self, loss: Tensor) -> None:
+        """Keep a loss, ()."""
+        self._waiting[self._count] = loss
+        self._count += 1
+        if self._count == self.ROOM:
+            self.read()
+
+    def read(self) -> list[float]:
+        """Return all losses so far."""
+        self._read += self._waiting[: self._count].tolist()
+        self._count = 0
+        return self._read

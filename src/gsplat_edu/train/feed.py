@@ -126,20 +126,31 @@ class ViewFeed:
         self._ahead, self._flat, self._kept = None, {}, {}
         self._flat_room = REDUCED_ROOM
 
-    def next(self) -> Draw:
-        """Draw a view, and start reading the photo of the next one. If reading fails, the view remains due."""
+    def next(self, later: int = 1) -> Draw:
+        """Draw a view, and start reading the photo of a later one. If reading fails, the view remains due.
+
+        Args:
+            later: How many draws later the view is whose photo is read, if it is known already.
+        """
         index = self._following()
         ahead, self._ahead = self._ahead, None
         view = self.views[index]
         photo = opaque = None
         if view not in self._kept:
             photo, opaque = ahead[1].result() if ahead and ahead[0] == index else self._read(view)
-        self._queue.pop(0)  # only now, so that a view whose photo could not be read remains due
-        following = self._following()
-        after = self.views[following]
-        if after.on_disk and after not in self._kept:
-            self._ahead = following, self._reader.submit(self._read, after)
+        self.skip()  # only now, so that a view whose photo could not be read remains due
+        if later <= len(self._queue):
+            following = self._queue[later - 1]
+            after = self.views[following]
+            if after.on_disk and after not in self._kept:
+                self._ahead = following, self._reader.submit(self._read, after)
         return Draw(index, view, photo, opaque)
+
+    def skip(self) -> None:
+        """Draw a view that another process renders; its photo is not read."""
+        self._following()
+        self._queue.pop(0)
+        self._following()
 
     def _read(self, view: View) -> Ready:
         """Read a photo and composite it over a fixed background; cache it if it was in memory or is of reduced size."""

@@ -5,6 +5,7 @@ Chapter: 12_the_backward_pass.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 
@@ -55,6 +56,10 @@ class Adam:
 
     The step count t is shared by all groups and survives density control, as in Kerbl et al.'s code.
 
+    A step whose gradients are the mean over B views stands for B steps: rate sqrt(B), eps / sqrt(B) and b1^B, b2^B
+    replace the numbers of one view, and t counts views (Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting
+    Training").
+
     Args:
         parameters: The tensors by name.
         groups: Settings by the same names; a number stands for a group with that rate. Tensors without a group do not
@@ -67,7 +72,7 @@ class Adam:
     Attributes:
         groups: The groups by name.
         learning_rates: Rate of the next step by group; `schedule` sets them.
-        steps: Steps taken.
+        steps: Views of all steps taken; B = 1 makes it the number of steps.
         first: First moments by group.
         second: Second moments by group.
 
@@ -90,6 +95,7 @@ class Adam:
         }
         self._kernel = kernel
         self.learning_rates: dict[str, float] = {}
+        self._views = 1
         self.schedule(0)
         self.steps = 0
         self.first, self.second = (
@@ -100,9 +106,15 @@ class Adam:
             for _ in MOMENTS
         )
 
-    def schedule(self, iteration: int) -> None:
-        """Set every group's rate for an iteration, counted from 0."""
-        self.learning_rates = {name: group.rate_at(iteration) for name, group in self.groups.items()}
+    def schedule(self, iteration: int, views: int = 1) -> None:
+        """Set the numbers of the next step.
+
+        Args:
+            iteration: Its first image, counted from 0.
+            views: B, the number of views whose mean gradient it takes.
+        """
+        self._views, root = views, math.sqrt(views)
+        self.learning_rates = {name: root * group.rate_at(iteration) for name, group in self.groups.items()}
 
     @torch.no_grad()
     def step(self, parameters: Mapping[str, Tensor], in_backward: AdamInBackward | None = None) -> None:
@@ -116,13 +128,15 @@ class Adam:
         Raises:
             ArgumentError: the moments of a group do not fit its parameter.
         """
-        self.steps += 1
+        views, root = self._views, math.sqrt(self._views)
+        self.steps += views
         deferred: dict[str, Moments] = {}
         for name, group in self.groups.items():
             parameter, m, v = parameters[name], self.first[name], self.second[name]
             b1, b2 = group.betas
             corrections = 1 - b1**self.steps, 1 - b2**self.steps
-            numbers = AdamNumbers(self.learning_rates[name], b1, b2, group.eps, *corrections)
+            rate, eps = self.learning_rates[name], group.eps / root
+            numbers = AdamNumbers(rate, b1**views, b2**views, eps, *corrections)
             if in_backward is not None and name in RAW:
                 _check_moments(name, parameter, (m, v))
                 deferred[name] = Moments(m, v, parameter.grad, numbers)
@@ -165,7 +179,7 @@ class Adam:
                     moments[name] = padded.index_select(0, rows)
 
     def state(self) -> tuple[dict[str, dict[str, Tensor]], int]:
-        """Return the moments, as "first" and "second", and the number of steps taken."""
+        """Return the moments, as "first" and "second", and the number of views of the steps taken."""
         return {name: getattr(self, name) for name in MOMENTS}, self.steps
 
     def load_state(
@@ -175,7 +189,7 @@ class Adam:
 
         Args:
             moments: "first" and "second", by group.
-            steps: Steps taken.
+            steps: Views of the steps taken.
             parameters: The parameters of the moments.
 
         Raises:

@@ -60,6 +60,18 @@ def decayed_rate(config: TrainConfig, rate: float, iteration: int) -> float:
     return float(rate * config.fast.decay ** min(t, 1.0))
 
 
+def milestone(iteration: int, every: int, batch: int) -> int | None:
+    """Return the last multiple of `every` among the images of a step; None if there is none.
+
+    Args:
+        iteration: The last image of the step, counted from 0.
+        every: The interval, images.
+        batch: Number of images of the step.
+    """
+    multiple = iteration // every * every
+    return multiple if multiple > iteration - batch else None
+
+
 def photo_factor(config: TrainConfig, iteration: int) -> float:
     """Return the divisor of the photos' width and height: above 1 only early in the fast recipe.
 

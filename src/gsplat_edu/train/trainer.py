@@ -17,21 +17,23 @@ from torch import Tensor
 from gsplat_edu.adam import AdamKernel, adam_step
 from gsplat_edu.buffers import reused_buffers
 from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.moments import AdamInBackward
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.threads import one_thread
+from gsplat_edu.train.batches import Batch, check_measured
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
-from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.events import Event, Losses, StepEvent
 from gsplat_edu.train.feed import Draw, ViewFeed
-from gsplat_edu.train.objective import PHOTO, Objective, Rendered, make_objective, sum_of_scalars
+from gsplat_edu.train.objective import PHOTO, Objective, Rendered, make_objective
 from gsplat_edu.train.optimizer import MOMENTS, Adam
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_tensor_kind, check_whole
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor, sh_degree
+from gsplat_edu.train.team import ALONE, SharedAdam, Team, places_of, share_results
 from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import Identity, Seen, ViewModel
 from gsplat_edu.views import View
@@ -60,7 +62,7 @@ BACKGROUND_STREAM = 1
 
 Reduce = Callable[[Mapping[str, Tensor], int], None]
 """Called with all parameters and the number of views: turns the sum over the views in each `grad` into the gradient to
-apply. Processes that share a step add up their sums here."""
+apply. Processes that share a step call it with the rows that each of them moves."""
 
 
 def mean_over_views(parameters: Mapping[str, Tensor], num_views: int) -> None:
@@ -83,6 +85,7 @@ class StepParts:
         transients: Finds and applies masks of things that move; None for none.
         fused: Takes Adam's step for the Gaussians in the backward pass where that gives the same bits, so that their
             gradients need no memory; see `Trainer.fuses`.
+        team: The processes that share each step.
     """
 
     objective: Objective | None = None
@@ -91,6 +94,7 @@ class StepParts:
     adam: AdamKernel = adam_step
     transients: Transients | None = None
     fused: bool = True
+    team: Team = ALONE
 
 
 @dataclass(frozen=True)
@@ -98,40 +102,14 @@ class TrainResult:
     """The record of one call of `Trainer.run`.
 
     Args:
-        losses: Loss of every iteration of this call.
-        counts: Gaussians rendered in every iteration of this call.
+        losses: Loss of every step of this call.
+        counts: Gaussians rendered in every step of this call.
         seconds: Wall time of the loop, callbacks included.
     """
 
     losses: list[float]
     counts: list[int]
     seconds: float
-
-
-class _Losses:
-    """The losses of a run as numbers.
-
-    They are collected on the Gaussians' device and read in batches: reading synchronises with a GPU, and keeping a
-    tensor for every step would pin heap pages.
-    """
-
-    ROOM = 1024
-
-    def __init__(self, like: Tensor) -> None:
-        self._read: list[float] = []
-        self._waiting, self._count = like.new_empty(self.ROOM), 0
-
-    def add(self, loss: Tensor) -> None:
-        self._waiting[self._count] = loss
-        self._count += 1
-        if self._count == self.ROOM:
-            self.read()
-
-    def read(self) -> list[float]:
-        """Return all losses so far."""
-        self._read += self._waiting[: self._count].tolist()
-        self._count = 0
-        return self._read
 
 
 class Trainer:
@@ -151,11 +129,11 @@ class Trainer:
         parts: The other parts of a step; the recipe's if None.
 
     Raises:
-        ArgumentError: there are no views, no Gaussians, or more Gaussians than the cap.
+        ArgumentError: there are no views, no Gaussians, more Gaussians than the cap, or parts that do not fit a batch.
 
     Attributes:
         gaussians: The current Gaussians.
-        iteration: Steps taken so far.
+        iteration: Images trained on so far: a step has `TrainConfig.batch` of them.
         last: The last image that was compared, its photo and its mask, for display.
         last_name: The name of their view.
     """
@@ -194,7 +172,12 @@ class Trainer:
         if taken := sorted(set(self._learned) & set(self.gaussians.tensors())):
             raise ArgumentError(f"view_model: {taken[0]!r} is the name of a parameter of the Gaussians")
         self._groups = gaussian_groups(config, extent) | dict(parts.view_model.groups())
-        self._optimizer = Adam(self.parameters(), self._groups, parts.adam)
+        self._places = places_of(parts.team, config.batch)
+        if config.batch > 1:
+            check_measured(self._measured(), len(views))
+        if parts.team.size > 1 and not self._blind:
+            raise ArgumentError("density: observes more than renders; train it in one process")
+        self._optimizer = self._make_optimizer(self.parameters())
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
 
     def run(
@@ -207,7 +190,7 @@ class Trainer:
             callbacks: Receive every event of this call, after the callbacks of the constructor.
         """
         receivers = (*self._callbacks, *callbacks)
-        losses, counts = _Losses(self.gaussians.means.detach()), []
+        losses, counts = Losses(self.gaussians.means.detach()), []
         start = time.perf_counter()
         with reused_buffers():
             while self.iteration < self.config.iterations:
@@ -230,17 +213,19 @@ class Trainer:
         factor = photo_factor(self.config, self.iteration)
         self._feed.use_factor(factor)
         transients = self._parts.transients
-        if transients is not None and transients.is_due(self.iteration):
+        if transients is not None and transients.is_due(self.iteration, self.config.batch):
             settings = self._settings(self.config.background)
             transients.find(self.gaussians, settings, self._parts.view_model.camera, factor)
-        iteration, draws = self.iteration, self._draw()
-        if len(draws) == 1 and self.fuses:
+        draws = self._draw()
+        if self._parts.team.size > 1:
+            terms = self._shared_step(draws)
+        elif len(draws) == 1 and self.fuses:
             terms = self._fused_step(draws[0])
         else:
             terms = self.gradients(draws)
             self._parts.reduce(self.parameters(), len(draws))
             self.apply()
-        return StepEvent(iteration, terms[PHOTO], len(self.gaussians), terms, factor)
+        return StepEvent(self.iteration - 1, terms[PHOTO], len(self.gaussians), terms, factor)
 
     @property
     def view_model(self) -> ViewModel:
@@ -258,14 +243,28 @@ class Trainer:
 
         Not if something needs their gradients: another `reduce` or `adam`, a subclass of `Objective` (it may pass
         backward more than once), or a density strategy without a true attribute `observes_renders_only`. A render
-        without `RenderOutput.defer` stores its gradients in any case.
+        without `RenderOutput.defer` stores its gradients in any case, and so does a batch: its views are rendered
+        from the same Gaussians.
         """
         parts = self._parts
         plain = (
             parts.reduce is mean_over_views and parts.adam is adam_step and type(self._objective) is Objective
         )
-        blind = self.density is None or getattr(self.density, "observes_renders_only", False)
-        return parts.fused and plain and blind
+        return parts.fused and plain and self._blind
+
+    @property
+    def _blind(self) -> bool:
+        return self.density is None or getattr(self.density, "observes_renders_only", False)
+
+    def _measured(self) -> dict[str, Tensor]:
+        """Return the view model's tensors that no gradient moves."""
+        return {name: tensor for name, tensor in self._learned.items() if name not in self._groups}
+
+    def _make_optimizer(self, parameters: Mapping[str, Tensor]) -> Adam:
+        kernel, team = self._parts.adam, self._parts.team
+        if team.size > 1:
+            return SharedAdam(parameters, self._groups, kernel, team)
+        return Adam(parameters, self._groups, kernel)
 
     def _fused_step(self, draw: Draw) -> dict[str, Tensor]:
         """Take a step with one view, moving the Gaussians in the backward pass if the backend offers it."""
@@ -281,11 +280,27 @@ class Trainer:
         return terms
 
     def _draw(self) -> list[Draw]:
-        """Return the views of the next step: one, as in the recipe. A batch would draw several here."""
-        return [self._feed.next()]
+        """Return the views of the next step that this process renders. If a photo cannot be read, all remain due."""
+        places, batch = self._places, self.config.batch
+        if batch == 1:
+            return [self._feed.next()]
+        before, draws = self._feed.state(), []
+        try:
+            for place in range(batch):
+                if place in places:
+                    last = place + 1 == places.stop
+                    draws.append(self._feed.next(batch - len(places) + 1 if last else 1))
+                else:
+                    self._feed.skip()
+        except DatasetError:
+            self._feed.load_state(before)
+            raise
+        return draws
 
     def gradients(self, draws: Sequence[Draw]) -> dict[str, Tensor]:
         """Add the gradients of the objective for these views to the parameters' `grad`.
+
+        Those of several views are summed in the tree of `gsplat_edu.train.batches`.
 
         Args:
             draws: Views from the feed; density control observes each of them.
@@ -293,17 +308,59 @@ class Trainer:
         Returns:
             () the mean over the views of every term of the objective, by name.
         """
-        found = []
-        for draw in draws:
-            rendered = self._rendered(draw)
-            found.append(self._objective.backward(rendered))
+        if len(draws) == 1:
+            rendered = self._rendered(draws[0])
+            terms = self._objective.backward(rendered)
             self._observe(rendered)
-        if len(found) == 1:
-            return found[0]
-        return {name: sum_of_scalars([values[name] for values in found]) / len(found) for name in found[0]}
+            return terms
+        batch, names = self._differentiated(draws, range(len(draws)), len(draws))
+        batch.commit()
+        for name, gradient in batch.sums.total.items():
+            batch.learned[name].grad = gradient
+        return batch.mean_terms(names)
 
-    def _observe(self, rendered: Rendered) -> None:
-        if self.density is not None:
+    def _differentiated(self, draws: Sequence[Draw], places: range, count: int) -> tuple[Batch, list[str]]:
+        """Render and differentiate views of a batch of `count`; return what they leave, and the terms' names."""
+        learned = {name: tensor for name, tensor in self.parameters().items() if name in self._groups}
+        batch, names = Batch(count, learned, self._measured()), list[str]()
+        alone, listens = len(places) == count, self.density and not getattr(self.density, "is_over", False)
+        for place, draw in zip(places, draws, strict=True):
+            rendered = self._rendered(draw)
+            terms = self._objective.backward(rendered)
+            names = list(terms)
+            self._observe(rendered, alone)
+            batch.take(place, draw.index, terms, rendered.output if listens and not alone else None)
+        return batch, names
+
+    def _shared_step(self, draws: Sequence[Draw]) -> dict[str, Tensor]:
+        """Take a step together with other processes, of whose views density control learns from their messages."""
+        count, places, team, optimizer = self.config.batch, self._places, self._parts.team, self._optimizer
+        assert isinstance(optimizer, SharedAdam)
+        self._skip_backgrounds(places.start)
+        batch, names = self._differentiated(draws, places, count)
+        self._skip_backgrounds(count - places.stop)
+        sums = share_results(team, batch, optimizer.outgoing(batch.sums))
+        batch.commit()
+        for place in range(count):
+            if self.density is not None:
+                with one_thread():
+                    self.density.observe(self.gaussians, batch.results[place].output())
+        rows = optimizer.own(self.parameters())
+        for name, gradient in optimizer.summed(list(batch.learned), sums, count).items():
+            rows[name].grad = gradient
+        self._parts.reduce(rows, count)
+        optimizer.schedule(self.iteration, count)
+        optimizer.step(rows)
+        optimizer.spread(self.gaussians.tensors())
+        self.iteration += count
+        return batch.mean_terms(names)
+
+    def _skip_backgrounds(self, count: int) -> None:
+        if self.config.random_background:
+            self._backgrounds.uniform(size=3 * count)
+
+    def _observe(self, rendered: Rendered, tell: bool = True) -> None:
+        if self.density is not None and tell:
             with one_thread():
                 self.density.observe(self.gaussians, rendered.output)
         self.last = rendered.image.detach(), rendered.target.image, rendered.target.mask
@@ -341,9 +398,9 @@ class Trainer:
         Args:
             in_backward: The step for the Gaussians, if their gradients are not stored; see `Adam.step`.
         """
-        self._optimizer.schedule(self.iteration)
+        self._optimizer.schedule(self.iteration, self.config.batch)
         self._optimizer.step(self.parameters(), in_backward)
-        self.iteration += 1
+        self.iteration += self.config.batch
 
     def parameters(self) -> dict[str, Tensor]:
         """Return all learned tensors by name: the raw parameters of the Gaussians and those of the view model."""
@@ -392,6 +449,8 @@ class Trainer:
         iteration = check_whole("iteration", given["iteration"], self.config.iterations)
         if check_whole("steps", given["steps"], self.config.iterations) != iteration:
             raise ArgumentError("steps: has to equal the iteration")
+        if iteration % self.config.batch:
+            raise ArgumentError(f"iteration: has to be a multiple of batch = {self.config.batch}")
         self._feed.check_state(given["feed"])
         check_numpy_generator("backgrounds", given["backgrounds"], self._backgrounds)
         learned = check_entries("view_model", parts["view_model"], tuple(self._learned))
@@ -403,7 +462,7 @@ class Trainer:
         elif parts["transients"]:
             raise ArgumentError("transients: are present, but this run has none")
         parameters = gaussians.tensors() | self._learned
-        optimizer = Adam(parameters, self._groups, self._parts.adam)
+        optimizer = self._make_optimizer(parameters)
         optimizer.load_state({part: parts[part] for part in MOMENTS}, iteration, parameters)
         if self.density is not None:  # the last check that can fail
             if not isinstance(given["density"], dict):

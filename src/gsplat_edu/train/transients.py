@@ -62,9 +62,9 @@ class Transients:
         self.masks: list[Bool[np.ndarray, "h w"] | None] = [None] * len(views)
         self.too_large: Bool[np.ndarray, " views"] = np.zeros(len(views), dtype=bool)
 
-    def is_due(self, iteration: int) -> bool:
-        """Return whether masks are found before this step."""
-        return iteration in self._when
+    def is_due(self, iteration: int, batch: int = 1) -> bool:
+        """Return whether masks are found before the step of `batch` images whose first is `iteration`."""
+        return any(iteration <= when < iteration + batch for when in self._when)
 
     def find(
         self,

@@ -23,6 +23,7 @@ from gsplat_edu.train.events import Change, DensifyEvent, ResetEvent
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.saved import check_entries, check_flag, check_statistics, check_torch_generator
+from gsplat_edu.train.schedule import milestone
 
 STATISTICS = ("norm_sums", "times_visible", "largest_radii")
 """Statistics collected for each Gaussian since the last densification."""
@@ -76,9 +77,10 @@ class AdaptiveDensityControl:
         """Clone, split, prune and reset when the schedule says so."""
         config, events = self.config, list[Change]()
         self.is_over = iteration + 1 >= config.adc.densify_stop
-        if iteration >= config.adc.densify_stop:
+        if iteration - config.batch + 1 >= config.adc.densify_stop:
             return gaussians, events
-        if iteration > config.densify_start and iteration % config.densify_every == 0:
+        due = milestone(iteration, config.densify_every, config.batch)
+        if due is not None and config.densify_start < due < config.adc.densify_stop:
             gaussians, densified = self._densify(iteration, gaussians, optimizer)
             events.append(densified)
         if self._reset_is_due(iteration):
@@ -136,9 +138,13 @@ class AdaptiveDensityControl:
         return chosen
 
     def _reset_is_due(self, iteration: int) -> bool:
-        every = self.config.adc.reset_every
-        on_white = min(self.config.background) >= 1.0 and iteration == self.config.densify_start
-        return bool(every) and iteration > 0 and (iteration % every == 0 or on_white)
+        config, every = self.config, self.config.adc.reset_every
+        if not every:
+            return False
+        dues = [milestone(iteration, every, config.batch)]
+        if min(config.background) >= 1.0 and iteration - config.batch < config.densify_start <= iteration:
+            dues.append(config.densify_start)
+        return any(due is not None and 0 < due < config.adc.densify_stop for due in dues)
 
     def _forget(self, gaussians: Gaussians) -> None:
         self.norm_sums = torch.zeros_like(gaussians.logit_opacities, requires_grad=False)

@@ -24,6 +24,8 @@ class DensityStrategy(Protocol):
 
     A strategy whose `observe` reads nothing but its `output` says so by a true attribute `observes_renders_only`. The
     trainer may then move the Gaussians in the backward pass (`Trainer.fuses`): before `observe`, and without `grad`.
+    Processes that share a step tell one another what such a strategy observes, unless its attribute `is_over` is true:
+    then it ignores renders from now on.
     """
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
@@ -32,6 +34,11 @@ class DensityStrategy(Protocol):
 
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Change the Gaussians after a step, and the optimiser's moments with them.
+
+        Args:
+            iteration: The last image of the step, counted from 0; a step has `TrainConfig.batch` of them.
+            gaussians: The Gaussians after the step.
+            optimizer: The optimiser.
 
         Returns:
             The Gaussians, as leaves that collect gradients: the given ones, possibly changed in place, or new ones;

@@ -32,7 +32,7 @@ from gsplat_edu.train.saved import (
     check_statistics,
     check_whole,
 )
-from gsplat_edu.train.schedule import planned_counts
+from gsplat_edu.train.schedule import milestone, planned_counts
 
 STATISTICS = ("norm_sums", "times_visible")
 """Statistics collected for each Gaussian since the last densification."""
@@ -76,13 +76,14 @@ class PlannedDensity:
         """Prune, and split up to the plan, when the schedule says so."""
         config = self.config
         self.is_over = iteration >= config.fast.stop
-        if iteration <= config.densify_start or iteration % config.densify_every:
+        due = milestone(iteration, config.densify_every, config.batch)
+        if due is None or due <= config.densify_start:
             return gaussians, []
-        growing = iteration <= config.fast.stop
+        growing = due <= config.fast.stop
         # Nothing replaces faint Gaussians later. Those below ALPHA_MIN are never drawn, and get no gradient.
         least = config.min_opacity if growing else min(config.min_opacity, ALPHA_MIN)
         keep = gaussians.finite_rows() & (gaussians.opacities >= least)
-        planned = int(planned_counts(config, self.start_count, self.cap, np.array([iteration]))[0])
+        planned = int(planned_counts(config, self.start_count, self.cap, np.array([due]))[0])
         room = planned - int(keep.sum()) if growing else 0
         may = keep if self.shell is None else self.shell.spared(keep, self._score(), gaussians.means)
         split = self._highest(may, room)

@@ -28,6 +28,7 @@ from gsplat_edu.train.events import Change, RelocateEvent
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.saved import check_entries, check_torch_generator
+from gsplat_edu.train.schedule import milestone
 
 MOST_SHARERS = 51
 """Largest number of Gaussians that share one place; beyond it the sum below loses precision. (2024's code)"""
@@ -51,7 +52,7 @@ class MCMC:
         ArgumentError: there is no cap.
     """
 
-    observes_renders_only = True
+    observes_renders_only = is_over = True
 
     def __init__(self, config: TrainConfig, generator: torch.Generator, shell: Shell | None = None) -> None:
         if config.max_gaussians is None:
@@ -66,8 +67,8 @@ class MCMC:
     def update(self, iteration: int, gaussians: Gaussians, optimizer: Adam) -> tuple[Gaussians, list[Change]]:
         """Relocate and grow when the schedule says so; add noise after every step."""
         config, events = self.config, list[Change]()
-        due = config.densify_start < iteration < config.mcmc.stop and iteration % config.densify_every == 0
-        if due and len(gaussians):
+        due = milestone(iteration, config.densify_every, config.batch)
+        if due is not None and config.densify_start < due < config.mcmc.stop and len(gaussians):
             dead = (gaussians.opacities <= config.min_opacity) | ~gaussians.finite_rows()
             num_relocated = self._relocate(gaussians, optimizer, torch.nonzero(dead)[:, 0])
             newborn = self._newborn(gaussians, optimizer)
@@ -125,6 +126,7 @@ class MCMC:
     def _add_noise(self, gaussians: Gaussians, rate: float) -> None:
         """Means += rate noise sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I).
 
+        The rate of a batch is larger by the root of its size, and so the sum of the noise of its images is kept.
         Splats of a shell stay: their covariance, hundreds of world units squared, would throw them out of the scene.
         """
         far = None if self.shell is None else self.shell.holds(gaussians.means)

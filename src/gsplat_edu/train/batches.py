@@ -1,0 +1,188 @@
+"""Batches: what the views of a step leave, and the fixed tree in which their gradients are summed.
+
+The sum of floating-point numbers depends on its order. Here the order depends on the size of the batch alone, not on
+who computes which views: neighbouring places are added in pairs, then neighbouring pairs, and so on. Any run of views
+yields partial sums of that tree, at most two per level, and whoever has all of them completes it to the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.render.output import RenderOutput
+
+Node = tuple[int, int]
+"""A node of the tree: its level, from 0 for the views, and its place within the level."""
+
+Gradients = dict[str, Tensor]
+"""A gradient for every parameter that the optimiser moves, by name."""
+
+
+class PartialSums:
+    """The sums of gradients over places of a batch, as nodes of its tree.
+
+    Adding the places in order keeps at most one node per level, beside the one that is added.
+
+    Args:
+        count: Number of views of the batch.
+
+    Attributes:
+        nodes: The sums so far, none of which are siblings.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self.nodes: dict[Node, Gradients] = {}
+
+    def add(self, node: Node, gradients: Gradients) -> None:
+        """Add a node, and combine it with its sibling while that is here.
+
+        Args:
+            node: The node: (0, place) for a view.
+            gradients: Its sum; the tensors may be overwritten.
+        """
+        level, place = node
+        while (width := -(-self._count >> level)) > 1:
+            sibling = level, place ^ 1
+            if sibling[1] < width:
+                if sibling not in self.nodes:
+                    break
+                other = self.nodes.pop(sibling)
+                for name in gradients:
+                    gradients[name] += other[name]
+            level, place = level + 1, place // 2
+        self.nodes[level, place] = gradients
+
+    @property
+    def total(self) -> Gradients:
+        """The sum over all places.
+
+        Raises:
+            ArgumentError: a place is missing.
+        """
+        if len(self.nodes) != 1 or -(-self._count >> next(iter(self.nodes))[0]) > 1:
+            raise ArgumentError(f"batch: places of its {self._count} views are missing")
+        return next(iter(self.nodes.values()))
+
+
+@dataclass(frozen=True, eq=False)
+class ViewResult:
+    """What the view at one place of a batch leaves beside gradients.
+
+    Args:
+        terms: (T,) the objective's terms, in their order.
+        rows: The view's row of each of the view model's tensors that no gradient moves, in their order.
+        visible: (M,) as in `RenderOutput`; empty if density control observes nothing.
+        radii: (M, 2) likewise.
+        norms: (M,) `RenderOutput.means2d_grad_norms`, likewise.
+    """
+
+    terms: Float[Tensor, " T"]
+    rows: Sequence[Tensor]
+    visible: Int64[Tensor, " M"]
+    radii: Float[Tensor, "M 2"]
+    norms: Float[Tensor, " M"]
+
+    def tensors(self) -> list[Tensor]:
+        """Return all tensors; `of` takes them."""
+        return [self.terms, self.visible, self.radii, self.norms, *self.rows]
+
+    @classmethod
+    def of(cls, tensors: Sequence[Tensor]) -> ViewResult:
+        """Make a result from what `tensors` returned."""
+        terms, visible, radii, norms, *rows = tensors
+        return cls(terms, rows, visible, radii, norms)
+
+    def output(self) -> RenderOutput:
+        """Return what density control observes, as a render without an image."""
+        empty = self.norms.new_zeros(0, 0)
+        image = self.norms.new_zeros(0, 0, 3)
+        return RenderOutput(image, empty, None, self.visible, self.radii, None, lambda: self.norms)
+
+
+@dataclass
+class Batch:
+    """The views of a step that this process has differentiated.
+
+    The state that a view model measures (its parameters without a group) has a row for each view, and `image` changes
+    only the row of its view. During a batch it stays what it was before: every view sees the same state, whoever
+    renders it, and `commit` writes the changed rows in the order of the places.
+
+    Args:
+        count: Number of views of the batch.
+        learned: The parameters that the optimiser moves, by name.
+        measured: The view model's other tensors, by name.
+    """
+
+    count: int
+    learned: Mapping[str, Tensor]
+    measured: Mapping[str, Tensor]
+    results: dict[int, ViewResult] = field(default_factory=dict)
+    indices: dict[int, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Remember the measured state."""
+        self.sums = PartialSums(self.count)
+        self._before = {name: tensor.clone() for name, tensor in self.measured.items()}
+
+    def take(self, place: int, index: int, terms: Mapping[str, Tensor], output: RenderOutput | None) -> None:
+        """Move a view's gradients out of the parameters' `grad`, and its rows out of the measured state.
+
+        A gradient that is absent counts as zeros.
+
+        Args:
+            place: The view's place in the batch.
+            index: The view's index into the trainer's views.
+            terms: () the objective's terms.
+            output: The render, for density control; None if it need not observe it later.
+        """
+        gradients = {}
+        for name, parameter in self.learned.items():
+            gradients[name] = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+            parameter.grad = None
+        self.sums.add((0, place), gradients)
+        rows = [tensor[index].clone() for tensor in self.measured.values()]
+        for name, tensor in self.measured.items():
+            tensor[index] = self._before[name][index]
+        stacked = torch.stack([*terms.values()])
+        if output is None:
+            none = stacked.new_zeros(0)
+            nothing = none.long(), none.new_zeros(0, 2), none
+            self.results[place] = ViewResult(stacked, rows, *nothing)
+        else:
+            observed = output.visible, output.radii.detach(), output.means2d_grad_norms().detach()
+            self.results[place] = ViewResult(stacked, rows, *observed)
+        self.indices[place] = index
+
+    def commit(self) -> None:
+        """Write the measured rows of all places, in order."""
+        for place in sorted(self.results):
+            for tensor, row in zip(self.measured.values(), self.results[place].rows, strict=True):
+                tensor[self.indices[place]] = row
+
+    def mean_terms(self, names: Sequence[str]) -> dict[str, Tensor]:
+        """Return the mean of every term over the places, added in order."""
+        first, *others = (self.results[place].terms for place in sorted(self.results))
+        for terms in others:
+            first = first + terms
+        return dict(zip(names, (first / len(self.results)).unbind(), strict=True))
+
+
+def check_measured(measured: Mapping[str, Tensor], num_views: int) -> None:
+    """Check that a view model's measured state has a row for each view.
+
+    Raises:
+        ArgumentError: a tensor has other rows.
+    """
+    for name, tensor in measured.items():
+        if not tensor.ndim or len(tensor) != num_views:
+            raise ArgumentError(
+                f"view_model: {name!r} has shape {tuple(tensor.shape)}, but batches need a row for each of the"
+                f" {num_views} views; train with batch 1"
+            )
