@@ -7,6 +7,7 @@
     ├── DatasetError                         a capture cannot be read or used
     ├── SceneFormatError                     a scene file is damaged or of another format
     ├── CheckpointError                      a run cannot be resumed or saved
+    ├── ProcessLostError                     another process of a shared training ended
     └── NotEnoughMemoryError                 work needs more memory than is free
 
     BackendWarning                           "auto" takes another backend than the machine suggests
@@ -53,6 +54,10 @@ class DatasetError(SplatError):
 
 class SceneFormatError(SplatError):
     """A scene file cannot be read; the message names the file and what it lacks."""
+
+
+class ProcessLostError(SplatError):
+    """Another process of a training that several share ended, or is out of reach."""
 
 
 class CheckpointError(SplatError):

@@ -9,7 +9,7 @@ the number of processes; `gsplat_edu.runs.processes` sends them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Int64
@@ -56,6 +56,14 @@ class Alone:
     def exchange(self, outgoing: Sequence[Sequence[Tensor]]) -> list[list[Tensor]]:
         """Return what it was given."""
         return [list(tensors) for tensors in outgoing]
+
+    def shared(self, value: Any) -> Any:  # noqa: ANN401
+        """Return what it was given."""
+        return value
+
+    def any(self, flag: bool) -> bool:
+        """Return what it was given."""
+        return flag
 
 
 ALONE = Alone()

@@ -1,0 +1,222 @@
+"""The processes that `torchrun` starts for one training: messages over gloo, and checks that they compute alike.
+
+gloo listens on the network interface of the machine's own name, or on that of GLOO_SOCKET_IFNAME; nothing is encrypted,
+and any program that reaches the ports can take part. Use it within a machine or a private network.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import socket
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from gsplat_edu.errors import ProcessLostError, SplatError
+from gsplat_edu.kernels import native
+from gsplat_edu.train.team import ALONE, Alone
+
+PATIENCE = timedelta(hours=6)
+"""How long a process waits for a message: another may be evaluating. A process that ends is noticed at once."""
+
+DTYPES = (torch.float32, torch.float64, torch.int64, torch.int32, torch.uint8, torch.bool)
+"""Types of tensors in messages, by their number."""
+
+ALIGNED = 8
+"""Tensors begin at multiples of this in a message, bytes."""
+
+
+class Processes:
+    """A process and its connections to the others of its run.
+
+    Args:
+        rank: This process, from 0.
+        size: Number of processes.
+        group: A process group of torch with point-to-point messages, gloo's.
+
+    Attributes:
+        sent: Bytes sent so far.
+        waited: Seconds spent on messages so far: packing, sending and waiting.
+    """
+
+    def __init__(self, rank: int, size: int, group: Any) -> None:  # noqa: ANN401
+        self.rank, self.size, self._group = rank, size, group
+        self.sent, self.waited = 0, 0.0
+
+    def exchange(self, outgoing: Sequence[Sequence[Tensor]]) -> list[list[Tensor]]:
+        """Send a list of tensors to every process, and receive one from each; see `Team.exchange`.
+
+        Raises:
+            ProcessLostError: another process ended.
+        """
+        start = time.perf_counter()
+        others = [rank for rank in range(self.size) if rank != self.rank]
+        packed = {id(tensors): pack(tensors) for rank, tensors in enumerate(outgoing) if rank in others}
+        blobs = {rank: packed[id(outgoing[rank])] for rank in others}
+        sizes = torch.tensor([len(blobs[rank]) if rank in blobs else 0 for rank in range(self.size)])
+        with _named_loss():
+            table = [torch.empty_like(sizes) for _ in range(self.size)]
+            self._group.allgather([table], [sizes]).wait(PATIENCE)
+            incoming = {rank: torch.empty(int(table[rank][self.rank]), dtype=torch.uint8) for rank in others}
+            works = [self._group.recv([incoming[rank]], rank, 0) for rank in others]
+            works += [self._group.send([blobs[rank]], rank, 0) for rank in others]
+            for work in works:
+                work.wait(PATIENCE)
+        self.sent += int(sizes.sum()) + sizes.nbytes * len(others)
+        self.waited += time.perf_counter() - start
+        return [
+            list(outgoing[rank]) if rank == self.rank else unpack(incoming[rank]) for rank in range(self.size)
+        ]
+
+    def shared(self, value: Any) -> Any:  # noqa: ANN401
+        """Return the value of process 0, which JSON can represent."""
+        return self.told(value)[0]
+
+    def told(self, value: Any) -> list[Any]:  # noqa: ANN401
+        """Return the value of every process, each of which JSON can represent."""
+        text = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
+        return [json.loads(bytes(part.numpy())) for (part,) in self.exchange([[text]] * self.size)]
+
+    def any(self, flag: bool) -> bool:
+        """Return whether the flag of any process is true."""
+        return any(bool(part) for (part,) in self.exchange([[torch.tensor([flag])]] * self.size))
+
+    def shared_state(
+        self, state: tuple[dict[str, Tensor], Any] | None
+    ) -> tuple[dict[str, Tensor], Any] | None:
+        """Return the tensors and the values for JSON of process 0, or its None."""
+        tensors, numbers = ({}, None) if state is None else state
+        names, numbers = self.shared([list(tensors), numbers])
+        parts = self.exchange([[tensor.contiguous() for tensor in tensors.values()]] * self.size)[0]
+        return dict(zip(names, parts, strict=True)), numbers if names else None
+
+
+Member = Alone | Processes
+
+
+@contextmanager
+def joined(size: int) -> Iterator[Member]:
+    """Join the processes that `torchrun` started, and check that all compute alike.
+
+    Args:
+        size: Their number; with 1 nothing happens.
+
+    Raises:
+        SplatError: the processes do not reach one another, or their versions or instruction sets differ.
+    """
+    if size == 1:
+        yield ALONE
+        return
+    try:
+        dist.init_process_group("gloo", timeout=PATIENCE)
+    except (RuntimeError, ValueError) as error:
+        raise SplatError(
+            f"torchrun: the {size} processes do not reach one another ({_first_line(error)}); GLOO_SOCKET_IFNAME"
+            " names the network interface"
+        ) from None
+    try:
+        team = Processes(dist.get_rank(), dist.get_world_size(), dist.group.WORLD)
+        check_alike(team, "compute alike", facts())
+        yield team
+    finally:
+        dist.destroy_process_group()
+
+
+def facts() -> dict[str, str]:
+    """Return what the bits of a training depend on besides its options, in this process."""
+    return {
+        "version of gsplat-edu": version("gsplat-edu"),
+        "version of torch": torch.__version__,
+        "instruction set (GSPLAT_EDU_ISA)": native().isa(),
+        "instruction set of torch (ATEN_CPU_CAPABILITY)": torch.backends.cpu.get_cpu_capability(),
+        "rounding of exponentials and products": _rounding(),
+    }
+
+
+def check_alike(team: Processes, what: str, found: dict[str, str]) -> None:
+    """Check that all processes found the same.
+
+    Raises:
+        SplatError: they did not; the message names the first difference.
+    """
+    everyone = team.told([socket.gethostname(), found])
+    first_host, first = everyone[0]
+    for rank, (host, other) in enumerate(everyone):
+        for name, value in first.items():
+            if other.get(name) != value:
+                raise SplatError(
+                    f"torchrun: the processes have to {what}: {name}: {value} in process 0 on {first_host}, but"
+                    f" {other.get(name)} in process {rank} on {host}; make them equal"
+                )
+
+
+def _rounding() -> str:
+    """Return a digest of what the libraries compute, which differs between processors for the same instruction set."""
+    digest, numbers = hashlib.sha256(), np.random.default_rng(0).normal(size=1027)
+    matrices = torch.from_numpy(numbers[:999].reshape(111, 3, 3))
+    with torch.no_grad():
+        for tensor in (torch.from_numpy(numbers), torch.from_numpy(numbers).float()):
+            for found in (
+                tensor.exp(),
+                tensor.sigmoid(),
+                tensor.abs().log(),
+                tensor.abs().rsqrt(),
+                tensor.sum(),
+            ):
+                digest.update(found.numpy().tobytes())
+        for some in (matrices, matrices.float()):
+            digest.update((some @ some.mT).numpy().tobytes())
+    digest.update(np.exp(numbers).tobytes() + np.sin(numbers).tobytes())
+    return digest.hexdigest()[:12]
+
+
+def pack(tensors: Sequence[Tensor]) -> Tensor:
+    """Return tensors as the bytes of one message."""
+    head = [len(tensors)]
+    for tensor in tensors:
+        head += [DTYPES.index(tensor.dtype), tensor.ndim, *tensor.shape]
+    parts = [torch.tensor([len(head), *head], dtype=torch.int64).view(torch.uint8)]
+    for tensor in tensors:
+        flat = tensor.detach().contiguous().reshape(-1).view(torch.uint8)
+        parts += [flat, flat.new_zeros(-len(flat) % ALIGNED)]
+    return torch.cat(parts)
+
+
+def unpack(message: Tensor) -> list[Tensor]:
+    """Return the tensors of a message made by `pack`."""
+    numbers = message[: len(message) // ALIGNED * ALIGNED].view(torch.int64)
+    length = int(numbers[0])
+    head = iter(numbers[1 : 1 + length].tolist())
+    found, at = [], (1 + length) * ALIGNED
+    for _ in range(next(head)):
+        dtype, ndim = DTYPES[next(head)], next(head)
+        shape = [next(head) for _ in range(ndim)]
+        size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+        found.append(message[at : at + size].view(dtype).reshape(shape))
+        at += size + -size % ALIGNED
+    return found
+
+
+@contextmanager
+def _named_loss() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:  # what gloo raises
+        raise ProcessLostError(
+            f"torchrun: another process of this run ended or cannot be reached ({_first_line(error)}); checkpoints are"
+            " intact, --resume continues from the last one"
+        ) from None
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).splitlines()
+    return lines[0].rpartition("] ")[2][:120] if lines else type(error).__name__

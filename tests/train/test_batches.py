@@ -1,0 +1,331 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import checkpoints
+from gains import Gains
+from gsplat_edu import ArgumentError
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.errors import DatasetError
+from gsplat_edu.render.api import render
+from gsplat_edu.train.batches import PartialSums
+from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent, StepEvent
+from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
+from gsplat_edu.train.objective import Objective, PhotoTerm
+from gsplat_edu.train.optimizer import Adam, ParameterGroup
+from gsplat_edu.train.schedule import milestone
+from gsplat_edu.train.team import ALONE
+from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.views import View
+from ranks import together
+
+SCHEDULE = {"densify_start": 3, "densify_every": 10, "sh_every": 20, "random_background": True}
+CONFIGS = {
+    "adc": {"densify_stop": 70, "reset_every": 30, "grad_threshold": 1e-5, "prune_screen_size": 40.0},
+    "mcmc": {"strategy": "mcmc", "max_gaussians": 700, "mcmc_stop": 70, "min_opacity": 0.05},
+    "fast": {"strategy": "fast", "max_gaussians": 700},
+}
+ITERATIONS = 48
+
+
+def config(name="adc", batch=4, **changes):
+    return recipe(ITERATIONS, batch=batch, **{**SCHEDULE, **CONFIGS[name], **changes})
+
+
+def trainer(settings, team=ALONE, splats=900, callbacks=(), **parts):
+    """A training of a procedural capture whose 600 Gaussians fill two pages and a part of a third."""
+    views, points, colors = procedural_capture(24, 6, splats=splats)
+    start = from_points(points, colors, settings)
+    model, _ = make_view_model(settings, [view.camera for view in views], 2.0, start)
+    return Trainer(
+        start,
+        views,
+        settings,
+        render=render,
+        extent=2.0,
+        density=make_strategy(settings, 2.0, start),
+        callbacks=callbacks,
+        parts=StepParts(view_model=model, team=team, **parts),
+    )
+
+
+def bits(run):
+    """The whole state as comparable values; ranks have to ask for it together."""
+    tensors, numbers = run.state()
+    return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}, numbers
+
+
+def trained(settings, team=ALONE, **parts):
+    run = trainer(settings, team, **parts)
+    losses = run.run().losses
+    return losses, bits(run)
+
+
+def contents_of(path):
+    """The contents of a checkpoint; safetensors writes the header's entries in a random order."""
+    tensors, metadata = checkpoints.read(path)
+    return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}, metadata
+
+
+@pytest.mark.parametrize("count", range(1, 18))
+def test_partial_sums_have_the_bits_of_the_whole_tree_for_any_runs(count):
+    """Numbers of very different sizes, so that another order of the sum shows."""
+    rng = np.random.default_rng(count)
+    values = torch.from_numpy(rng.normal(size=(count, 64)) * 10.0 ** rng.integers(-6, 6, (count, 64))).float()
+
+    def sums(places):
+        found = PartialSums(count)
+        most = 0
+        for place in places:
+            found.add((0, place), {"a": values[place].clone()})
+            most = max(most, len(found.nodes))
+        assert most <= math.log2(count) + 1 if places == range(count) else True
+        return found
+
+    whole = sums(range(count)).total["a"]
+    assert torch.allclose(
+        whole.double(), values.double().sum(dim=0), rtol=0, atol=float(values.abs().sum()) * 1e-6
+    )
+    for parts in [n for n in range(1, count + 1) if count % n == 0]:
+        completed = PartialSums(count)
+        for rank in range(parts):
+            for node, value in sums(range(rank * count // parts, (rank + 1) * count // parts)).nodes.items():
+                completed.add(node, value)
+        assert torch.equal(completed.total["a"], whole), parts
+
+
+def test_a_sum_without_all_places_is_refused():
+    found = PartialSums(3)
+    found.add((0, 1), {})
+    with pytest.raises(ArgumentError, match="^batch: places of its 3 views are missing"):
+        _ = found.total
+
+
+def test_the_gradient_of_a_batch_is_the_mean_of_those_of_its_views():
+    """In float64 each sum of four rounds three times by at most 2^-53 of the sum of magnitudes, the mean not at all."""
+    settings = config(random_background=False, densify_start=40)
+    views, points, colors = procedural_capture(24, 6, splats=60)
+    start = from_points(points, colors, settings).map(torch.Tensor.double)
+    objective = Objective({"photo": PhotoTerm(0.2)})
+    views = [View(view.camera, view.read().image.astype(np.float32) / 255) for view in views]
+    given = {}
+
+    def note(parameters, count):
+        given.update({name: parameter.grad / count for name, parameter in parameters.items()})
+        for parameter in parameters.values():
+            parameter.grad = None
+
+    def make(reduce):
+        parts = StepParts(objective, reduce=reduce)
+        return Trainer(start, views, settings, render=render, parts=parts)
+
+    run = make(note)
+    draws = [run._feed.next() for _ in range(4)]
+    single, alone = [], make(note)
+    for draw in draws:
+        terms = alone.gradients([draw])
+        single.append(
+            {name: tensor.grad for name, tensor in alone.parameters().items()} | {"loss": terms["photo"]}
+        )
+        for tensor in alone.parameters().values():
+            tensor.grad = None
+    seen = []
+    batch = make(note)
+    batch.run(lambda: True, [lambda _, event: seen.append(event)])
+    (step,) = seen
+    assert step.iteration == 3 and batch.iteration == 4
+    for name, gradient in given.items():
+        parts = torch.stack([view[name] for view in single])
+        bound = 3 * 2.0**-53 * parts.abs().sum(dim=0) / 4
+        assert bool((parts.sum(dim=0) != 0).any()) or name == "sh_rest"
+        assert bool(((gradient - parts.sum(dim=0) / 4).abs() <= 2 * bound).all()), name
+    assert step.loss == pytest.approx(float(sum(view["loss"] for view in single)) / 4, rel=1e-12)
+
+
+def test_adam_follows_the_rule_for_batches():
+    """Zhao et al. 2024: rate sqrt(B), eps / sqrt(B), b^B; here by hand in float64."""
+    p, g, B, rate, eps, b1, b2 = 1.0, 0.3, 4, 0.01, 1e-3, 0.9, 0.999
+    tensors = {"p": torch.tensor([p], dtype=torch.float64, requires_grad=True)}
+    adam = Adam(tensors, {"p": ParameterGroup(rate, eps, (b1, b2))})
+    m = v = 0.0
+    for step in range(1, 4):
+        adam.schedule(0, B)
+        tensors["p"].grad = torch.tensor([g], dtype=torch.float64)
+        adam.step(tensors)
+        m, v = b1**B * m + (1 - b1**B) * g, b2**B * v + (1 - b2**B) * g * g
+        t = B * step
+        p -= rate * 2 * (m / (1 - b1**t)) / (math.sqrt(v / (1 - b2**t)) + eps / 2)
+        assert float(tensors["p"].detach()) == pytest.approx(p, rel=1e-12)
+    assert adam.steps == 12
+
+
+def test_milestones_count_images():
+    assert [milestone(i, 10, 1) for i in (0, 9, 10, 11)] == [0, None, 10, None]
+    assert [milestone(i, 10, 4) for i in (3, 7, 11, 15, 19, 23)] == [0, None, 10, None, None, 20]
+    assert milestone(7, 3, 8) == 6
+
+
+@pytest.mark.parametrize("batch", [1, 2, 3, 4])
+def test_densification_comes_as_often_per_image_for_any_batch(batch):
+    changes = []
+    watch = [lambda _, event: changes.append(event)]
+    run = trainer(config("adc", batch), callbacks=watch)
+    run.run()
+    due = [10, 20, 30, 40]
+    densified = [event.iteration for event in changes if isinstance(event, DensifyEvent)]
+    assert densified == [i // batch * batch + batch - 1 for i in due]
+    resets = [event.iteration for event in changes if isinstance(event, ResetEvent)]
+    assert resets == [30 // batch * batch + batch - 1]
+    steps = [event.iteration + 1 for event in changes if isinstance(event, StepEvent)]
+    assert steps == list(range(batch, ITERATIONS + 1, batch)) and run.iteration == ITERATIONS
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "fast"])
+def test_the_other_strategies_count_images_too(strategy):
+    changes = []
+    run = trainer(config(strategy), callbacks=[lambda _, event: changes.append(event)])
+    run.run()
+    kind = RelocateEvent if strategy == "mcmc" else DensifyEvent
+    assert [event.iteration for event in changes if isinstance(event, kind)] == [11, 23, 31, 43]
+    assert len(run.gaussians) > changes[0].num_gaussians
+
+
+def test_masks_of_things_that_move_are_found_before_the_step_that_has_their_image():
+    views, _, _ = procedural_capture(24, 6, splats=30)
+    found = make_transients(config("adc", transients="mask", means_rate_iterations=20), views, render)
+    due = [first for first in range(0, 24, 4) if found.is_due(first, 4)]
+    assert due == [0, 4, 8]  # images 2, 4, 7 and 10
+    assert [i for i in range(24) if found.is_due(i)] == [2, 4, 7, 10]
+
+
+@pytest.mark.parametrize("name", [*CONFIGS])
+@pytest.mark.parametrize("extra", [{}, {"appearance": "exposure", "refine": "both"}], ids=["plain", "models"])
+def test_ranks_train_to_the_same_bits(name, extra):
+    """Gaussians change their number, and with it the ranges that the ranks move."""
+    settings = config(name, **extra) if not extra else config(name, **extra, random_background=False)
+    losses, expected = trained(settings)
+    for size in (2, 4):
+        for found_losses, found in together(size, lambda team: trained(settings, team)):
+            assert found_losses == losses
+            assert found == expected
+
+
+def test_batches_that_no_power_of_two_divides_are_shared_too():
+    settings = config("adc", 6)
+    _, expected = trained(settings)
+    for size in (2, 3):
+        assert [found for _, found in together(size, lambda team: trained(settings, team))] == [
+            expected
+        ] * size
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_the_number_of_threads_does_not_change_a_batch(threads):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        _, expected = trained(config())
+        torch.set_num_threads(threads)
+        assert trained(config())[1] == expected
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_a_run_goes_on_with_another_number_of_ranks(tmp_path):
+    settings = config("adc", appearance="exposure", random_background=False)
+    _, expected = trained(settings)
+
+    def first(team):
+        run = trainer(settings, team)
+        run.run(lambda: run.iteration >= 24)
+        save_checkpoint(tmp_path / str(team.rank), run, 1.0)
+
+    together(4, first)
+    paths = [tmp_path / str(rank) / "iteration_24.safetensors" for rank in range(4)]
+    contents = [contents_of(path) for path in paths]
+    alone = trainer(settings)
+    alone.run(lambda: alone.iteration >= 24)
+    assert contents == 4 * [contents_of(save_checkpoint(tmp_path / "alone", alone, 1.0))]
+
+    def second(team):
+        run = trainer(settings, team)
+        load_checkpoint(paths[0], run)
+        run.run()
+        return bits(run)
+
+    assert together(2, second) == [expected] * 2
+    assert second(ALONE) == expected
+
+
+def test_moments_are_shared_out():
+    def held(team):
+        run = trainer(config(), team)
+        return len(run._optimizer.first["means"]), len(run._optimizer.first["sh_rest"])
+
+    assert together(2, held) == [(256, 256), (344, 344)]
+
+
+def test_what_a_view_model_measures_is_the_same_for_every_view_of_a_batch():
+    settings = config("adc", appearance="exposure", random_background=False)
+    run = trainer(settings)
+    run.iteration = 4  # after the warm-up
+    draws = run._draw()
+    rows = run._parts.view_model._state
+    before = rows.clone()
+    found, _ = run._differentiated(draws, range(4), 4)
+    assert torch.equal(rows, before)
+    found.commit()
+    drawn = [draw.index for draw in draws]
+    assert len(set(drawn)) == 4
+    assert all((rows[i] != before[i]).any() == (i in drawn) for i in range(6))
+
+
+def test_a_photo_that_cannot_be_read_leaves_all_views_of_the_batch_due(monkeypatch):
+    run = trainer(config())
+    before, read, calls = run.state()[1]["feed"], run._feed._read, []
+
+    def fails(view):
+        calls.append(view)
+        if len(calls) == 3:
+            raise DatasetError("photo: is gone")
+        return read(view)
+
+    monkeypatch.setattr(run._feed, "_read", fails)
+    with pytest.raises(DatasetError):
+        run.run()
+    assert run.state()[1]["feed"]["generator"] == before["generator"] or before["queue"] == []
+    assert run.iteration == 0
+    monkeypatch.undo()
+    run._feed._read = read
+    run.run()
+    assert bits(run) == trained(config())[1]
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_what_does_not_fit_a_batch_is_refused():
+    with pytest.raises(
+        ArgumentError, match="^iterations: is 10, but has to be a multiple of batch = 4, for example 12"
+    ):
+        recipe(10, batch=4)
+    with pytest.raises(ArgumentError, match="^batch: "):
+        recipe(10, batch=0)
+    with pytest.raises(ArgumentError, match="^--batch: is 4, but has to be a multiple of the 3 processes"):
+        together(3, lambda team: trainer(config(), team))
+
+    class Totals(Gains):
+        def groups(self):
+            return {}
+
+    views, points, colors = procedural_capture(24, 6, splats=30)
+    with pytest.raises(ArgumentError, match="^view_model: 'gains' has shape"):
+        Trainer(
+            from_points(points, colors, config()),
+            views,
+            config(),
+            render=render,
+            parts=StepParts(view_model=Totals(4)),
+        )
