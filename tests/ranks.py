@@ -1,7 +1,7 @@
 """Several ranks in one process: threads that exchange real gloo messages over loopback.
 
-Starting Python and torch takes seconds of CPU time per process; a thread takes none. Torch runs on one thread meanwhile,
-because its number of threads belongs to the process.
+Starting Python and torch takes seconds of CPU time per process; a thread takes none. Torch runs on one thread
+meanwhile, because its number of threads belongs to the process.
 """
 
 import threading

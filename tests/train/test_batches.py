@@ -307,9 +307,7 @@ def test_a_photo_that_cannot_be_read_leaves_all_views_of_the_batch_due(monkeypat
 
 @pytest.mark.usefixtures("as_shipped")
 def test_what_does_not_fit_a_batch_is_refused():
-    with pytest.raises(
-        ArgumentError, match="^iterations: is 10, but has to be a multiple of batch = 4, for example 12"
-    ):
+    with pytest.raises(ArgumentError, match="^iterations: is 10, but .* of batch = 4, for example 12"):
         recipe(10, batch=4)
     with pytest.raises(ArgumentError, match="^batch: "):
         recipe(10, batch=0)

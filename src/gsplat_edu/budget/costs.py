@@ -252,17 +252,19 @@ class Footprint:
         process: Bytes of the process without scene and photos.
         pairs: Pairs of Gaussian and tile in one view of the start scene.
         sh_degree: SH degree of the Gaussians.
+        batch: Views of a step, whose gradients are held as partial sums: one more for each doubling.
     """
 
     facts: Facts
     process: int
     pairs: int
     sh_degree: int
+    batch: int = 1
 
     @property
     def _per_gaussian(self) -> int:
         floats = 11 + 3 * (self.sh_degree + 1) ** 2
-        return COPIES * 4 * floats + PER_GAUSSIAN
+        return (COPIES + math.ceil(math.log2(self.batch))) * 4 * floats + PER_GAUSSIAN
 
     def parts(self, gaussians: int, image_memory: int) -> dict[str, int]:
         """Return the peak memory by part, bytes.

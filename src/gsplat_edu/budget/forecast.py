@@ -117,7 +117,7 @@ def predict(
         return speed.seconds(float(counts[iteration]), pixels) + reading_again
 
     process = measured.process + reduced_bytes(config, facts.photo_bytes)
-    footprint = Footprint(facts, process, measured.pairs, config.sh_degree)
+    footprint = Footprint(facts, process, measured.pairs, config.sh_degree, config.batch)
     evaluations, saved = (last // every if every else 0 for every in (eval_every, save_every))
     saving = saving_seconds(float(counts.mean()), config.sh_degree)
     views = facts.train + facts.test

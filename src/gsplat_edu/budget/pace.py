@@ -113,6 +113,7 @@ class Pace:
         if done == first or left < LEFT_OVER * self._deadline.seconds:
             return
         total = min(done + int(CAREFUL * left * (done - first) / (now - then)), RECIPE_ITERATIONS)
+        total -= total % trainer.config.batch
         if total <= done:
             return
         self._planned = self._planned or done

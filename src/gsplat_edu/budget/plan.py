@@ -152,12 +152,13 @@ class Request:
         """Return the recipe for a number of iterations, with a cap that fits the memory and the planned time.
 
         Args:
-            iterations: Number of iterations.
+            iterations: Number of iterations, of which whole batches count.
             factor: Downscaling factor of the photos.
             cap: Number of Gaussians that fit into memory; None for no limit.
         """
         config = self.options.config
         if "iterations" not in self.given:
+            iterations = max(iterations // config.batch, 1) * config.batch
             fresh = recipe(iterations, rescale=self.rescale, strategy=config.strategy).flat()
             scaled = {name: fresh[name] for name in (*MILESTONES, "densify_every") if name not in self.given}
             config = config.changed(iterations=iterations, **scaled)
@@ -278,7 +279,7 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
     facts = request.facts.smaller(choice.factor)
     found = Plan(options, request.by_time, _predicted(request, measured, choice, config))
     at_cap = Footprint(
-        facts, process + reduced_bytes(config, facts.photo_bytes), pairs, config.sh_degree
+        facts, process + reduced_bytes(config, facts.photo_bytes), pairs, config.sh_degree, config.batch
     ).peak(found.max_gaussians or 0, found.image_memory)
     return dataclasses.replace(found, sentences=_sentences(request, found, at_cap))
 
@@ -294,8 +295,8 @@ def _within_memory(
     for factor in factors:
         facts = request.facts.smaller(factor)
         reduced = reduced_bytes(request.options.config, facts.photo_bytes)
-        footprint = Footprint(facts, process + reduced, pairs, request.options.config.sh_degree)
         config = request.config(iterations, factor, None)
+        footprint = Footprint(facts, process + reduced, pairs, config.sh_degree, config.batch)
         wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
         if config.strategy == "none":
             wanted = facts.points

@@ -35,7 +35,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.surgery import split_children
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.initialize import from_points, make_strategy
-from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.train.trainer import StepParts, Trainer
 from gsplat_edu.views import View
 
 Bytes = UInt8[np.ndarray, "H W 3"]
@@ -181,6 +181,7 @@ def _trial(
 
     plain = config.changed(
         iterations=PROBE_STEPS,
+        batch=1,
         sh_every=0,
         densify_start=PROBE_STEPS,
         densify_stop=PROBE_STEPS + 1,
@@ -191,7 +192,16 @@ def _trial(
     )
     placed = gaussians.to(device_of(backend))
     density = make_strategy(plain, extent, placed)
-    trainer = Trainer(placed, views, plain, render=counting, extent=extent, density=density, callbacks=[note])
+    trainer = Trainer(
+        placed,
+        views,
+        plain,
+        render=counting,
+        extent=extent,
+        density=density,
+        callbacks=[note],
+        parts=StepParts(fused=config.batch == 1),  # a batch stores its gradients
+    )
     trainer.run(_until(moments))
     pixels = float(np.mean([view.camera.W * view.camera.H for view in views]))
     return _Trial(len(gaussians), pixels, max(pairs), np.diff(moments).tolist())

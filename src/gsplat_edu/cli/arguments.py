@@ -17,11 +17,11 @@ from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO
 
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
+from gsplat_edu.cli.ranks import is_first, speaks_for_all
 from gsplat_edu.errors import BackendWarning, SplatError
 from gsplat_edu.files import described
 from gsplat_edu.headroom import shortage
 from gsplat_edu.render.settings import BACKENDS
-from gsplat_edu.text import printable
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -95,7 +95,9 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the line and exit with 2."""
         end = "" if message.endswith("?") else ";"
-        self.exit(EXIT_BAD_INPUT, printable(f"{self.prog}: {message}{end} see {self.prog} --help") + "\n")
+        if speaks_for_all():
+            complain(f"{self.prog}: {message}{end} see {self.prog} --help")
+        self.exit(EXIT_BAD_INPUT)
 
 
 class _HelpAll(argparse.Action):
@@ -179,14 +181,16 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
         with _terminable(), _one_line_warnings(program):
             command()
     except KeyboardInterrupt as interruption:
-        complain(f"{program}: {str(interruption) or 'interrupted'}")
+        if speaks_for_all():
+            complain(f"{program}: {str(interruption) or 'interrupted'}")
         return EXIT_INTERRUPTED
     except Exception as error:
         if (line := _line(program, error)) is None:
             raise
         if debug:
             traceback.print_exc()
-        complain(f"{program}: {line}")
+        if speaks_for_all():
+            complain(f"{program}: {line}")
         return EXIT_BAD_INPUT
     return 0
 
@@ -224,6 +228,8 @@ def _one_line_warnings(program: str) -> Iterator[None]:
         file: TextIO | None = None,
         line: str | None = None,
     ) -> None:
+        if issubclass(category, BackendWarning) and not is_first():
+            return
         if issubclass(category, BackendWarning):
             complain(f"{program}: {message}")
         else:

@@ -9,8 +9,9 @@ import math
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import ModuleType
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
@@ -22,11 +23,13 @@ from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.train import left_open, options_from
 from gsplat_edu.cli.process import process_age
+from gsplat_edu.cli.ranks import count
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.points import read_points_ply
+from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.remedies import Remedy, remedies_for, transients_for
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
@@ -34,10 +37,13 @@ from gsplat_edu.locks import locked
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.pilot import ORDER, PILOT_STEPS, refinement_for
+from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import needs_poses
+from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event, StepEvent
+from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
 from gsplat_edu.viewer.serve import LOOPBACK, exposure, free_port
@@ -62,19 +68,64 @@ def run(arguments: argparse.Namespace) -> None:
     live = _live(arguments)
     for path in arguments.export:
         check_target("--export", path)
-    with locked("--out", arguments.out, "gsplat-edu train", say):
-        _run(arguments, console, say, live)
+    size = count()
+    if size > 1 and needs_poses(arguments.data):
+        raise ArgumentError(
+            f"{arguments.data}: has no poses; find them first, in one process, by `gsplat-edu sfm`"
+        )
+    with joined(size) as team:
+        if team.rank > 0:
+            _follow(arguments, team)
+            return
+        with locked("--out", arguments.out, "gsplat-edu train", say):
+            _run(arguments, console, say, live, team)
+
+
+def _follow(arguments: argparse.Namespace, team: Member) -> None:
+    """Train together with process 0, which reads the options, prints, and writes the run."""
+    told = team.shared(None)
+    if told["finished"]:
+        return
+    data, train = ({name: _tuple(value) for name, value in told[part].items()} for part in ("data", "train"))
+    options = RunOptions(
+        arguments.data,
+        arguments.out,
+        TrainConfig().changed(**train),
+        DataSettings(**data),
+        points=arguments.points,
+        eval_every=arguments.eval_every,
+        save_every=arguments.save_every,
+    )
+    with interruptible(patient=True) as interrupted:
+        CaptureRun(options, team=team).train(interrupted)
+    if interrupted():
+        raise KeyboardInterrupt
+
+
+def _tuple(value: Any) -> Any:  # noqa: ANN401
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _run(
-    arguments: argparse.Namespace, console: Console, say: Callable[[str], None], live: ModuleType | None
+    arguments: argparse.Namespace,
+    console: Console,
+    say: Callable[[str], None],
+    live: ModuleType | None,
+    team: Member,
 ) -> None:
     seconds = arguments.time_limit
     deadline = None if seconds is None else Deadline(seconds, stopwatch(process_age()))
     chosen = _planned(arguments, deadline, console, say)
-    with interruptible() as interrupted, ExitStack() as closing:
+    with interruptible(patient=team.size > 1) as interrupted, ExitStack() as closing:
         options = chosen.options
-        if is_finished(options):
+        if team.size > 1 and options.backend != "cpu":
+            raise ArgumentError(
+                f"--backend: is {options.backend}, but several processes train on cpu; give that"
+            )
+        finished = is_finished(options)
+        settings = {"train": options.config.flat(), "data": asdict(options.data_settings)}
+        team.shared({"finished": finished, **settings})
+        if finished:
             say(f"{options.out}: is finished, {options.config.iterations} iterations; nothing to do")
             return
         host = arguments.view_host or LOOPBACK
@@ -82,7 +133,7 @@ def _run(
             port = live.PORT if arguments.view_port is None else arguments.view_port
             free_port(host, port, live.NAMES)  # before the run writes anything
         with _bar(console, "") as bar:
-            capture = CaptureRun(options, say, _photos(bar, interrupted))
+            capture = CaptureRun(options, say, _photos(bar, interrupted), team)
         callbacks: list[Callback] = []
         ends = interrupted
         if deadline is not None:
@@ -97,8 +148,8 @@ def _run(
             if warning := exposure(host, "sees the training and can pause it", token=True):
                 say(warning)
         with _bar(console, "{task.fields[state]}") as bar:
-            _train(capture, bar, ends, callbacks if view is None else [*callbacks, view.show])
-        if interrupted():
+            ended = _train(capture, bar, ends, callbacks if view is None else [*callbacks, view.show])
+        if interrupted() or (ended and team.size > 1 and not ends()):  # or another process was
             raise KeyboardInterrupt(
                 f"interrupted after {capture.trainer.iteration} iterations;"
                 " add --resume to the same command to continue"
@@ -246,7 +297,7 @@ def _train(
     bar: Progress,
     ends: Callable[[], bool],
     callbacks: Sequence[Callback],
-) -> None:
+) -> bool:
     iterations, start = capture.options.config.iterations, capture.trainer.iteration
     task = bar.add_task("training", total=iterations, completed=start, state="")
 
@@ -254,17 +305,18 @@ def _train(
         if not isinstance(event, StepEvent):
             return
         iterations = trainer.config.iterations  # a time limit may have raised it
-        if event.iteration % PSNR_EVERY == 0 or trainer.iteration == iterations:
+        batch = trainer.config.batch
+        if milestone(event.iteration, PSNR_EVERY, batch) is not None or trainer.iteration == iterations:
             speed = bar.tasks[-1].speed or 0.0
             state = f"loss {event.loss:.3f}  PSNR {_psnr(trainer):.1f} of {_short(trainer.last_name)}"
             bar.update(task, state=f"{state}  {event.num_gaussians} Gaussians  {speed:.0f} it/s")
         bar.update(task, completed=trainer.iteration, total=iterations)
-        if bar.disable and trainer.iteration % max(iterations // LINES, 1) == 0:
+        if bar.disable and milestone(trainer.iteration, max(iterations // LINES, 1), batch) is not None:
             figures = f"loss {event.loss:.4f}, PSNR {_psnr(trainer):.2f} dB of {trainer.last_name}"
             figures += f", {event.num_gaussians} Gaussians"
             bar.console.print(f"iteration {trainer.iteration}/{iterations}: {figures}", soft_wrap=True)
 
-    capture.train(ends, [show, *callbacks])
+    return capture.train(ends, [show, *callbacks])
 
 
 def _photos(bar: Progress, interrupted: Callable[[], bool]) -> Callable[[int, int], None]:
@@ -302,8 +354,11 @@ def _bar(console: Console, state: str) -> Progress:
 
 
 @contextmanager
-def interruptible() -> Iterator[Callable[[], bool]]:
+def interruptible(patient: bool = False) -> Iterator[Callable[[], bool]]:
     """Let Ctrl-C and SIGTERM end a training between two iterations; a second signal ends it at once.
+
+    Args:
+        patient: Ignore a second signal: torchrun sends one after that of the terminal.
 
     Yields:
         A function that returns whether a signal arrived. A loop that polls it should end soon after.
@@ -312,7 +367,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
     def note(number: int, frame: object) -> None:
         nonlocal came
-        if came:
+        if came and not patient:
             raise KeyboardInterrupt(
                 "interrupted; saved checkpoints are intact, --resume continues from the last one"
             )

@@ -1,4 +1,4 @@
-"""The log of a run: log.jsonl, one JSON object per line, each with the number of steps taken as `iteration`."""
+"""The log of a run: log.jsonl, one JSON object per line, each with the number of images trained on as `iteration`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from gsplat_edu.files import named_failure, written_aside
 from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.train.events import Event, StepEvent
 
-STEPS_PER_LINE = 10
-"""Steps per line; loss and time are means over them."""
+IMAGES_PER_LINE = 10
+"""Images per line, or those of a step if it has more; loss and time are means over them."""
 
 
 class LogWriter:
@@ -30,9 +30,11 @@ class LogWriter:
         self._file: TextIO | None = None
         self._steps: list[StepEvent] = []
         self._last = 0.0
+        self._done: int | None = None  # images of the steps so far
+        self._images = 0  # those of `_steps`
 
     def record(self, event: Event, seconds: float) -> None:
-        """Write a change of the Gaussians at once, and one line for every ten steps.
+        """Write a change of the Gaussians at once, and one line for every ten images.
 
         Args:
             event: The event.
@@ -43,11 +45,13 @@ class LogWriter:
             kind = type(event).__name__.removesuffix("Event").lower()
             self.write({**dataclasses.asdict(event), "iteration": iteration, "event": kind})
             return
+        before = iteration - 1 if self._done is None else self._done
+        self._done, self._images = iteration, self._images + iteration - before
         self._steps.append(event)
-        if iteration % STEPS_PER_LINE == 0:
+        if iteration // IMAGES_PER_LINE > before // IMAGES_PER_LINE:
             count, names = len(self._steps), list(event.terms)
             values = [[step.loss_tensor, *(step.terms[name] for name in names)] for step in self._steps]
-            # one GPU synchronisation per ten steps
+            # one GPU synchronisation per line
             rows = torch.stack([torch.stack(row) for row in values]).tolist()
             loss, *terms = (sum(column) / count for column in zip(*rows, strict=True))
             line = {
@@ -56,11 +60,11 @@ class LogWriter:
                 "terms": dict(zip(names, terms, strict=True)),
                 "num_gaussians": event.num_gaussians,
                 "photo_factor": event.photo_factor,
-                "ms": round(1e3 * (seconds - self._last) / count, 3),
+                "ms": round(1e3 * (seconds - self._last) / self._images, 3),
                 "seconds": round(seconds, 3),
             }
             self.write(line)
-            self._steps, self._last = [], seconds
+            self._steps, self._images, self._last = [], 0, seconds
 
     def write(self, line: dict[str, Any]) -> None:
         """Append a line and flush it to the operating system."""
@@ -79,7 +83,7 @@ class LogWriter:
             seconds: Wall time of the training up to the checkpoint.
         """
         self.close()
-        self._steps, self._last = [], seconds
+        self._steps, self._images, self._last, self._done = [], 0, seconds, iteration
         if not self.path.exists():
             return
         kept = []

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from gsplat_edu.errors import ProcessLostError, SplatError
@@ -97,7 +96,7 @@ class Processes:
         tensors, numbers = ({}, None) if state is None else state
         names, numbers = self.shared([list(tensors), numbers])
         parts = self.exchange([[tensor.contiguous() for tensor in tensors.values()]] * self.size)[0]
-        return dict(zip(names, parts, strict=True)), numbers if names else None
+        return (dict(zip(names, parts, strict=True)), numbers) if names else None
 
 
 Member = Alone | Processes
@@ -116,6 +115,8 @@ def joined(size: int) -> Iterator[Member]:
     if size == 1:
         yield ALONE
         return
+    import torch.distributed as dist  # no other training needs it
+
     try:
         dist.init_process_group("gloo", timeout=PATIENCE)
     except (RuntimeError, ValueError) as error:
@@ -157,6 +158,11 @@ def check_alike(team: Processes, what: str, found: dict[str, str]) -> None:
                     f"torchrun: the processes have to {what}: {name}: {value} in process 0 on {first_host}, but"
                     f" {other.get(name)} in process {rank} on {host}; make them equal"
                 )
+
+
+def digest_of(data: bytes) -> str:
+    """Return a short digest, for `check_alike`."""
+    return hashlib.sha256(data).hexdigest()[:12]
 
 
 def _rounding() -> str:

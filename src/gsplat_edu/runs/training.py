@@ -30,6 +30,7 @@ from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_ru
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.runs.options import RunOptions as RunOptions
+from gsplat_edu.runs.processes import Member, Processes, check_alike, digest_of
 from gsplat_edu.runs.refined import aligned_score, with_refined_cameras, write_refined
 from gsplat_edu.runs.skies import shell_around, start_sky, with_room_for
 from gsplat_edu.runs.source import Source, open_source
@@ -38,6 +39,7 @@ from gsplat_edu.runs.transients import write_masks
 from gsplat_edu.train.checkpoint import (
     list_checkpoints,
     load_checkpoint,
+    read_checkpoint,
     read_seconds,
     save_checkpoint,
 )
@@ -45,6 +47,8 @@ from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
 from gsplat_edu.train.objective import make_objective
+from gsplat_edu.train.schedule import milestone
+from gsplat_edu.train.team import ALONE
 from gsplat_edu.train.trainer import Callback, StepParts, Trainer
 from gsplat_edu.train.transients import check_enough
 
@@ -132,6 +136,8 @@ class CaptureRun:
         options: Options of the run.
         say: Receives sentences for the user.
         progress: Receives the number of photos read and their total.
+        team: The processes that share the training; each makes this object and calls `train`. Only the first uses the
+            folder, so the others may run on machines that do not have it.
 
     Raises:
         CheckpointError: the folder contains a different run, or one that the options do not resume.
@@ -152,9 +158,15 @@ class CaptureRun:
         options: RunOptions,
         say: Callable[[str], None] = lambda sentence: None,
         progress: Callable[[int, int], None] | None = None,
+        team: Member = ALONE,
     ) -> None:
-        self.options, self.folder, self._say = _checked_folder(options), options.folder, say
-        self._say_what_is_resumed()
+        self._team, self._leads = team, team.rank == 0
+        options = _checked_folder(options) if self._leads else options
+        scene = team.shared(None if options.scene is None else str(options.scene))
+        self.options = dataclasses.replace(options, scene=None if scene is None else Path(scene))
+        self.folder, self._say = options.folder, say
+        if self._leads:
+            self._say_what_is_resumed()
         self.seconds = 0.0
         self._began: float | None = None  # during training: when the count of seconds started
         settings = as_trained(options.data_settings, options.config.appearance)
@@ -165,12 +177,26 @@ class CaptureRun:
         if options.config.transients != "none":
             check_enough(len(self.dataset.train))
         # a scene to start from may have a sky; a resumed run need not say --from again
-        self._shell = shell_around(self.dataset) if self._is_from_scene() else None
+        from_scene = team.shared(self._leads and self._is_from_scene())
+        self._shell = shell_around(self.dataset) if from_scene else None
         gaussians = self._begin()
         self._log = LogWriter(self.folder.log_file)
         self.trainer = self._trainer(gaussians)
-        self._take_up()
-        self._extend()
+        if self._leads:
+            self._take_up()
+            self._extend()
+        if isinstance(team, Processes):
+            self._share_start(team, gaussians)
+
+    def _share_start(self, team: Processes, gaussians: Gaussians) -> None:
+        """Check that all processes start alike, and let them take up the first one's checkpoint."""
+        views = [(view.name, view.camera.W, view.camera.H) for view in self.dataset.train]
+        start = {"photos": fingerprint(self.dataset), "views": digest_of(repr(views).encode())}
+        check_alike(team, "start alike", start | {"Gaussians": scene_digest(gaussians)})
+        checkpoints = list_checkpoints(self.folder.checkpoints) if self._leads else []
+        state = team.shared_state(read_checkpoint(checkpoints[-1]) if checkpoints else None)
+        if state is not None and not self._leads:
+            self.trainer.load_state(*state)
 
     def _is_from_scene(self) -> bool:
         stored = self.folder.read_config().get("data") if self.folder.exists() else None
@@ -191,6 +217,8 @@ class CaptureRun:
         """Make the start Gaussians; write the run's settings, or compare them with the stored ones."""
         options, dataset, folder = self.options, self.dataset, self.folder
         gaussians, digest = self._start_cloud()
+        if not self._leads:
+            return sorted_in_space(gaussians)
         if folder.exists():
             remove_leftovers(folder.path)
             check_capture(folder, dataset)
@@ -226,6 +254,7 @@ class CaptureRun:
                 make_objective(options.config, self._shell),
                 model,
                 transients=make_transients(options.config, dataset.train, renderer),
+                team=self._team,
             ),
         )
 
@@ -283,23 +312,23 @@ class CaptureRun:
             callbacks: Receive every step and every change, after the log.
 
         Returns:
-            Whether `stop` ended the training.
+            Whether `stop` ended the training, in any of the processes that share it.
         """
-        asked, whole = False, self.trainer.iteration
+        asked, whole, alone = False, self.trainer.iteration, self._team.size == 1
         self._began = time.perf_counter() - self.seconds
 
         def ends() -> bool:
             nonlocal asked, whole
-            asked, whole = stop(), self.trainer.iteration
+            asked, whole = self._team.any(stop()), self.trainer.iteration
             if not asked:
                 self._judge_and_save_where_due(stop)
-                asked = stop()
+                asked = alone and stop()
             return asked
 
         try:
             self.trainer.run(ends, callbacks)
         except DatasetError as error:
-            if whole != self.trainer.iteration:
+            if whole != self.trainer.iteration or not alone:
                 raise  # in the middle of an iteration: resume from the last checkpoint
             self.save()
             raise DatasetError(
@@ -315,9 +344,13 @@ class CaptureRun:
         done, options = self.trainer.iteration, self.options
         if done == options.config.iterations:
             return  # the end of the run evaluates and saves anyway
-        if options.eval_every and done % options.eval_every == 0 and self.dataset.test:
+
+        def due(every: int) -> bool:
+            return bool(every) and milestone(done, every, options.config.batch) is not None
+
+        if due(options.eval_every) and self.dataset.test and self._leads:
             self._judge(stop)
-        if options.save_every and done % options.save_every == 0:
+        if due(options.save_every):
             self.save()
 
     def _judge(self, stop: Callable[[], bool]) -> None:
@@ -334,9 +367,15 @@ class CaptureRun:
         figures = f"test PSNR {means['psnr']:.2f} dB, SSIM {means['ssim']:.4f}"
         self._say(f"iteration {done}: {figures}, {len(self.trainer.gaussians)} Gaussians")
 
-    def save(self) -> Path:
-        """Write a checkpoint; see `gsplat_edu.train.checkpoint.save_checkpoint`."""
-        return save_checkpoint(self.folder.checkpoints, self.trainer, self._elapsed())
+    def save(self) -> Path | None:
+        """Write a checkpoint; see `gsplat_edu.train.checkpoint.save_checkpoint`.
+
+        All processes of the run have to call it. The first one writes the file and returns its path.
+        """
+        if self._leads:
+            return save_checkpoint(self.folder.checkpoints, self.trainer, self._elapsed())
+        self.trainer.state()  # sends the moments that this process holds
+        return None
 
     def finish(
         self, progress: Progress | None = None, export: Export | None = None, clean: Clean | None = None
@@ -389,7 +428,8 @@ class CaptureRun:
         return self.seconds if self._began is None else time.perf_counter() - self._began
 
     def _record(self, trainer: Trainer, event: Event) -> None:
-        self._log.record(event, self._elapsed())
+        if self._leads:
+            self._log.record(event, self._elapsed())
         if not len(trainer.gaussians):
             raise ArgumentError(
                 f"iteration {trainer.iteration}: every Gaussian was pruned; lower --min-opacity or the learning rates"

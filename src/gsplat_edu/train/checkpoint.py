@@ -40,6 +40,8 @@ _NAME = re.compile(r"iteration_(\d+)\.safetensors")
 def save_checkpoint(folder: Path, trainer: Trainer, seconds: float) -> Path:
     """Write the trainer's state as folder/iteration_N.safetensors, and remove all but the last two.
 
+    The file does not depend on the number of processes that share the training.
+
     Args:
         folder: Folder of the checkpoints; created if missing.
         trainer: The run.
@@ -93,6 +95,16 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
         metadata = file.metadata()
         _seconds(metadata)
         trainer.load_state(_tensors(file), _parsed("state", metadata))
+
+
+def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], Any]:
+    """Return the state of a checkpoint, as `Trainer.load_state` takes it.
+
+    Raises:
+        CheckpointError: the file is damaged.
+    """
+    with _opened(path) as file:
+        return _tensors(file), _parsed("state", file.metadata())
 
 
 @contextmanager

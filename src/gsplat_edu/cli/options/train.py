@@ -8,6 +8,7 @@ from typing import Any
 
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
+from gsplat_edu.cli.ranks import count, restarts_are_allowed
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
@@ -141,8 +142,8 @@ def _add_length(group: argparse._ArgumentGroup) -> None:
     _add_number(
         group,
         "--iterations",
-        f"number of training steps (default: those of --quality, or as many as fit --time-limit; {RECIPE_ITERATIONS:,}"
-        " for strategies other than fast)",
+        f"number of images to train on (default: those of --quality, or as many as fit --time-limit;"
+        f" {RECIPE_ITERATIONS:,} for strategies other than fast)",
     )
     group.add_argument(
         "--no-rescale",
@@ -317,9 +318,35 @@ def check(arguments: argparse.Namespace) -> None:
         raise DatasetError(
             f"{arguments.data}: does not exist; give the folder of a capture, of photos, or a video"
         )
+    if count() > 1:
+        _check_several(arguments)
     for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):
         if path is not None and not path.exists():
             raise ArgumentError(f"{flag}: {path} does not exist; correct the name, or omit the option")
+
+
+def _check_several(arguments: argparse.Namespace) -> None:
+    """Check what only holds for several processes.
+
+    Raises:
+        ArgumentError: an option does not go with them.
+    """
+    size, batch = count(), arguments.batch or 1
+    if batch % size:
+        raise ArgumentError(
+            f"--batch: is {batch}, but has to be a multiple of the {size} processes, so that each renders equally many"
+            " views"
+        )
+    if arguments.view:
+        raise ArgumentError(
+            "--view: shows the training of one process; leave it out, or train without torchrun"
+        )
+    if arguments.time_limit is not None and arguments.iterations is None:
+        raise ArgumentError(
+            "--time-limit: cannot choose the length for several processes; give --iterations too"
+        )
+    if restarts_are_allowed() and not arguments.resume:
+        raise ArgumentError("--resume: is needed with --max-restarts, so that a restart continues; add it")
 
 
 def options_from(arguments: argparse.Namespace) -> RunOptions:
@@ -426,7 +453,7 @@ def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 
 def _length(arguments: argparse.Namespace, strategy: str) -> int:
-    """Return the iterations: those given, those of the quality, or the recipe's."""
+    """Return the iterations: those given, or those of the quality or the recipe, as whole batches."""
     fast, quality = strategy == "fast", arguments.quality
     if quality is not None:
         one_of("--quality", quality, tuple(QUALITIES))
@@ -440,7 +467,8 @@ def _length(arguments: argparse.Namespace, strategy: str) -> int:
             )
     if arguments.iterations is not None:
         return int(arguments.iterations)
-    return QUALITIES[quality or DEFAULT_QUALITY] if fast else RECIPE_ITERATIONS
+    length = QUALITIES[quality or DEFAULT_QUALITY] if fast else RECIPE_ITERATIONS
+    return length + -length % max(arguments.batch or 1, 1)  # whole batches
 
 
 def _starts_from_scene(arguments: argparse.Namespace) -> bool:
