@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import socket
 import time
 from collections.abc import Iterator, Sequence
@@ -26,6 +27,9 @@ from gsplat_edu.train.team import ALONE, Alone
 
 PATIENCE = timedelta(hours=6)
 """How long a process waits for a message: another may be evaluating. A process that ends is noticed at once."""
+
+MEETING = timedelta(minutes=5)
+"""How long the processes wait for one another at the start."""
 
 DTYPES = (torch.float32, torch.float64, torch.int64, torch.int32, torch.uint8, torch.bool)
 """Types of tensors in messages, by their number."""
@@ -61,20 +65,25 @@ class Processes:
         others = [rank for rank in range(self.size) if rank != self.rank]
         packed = {id(tensors): pack(tensors) for rank, tensors in enumerate(outgoing) if rank in others}
         blobs = {rank: packed[id(outgoing[rank])] for rank in others}
-        sizes = torch.tensor([len(blobs[rank]) if rank in blobs else 0 for rank in range(self.size)])
-        with _named_loss():
-            table = [torch.empty_like(sizes) for _ in range(self.size)]
-            self._group.allgather([table], [sizes]).wait(PATIENCE)
-            incoming = {rank: torch.empty(int(table[rank][self.rank]), dtype=torch.uint8) for rank in others}
-            works = [self._group.recv([incoming[rank]], rank, 0) for rank in others]
-            works += [self._group.send([blobs[rank]], rank, 0) for rank in others]
-            for work in works:
-                work.wait(PATIENCE)
-        self.sent += int(sizes.sum()) + sizes.nbytes * len(others)
+        lengths = {rank: torch.tensor([len(blob)]) for rank, blob in blobs.items()}
+        arriving = self._traded({rank: torch.zeros_like(length) for rank, length in lengths.items()}, lengths)
+        incoming = self._traded(
+            {rank: torch.empty(int(length), dtype=torch.uint8) for rank, length in arriving.items()}, blobs
+        )
+        self.sent += sum(blob.nbytes + lengths[rank].nbytes for rank, blob in blobs.items())
         self.waited += time.perf_counter() - start
         return [
             list(outgoing[rank]) if rank == self.rank else unpack(incoming[rank]) for rank in range(self.size)
         ]
+
+    def _traded(self, incoming: dict[int, Tensor], outgoing: dict[int, Tensor]) -> dict[int, Tensor]:
+        """Fill the tensors to come from other processes with what these send, and send them theirs."""
+        with _named_loss():
+            works = [self._group.recv([tensor], rank, 0) for rank, tensor in incoming.items()]
+            works += [self._group.send([tensor], rank, 0) for rank, tensor in outgoing.items()]
+            for work in works:
+                work.wait(PATIENCE)
+        return incoming
 
     def shared(self, value: Any) -> Any:  # noqa: ANN401
         """Return the value of process 0, which JSON can represent."""
@@ -118,18 +127,31 @@ def joined(size: int) -> Iterator[Member]:
     import torch.distributed as dist  # no other training needs it
 
     try:
-        dist.init_process_group("gloo", timeout=PATIENCE)
+        rank = int(os.environ["RANK"])
+        hosts = rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+        address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+        table = dist.TCPStore(  # type: ignore[attr-defined]
+            address, port, size, is_master=hosts, timeout=MEETING, multi_tenant=True
+        )
+        store = dist.PrefixStore(_place(), table)  # type: ignore[attr-defined]
+        dist.init_process_group("gloo", store=store, rank=rank, world_size=size, timeout=MEETING)
     except (RuntimeError, ValueError) as error:
         raise SplatError(
             f"torchrun: the {size} processes do not reach one another ({_first_line(error)}); GLOO_SOCKET_IFNAME"
             " names the network interface"
         ) from None
     try:
-        team = Processes(dist.get_rank(), dist.get_world_size(), dist.group.WORLD)
+        team = Processes(rank, size, dist.group.WORLD)
         check_alike(team, "compute alike", facts())
         yield team
     finally:
         dist.destroy_process_group()
+
+
+def _place() -> str:
+    """Return the prefix of this start's entries in torchrun's store, which outlives the processes of a failed start."""
+    names = ("TORCHELASTIC_RUN_ID", "TORCHELASTIC_RESTART_COUNT")
+    return "/".join(["gsplat_edu", *(os.environ.get(name, "") for name in names)])
 
 
 def facts() -> dict[str, str]:
@@ -225,4 +247,4 @@ def _named_loss() -> Iterator[None]:
 
 def _first_line(error: Exception) -> str:
     lines = str(error).splitlines()
-    return lines[0].rpartition("] ")[2][:120] if lines else type(error).__name__
+    return lines[0].rpartition("] ")[2].partition(". ")[0] if lines else type(error).__name__
