@@ -181,7 +181,7 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
         with _terminable(), _one_line_warnings(program):
             command()
     except KeyboardInterrupt as interruption:
-        if speaks_for_all():
+        if is_first() and speaks_for_all():
             complain(f"{program}: {str(interruption) or 'interrupted'}")
         return EXIT_INTERRUPTED
     except Exception as error:

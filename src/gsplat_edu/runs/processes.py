@@ -45,14 +45,15 @@ class Processes:
         rank: This process, from 0.
         size: Number of processes.
         group: A process group of torch with point-to-point messages, gloo's.
+        patience: How long to wait for a message.
 
     Attributes:
         sent: Bytes sent so far.
         waited: Seconds spent on messages so far: packing, sending and waiting.
     """
 
-    def __init__(self, rank: int, size: int, group: Any) -> None:  # noqa: ANN401
-        self.rank, self.size, self._group = rank, size, group
+    def __init__(self, rank: int, size: int, group: Any, patience: timedelta = PATIENCE) -> None:  # noqa: ANN401
+        self.rank, self.size, self._group, self._patience = rank, size, group, patience
         self.sent, self.waited = 0, 0.0
 
     def exchange(self, outgoing: Sequence[Sequence[Tensor]]) -> list[list[Tensor]]:
@@ -82,7 +83,7 @@ class Processes:
             works = [self._group.recv([tensor], rank, 0) for rank, tensor in incoming.items()]
             works += [self._group.send([tensor], rank, 0) for rank, tensor in outgoing.items()]
             for work in works:
-                work.wait(PATIENCE)
+                work.wait(self._patience)
         return incoming
 
     def shared(self, value: Any) -> Any:  # noqa: ANN401
@@ -105,7 +106,9 @@ class Processes:
         tensors, numbers = ({}, None) if state is None else state
         names, numbers = self.shared([list(tensors), numbers])
         parts = self.exchange([[tensor.contiguous() for tensor in tensors.values()]] * self.size)[0]
-        return (dict(zip(names, parts, strict=True)), numbers) if names else None
+        # Copies, because a generator reads its state from the start of the memory that a tensor is part of.
+        copies = [part.clone() for part in parts]
+        return (dict(zip(names, copies, strict=True)), numbers) if names else None
 
 
 Member = Alone | Processes

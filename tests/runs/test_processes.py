@@ -1,0 +1,275 @@
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import checkpoints
+from gsplat_edu.cli.main import main
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.errors import CheckpointError, ProcessLostError, SplatError
+from gsplat_edu.runs.options import DataSettings, RunOptions
+from gsplat_edu.runs.processes import check_alike, facts, pack, unpack
+from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.train.config import recipe
+from gsplat_edu.train.team import ALONE
+from ranks import together
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "egg"
+    write_colmap(folder, *procedural_capture(24, 9, splats=900))
+    return folder
+
+
+def options(capture, out, **changes):
+    config = recipe(48, batch=4, densify_start=3, densify_every=10, densify_stop=40, grad_threshold=1e-5)
+    given = RunOptions(capture, out, config, DataSettings(), eval_every=24, save_every=16)
+    return replace(given, **changes)
+
+
+def train(settings, team=ALONE, until=None):
+    """Train as the command does: every rank trains, the first one also finishes."""
+    own = settings if team.rank == 0 else replace(settings, out=Path("/nowhere"), resume=False)
+    run = CaptureRun(own, team=team)
+    stopped = run.train((lambda: run.trainer.iteration >= until) if until else lambda: False)
+    if team.rank == 0 and not stopped:
+        run.finish()
+    return stopped
+
+
+def scene(out):
+    return (out / "point_cloud/iteration_48/point_cloud.ply").read_bytes()
+
+
+def contents(out, iteration):
+    tensors, metadata = checkpoints.read(out / f"checkpoints/iteration_{iteration}.safetensors")
+    return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}, metadata["state"]
+
+
+@pytest.fixture(scope="module")
+def alone(capture, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "alone"
+    train(options(capture, out))
+    return out
+
+
+def test_messages_arrive_as_they_were_sent():
+    sent = [
+        torch.arange(5, dtype=torch.int64),
+        torch.tensor([[True, False]]),
+        torch.zeros(0, 15, 3),
+        torch.tensor(1.5, dtype=torch.float64),
+        torch.tensor([float("nan"), -0.0]),
+        torch.arange(7, dtype=torch.uint8)[::2],
+    ]
+    for received in (unpack(pack(sent)), together(2, lambda team: team.exchange([sent] * 2))[1][0]):
+        assert len(received) == len(sent)
+        for ours, theirs in zip(sent, received, strict=True):
+            assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
+            assert ours.numpy().tobytes() == theirs.numpy().tobytes()
+
+
+def test_every_rank_gets_what_each_other_sends_it():
+    def work(team):
+        found = team.exchange([[torch.tensor([10 * team.rank + rank])] for rank in range(team.size)])
+        return (
+            [int(part) for (part,) in found],
+            team.shared(team.rank + 7),
+            team.any(team.rank == 1),
+            team.sent,
+        )
+
+    results = together(3, work)
+    assert [found for found, *_ in results] == [[0, 10, 20], [1, 11, 21], [2, 12, 22]]
+    assert all((shared, any_) == (7, True) for _, shared, any_, _ in results)
+    assert all(sent > 0 for *_, sent in results)
+
+
+def test_a_rank_that_sends_nothing_is_noticed_by_the_others():
+    def work(team):
+        if team.rank == 0:
+            team.exchange([[torch.zeros(3)]] * 2)
+
+    with pytest.raises(
+        ProcessLostError, match="^torchrun: another process of this run ended or cannot be reached"
+    ):
+        together(2, work, patience=1.0)
+
+
+@pytest.mark.parametrize("name", [*facts()])
+def test_processes_that_compute_differently_are_refused(name):
+    def work(team):
+        found = facts()
+        check_alike(team, "compute alike", found)
+        check_alike(team, "compute alike", found | ({name: "other"} if team.rank == 1 else {}))
+
+    with pytest.raises(
+        SplatError, match="torchrun: the processes have to compute alike: .* but other in process 1 on"
+    ):
+        together(2, work)
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_a_run_of_several_processes_has_the_bytes_of_one(capture, alone, tmp_path, size):
+    together(size, lambda team: train(options(capture, tmp_path / "run"), team))
+    assert scene(tmp_path / "run") == scene(alone)
+    assert contents(tmp_path / "run", 48) == contents(alone, 48)
+
+
+def test_a_run_goes_on_with_another_number_of_processes(capture, alone, tmp_path):
+    """One process, then four, then two; interrupted at 20 and 32 images, by one of the ranks."""
+    out = tmp_path / "run"
+    assert train(options(capture, out), until=20)
+    assert (out / "checkpoints/iteration_20.safetensors").exists()
+    resumed = options(capture, out, resume=True)
+    assert together(4, lambda team: train(resumed, team, until=32 if team.rank == 2 else None)) == [True] * 4
+    assert together(2, lambda team: train(resumed, team)) == [False] * 2
+    assert scene(out) == scene(alone)
+    assert contents(out, 48) == contents(alone, 48)
+
+
+def test_another_batch_is_another_run(capture, alone):
+    config = recipe(48, batch=2, densify_start=3, densify_every=10, densify_stop=40, grad_threshold=1e-5)
+    with pytest.raises(CheckpointError, match="was started with batch = 4, not 2"):
+        CaptureRun(options(capture, alone, config=config, resume=True))
+
+
+def test_processes_with_different_captures_are_refused(capture, tmp_path):
+    other = tmp_path / "other"
+    write_colmap(other, *procedural_capture(24, 9, splats=600))
+
+    def work(team):
+        train(options(other if team.rank == 1 else capture, tmp_path / "run"), team)
+
+    with pytest.raises(SplatError, match="the processes have to start alike: "):
+        together(2, work, patience=10.0)
+
+
+WORDS = (
+    "--batch",
+    "4",
+    "--iterations",
+    "400",
+    "--max-gaussians",
+    "700",
+    "--eval-every",
+    "0",
+    "--save-every",
+    "40",
+)
+
+
+@pytest.mark.own_process
+@pytest.mark.sliced(1)
+@pytest.mark.parametrize(("size", "victim"), [(2, 0), (2, 1), (4, None), (4, 3)])
+def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tmp_path, size, victim):
+    assert main(["train", str(capture), "--out", str(tmp_path / "alone"), *WORDS]) == 0
+    out = tmp_path / "several"
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={size}"]
+    command = [*launcher, "--max-restarts=1", "-m", "gsplat_edu", "train", str(capture), "--out", str(out)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        [*command, *WORDS, "--resume"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    said = []
+    reader = threading.Thread(target=lambda: said.append(process.stdout.read()))
+    reader.start()
+    try:
+        if victim is not None:
+            deadline = time.monotonic() + 100
+            while not list((out / "checkpoints").glob("*.safetensors")):
+                assert time.monotonic() < deadline and process.poll() is None, said
+                time.sleep(0.02)
+            os.kill(rank_of(process.pid, victim), signal.SIGKILL)
+        assert process.wait(120) == 0, said
+    finally:
+        process.kill()
+        reader.join(10)
+    path = "point_cloud/iteration_400/point_cloud.ply"
+    found = [
+        hashlib.sha256((tmp_path / name / path).read_bytes()).hexdigest() for name in ("alone", "several")
+    ]
+    assert found[0] == found[1]
+    assert victim is None or "resuming after" in said[0]
+
+
+def rank_of(launcher, rank):
+    """Return the process with a rank among the children of torchrun."""
+    for pid in Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split():
+        if f"RANK={rank}".encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0"):
+            return int(pid)
+    raise AssertionError("has no such rank")
+
+
+@pytest.mark.own_process
+@pytest.mark.sliced(1)
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            ["train", "CAPTURE", "--batch", "3"],
+            "gsplat-edu train: --batch: is 3, but has to be a multiple of the 2 ",
+        ),
+        (
+            ["train", "CAPTURE", "--batch", "2", "--time-limit", "9s"],
+            "gsplat-edu train: --time-limit: cannot choose",
+        ),
+        (
+            ["train", "CAPTURE", "--batch", "2", "--view"],
+            "gsplat-edu train: --view: shows the training of one process",
+        ),
+        (
+            ["train", "CAPTURE", "--batch", "two"],
+            "gsplat-edu train: argument --batch: 'two' is not a whole number",
+        ),
+        (["doctor", "CAPTURE"], "gsplat-edu: doctor: runs in one process"),
+    ],
+)
+def test_a_mistake_is_reported_once(capture, tmp_path, words, line):
+    words = [str(capture) if word == "CAPTURE" else word for word in words]
+    words += ["--out", str(tmp_path / "run")] if words[0] == "train" else []
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    done = subprocess.run(
+        [*launcher, "-m", "gsplat_edu", *words],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    ours = [found for found in done.stderr.splitlines() if found.startswith("gsplat-edu")]
+    assert len(ours) == 1 and ours[0].startswith(line), done.stderr
+    assert "exitcode  : 2" in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("names", "allowed"), [({}, False), ({"TORCHELASTIC_MAX_RESTARTS": "2"}, True)])
+def test_restarts_need_resume(capture, tmp_path, monkeypatch, capsys, names, allowed):
+    """A restart that did not resume would fail, because the folder holds a run."""
+    for name, value in {
+        "RANK": "0",
+        "WORLD_SIZE": "2",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": "x",
+    }.items():
+        monkeypatch.setenv(name, value)
+    for name, value in names.items():
+        monkeypatch.setenv(name, value)
+    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--batch", "2" if allowed else "3"]
+    assert main(words) == 2
+    said = "--resume: is needed with --max-restarts" if allowed else "--batch: is 3"
+    assert capsys.readouterr().err.startswith(f"gsplat-edu train: {said}")
