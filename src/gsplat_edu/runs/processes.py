@@ -50,11 +50,12 @@ class Processes:
     Attributes:
         sent: Bytes sent so far.
         waited: Seconds spent on messages so far: packing, sending and waiting.
+        worked: Processor seconds of these, of all threads.
     """
 
     def __init__(self, rank: int, size: int, group: Any, patience: timedelta = PATIENCE) -> None:  # noqa: ANN401
         self.rank, self.size, self._group, self._patience = rank, size, group, patience
-        self.sent, self.waited = 0, 0.0
+        self.sent, self.waited, self.worked = 0, 0.0, 0.0
 
     def exchange(self, outgoing: Sequence[Sequence[Tensor]]) -> list[list[Tensor]]:
         """Send a list of tensors to every process, and receive one from each; see `Team.exchange`.
@@ -62,7 +63,7 @@ class Processes:
         Raises:
             ProcessLostError: another process ended.
         """
-        start = time.perf_counter()
+        start, processor = time.perf_counter(), time.process_time()
         others = [rank for rank in range(self.size) if rank != self.rank]
         packed = {id(tensors): pack(tensors) for rank, tensors in enumerate(outgoing) if rank in others}
         blobs = {rank: packed[id(outgoing[rank])] for rank in others}
@@ -73,6 +74,7 @@ class Processes:
         )
         self.sent += sum(blob.nbytes + lengths[rank].nbytes for rank, blob in blobs.items())
         self.waited += time.perf_counter() - start
+        self.worked += time.process_time() - processor
         return [
             list(outgoing[rank]) if rank == self.rank else unpack(incoming[rank]) for rank in range(self.size)
         ]
