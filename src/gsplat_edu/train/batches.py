@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.threads import one_thread
 
 Node = tuple[int, int]
 """A node of the tree: its level, from 0 for the views, and its place within the level."""
@@ -40,6 +41,7 @@ class PartialSums:
         self._count = count
         self.nodes: dict[Node, Gradients] = {}
 
+    @one_thread()  # a second thread of torch's would wait busily while the kernels' own threads work
     def add(self, node: Node, gradients: Gradients) -> None:
         """Add a node, and combine it with its sibling while that is here.
 
@@ -131,6 +133,7 @@ class Batch:
         self.sums = PartialSums(self.count)
         self._before = {name: tensor.clone() for name, tensor in self.measured.items()}
 
+    @one_thread()
     def take(self, place: int, index: int, terms: Mapping[str, Tensor], output: RenderOutput | None) -> None:
         """Move a view's gradients out of the parameters' `grad`, and its rows out of the measured state.
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsplat_edu.adam import AdamKernel
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.threads import one_thread
 from gsplat_edu.train.batches import Batch, Gradients, PartialSums, ViewResult
 from gsplat_edu.train.optimizer import MOMENTS, Adam, ParameterGroup
 
@@ -148,6 +149,7 @@ class SharedAdam(Adam):
             for rank in range(self._team.size)
         ]
 
+    @one_thread()
     def summed(self, names: Sequence[str], incoming: Sequence[Sequence[Tensor]], batch: int) -> Gradients:
         """Complete the sums of the rows that this process moves.
 
@@ -164,6 +166,7 @@ class SharedAdam(Adam):
         return sums.total
 
     @torch.no_grad()
+    @one_thread()
     def spread(self, parameters: Mapping[str, Tensor]) -> None:
         """Send the rows that this process has moved to all, and take over theirs, in place."""
         names = [name for name in parameters if name in self._shared]
@@ -219,6 +222,7 @@ class SharedAdam(Adam):
                     kept[name] = kept[name][self._rows(self._count)].clone()
 
 
+@one_thread()
 def share_results(team: Team, batch: Batch, sums: Sequence[Sequence[Tensor]]) -> list[list[Tensor]]:
     """Tell all processes what the views of this one left, together with their rows of the partial sums.
 

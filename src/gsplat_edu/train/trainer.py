@@ -65,6 +65,7 @@ Reduce = Callable[[Mapping[str, Tensor], int], None]
 apply. Processes that share a step call it with the rows that each of them moves."""
 
 
+@one_thread()
 def mean_over_views(parameters: Mapping[str, Tensor], num_views: int) -> None:
     """Divide every gradient by the number of views; the gradient of a single view is unchanged."""
     if num_views > 1:
