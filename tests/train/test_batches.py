@@ -1,3 +1,4 @@
+import functools
 import math
 
 import numpy as np
@@ -9,7 +10,9 @@ from gains import Gains
 from gsplat_edu import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.errors import DatasetError
+from gsplat_edu.evaluate.metrics import score_views
 from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.batches import PartialSums
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
@@ -327,3 +330,20 @@ def test_what_does_not_fit_a_batch_is_refused():
             render=render,
             parts=StepParts(view_model=Totals(4)),
         )
+
+
+def test_batches_learn_as_well_from_as_many_images():
+    """Measured: 29.5, 29.3 and 29.3 dB for batches of 1, 2 and 4; at the rates of one view 29.5, 28.5 and 27.3 dB."""
+    views, points, colors = procedural_capture(24, 9, splats=300)
+    found = {}
+    for batch in (1, 2, 4):
+        settings = recipe(400, batch=batch, strategy="fast", max_gaussians=300, fast_start_factor=1.0)
+        start = from_points(points, colors, settings)
+        density = make_strategy(settings, 2.0, start)
+        run = Trainer(start, views[1:], settings, render=render, extent=2.0, density=density)
+        run.run()
+        (score,) = score_views(
+            run.gaussians, views[:1], functools.partial(render, settings=RenderSettings()), (0.0,) * 3
+        )
+        found[batch] = score.psnr
+    assert found[1] > 28 and min(found.values()) > found[1] - 0.8, found
