@@ -28,7 +28,7 @@ import hardware
 from captures import capture
 
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.ranks import count
+from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.runs.options import RunOptions
@@ -144,7 +144,7 @@ def on_two(folder: Path, arguments: Any) -> dict[str, Steps]:  # noqa: ANN401
 
 def rank(arguments: Any) -> None:  # noqa: ANN401
     """Train as one of torchrun's processes; the first one writes what its steps took."""
-    with joined(count()) as team, TemporaryDirectory() as scratch:
+    with joined(num_processes()) as team, TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
         given = options(arguments.capture, out, arguments.resolution, arguments.iterations, SHARED)
         _, steps = train(given, team)

@@ -11,7 +11,7 @@ from importlib.metadata import version
 
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
-from gsplat_edu.cli.ranks import count
+from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.render.settings import check_backend
 
 COMMANDS = {
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if parsed.command is None:
             parser.print_help()
             return EXIT_BAD_INPUT
-        if count() > 1 and parsed.command != "train":
+        if num_processes() > 1 and parsed.command != "train":
             parser.error(f"{parsed.command}: runs in one process; torchrun is for train")
         return run_command(f"gsplat-edu {parsed.command}", lambda: parsed.run(parsed), parsed.debug)
     except KeyboardInterrupt:  # while the options were still being imported

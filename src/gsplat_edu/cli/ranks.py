@@ -12,7 +12,7 @@ PATIENCE = timedelta(seconds=10)
 """How long to wait for torchrun's table of values."""
 
 
-def count() -> int:
+def num_processes() -> int:
     """Return the number of processes that `torchrun` started for this command; 1 without it."""
     size = os.environ.get("WORLD_SIZE", "")
     return int(size) if size.isdecimal() and all(name in os.environ for name in VARIABLES) else 1
@@ -20,17 +20,17 @@ def count() -> int:
 
 def is_first() -> bool:
     """Return whether this is process 0, which prints."""
-    return count() == 1 or os.environ["RANK"] == "0"
+    return num_processes() == 1 or os.environ["RANK"] == "0"
 
 
 def restarts_are_allowed() -> bool:
     """Return whether `torchrun` starts the processes again when one fails."""
-    return count() > 1 and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
+    return num_processes() > 1 and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
 
 
 def speaks_for_all() -> bool:
     """Return whether this process reports a failure: the first that asks does, since one failure ends all of them."""
-    if count() == 1:
+    if num_processes() == 1:
         return True
     import torch.distributed as dist
 

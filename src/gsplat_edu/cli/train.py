@@ -23,7 +23,7 @@ from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
 from gsplat_edu.cli.options.train import left_open, options_from
 from gsplat_edu.cli.process import process_age
-from gsplat_edu.cli.ranks import count
+from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.colmap import find_model
@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> None:
     live = _live(arguments)
     for path in arguments.export:
         check_target("--export", path)
-    size = count()
+    size = num_processes()
     if size > 1 and needs_poses(arguments.data):
         raise ArgumentError(
             f"{arguments.data}: has no poses; find them first, in one process, by `gsplat-edu sfm`"
@@ -118,15 +118,7 @@ def _run(
     chosen = _planned(arguments, deadline, console, say)
     with interruptible(patient=team.size > 1) as interrupted, ExitStack() as closing:
         options = chosen.options
-        if team.size > 1 and options.backend != "cpu":
-            raise ArgumentError(
-                f"--backend: is {options.backend}, but several processes train on cpu; give that"
-            )
-        finished = is_finished(options)
-        settings = {"train": options.config.flat(), "data": asdict(options.data_settings)}
-        team.shared({"finished": finished, **settings})
-        if finished:
-            say(f"{options.out}: is finished, {options.config.iterations} iterations; nothing to do")
+        if _is_over(options, team, say):
             return
         host = arguments.view_host or LOOPBACK
         if live is not None:
@@ -142,8 +134,7 @@ def _run(
             ends = functools.partial(_either, interrupted, pace.over)
         view = None
         if live is not None:
-            view = live.LiveView(capture, interrupted, host, port)
-            closing.enter_context(view)
+            view = closing.enter_context(live.LiveView(capture, interrupted, host, port))
             say(f"live view: {view.url}")
             if warning := exposure(host, "sees the training and can pause it", token=True):
                 say(warning)
@@ -166,17 +157,25 @@ def _run(
                 if view is not None:
                     view.update("evaluating")
 
-            result = capture.finish(
-                scored,
-                functools.partial(export_all, arguments.export, bar, options.backend, say)
-                if arguments.export
-                else None,
-                _cleaner(capture, say) if arguments.clean else None,
-            )
+            export = functools.partial(export_all, arguments.export, bar, options.backend, say)
+            clean = _cleaner(capture, say) if arguments.clean else None
+            result = capture.finish(scored, export if arguments.export else None, clean)
         _report(capture, result, say)
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
             view.stay()
+
+
+def _is_over(options: RunOptions, team: Member, say: Callable[[str], None]) -> bool:
+    """Tell the other processes the options; return whether nothing is left to do, and say so."""
+    if team.size > 1 and options.backend != "cpu":
+        raise ArgumentError(f"--backend: is {options.backend}, but several processes train on cpu; give that")
+    finished = is_finished(options)
+    settings = {"train": options.config.flat(), "data": asdict(options.data_settings)}
+    team.shared({"finished": finished, **settings})
+    if finished:
+        say(f"{options.out}: is finished, {options.config.iterations} iterations; nothing to do")
+    return finished
 
 
 def _cleaner(capture: CaptureRun, say: Callable[[str], None]) -> Clean:

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
-from gsplat_edu.cli.ranks import count, restarts_are_allowed
+from gsplat_edu.cli.ranks import num_processes, restarts_are_allowed
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
@@ -318,7 +318,7 @@ def check(arguments: argparse.Namespace) -> None:
         raise DatasetError(
             f"{arguments.data}: does not exist; give the folder of a capture, of photos, or a video"
         )
-    if count() > 1:
+    if num_processes() > 1:
         _check_several(arguments)
     for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):
         if path is not None and not path.exists():
@@ -331,7 +331,7 @@ def _check_several(arguments: argparse.Namespace) -> None:
     Raises:
         ArgumentError: an option does not go with them.
     """
-    size, batch = count(), arguments.batch or 1
+    size, batch = num_processes(), arguments.batch or 1
     if batch % size:
         raise ArgumentError(
             f"--batch: is {batch}, but has to be a multiple of the {size} processes, so that each renders equally many"
