@@ -40,6 +40,8 @@ FIRST = (
     "tests/viewer/test_page_drawing.py",
     "tests/viewer/test_live_browser.py",
     "tests/runs/test_training.py",
+    "tests/runs/test_processes.py",
+    "tests/train/test_batches.py",
     "tests/gpu/test_training.py",
     "tests/sfm/test_training.py",
     "tests/viewer/test_page_controls.py",

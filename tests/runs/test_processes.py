@@ -1,4 +1,5 @@
 import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -137,6 +138,17 @@ def test_a_run_goes_on_with_another_number_of_processes(capture, alone, tmp_path
     assert contents(out, 48) == contents(alone, 48)
 
 
+def test_the_log_and_the_milestones_count_images(alone):
+    """Steps have four images: lines follow every tenth image, an evaluation the 24th, checkpoints the 16th."""
+    lines = [json.loads(line) for line in (alone / "log.jsonl").read_text().splitlines()]
+    assert [line["iteration"] for line in lines if "loss" in line] == [12, 20, 32, 40]
+    assert [line["iteration"] for line in lines if "psnr" in line] == [24]
+    assert [line["iteration"] for line in lines if line.get("event") == "densify"] == [12, 24, 32]
+    assert [path.name for path in sorted((alone / "checkpoints").iterdir())] == [
+        f"iteration_{done}.safetensors" for done in (32, 48)
+    ]
+
+
 def test_another_batch_is_another_run(capture, alone):
     config = recipe(48, batch=2, densify_start=3, densify_every=10, densify_stop=40, grad_threshold=1e-5)
     with pytest.raises(CheckpointError, match="was started with batch = 4, not 2"):
@@ -158,7 +170,7 @@ WORDS = (
     "--batch",
     "4",
     "--iterations",
-    "400",
+    "240",
     "--max-gaussians",
     "700",
     "--eval-every",
