@@ -156,7 +156,7 @@ def _photographed(
     camera: Camera, dome: float, clouds: float
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Rows, Rows, Bool[np.ndarray, " N"]]:
     """Return a photo, and the place, colour and whether it is the sky of each of its rays."""
-    eyes, directions = _rays(camera)
+    eyes, directions = camera_rays(camera)
     parts = [
         _traced(eyes[start : start + AT_ONCE], directions[start : start + AT_ONCE], dome, clouds)
         for start in range(0, len(eyes), AT_ONCE)
@@ -166,7 +166,8 @@ def _photographed(
     return np.round(255 * image).astype(np.uint8), hits, color, sky
 
 
-def _rays(camera: Camera) -> tuple[Rows, Rows]:
+def camera_rays(camera: Camera) -> tuple[Rows, Rows]:
+    """Return origin and unit direction of `SUPERSAMPLING` squared rays for each pixel, row by row of the finer grid."""
     inside = (np.arange(SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
     u = (np.arange(camera.W)[:, None] + inside).ravel()
     v = (np.arange(camera.H)[:, None] + inside).ravel()
@@ -187,7 +188,7 @@ def _traced(
     nearest[rows] = ground[rows]
     color[rows] = _ground(eyes[rows] + ground[rows, None] * directions[rows], ground[rows])
     for place, halves, turn, paint in BOXES:
-        distance, normals = _box(eyes, directions, place, halves, turn)
+        distance, normals = box_hits(eyes, directions, place, halves, turn)
         rows = np.flatnonzero(distance < nearest)
         nearest[rows] = distance[rows]
         hits = eyes[rows] + distance[rows, None] * directions[rows]
@@ -222,10 +223,18 @@ def _painted(hits: Rows, normals: Rows, paint: Float64[np.ndarray, "3"]) -> Rows
     return np.asarray(light * (paint * (0.6 + 0.4 * checks)))
 
 
-def _box(
+def box_hits(
     eyes: Rows, directions: Rows, place: tuple[float, float], halves: tuple[float, ...], turn: float
 ) -> tuple[Float64[np.ndarray, " N"], Rows]:
-    """Return the distance at which each ray enters a box, infinity where it misses, and the normals there."""
+    """Return the distance at which each ray enters a box, infinity where it misses, and the normal there or zero.
+
+    Args:
+        eyes: (N, 3) origins of the rays.
+        directions: (N, 3) unit vectors.
+        place: Centre of the box on the ground, x and z.
+        halves: Half width along x, height, and half width along z.
+        turn: Turn of the box about the vertical, radians.
+    """
     half = np.array([halves[0], halves[1] / 2, halves[2]])
     c, s = math.cos(turn), math.sin(turn)
     axes = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
@@ -233,8 +242,12 @@ def _box(
     heading = directions @ axes.T
     heading = np.where(np.abs(heading) < 1e-12, 1e-12, heading)
     one, other = (-half - origins) / heading, (half - origins) / heading
-    enters = np.minimum(one, other)
-    near, far = enters.max(axis=1), np.maximum(one, other).min(axis=1)
-    first = enters.argmax(axis=1)
-    normals = -np.sign(np.take_along_axis(heading, first[:, None], axis=1)) * axes[first]
-    return np.where((near < far) & (near > 1e-4), near, np.inf), normals
+    enters, leaves = np.minimum(one, other).T, np.maximum(one, other).T
+    # one axis after the other: numpy is slow at the maximum of three
+    near = np.maximum(np.maximum(enters[0], enters[1]), enters[2])
+    far = np.minimum(np.minimum(leaves[0], leaves[1]), leaves[2])
+    hit = (near < far) & (near > 1e-4)
+    rows, normals = np.flatnonzero(hit), np.zeros_like(directions)
+    first = enters[:, rows].argmax(axis=0)
+    normals[rows] = -np.sign(heading[rows, first])[:, None] * axes[first]
+    return np.where(hit, near, np.inf), normals

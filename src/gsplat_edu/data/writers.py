@@ -39,30 +39,48 @@ def write_colmap(
     Raises:
         ShapeError: points or colours are not (N, 3).
     """
-    cloud = _cloud(points, colors)
-    model = folder / "sparse" / "0"
-    model.mkdir(parents=True, exist_ok=True)
-    cameras: dict[tuple[float, ...], int] = {}
     for view in views:
-        cameras.setdefault(_intrinsics(view.camera), len(cameras) + 1)
         photo = view.read()
         _save_photo(folder / "images" / view.name, photo)
         _save_mask(folder / "masks" / f"{view.name}.png", photo)
+    write_model(folder, [(view.name, view.camera) for view in views], points, colors, binary=binary)
+
+
+def write_model(
+    folder: Path,
+    cameras: Sequence[tuple[str, Camera]],
+    points: ArrayLike,
+    colors: ArrayLike,
+    *,
+    binary: bool = True,
+) -> None:
+    """Write a COLMAP model in sparse/0, without photos.
+
+    Args:
+        folder: The capture; created if missing.
+        cameras: Name and camera of each photo in images/.
+        points: (N, 3) world units.
+        colors: (N, 3) 0 to 1, rounded to 8 bits.
+        binary: Write .bin instead of .txt.
+
+    Raises:
+        ShapeError: points or colours are not (N, 3).
+    """
+    cloud = _cloud(points, colors)
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True, exist_ok=True)
+    lenses: dict[tuple[float, ...], int] = {}
+    for _, camera in cameras:
+        lenses.setdefault(_intrinsics(camera), len(lenses) + 1)
     poses = [
-        (
-            i,
-            _quaternion(view.camera),
-            -view.camera.R @ view.camera.eye,
-            cameras[_intrinsics(view.camera)],
-            view.name,
-        )
-        for i, view in enumerate(views, 1)
+        (i, _quaternion(camera), -camera.R @ camera.eye, lenses[_intrinsics(camera)], name)
+        for i, (name, camera) in enumerate(cameras, 1)
     ]
     rgb = np.round(255.0 * np.clip(cloud.colors, 0.0, 1.0)).astype(int)
     if binary:
-        _write_bin(model, cameras, poses, cloud.points, rgb)
+        _write_bin(model, lenses, poses, cloud.points, rgb)
     else:
-        _write_txt(model, cameras, poses, cloud.points, rgb)
+        _write_txt(model, lenses, poses, cloud.points, rgb)
 
 
 def write_transforms(
