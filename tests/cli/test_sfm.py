@@ -13,7 +13,7 @@ from rich.console import Console
 from gsplat_edu.cli.main import build_parser, main
 from gsplat_edu.cli.options.train import options_from as train_options_from
 from gsplat_edu.cli.sfm import options_from, stage_bars
-from gsplat_edu.cli.train import _with_poses
+from gsplat_edu.cli.train import with_poses
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.textured_box import box_camera, box_orbit, photograph_box
 from gsplat_edu.sfm.reconstruct import SfmOptions
@@ -258,7 +258,7 @@ def test_a_resumed_run_keeps_its_poses(tmp_path):
     options = train_options_from(build_parser(["train"]).parse_args(words))
     said = []
     assert (
-        _with_poses(
+        with_poses(
             options,
             argparse.Namespace(panorama="auto", scale="auto"),
             Console(file=io.StringIO()),

@@ -18,6 +18,9 @@ COMMANDS = {
     "demo": "train a sphere from 24 renders of it and evaluate the result with a held-out camera",
     "sfm": "estimate the camera poses of photos or a video, and write a capture that train reads",
     "train": "train a scene from a capture, photos or a video",
+    "split": "split a large capture into blocks that are trained one by one, here or on other machines",
+    "block": "train one block of a run that `split` prepared",
+    "merge": "merge the trained blocks into one scene, score it and write the report",
     "eval": "score a run's latest scene on its test and training views; write metrics, renders and a report",
     "render": "render images or a video of a run or a scene file, along a path or from a capture's cameras",
     "convert": "write a scene in another format, or as a web page; filter, transform, merge and verify it",
@@ -80,4 +83,5 @@ def _run(name: str, arguments: argparse.Namespace) -> None:
     options = importlib.import_module(f"gsplat_edu.cli.options.{name}")
     if hasattr(options, "check"):
         options.check(arguments)
-    importlib.import_module(f"gsplat_edu.cli.{name}").run(arguments)
+    module = options.runner(arguments) if hasattr(options, "runner") else name
+    importlib.import_module(f"gsplat_edu.cli.{module}").run(arguments)

@@ -124,8 +124,8 @@ def _run(
         if live is not None:
             port = live.PORT if arguments.view_port is None else arguments.view_port
             free_port(host, port, live.NAMES)  # before the run writes anything
-        with _bar(console, "") as bar:
-            capture = CaptureRun(options, say, _photos(bar, interrupted), team)
+        with progress_bar(console, "") as bar:
+            capture = CaptureRun(options, say, photos_read(bar, interrupted), team)
         callbacks: list[Callback] = []
         ends = interrupted
         if deadline is not None:
@@ -138,14 +138,14 @@ def _run(
             say(f"live view: {view.url}")
             if warning := exposure(host, "sees the training and can pause it", token=True):
                 say(warning)
-        with _bar(console, "{task.fields[state]}") as bar:
-            ended = _train(capture, bar, ends, callbacks if view is None else [*callbacks, view.show])
+        with progress_bar(console, "{task.fields[state]}") as bar:
+            ended = train_with_bar(capture, bar, ends, callbacks if view is None else [*callbacks, view.show])
         if interrupted() or (ended and team.size > 1 and not ends()):  # or another process was
             raise KeyboardInterrupt(
                 f"interrupted after {capture.trainer.iteration} iterations;"
                 " add --resume to the same command to continue"
             )
-        with _bar(console, "") as bar:
+        with progress_bar(console, "") as bar:
             task = bar.add_task("evaluating", total=len(capture.dataset.test) + len(capture.dataset.train))
 
             def scored(split: str, score: ImageScore) -> None:
@@ -183,7 +183,7 @@ def _cleaner(capture: CaptureRun, say: Callable[[str], None]) -> Clean:
     return cleaner(options.render_settings, say, options.config.appearance)
 
 
-def _with_poses(
+def with_poses(
     options: RunOptions, arguments: argparse.Namespace, console: Console, say: Callable[[str], None]
 ) -> RunOptions:
     """Find the poses first if the input is plain photos or a video; keep the capture in the run's folder."""
@@ -220,8 +220,8 @@ def _planned(
     arguments: argparse.Namespace, deadline: Deadline | None, console: Console, say: Callable[[str], None]
 ) -> Plan:
     """Find poses if necessary, and choose the options that the limits leave open."""
-    options = _with_poses(options_from(arguments), arguments, console, say)
-    options = _with_choices(options, left_open(arguments), console, say)
+    options = with_poses(options_from(arguments), arguments, console, say)
+    options = with_choices(options, left_open(arguments), console, say)
     limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
     given += ["iterations"] if arguments.quality is not None else []
@@ -231,7 +231,7 @@ def _planned(
     return chosen
 
 
-def _with_choices(
+def with_choices(
     options: RunOptions, names: tuple[str, ...], console: Console, say: Callable[[str], None]
 ) -> RunOptions:
     """Choose the settings whose option is auto, and say which were chosen and why."""
@@ -242,15 +242,15 @@ def _with_choices(
         return replace(options, config=options.config.changed(**{name: remedy.value}))
 
     if by_photos := [name for name in names if name in ("appearance", "sky")]:
-        with _bar(console, "") as bar:
-            remedies = remedies_for(options.data, by_photos, _photos(bar, lambda: False))
+        with progress_bar(console, "") as bar:
+            remedies = remedies_for(options.data, by_photos, photos_read(bar, lambda: False))
         for name, remedy in remedies.items():
             options = take(options, name, remedy)
     if "transients" in names:
         count = len(load_dataset(options.data, options.data_settings).train)
         options = take(options, "transients", transients_for(count))
     if "refine" in names:
-        with _bar(console, "") as bar:
+        with progress_bar(console, "") as bar:
             task = bar.add_task("short trainings", total=len(ORDER) * PILOT_STEPS)
             chosen = refinement_for(options, progress=lambda: bar.advance(task))
         options = take(options, "refine", Remedy(*chosen))
@@ -291,12 +291,23 @@ def _live(arguments: argparse.Namespace) -> ModuleType | None:
         raise ArgumentError(f"--view: {error.name} is not installed; {how}, or omit --view") from None
 
 
-def _train(
+def train_with_bar(
     capture: CaptureRun,
     bar: Progress,
     ends: Callable[[], bool],
     callbacks: Sequence[Callback],
 ) -> bool:
+    """Run the remaining iterations with a progress bar.
+
+    Args:
+        capture: The run.
+        bar: Shows the state.
+        ends: Whether to stop, asked after every iteration.
+        callbacks: Receive every step.
+
+    Returns:
+        Whether `ends`, in any of the processes that share the training, ended it.
+    """
     iterations, start = capture.options.config.iterations, capture.trainer.iteration
     task = bar.add_task("training", total=iterations, completed=start, state="")
 
@@ -318,7 +329,7 @@ def _train(
     return capture.train(ends, [show, *callbacks])
 
 
-def _photos(bar: Progress, interrupted: Callable[[], bool]) -> Callable[[int, int], None]:
+def photos_read(bar: Progress, interrupted: Callable[[], bool]) -> Callable[[int, int], None]:
     """Return what shows how many photos have been read."""
     task = bar.add_task("photos", total=None)
 
@@ -341,7 +352,13 @@ def _psnr(trainer: Trainer) -> float:
     return psnr(*trainer.last)
 
 
-def _bar(console: Console, state: str) -> Progress:
+def progress_bar(console: Console, state: str) -> Progress:
+    """Make a progress bar; one that shows a state stays on the screen.
+
+    Args:
+        console: The terminal; without one, nothing is drawn.
+        state: Template of the text behind the bar.
+    """
     columns = (
         Field("{task.description}"),
         BarColumn(bar_width=16),

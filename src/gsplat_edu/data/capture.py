@@ -18,6 +18,7 @@ from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
 from gsplat_edu.data.panorama import FaceLens, face_rotations
 from gsplat_edu.data.scale import Scale
+from gsplat_edu.data.settings import FACTOR_BELOW
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import unreadable
 
@@ -26,9 +27,6 @@ ROTATION_SLACK = 1e-2
 
 MAX_COORDINATE = 1e12
 """Largest plausible coordinate, world units."""
-
-FACTOR_BELOW = 32
-"""A resolution below this is a divisor of the size; from here on it is the longest side, px."""
 
 READY_MADE = (2, 4, 8)
 """Factors of the folders images_2, images_4 and images_8 that are searched."""

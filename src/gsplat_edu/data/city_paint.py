@@ -247,4 +247,4 @@ def _noise(u: Numbers, v: Numbers, salt: int) -> Numbers:
     one, other = (
         (1 - a) * _speckle(left, low + k, salt) + a * _speckle(left + 1, low + k, salt) for k in (0, 1)
     )
-    return (1 - b) * one + b * other
+    return np.asarray((1 - b) * one + b * other)

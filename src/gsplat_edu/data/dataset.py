@@ -132,6 +132,8 @@ def load_dataset(
     notes = [str(note) for note in capture.notes]
     frames = sorted(capture.frames, key=lambda frame: frame.name)
     frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
+    if settings.train_views is not None:
+        frames = _listed(path, frames, (*settings.train_views, *settings.test_views))
     header_of = functools.cache(image_header)
 
     def size_of(path: Path) -> tuple[int, int]:
@@ -154,7 +156,12 @@ def load_dataset(
             "others are decoded again whenever they are used; raise --image-memory, or load smaller photos with "
             "--resolution"
         )
-    train, test = _split(path, views, [frame.part for frame in frames], settings.test_every, notes)
+    if settings.train_views is None:
+        train, test = _split(path, views, [frame.part for frame in frames], settings.test_every, notes)
+    else:
+        held_out = frozenset(settings.test_views)
+        train = tuple(view for view in views if view.name not in held_out)
+        test = tuple(view for view in views if view.name in held_out)
     start = cloud or _random_start(capture, [view.camera for view in views], notes, origin)
     files = tuple((frame.name, source) for frame, (source, _, _) in zip(frames, made, strict=True))
     return Dataset(
@@ -241,6 +248,17 @@ def _near_origin(
     notes.append(f"coordinates are large: {tuple(origin.tolist())} was subtracted from all of them")
     frames = [replace(frame, eye=frame.eye - origin) for frame in frames]
     return frames, None if cloud is None else replace(cloud, points=cloud.points - origin), origin
+
+
+def _listed(path: Path, frames: Sequence[Frame], names: Sequence[str]) -> list[Frame]:
+    """Return the frames of these names; refuse a capture that lacks one."""
+    by_name = {frame.name: frame for frame in frames}
+    if missing := [name for name in names if name not in by_name]:
+        raise DatasetError(
+            f"{path}: {len(missing)} of the {len(names)} photos asked for are missing here, first {missing[0]};"
+            " copy them here, or mount the folder that has them"
+        )
+    return [by_name[name] for name in sorted(set(names))]
 
 
 def _spelled(nbytes: int) -> str:

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.validation import float64_array, in_range, whole_number
 
+FACTOR_BELOW = 32
+"""A resolution below this is a divisor of the size; from here on it is the longest side, px."""
+
 
 @dataclass(frozen=True)
 class DataSettings:
@@ -20,6 +23,9 @@ class DataSettings:
         background: (r, g, b), 0 to 1, composited behind photos with alpha on loading. None keeps the alpha for a
             background chosen later.
         image_memory: Bytes of decoded photos to keep in memory; other photos are decoded again on each use.
+        train_views: Names of the training views, at least one; only these and `test_views` are read, and no split is
+            made. None uses every view.
+        test_views: Names of the test views to go with `train_views`.
 
     Raises:
         ArgumentError: a value is out of range, or the split would leave no training view.
@@ -29,6 +35,8 @@ class DataSettings:
     test_every: int | None = None
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
     image_memory: int = 4 * 2**30
+    train_views: tuple[str, ...] | None = None
+    test_views: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.resolution is not None and (in_range("resolution", self.resolution, 1.0) > 1e6):
@@ -44,3 +52,5 @@ class DataSettings:
             )
             object.__setattr__(self, "background", (r, g, b))
         whole_number("image_memory", self.image_memory, 0)
+        if self.train_views is not None and not self.train_views:
+            raise ArgumentError("train_views: is empty; name at least one view, or give None for all")

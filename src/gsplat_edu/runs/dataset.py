@@ -10,6 +10,9 @@ from typing import Any
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError, CheckpointError
 
+KEYS = ("resolution", "test_every", "background", "image_memory", "train_views", "test_views")
+"""Keys of the section "data" that are data settings."""
+
 
 def appearance_of(config: Mapping[str, Any]) -> str:
     """Return what a run's config.json says that its training corrected: one of `APPEARANCES`."""
@@ -34,10 +37,8 @@ def data_settings(config: dict[str, Any]) -> DataSettings:
     section = config.get("data")
     if not isinstance(section, dict):
         raise CheckpointError("config.json: the section data is missing; restore it or train again")
-    keys = ("resolution", "test_every", "background", "image_memory")
-    values = {key: section[key] for key in keys if key in section}
-    if isinstance(values.get("background"), list):
-        values["background"] = tuple(values["background"])
+    values = {key: section[key] for key in KEYS if key in section}
+    values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
     try:
         return as_trained(DataSettings(**values), appearance_of(config))
     except (ArgumentError, TypeError) as error:

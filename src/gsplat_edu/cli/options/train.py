@@ -6,10 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
+from gsplat_edu.cli.options.blocks import COARSE_FACTOR, COARSE_SHARE, add_blocks, add_cluster, check_blocks
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
 from gsplat_edu.cli.ranks import num_processes, restarts_are_allowed
-from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.data.settings import FACTOR_BELOW, DataSettings
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
@@ -83,6 +85,18 @@ NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "back
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    add_training(parser)
+    add_blocks(parser)
+    add_cluster(parser)
+
+
+def runner(arguments: argparse.Namespace) -> str:
+    """Return the module of `gsplat_edu.cli` that runs the command."""
+    return "train" if arguments.blocks is None else "blocks"
+
+
+def add_training(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a training."""
     parser.usage = "%(prog)s DATA --out RUN [options]"
     parser.add_argument(
         "data",
@@ -311,6 +325,7 @@ def check(arguments: argparse.Namespace) -> None:
         CheckpointError: the config.json of a run to resume is damaged.
         DatasetError: there is nothing under DATA.
     """
+    check_blocks(arguments)
     _options(arguments, arguments.backend)
     one_of("--panorama", arguments.panorama, PANORAMA)
     check_scale(arguments.scale)
@@ -360,6 +375,35 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
     from gsplat_edu.render.backends import resolve_backend  # it imports torch
 
     return _options(arguments, resolve_backend(arguments.backend))
+
+
+def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, argparse.Namespace | None]:
+    """Return the arguments of each block's run, and those of the coarse model's; None where --from gives one.
+
+    The resolution of the coarse run is divided by `COARSE_FACTOR`, and its length is --coarse-iterations.
+
+    Args:
+        arguments: Those of a run in blocks.
+    """
+    of_block = argparse.Namespace(**vars(arguments))
+    of_block.resume, of_block.scene = False, arguments.scene or arguments.out
+    for name in FOR_POINTS:
+        setattr(of_block, name, None)
+    if arguments.scene is not None:
+        return of_block, None
+    coarse = argparse.Namespace(**vars(arguments))
+    length = _length(arguments, _strategy(arguments))
+    coarse.iterations = arguments.coarse_iterations or max(round(COARSE_SHARE * length), 1)
+    coarse.quality, coarse.out = None, BlocksFolder(arguments.out).coarse
+    coarse.resume = RunFolder(coarse.out).exists()
+    if arguments.max_gaussians is not None:
+        coarse.max_gaussians = max(round(arguments.max_gaussians / COARSE_FACTOR**2), 1)
+    size = arguments.resolution
+    if size is None or size < FACTOR_BELOW:
+        coarse.resolution = min(COARSE_FACTOR * (size or 1.0), FACTOR_BELOW - 1)
+    else:
+        coarse.resolution = max(size / COARSE_FACTOR, FACTOR_BELOW)
+    return of_block, coarse
 
 
 def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:

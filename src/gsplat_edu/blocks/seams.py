@@ -1,0 +1,116 @@
+"""Scores of held-out views near the cuts between cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from gsplat_edu.blocks.plan import Area, Cell
+from gsplat_edu.camera import Camera
+from gsplat_edu.evaluate.metrics import MSE_FLOOR, Renderer
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.validation import ArrayLike
+from gsplat_edu.views import View
+
+WIDTH = 0.05
+"""Half the width of the strip along a cut, as a fraction of the mean side of the cells."""
+
+Mask = Bool[np.ndarray, "H W"]
+
+
+def strip_width(area: Area, cells: Sequence[Cell]) -> float:
+    """Return half the width of the strip along a cut, world units.
+
+    Args:
+        area: The ground.
+        cells: The cells.
+    """
+    parts = [cell.clipped(area.low, area.high) for cell in cells]
+    return WIDTH * float(np.mean([part.high[i] - part.low[i] for part in parts for i in range(2)]))
+
+
+def near_a_cut(
+    places: Float64[np.ndarray, "N D"], cells: Sequence[Cell], width: float
+) -> Bool[np.ndarray, " N"]:
+    """Return which places on the ground lie near an edge between two cells.
+
+    Args:
+        places: (N, 2) or more columns, of which the first two are a and b.
+        cells: The cells.
+        width: Largest distance from the edge, world units.
+    """
+    near = np.zeros(len(places), dtype=bool)
+    for cell in cells:
+        rows = np.flatnonzero(cell.holds(places))
+        for i in range(2):
+            for edge in (cell.low[i], cell.high[i]):  # no place is near infinity
+                near[rows] |= np.abs(places[rows, i] - edge) < width
+    return near
+
+
+def strip_mask(
+    area: Area, cells: Sequence[Cell], gaussians: Gaussians, camera: Camera, render: Renderer
+) -> Mask:
+    """Return which pixels of a view show places near a cut, by the depth of a scene.
+
+    Args:
+        area: The ground.
+        cells: The cells.
+        gaussians: The scene.
+        camera: The view's camera.
+        render: Renders Gaussians from a camera, with depths.
+    """
+    with torch.no_grad():
+        depth = render(gaussians, camera).mean_depth
+    assert depth is not None
+    z = depth.double().numpy(force=True).ravel()
+    columns, rows = np.meshgrid(np.arange(camera.W), np.arange(camera.H))
+    x, y = (columns.ravel() - camera.cx) / camera.fx * z, (rows.ravel() - camera.cy) / camera.fy * z
+    points = np.stack([x, y, z], axis=1) @ camera.R + camera.eye
+    near = near_a_cut(area.ground.coordinates(points), cells, strip_width(area, cells))
+    return np.asarray((near & (z > 0)).reshape(camera.H, camera.W))
+
+
+def pooled_psnr(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    masks: Sequence[Mask],
+    render: Renderer,
+    background: ArrayLike,
+) -> tuple[float | None, float | None]:
+    """Return the PSNR of all masked pixels of all views together, and of the others; None where there are none.
+
+    Args:
+        gaussians: The scene.
+        views: Held-out views.
+        masks: One for each view.
+        render: Renders Gaussians from a camera.
+        background: (3,) colour behind photos that are not opaque.
+    """
+    sums, counts = np.zeros(2), np.zeros(2)
+    for view, mask in zip(views, masks, strict=True):
+        photo = view.read()
+        counted = np.ones_like(mask) if photo.mask is None else photo.mask
+        with torch.no_grad():
+            image = render(gaussians, view.camera).image.double().numpy(force=True)
+        truth = np.asarray(photo.over(background), dtype=np.float64)
+        truth = truth / 255.0 if photo.image.dtype == np.uint8 else truth
+        error = np.square(np.clip(image, 0.0, 1.0) - truth).mean(axis=2)
+        for part, pixels in enumerate((mask & counted, ~mask & counted)):
+            sums[part] += float(error[pixels].sum())
+            counts[part] += int(pixels.sum())
+    inside, outside = (
+        float(-10 * np.log10(max(total / count, MSE_FLOOR))) if count else None
+        for total, count in zip(sums, counts, strict=True)
+    )
+    return inside, outside
+
+
+def masks_of(
+    area: Area, cells: Sequence[Cell], gaussians: Gaussians, cameras: Sequence[Camera], render: Renderer
+) -> list[Mask]:
+    """Return `strip_mask` for several cameras."""
+    return [strip_mask(area, cells, gaussians, camera, render) for camera in cameras]

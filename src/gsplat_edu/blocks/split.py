@@ -1,0 +1,166 @@
+"""Prepare a run in blocks: split the ground with a coarse model, and write what each block starts from."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsplat_edu.blocks.layout import PLAN, BlocksFolder, file_digest
+from gsplat_edu.blocks.plan import Block, BlockPlan, automatic_count, measured_area
+from gsplat_edu.blocks.views import LEAST_VIEWS, assigned, in_any_view, seen_shares
+from gsplat_edu.budget.costs import wanted_gaussians
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.dataset import Dataset, load_dataset
+from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.ply import save_ply
+from gsplat_edu.render.api import render
+from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.runs.start import scene_file, scene_start
+from gsplat_edu.shells import far_shell
+
+OPAQUE = 0.1
+"""Gaussians of the coarse model above this opacity count as points of the scene."""
+
+ROOM = 1.5
+"""fast: a block may grow to at least this multiple of the Gaussians that it starts with."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SplitOptions:
+    """How a capture is split.
+
+    Args:
+        count: Number of blocks; None chooses it from the number of training views.
+        least_views: Smallest number of training views of a block.
+    """
+
+    count: int | None = None
+    least_views: int = LEAST_VIEWS
+
+
+def recipe_of(options: RunOptions) -> dict[str, Any]:
+    """Return what a plan stores of the options of its blocks."""
+    return {
+        "train": options.config.flat(),
+        "data": dataclasses.asdict(options.data_settings),
+        "backend": options.backend,
+        "eval_every": options.eval_every,
+        "save_every": options.save_every,
+    }
+
+
+def check_recipe(folder: Path, plan: BlockPlan, options: RunOptions) -> None:
+    """Compare the options of a command that goes on with those of the plan.
+
+    Raises:
+        CheckpointError: one differs; the message names it.
+    """
+    stored, given = (_flat(recipe) for recipe in (plan.recipe, recipe_of(options)))
+    for key, value in given.items():
+        if key not in ("data.image_memory", "eval_every", "save_every") and stored.get(key) != value:
+            raise CheckpointError(
+                f"--resume: {folder / PLAN} was made with {key} = {stored.get(key)}, not {value}; give the same"
+                " options or another --out"
+            )
+
+
+def split_capture(options: RunOptions, coarse: Path, split: SplitOptions, say: Say) -> BlockPlan:
+    """Split a capture into blocks, and write the plan and what each block starts from.
+
+    Args:
+        options: Options of the run in blocks; its config is that of each block.
+        coarse: The coarse model: a scene file or a run.
+        split: How to split.
+        say: Receives sentences for the user.
+
+    Raises:
+        DatasetError: the capture cannot be read.
+        ArgumentError: the coarse model has too many Gaussians, or no usable one.
+        OSError: a file cannot be written.
+    """
+    folder, config = BlocksFolder(options.out), options.config
+    dataset = load_dataset(options.data, options.data_settings)
+    for note in dataset.notes:
+        say(note)
+    gaussians, notes = scene_start(coarse, config.changed(max_gaussians=None), dataset.origin)
+    for note in notes:
+        say(note)
+    means = gaussians.means.double().numpy()
+    solid = (gaussians.opacities.numpy() > OPAQUE) & ~far_shell(means)
+    points = means[solid if solid.any() else slice(None)]
+    area = measured_area([view.camera for view in dataset.train], points)
+    wanted = automatic_count(len(dataset.train)) if split.count is None else split.count
+    measure = functools.partial(seen_shares, area, gaussians, functools.partial(_render, options))
+    blocks = assigned(dataset, area, points, wanted, measure, split.least_views)
+    if split.count is not None and len(blocks) < wanted:
+        say(
+            f"{wanted} blocks would have fewer than {split.least_views} training views: the capture is split into"
+            f" {len(blocks)}"
+        )
+    cameras = {view.name: view.camera for view in dataset.train}
+    places = area.ground.coordinates(means)
+    made = []
+    for number, block in enumerate(blocks):
+        stays = block.core.enlarged(area.low, area.high).holds(places)
+        stays |= in_any_view(gaussians, [cameras[name] for name in block.train])
+        kept = torch.from_numpy(np.flatnonzero(stays))
+        start = gaussians.map(functools.partial(torch.index_select, dim=0, index=kept))
+        save_ply(folder.start(number), start, dataset.origin, config.antialiased)
+        cap = _cap(options, dataset, block, len(kept), len(gaussians))
+        made.append(dataclasses.replace(block, start=file_digest(folder.start(number)), max_gaussians=cap))
+        say(
+            f"block {number}: {len(block.train)} training views, {len(block.test)} held out,"
+            f" {len(kept):,} Gaussians to start from"
+        )
+    x, y, z = dataset.origin.tolist()
+    plan = BlockPlan(str(options.data.resolve()), (x, y, z), area, tuple(made), recipe_of(options))
+    plan.write(folder.path)  # last: its presence means that everything else is there
+    return plan
+
+
+def _render(options: RunOptions, gaussians: Gaussians, camera: Camera, features: Tensor) -> RenderOutput:
+    return render(
+        gaussians, camera, settings=options.render_settings, features=features, backend=options.backend
+    )
+
+
+def _cap(options: RunOptions, dataset: Dataset, block: Block, start: int, whole: int) -> int | None:
+    """Return the cap of a block: its share of that of the scene, or what the recipe plans for its views."""
+    config = options.config
+    if config.max_gaussians is not None:
+        if config.max_gaussians < whole:
+            raise ArgumentError(
+                f"--max-gaussians: is {config.max_gaussians}, but the coarse model has {whole} already; raise it, or"
+                " give a smaller one with --from"
+            )
+        return max(config.max_gaussians * start // whole, 1)
+    if config.strategy != "fast":
+        return None
+    pixels = np.mean([view.camera.W * view.camera.H for view in dataset.train])
+    return max(wanted_gaussians(config, start, float(pixels), len(block.train)), int(ROOM * start))
+
+
+def coarse_scene(options: RunOptions) -> Path:
+    """Return the scene of a coarse model that was given, or of the run that was trained for it."""
+    return scene_file(options.scene or BlocksFolder(options.out).coarse)
+
+
+def _flat(recipe: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in recipe.items():
+        parts = value if isinstance(value, dict) else {"": value}
+        for name, entry in parts.items():
+            found[f"{key}.{name}".rstrip(".")] = list(entry) if isinstance(entry, tuple) else entry
+    return found

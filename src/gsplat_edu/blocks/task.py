@@ -1,0 +1,144 @@
+"""Train one block: an ordinary run, and a record that is renamed into place when it is finished."""
+
+from __future__ import annotations
+
+import platform
+import socket
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
+from gsplat_edu.blocks.plan import BlockPlan
+from gsplat_edu.data.settings import DataSettings
+from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
+from gsplat_edu.kernels import REASON, native
+from gsplat_edu.locks import locked
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.trainer import Callback
+
+Say = Callable[[str], None]
+
+
+def block_options(folder: BlocksFolder, plan: BlockPlan, number: int, data: Path | None = None) -> RunOptions:
+    """Return the options of a block's run.
+
+    Args:
+        folder: The run in blocks.
+        plan: Its plan.
+        number: The block.
+        data: Where the capture is on this machine; None for the path in the plan.
+
+    Raises:
+        ArgumentError: there is no such block.
+        CheckpointError: the plan's recipe is damaged.
+    """
+    if not 0 <= number < len(plan.blocks):
+        raise ArgumentError(f"block: is {number}, but the plan has blocks 0 to {len(plan.blocks) - 1}")
+    block = plan.blocks[number]
+    try:
+        train, settings = (_tuples(plan.recipe[name]) for name in ("train", "data"))
+        config = TrainConfig().changed(**train | {"max_gaussians": block.max_gaussians})
+        views = {"train_views": block.train, "test_views": block.test}
+        return RunOptions(
+            data=Path(plan.capture) if data is None else data,
+            out=folder.run(number).path,
+            config=config,
+            data_settings=DataSettings(**settings | views),
+            scene=folder.start(number),
+            backend=str(plan.recipe["backend"]),
+            eval_every=plan.recipe["eval_every"],
+            save_every=plan.recipe["save_every"],
+            resume=folder.run(number).exists(),
+        )
+    except (KeyError, TypeError, ArgumentError) as error:
+        raise CheckpointError(f"{folder.path}: the plan's recipe is damaged ({error}); split again") from None
+
+
+def train_block(
+    path: Path,
+    number: int,
+    data: Path | None = None,
+    say: Say = lambda sentence: None,
+    stop: Callable[[], bool] = lambda: False,
+    callbacks: Sequence[Callback] = (),
+) -> Done | None:
+    """Train a block to the end, from its last checkpoint if it has one. A finished block is not trained again.
+
+    Args:
+        path: Folder of the run in blocks.
+        number: The block.
+        data: Where the capture is on this machine; None for the path in the plan.
+        say: Receives sentences for the user.
+        stop: Called after every iteration; if it returns true, the block is saved and can be resumed.
+        callbacks: Receive every step.
+
+    Returns:
+        The record; None if `stop` ended the training.
+
+    Raises:
+        ArgumentError: there is no such block, or another process is training it.
+        CheckpointError: plan, start or run are damaged.
+        DatasetError: a photo is missing or cannot be read here.
+        OSError: a file cannot be written, for example because the disk is full.
+    """
+    folder = BlocksFolder(path)
+    plan = BlockPlan.read(path)
+    options = block_options(folder, plan, number, data)
+    if (done := folder.read_done(number, plan.digest())) is not None:
+        return done
+    with locked(f"block {number}", options.out, "a training of this block", say):
+        if (done := folder.read_done(number, plan.digest())) is not None:
+            return done  # by a process that held the lock until now
+        start = folder.start(number)
+        if not start.is_file() or file_digest(start) != plan.blocks[number].start:
+            raise CheckpointError(f"{start}: is missing or not as it was split; restore it, or split again")
+        capture = CaptureRun(options, say)
+        if not np.array_equal(capture.dataset.origin, plan.origin):
+            raise DatasetError(f"{options.data}: photos that the plan knows are missing here; copy them here")
+        if capture.train(stop, callbacks):
+            return None
+        capture.finish()
+        done = _record(folder, plan, number, capture)
+        done.write(folder)  # last: it marks the block as finished
+    return done
+
+
+def _record(folder: BlocksFolder, plan: BlockPlan, number: int, capture: CaptureRun) -> Done:
+    scene = capture.folder.scene(capture.trainer.iteration)
+    return Done(
+        block=number,
+        plan=plan.digest(),
+        scene=scene.relative_to(folder.path).as_posix(),
+        sha256=file_digest(scene),
+        gaussians=int(capture.folder.read_metrics()["num_gaussians"]),
+        iterations=capture.trainer.iteration,
+        seconds=round(capture.seconds, 3),
+        peak_memory=_peak_memory(),
+        host=socket.gethostname(),
+        instructions=_instructions(),
+        version=version("gsplat-edu"),
+    )
+
+
+def _instructions() -> str:
+    return platform.machine() if REASON is not None else f"{platform.machine()} {native().isa()}"
+
+
+def _peak_memory() -> int:
+    """Return the largest resident memory of this process so far, bytes; 0 if the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(most if platform.system() == "Darwin" else 1024 * most)
+
+
+def _tuples(section: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in section.items()}

@@ -1,0 +1,179 @@
+"""Which views a block needs: those inside it, and those that show enough of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from gsplat_edu.blocks.plan import Area, Block, Cell, halved
+from gsplat_edu.camera import Camera
+from gsplat_edu.data.dataset import Dataset
+from gsplat_edu.evaluate.paths import resized
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.output import MOST_CHANNELS, RenderOutput
+
+Shares = Float64[np.ndarray, "V B"]
+Renderer = Callable[[Gaussians, Camera, Tensor], RenderOutput]
+"""Renders Gaussians with features."""
+
+ENOUGH = 0.25
+"""A view belongs to a block that covers more than this fraction of its image (VastGaussian, Lin et al. 2024)."""
+
+LEAST_VIEWS = 50
+"""Blocks with fewer training views join a neighbour."""
+
+RAYS = (16, 12)
+"""Rays of a view, across and down, that measure how much of its image a box covers."""
+
+SIDE = 96
+"""Longer side of the small renders that measure what a view sees, px."""
+
+Measure = Callable[[Sequence[Camera], Sequence[Cell]], Shares]
+"""Returns how much of each view's image each cell covers, 0 to 1."""
+
+
+def assigned(
+    dataset: Dataset, area: Area, points: np.ndarray, count: int, measure: Measure, least: int
+) -> list[Block]:
+    """Split a capture into blocks with their views.
+
+    If a block would have too few training views, the ground is split into one block less, and so on.
+
+    Args:
+        dataset: The capture.
+        area: Its ground.
+        points: (N, 3) points of the scene, world units.
+        count: Number of blocks.
+        measure: How much of a view each cell covers.
+        least: Smallest number of training views of a block.
+    """
+    train, test = ([view.camera for view in views] for views in (dataset.train, dataset.test))
+    eyes = area.ground.coordinates(np.stack([camera.eye for camera in train]))
+    while True:
+        cores = halved(area, train, points, count)
+        wide = [core.enlarged(area.low, area.high) for core in cores]
+        inside = np.stack([cell.holds(eyes) for cell in wide], axis=1)
+        needs = inside | (measure(train, wide) > ENOUGH)
+        if count == 1 or needs.sum(axis=0).min() >= least:
+            break
+        count -= 1
+    shown = measure(test, cores).argmax(axis=1) if test else np.zeros(0, dtype=int)
+    return [
+        Block(
+            core,
+            tuple(sorted(dataset.train[i].name for i in np.flatnonzero(needs[:, number]))),
+            tuple(sorted(dataset.test[i].name for i in np.flatnonzero(shown == number))),
+        )
+        for number, core in enumerate(cores)
+    ]
+
+
+def airspace_shares(area: Area, cameras: Sequence[Camera], cells: Sequence[Cell]) -> Shares:
+    """Measure how much of each view's image the airspace of each cell covers: a box from the ground to the roofs.
+
+    Args:
+        area: Ground and heights.
+        cameras: V cameras.
+        cells: B cells; an infinite side ends at the area's rectangle.
+
+    Returns:
+        (V, B) fractions of the image.
+    """
+    parts = [cell.clipped(*_widened(area)) for cell in cells]
+    low = np.array([(*part.low, area.heights[0]) for part in parts])
+    high = np.array([(*part.high, area.heights[1]) for part in parts])
+    turn = np.array(area.ground.axes)
+    shares = np.zeros((len(cameras), len(cells)))
+    for row, camera in enumerate(cameras):
+        eye = area.ground.coordinates(camera.eye[None])[0]
+        heading = _directions(camera) @ turn.T
+        heading = np.where(np.abs(heading) < 1e-12, 1e-12, heading)[:, None]
+        one, other = (low - eye) / heading, (high - eye) / heading
+        enters, leaves = np.minimum(one, other).max(axis=2), np.maximum(one, other).min(axis=2)
+        shares[row] = ((enters < leaves) & (leaves > 0)).mean(axis=0)
+    return shares
+
+
+def seen_shares(
+    area: Area, gaussians: Gaussians, render: Renderer, cameras: Sequence[Camera], cells: Sequence[Cell]
+) -> Shares:
+    """Measure how much of each view's image shows Gaussians of each cell; what hides another thing counts alone.
+
+    The share is the mean over the pixels of the sum of weights w_i of the Gaussians in the cell.
+
+    Args:
+        area: Ground.
+        gaussians: A coarse model of the whole scene.
+        render: Renders Gaussians with features.
+        cameras: V cameras.
+        cells: B cells.
+
+    Returns:
+        (V, B) fractions of the image.
+    """
+    places = area.ground.coordinates(gaussians.means.numpy(force=True))
+    members = torch.from_numpy(np.stack([cell.holds(places) for cell in cells], axis=1)).to(gaussians.means)
+    small = [resized(c, SIDE) if max(c.W, c.H) > SIDE else c for c in cameras]
+    shares = np.zeros((len(cameras), len(cells)))
+    for start in range(0, len(cells), MOST_CHANNELS):
+        part = members[:, start : start + MOST_CHANNELS].contiguous()
+        for row, camera in enumerate(small):
+            with torch.no_grad():
+                image = render(gaussians, camera, part).features
+            assert image is not None
+            shares[row, start : start + MOST_CHANNELS] = _means(image)
+    return shares
+
+
+def in_any_view(gaussians: Gaussians, cameras: Sequence[Camera]) -> Bool[np.ndarray, " N"]:
+    """Return which Gaussians at least one camera may show: within three standard deviations of its frustum.
+
+    Args:
+        gaussians: N Gaussians.
+        cameras: The cameras.
+    """
+    means = gaussians.means.detach().double().numpy(force=True)
+    reach = 3.0 * gaussians.scales.detach().double().numpy(force=True).max(axis=1)
+    shown = np.zeros(len(means), dtype=bool)
+    for camera in cameras:
+        rest = np.flatnonzero(~shown)
+        x, y, z = _seen_from(camera, means[rest])
+        near = z + reach[rest] > 0
+        for place, size, middle, focal in (
+            (x, camera.W, camera.cx, camera.fx),
+            (y, camera.H, camera.cy, camera.fy),
+        ):
+            for edge, sign in ((-0.5 - middle, -1.0), (size - 0.5 - middle, 1.0)):
+                slope = edge / focal  # the plane through the camera and an edge of its image
+                near &= sign * (place - slope * z) <= reach[rest] * np.sqrt(1 + slope * slope)
+        shown[rest[near]] = True
+    return shown
+
+
+def _seen_from(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> list[np.ndarray]:
+    """Return camera coordinates, with sums of a fixed order."""
+    x, y, z = (points[:, i] - camera.eye[i] for i in range(3))
+    return [u * x + v * y + w * z for u, v, w in camera.R.tolist()]
+
+
+def _widened(area: Area) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the area's rectangle with a tenth of its sides around it, where infinite cells end."""
+    by = [0.1 * (area.high[i] - area.low[i]) for i in range(2)]
+    return (area.low[0] - by[0], area.low[1] - by[1]), (area.high[0] + by[0], area.high[1] + by[1])
+
+
+def _directions(camera: Camera) -> Float64[np.ndarray, "N 3"]:
+    """Return directions of rays spread evenly over the image."""
+    across, down = RAYS
+    u = (np.arange(across) + 0.5) * camera.W / across - 0.5
+    v = (np.arange(down) + 0.5) * camera.H / down - 0.5
+    columns, rows = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    return np.asarray(np.stack([columns.ravel(), rows.ravel(), np.ones(columns.size)], axis=1) @ camera.R)
+
+
+def _means(image: Float[Tensor, "H W C"]) -> Float64[np.ndarray, " C"]:
+    return np.asarray(image.double().numpy(force=True).mean(axis=(0, 1)))

@@ -1,0 +1,189 @@
+"""`gsplat-edu train --blocks`: split a capture, train its blocks here or on a cluster, and merge them."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from gsplat_edu.blocks.cluster import AGAIN, ClusterOptions, run_on_cluster
+from gsplat_edu.blocks.layout import BlocksFolder
+from gsplat_edu.blocks.merge import merge_blocks
+from gsplat_edu.blocks.plan import BlockPlan
+from gsplat_edu.blocks.split import SplitOptions, check_recipe, coarse_scene, split_capture
+from gsplat_edu.blocks.task import train_block
+from gsplat_edu.budget.plan import Limits, plan
+from gsplat_edu.cli.block_table import BlockTable
+from gsplat_edu.cli.eval import score_lines
+from gsplat_edu.cli.exporting import export_all
+from gsplat_edu.cli.options.blocks import LEAST_VIEWS, block_count
+from gsplat_edu.cli.options.train import OPEN, left_open, options_from, parts_of_blocks
+from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.train import (
+    interruptible,
+    photos_read,
+    progress_bar,
+    train_with_bar,
+    with_choices,
+    with_poses,
+)
+from gsplat_edu.errors import CheckpointError
+from gsplat_edu.evaluate.metrics import ImageScore
+from gsplat_edu.locks import locked
+from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.runs.training import CaptureRun, is_finished
+from gsplat_edu.viewer.export import check_target
+
+Say = Callable[[str], None]
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Split, train every block, merge and report."""
+    console = Terminal()
+
+    def say(sentence: str) -> None:
+        console.print(sentence, soft_wrap=True)
+
+    for path in arguments.export:
+        check_target("--export", path)
+    cluster = None
+    if arguments.scheduler is not None or (arguments.workers or 1) > 1:
+        cluster = ClusterOptions(arguments.scheduler, arguments.workers or 1)
+    with locked("--out", arguments.out, "gsplat-edu train --blocks", say):
+        planned = prepared(arguments, console, say)
+        folder = BlocksFolder(arguments.out)
+        with BlockTable(console, folder, planned) as table:
+            if cluster is None:
+                _train_here(folder, planned, table)
+            else:
+                _train_there(folder, planned, cluster, table, say)
+        if is_merged(folder):
+            say(f"{folder.path}: is finished, {len(planned.blocks)} blocks; nothing to do")
+            return
+        merge_and_report(arguments.out, arguments.export, console, say)
+
+
+def prepared(arguments: argparse.Namespace, console: Console, say: Say) -> BlockPlan:
+    """Return the plan of a run in blocks; train the coarse model and split the capture if there is none yet.
+
+    Raises:
+        CheckpointError: the folder holds another run, or the options are not those of its plan.
+    """
+    folder = BlocksFolder(arguments.out)
+    of_block, of_coarse = parts_of_blocks(arguments)
+    options = options_from(of_block)
+    exists = folder.plan.is_file()
+    if (exists or folder.merged.exists()) and not arguments.resume:
+        raise CheckpointError(
+            f"--out: {folder.path} already holds a run; add --resume to continue it, or give another folder"
+        )
+    if exists:
+        stored = BlockPlan.read(folder.path)
+        chosen = stored.recipe.get("train", {})
+        still_open = {n: chosen[n] for n in OPEN if getattr(of_block, n) in (None, "auto") and n in chosen}
+        check_recipe(folder.path, stored, replace(options, config=options.config.changed(**still_open)))
+        return stored
+    if folder.merged.exists():
+        raise CheckpointError(f"--out: {folder.path} holds a run that is not in blocks; give another folder")
+    options = with_poses(options, arguments, console, say)
+    if of_coarse is not None:
+        coarse = replace(options_from(of_coarse), data=options.data)
+        if not coarse.resume:
+            names = left_open(of_coarse)
+            coarse = with_choices(coarse, names, console, say)
+            shared = {name: getattr(coarse.config, name) for name in names if name != "sky"}
+            options = replace(options, config=options.config.changed(**shared))
+        else:
+            options = replace(options, config=options.config.changed(**_chosen_before(coarse, of_block)))
+        _train_coarse(coarse, console, say)
+    split = SplitOptions(block_count(arguments), arguments.min_views or LEAST_VIEWS)
+    scene = coarse_scene(replace(options, scene=arguments.scene))
+    return split_capture(replace(options, scene=None), scene, split, say)
+
+
+def _chosen_before(coarse: RunOptions, of_block: argparse.Namespace) -> dict[str, object]:
+    """Return what the coarse run, which was interrupted, chose for the settings that were left open."""
+    stored = coarse.folder.read_config().get("train", {})
+    names = [name for name in OPEN if name != "sky" and getattr(of_block, name) in (None, "auto")]
+    return {name: stored[name] for name in names if name in stored}
+
+
+def _train_coarse(options: RunOptions, console: Console, say: Say) -> None:
+    """Train the coarse model of the whole capture, in a run folder of its own."""
+    say(f"training a coarse model of the whole: {options.config.iterations} iterations, {options.out}")
+    chosen = plan(options, Limits(), ["max_gaussians"] if options.config.max_gaussians is not None else [])
+    options = chosen.options
+    if is_finished(options):
+        return
+    with interruptible() as interrupted:
+        with progress_bar(console, "") as bar:
+            capture = CaptureRun(options, say, photos_read(bar, interrupted))
+        with progress_bar(console, "{task.fields[state]}") as bar:
+            train_with_bar(capture, bar, interrupted, [])
+        if interrupted():
+            raise KeyboardInterrupt(f"interrupted in the coarse training; {AGAIN}")
+        capture.finish()
+
+
+def _train_here(folder: BlocksFolder, planned: BlockPlan, table: BlockTable) -> None:
+    """Train the blocks in this process, one after the other."""
+    with interruptible() as interrupted:
+        for number in range(len(planned.blocks)):
+            if train_block(folder.path, number, stop=interrupted) is None:
+                raise KeyboardInterrupt(f"interrupted in block {number}; {AGAIN}")
+            table.look()
+
+
+def _train_there(
+    folder: BlocksFolder, planned: BlockPlan, cluster: ClusterOptions, table: BlockTable, say: Say
+) -> None:
+    """Train the blocks that are not finished on a cluster, those with the most views first."""
+    digest = planned.digest()
+    rest = [n for n in range(len(planned.blocks)) if folder.read_done(n, digest) is None]
+    rest.sort(key=lambda number: (-len(planned.blocks[number].train), number))
+    if not rest:
+        return
+    try:
+        run_on_cluster(folder.path, rest, cluster, table.look, say)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; {AGAIN}") from None
+
+
+def is_merged(folder: BlocksFolder) -> bool:
+    """Return whether the blocks are merged and scored."""
+    return folder.merged.exists() and folder.merged.metrics.is_file()
+
+
+def merge_and_report(
+    path: Path, exports: list[Path], console: Console, say: Say, data: Path | None = None
+) -> None:
+    """Merge the blocks of a run and print the scores.
+
+    Args:
+        path: Folder of the run in blocks.
+        exports: Files to write in other formats.
+        console: The terminal.
+        say: Receives sentences for the user.
+        data: Where the capture is on this machine; None for the path in the plan.
+    """
+    recipe = BlockPlan.read(path).recipe
+    with progress_bar(console, "") as bar:
+        task = bar.add_task("evaluating", total=None)
+
+        def scored(split: str, score: ImageScore) -> None:
+            bar.advance(task)
+
+        export = (
+            functools.partial(export_all, exports, bar, str(recipe.get("backend")), say) if exports else None
+        )
+        result = merge_blocks(path, say, data, scored, export)
+    for line in score_lines(result.test, result.train):
+        say(line)
+    seams = result.metrics["seams"]
+    if seams is not None and seams["psnr"] is not None:
+        say(f"along the cuts: PSNR {seams['psnr']:.2f} dB, elsewhere {seams['psnr_elsewhere']:.2f} dB")
+    say(f"wrote {BlocksFolder(path).merged.report}")

@@ -1,0 +1,23 @@
+"""`gsplat-edu merge`: merge the blocks of a run into one scene."""
+
+from __future__ import annotations
+
+import argparse
+
+from gsplat_edu.cli.blocks import merge_and_report
+from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.locks import locked
+from gsplat_edu.viewer.export import check_target
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Merge, score and report."""
+    console = Terminal()
+
+    def say(sentence: str) -> None:
+        console.print(sentence, soft_wrap=True)
+
+    for path in arguments.export:
+        check_target("--export", path)
+    with locked("RUN", arguments.run_folder, "gsplat-edu merge", say):
+        merge_and_report(arguments.run_folder, arguments.export, console, say, arguments.data)
