@@ -22,11 +22,16 @@ LOCK = ".lock"
 _FAR = 1 << 30
 """Offset of the locked byte on Windows, far beyond the contents, because a locked byte cannot be read."""
 
+_POLL = 0.2
+"""Seconds between two attempts to take a lock."""
+
 _held: set[int] = set()
 
 
 @contextmanager
-def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> Iterator[None]:
+def locked(
+    name: str, folder: Path, what: str, say: Callable[[str], None], patience: float = 0.0
+) -> Iterator[None]:
     """Keep other processes from writing to a folder inside the block. The folder is created if missing.
 
     The lock is `flock` on Linux and macOS and a locked byte on Windows. Both end with the process, even with kill -9;
@@ -37,6 +42,7 @@ def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> It
         folder: The folder. It is removed again if it was created here and the block leaves it empty.
         what: The activity of this process, for the message shown to another process.
         say: Receives a sentence if the file system has no locks; the block then runs without one.
+        patience: Seconds to wait for another process that holds the lock.
 
     Raises:
         ArgumentError: another process holds the lock (the message names it), or the folder is not writable.
@@ -46,7 +52,7 @@ def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> It
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / LOCK
     try:
-        handle = _acquired(name, path)
+        handle = _acquired(name, path, time.monotonic() + patience)
         if handle is None:
             say(
                 f"{folder}: its file system has no locks; do not let two commands write to it at the same time"
@@ -67,7 +73,7 @@ def locked(name: str, folder: Path, what: str, say: Callable[[str], None]) -> It
                 place.rmdir()
 
 
-def _acquired(name: str, path: Path) -> int | None:
+def _acquired(name: str, path: Path, until: float) -> int | None:
     """Return an open, locked file; None if the file system has no locks."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)  # child processes do not inherit it
@@ -76,6 +82,9 @@ def _acquired(name: str, path: Path) -> int | None:
         except (BlockingIOError, PermissionError):
             holder = _holder(handle)
             os.close(handle)
+            if time.monotonic() < until:
+                time.sleep(_POLL)
+                continue
             raise ArgumentError(
                 f"{name}: {path.parent} is in use by {holder}; wait until it ends, or choose another folder"
             ) from None

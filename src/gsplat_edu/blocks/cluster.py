@@ -8,6 +8,7 @@ program there: the local cluster listens on the loopback interface only.
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import threading
 import time
@@ -116,7 +117,8 @@ def _task(folder: str, number: int, threads: int) -> dict[str, Any]:
     ):  # a worker may have several threads, but the number of torch's is that of the process
         torch.set_num_threads(threads)
         try:
-            done = train_block(Path(folder), number)
+            # a worker that was cut off may still be at it: it finishes the block, or its end frees the lock
+            done = train_block(Path(folder), number, patience=math.inf)
         except SplatError as error:
             return {"error": str(error)}
         except Exception as error:

@@ -67,6 +67,7 @@ def train_block(
     say: Say = lambda sentence: None,
     stop: Callable[[], bool] = lambda: False,
     callbacks: Sequence[Callback] = (),
+    patience: float = 0.0,
 ) -> Done | None:
     """Train a block to the end, from its last checkpoint if it has one. A finished block is not trained again.
 
@@ -77,6 +78,7 @@ def train_block(
         say: Receives sentences for the user.
         stop: Called after every iteration; if it returns true, the block is saved and can be resumed.
         callbacks: Receive every step.
+        patience: Seconds to wait for another process that trains the block.
 
     Returns:
         The record; None if `stop` ended the training.
@@ -92,7 +94,7 @@ def train_block(
     options = block_options(folder, plan, number, data)
     if (done := folder.read_done(number, plan.digest())) is not None:
         return done
-    with locked(f"block {number}", options.out, "a training of this block", say):
+    with locked(f"block {number}", options.out, "a training of this block", say, patience):
         if (done := folder.read_done(number, plan.digest())) is not None:
             return done  # by a process that held the lock until now
         start = folder.start(number)

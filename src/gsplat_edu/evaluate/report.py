@@ -20,6 +20,7 @@ import torch
 from jaxtyping import UInt8
 
 from gsplat_edu.content_policy import content_policy, policy_element
+from gsplat_edu.evaluate.block_figures import blocks_table, cells_figure
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.images import small_jpeg
 from gsplat_edu.evaluate.masked import MaskedPicture, masked_figures
@@ -196,12 +197,14 @@ def write_report(path: Path, report: Report) -> None:
     """
     figures = run_curve_figures(_with_last(report.log, report.metrics), _cap(report.config))
     curves = "".join(svg_element(figure, str(number)) for number, figure in enumerate(figures))
+    cells = _cells(report)
     config = {key: value for key, value in report.config.items() if key != "machine"}
     sections = [
         f'<p class="verdict">{html.escape(verdict(report.metrics, report.scores))}</p>\n',
         _page_link(path, report.metrics.get("exports")),
         _headline(report.metrics),
         _section("Curves", f'<div class="curves">{curves}</div>\n' if curves else ""),
+        _section("Blocks", cells),
         _views(report.scores, report.pictures),
         _section("Masked things that moved", masked_figures(report.masked)),
         _exports(report.metrics.get("exports")),
@@ -210,7 +213,7 @@ def write_report(path: Path, report: Report) -> None:
         *_machines(report),
     ]
     title = html.escape(report.title)
-    policy = policy_element(content_policy(scripts=[SCRIPT], styles=[STYLE], markup=curves))
+    policy = policy_element(content_policy(scripts=[SCRIPT], styles=[STYLE], markup=curves + cells))
     page = (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n{policy}\n<title>{title}</title>\n'
         f'<meta name="viewport" content="width=device-width">\n<style>{STYLE}</style>\n</head>\n<body>\n'
@@ -218,6 +221,15 @@ def write_report(path: Path, report: Report) -> None:
     )
     with written_aside(path) as aside:
         write_text(aside, page)
+
+
+def _cells(report: Report) -> str:
+    """Draw the blocks of a merged run, and list their scores."""
+    blocks = report.metrics.get("blocks")
+    if not isinstance(blocks, Mapping):
+        return ""
+    drawing = svg_element(cells_figure(blocks, report.scores), "cells")
+    return f"<div>{drawing}</div>\n{blocks_table(blocks, report.metrics.get('seams'), report.scores)}"
 
 
 def verdict(metrics: Mapping[str, Any], scores: Sequence[ImageScore] = ()) -> str:

@@ -86,6 +86,11 @@ def _checked_folder(options: RunOptions) -> RunOptions:
             raise CheckpointError(
                 f"--out: {folder.path} already holds a run; add --resume to continue it, or give another folder"
             )
+        if "blocks" in folder.read_config():
+            raise CheckpointError(
+                f"--resume: {folder.path} is merged from blocks; start a new run with --from {folder.path}, or add"
+                " --blocks"
+            )
         options = _with_scene(options)
         check_options(folder, document(options))
         return options

@@ -1,0 +1,8 @@
+"""The recipe of the runs in blocks that the tests train."""
+
+RECIPE = [
+    *("--min-views", "8", "--iterations", "60", "--coarse-iterations", "40"),
+    *("--strategy", "fast", "--max-gaussians", "3000", "--min-opacity", "0.005"),
+    *("--appearance", "none", "--sky", "none", "--eval-every", "0", "--save-every", "10"),
+]
+"""Options of every run here. The blocks grow, so that density control is part of what has to be repeated."""

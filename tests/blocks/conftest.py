@@ -1,0 +1,36 @@
+"""A small city, split once; the tests train its blocks in copies of that folder."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from block_runs import RECIPE
+from gsplat_edu.cli.main import main
+from gsplat_edu.data.city import City, write_city
+
+
+@pytest.fixture(scope="session")
+def city(tmp_path_factory) -> Path:
+    """The capture: 36 photos from the air."""
+    folder = tmp_path_factory.mktemp("city")
+    write_city(folder, City(photos=36, width=32, points=40))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def split(city, tmp_path_factory) -> Path:
+    """The capture, split into four blocks that are not trained yet."""
+    folder = tmp_path_factory.mktemp("split") / "run"
+    assert main(["split", str(city), "--out", str(folder), "--blocks", "4", *RECIPE]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def serial(city, split, tmp_path_factory) -> Path:
+    """The blocks, trained one after the other in one process, and merged."""
+    folder = tmp_path_factory.mktemp("serial") / "run"
+    shutil.copytree(split, folder)
+    words = ["train", str(city), "--out", str(folder), "--blocks", "4", *RECIPE, "--resume"]
+    assert main(words) == 0
+    return folder

@@ -1,0 +1,185 @@
+"""Blocks on dask.distributed: whoever is lost, the merged scene has the bytes of the serial run."""
+
+import contextlib
+import random
+import shutil
+import signal
+import socket
+import time
+
+import pytest
+
+from block_runs import RECIPE
+from gsplat_edu.blocks.cluster import ClusterOptions, exposed, run_on_cluster
+from gsplat_edu.blocks.layout import BlocksFolder
+from gsplat_edu.blocks.plan import BlockPlan
+from gsplat_edu.blocks.status import statuses
+from gsplat_edu.cli.main import main
+from gsplat_edu.errors import ArgumentError
+from processes import Program
+from slices import SEED
+
+SCHEDULER = "from distributed.cli.dask_scheduler import main; main()"
+WORKER = "from distributed.cli.dask_worker import main; main()"
+COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
+
+PATIENCE = 180.0
+"""Seconds after which a test gives up waiting for what has to come."""
+
+
+def scene(folder):
+    return (folder / "point_cloud" / "iteration_60" / "point_cloud.ply").read_bytes()
+
+
+class Cluster:
+    """A scheduler and workers in processes of their own, on the loopback interface. Every process that is left is killed
+    at the end."""
+
+    def __init__(self, folder):
+        self.folder, self.started = folder, 0
+        self.processes = contextlib.ExitStack()
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self.address = f"tcp://127.0.0.1:{self.port}"
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.processes.close()
+
+    def start(self, code, *words):
+        self.started += 1
+        place = self.folder / f"process_{self.started}"
+        place.mkdir(parents=True)
+        program = Program(code, words, place)
+        self.processes.callback(kill, program)
+        return program
+
+    def scheduler(self):
+        program = self.start(
+            SCHEDULER,
+            "--host",
+            "127.0.0.1",
+            "--port",
+            self.port,
+            "--no-dashboard",
+            "--dashboard-address",
+            "127.0.0.1:0",
+        )
+        wait_for(lambda: answers(self.port))
+        return program
+
+    def worker(self):
+        space = self.folder / f"space_{self.started}"
+        return self.start(
+            WORKER, self.address, "--no-nanny", "--nthreads", 1, "--no-dashboard", "--local-directory", space
+        )
+
+
+def kill(program):
+    if program.runs:
+        program.send(signal.SIGKILL)
+    program.process.join()
+
+
+def answers(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def wait_for(condition):
+    until = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < until, "what has to come does not come"
+        time.sleep(0.02)
+
+
+def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(city, split, serial, tmp_path):
+    draw = random.Random(SEED)
+    moments = sorted(draw.sample(range(5, 200), 2))
+    run = tmp_path / "run"
+    shutil.copytree(split, run)
+    plan, folder = BlockPlan.read(run), BlocksFolder(run)
+    digest = plan.digest()
+
+    def steps():
+        return sum(status.iteration for status in statuses(folder, plan, digest))
+
+    words = ["train", city, "--out", run, "--blocks", "4", *RECIPE, "--resume", "--scheduler"]
+    with Cluster(tmp_path / "first") as cluster:
+        scheduler = cluster.scheduler()
+        workers = [cluster.worker(), cluster.worker()]
+        command = cluster.start(COMMAND, *words, cluster.address)
+        wait_for(lambda: steps() >= moments[0] or not command.runs)
+        kill(draw.choice(workers))
+        cluster.worker()
+        wait_for(lambda: steps() >= moments[1] or not command.runs)
+        kill(scheduler)
+        code, _, err = command.ended()
+        assert code == 2, f"moments {moments}: {err}"
+        assert f"{cluster.address}: the scheduler was lost; finished blocks and checkpoints are kept" in err
+        assert len(err.splitlines()) == 1
+    finished = {n: folder.record(n).stat().st_mtime_ns for n in range(4) if folder.record(n).is_file()}
+    assert len(finished) < 4, "the scheduler was killed before the end"
+    before = steps()
+    assert before >= moments[0] - 20, "a checkpoint every 10 steps, and two workers"
+    with Cluster(tmp_path / "second") as cluster:
+        cluster.scheduler()
+        for _ in range(2):
+            cluster.worker()
+        code, out, err = cluster.start(COMMAND, *words, cluster.address).ended()
+        assert code == 0, err
+    assert scene(run) == scene(serial), f"moments {moments}"
+    assert {n: folder.record(n).stat().st_mtime_ns for n in finished} == finished, "nothing is done again"
+
+
+def test_a_local_cluster_gives_the_bytes_too_and_names_what_fails(city, split, serial, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(split, run)
+    plan = BlockPlan.read(run)
+    only = sorted(set(plan.blocks[0].train) - {n for block in plan.blocks[1:] for n in block.train})
+    photo = city / "images" / (only or plan.blocks[0].train)[0]
+    bad = [number for number, block in enumerate(plan.blocks) if photo.name in block.train]
+    away = city / f"away_{photo.name}"
+    photo.rename(away)
+    words = ["train", str(city), "--out", str(run), "--blocks", "4", *RECIPE, "--resume", "--workers", "2"]
+    command = Program(COMMAND, words, tmp_path)
+    try:
+        code, _, err = command.ended()
+    finally:
+        away.rename(photo)
+    assert code == 2 and photo.name in err and "missing here" in err
+    assert f"{len(bad)} of 4 blocks failed; finished blocks and checkpoints are kept" in err
+    folder, digest = BlocksFolder(run), plan.digest()
+    assert [n for n in range(4) if folder.read_done(n, digest) is None] == bad, "the others are trained"
+    command = Program(COMMAND, words, tmp_path)
+    code, _, err = command.ended()
+    assert code == 0, err
+    assert scene(run) == scene(serial)
+
+
+def test_no_scheduler_and_no_workers_are_one_line(split, tmp_path, capsys):
+    with Cluster(tmp_path / "cluster") as cluster:
+        options = ClusterOptions(cluster.address, patience=2.0)
+        with pytest.raises(ArgumentError, match="no scheduler answers at tcp://127.0.0.1"):
+            run_on_cluster(split, [0], options)
+        cluster.scheduler()
+        with pytest.raises(Exception, match=r"has no workers; start some with `dask worker ADDRESS`"):
+            run_on_cluster(split, [0], options)
+
+
+def test_a_network_without_tls_gets_a_warning():
+    for safe in ("tcp://127.0.0.1:8786", "localhost:8786", "tls://10.0.0.5:8786"):
+        assert exposed(safe) is None
+    for open_to_others in ("tcp://10.0.0.5:8786", "host:8786"):
+        assert "whoever reaches it can run programs" in exposed(open_to_others)
+
+
+def test_main_without_a_scheduler_is_one_line(city, split, tmp_path, capsys):
+    shutil.copytree(split, run := tmp_path / "run")
+    words = ["train", str(city), "--out", str(run), "--blocks", "4", *RECIPE, "--resume"]
+    assert main([*words, "--scheduler", "nowhere"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--scheduler: no scheduler answers at nowhere" in line

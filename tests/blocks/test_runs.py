@@ -1,0 +1,194 @@
+"""A run in blocks: the same bytes whoever trains them, ordinary run folders, and one line for each mistake."""
+
+import json
+import resource
+import shutil
+
+import numpy as np
+import pytest
+
+from block_runs import RECIPE
+from gsplat_edu.blocks.layout import BlocksFolder, Done
+from gsplat_edu.blocks.plan import BlockPlan
+from gsplat_edu.cli.main import main
+from gsplat_edu.io.ply import load_ply
+from gsplat_edu.runs.dataset import run_dataset
+
+
+def scene(folder):
+    return (folder / "point_cloud" / "iteration_60" / "point_cloud.ply").read_bytes()
+
+
+@pytest.fixture
+def run(split, tmp_path):
+    """A split capture whose blocks are not trained yet."""
+    shutil.copytree(split, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_a_command_for_each_block_gives_the_bytes_of_one_command_for_all(city, run, serial, capsys):
+    for number in (2, 0, 3, 1):  # in any order
+        assert main(["block", str(run), str(number)]) == 0
+    before = [BlocksFolder(run).record(number).read_bytes() for number in range(4)]
+    assert main(["block", str(run), "1"]) == 0 and "is finished; nothing to do" in capsys.readouterr().out
+    assert main(["merge", str(run)]) == 0
+    assert scene(run) == scene(serial)
+    words = ["train", str(city), "--out", str(run), "--blocks", "4", *RECIPE, "--resume"]
+    assert main(words) == 0 and "is finished, 4 blocks; nothing to do" in capsys.readouterr().out
+    assert [BlocksFolder(run).record(number).read_bytes() for number in range(4)] == before
+    assert main([*words[:-1]]) == 2 and "already holds a run; add --resume" in capsys.readouterr().err
+
+
+def test_the_whole_command_without_a_split_before_gives_them_too(city, serial, tmp_path):
+    words = ["train", str(city), "--out", str(tmp_path / "run"), "--blocks", "4", *RECIPE]
+    assert main(words) == 0
+    assert scene(tmp_path / "run") == scene(serial)
+
+
+def test_each_block_keeps_the_gaussians_of_its_cell(serial):
+    plan, folder = BlockPlan.read(serial), BlocksFolder(serial)
+    whole = load_ply(serial / "point_cloud" / "iteration_60" / "point_cloud.ply").means.numpy()
+    cells = json.loads((serial / "metrics.json").read_text())["blocks"]["cells"]
+    assert sum(cell["gaussians"] for cell in cells) == len(whole)
+    first = 0
+    for number, (block, cell) in enumerate(zip(plan.blocks, cells, strict=True)):
+        part = whole[first : first + cell["gaussians"]]
+        assert block.core.holds(plan.area.ground.coordinates(part)).all()
+        done = folder.read_done(number, plan.digest())
+        trained = load_ply(serial / done.scene).means.numpy()
+        inside = block.core.holds(plan.area.ground.coordinates(trained))
+        np.testing.assert_array_equal(part, trained[inside])
+        assert 0 < inside.sum() < len(trained), "a block also has what its views show around it"
+        first += cell["gaussians"]
+
+
+def test_merged_run_and_blocks_are_ordinary_runs(serial, tmp_path):
+    block = serial / "blocks" / "block_01"
+    dataset = run_dataset(json.loads((block / "config.json").read_text()))
+    plan = BlockPlan.read(serial)
+    assert tuple(view.name for view in dataset.train) == plan.blocks[1].train
+    assert tuple(view.name for view in dataset.test) == plan.blocks[1].test
+    copy = tmp_path / "copy"
+    shutil.copytree(serial, copy)
+    for folder in (copy, copy / "blocks" / "block_01"):
+        before = json.loads((folder / "metrics.json").read_text())
+        assert main(["eval", str(folder)]) == 0
+        after = json.loads((folder / "metrics.json").read_text())
+        assert after["test"] == before["test"]
+    report = (copy / "report.html").read_text()
+    assert "<h2>Blocks</h2>" in report and "Along the cuts" in report
+
+
+def test_a_merged_run_is_not_continued_as_if_it_were_one(city, serial, capsys):
+    assert main(["train", str(city), "--out", str(serial), "--resume", "--iterations", "90"]) == 2
+    assert "is merged from blocks" in capsys.readouterr().err
+
+
+def test_a_missing_photo_stops_its_blocks_and_loses_nothing(city, run, serial, capsys):
+    plan = BlockPlan.read(run)
+    counts = {
+        name: sum(name in block.train for block in plan.blocks)
+        for block in plan.blocks
+        for name in block.train
+    }
+    name = min(counts, key=lambda name: (counts[name], name))
+    number = next(i for i, block in enumerate(plan.blocks) if name in block.train)
+    other = next(i for i, block in enumerate(plan.blocks) if name not in block.train)
+    photo, away = city / "images" / name, city / f"away_{name}"
+    photo.rename(away)
+    try:
+        assert main(["block", str(run), str(number)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert name in line and "missing here" in line
+        assert main(["block", str(run), str(other)]) == 0, "a block that does not need it is trained"
+    finally:
+        away.rename(photo)
+    assert main(["merge", str(run)]) == 2
+    assert f"3 of 4 blocks are not trained yet: {', '.join(str(n) for n in range(4) if n != other)}" in (
+        capsys.readouterr().err
+    )
+    for rest in set(range(4)) - {other}:
+        assert main(["block", str(run), str(rest)]) == 0
+    assert main(["merge", str(run)]) == 0 and scene(run) == scene(serial)
+
+
+def test_a_full_disk_is_one_line_and_the_block_goes_on(run, serial, capsys):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))  # too little for a checkpoint
+    try:
+        assert main(["block", str(run), "2"]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "block_02" in line
+    assert BlocksFolder(run).read_done(2, BlockPlan.read(run).digest()) is None
+    assert main(["block", str(run), "2"]) == 0
+    done, known = (
+        BlocksFolder(folder).read_done(2, BlockPlan.read(folder).digest()) for folder in (run, serial)
+    )
+    assert done.sha256 == known.sha256
+
+
+def test_what_was_changed_or_damaged_is_named(serial, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(serial, copy)
+    folder = BlocksFolder(copy)
+    done = folder.read_done(3, BlockPlan.read(copy).digest())
+    with (copy / done.scene).open("ab") as file:
+        file.write(b"x")
+    assert main(["merge", str(copy)]) == 2
+    assert "block_03" in (error := capsys.readouterr().err) and "was changed after the training" in error
+    Done(**{**vars(done), "plan": "another"}).write(folder)
+    assert main(["merge", str(copy)]) == 2 and "belongs to another plan" in capsys.readouterr().err
+    folder.record(3).write_text("{")
+    assert main(["block", str(copy), "3"]) == 2 and "block_03.json: is damaged" in capsys.readouterr().err
+    folder.record(3).unlink()
+    shutil.rmtree(copy / "blocks" / "block_03")
+    folder.start(3).write_bytes(b"x")
+    assert main(["block", str(copy), "3"]) == 2 and "not as it was split" in capsys.readouterr().err
+    assert main(["block", str(copy), "4"]) == 2 and "blocks 0 to 3" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--blocks", "0"], "--blocks: is 0, but has to be auto or a number from 1 to 256"),
+        (["--blocks", "some"], "--blocks: is some, but has to be"),
+        (["--workers", "2"], "--workers: has an effect only with --blocks"),
+        (["--blocks", "2", "--time-limit", "1h"], "--time-limit: does not go with --blocks"),
+        (["--blocks", "2", "--view"], "--view: does not go with --blocks"),
+        (["--blocks", "2", "--workers", "0"], "--workers: is 0"),
+        (
+            ["--blocks", "2", "--workers", "2", "--scheduler", "tcp://a:1"],
+            "--workers: --scheduler has workers",
+        ),
+        (
+            ["--blocks", "2", "--coarse-iterations", "5", "--from", "SCENE"],
+            "--coarse-iterations: --from gives",
+        ),
+    ],
+)
+def test_mistakes_are_one_line(city, serial, tmp_path, capsys, words, problem):
+    words = [str(serial) if word == "SCENE" else word for word in words]
+    assert main(["train", str(city), "--out", str(tmp_path / "run"), *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert problem in line and not (tmp_path / "run").exists()
+
+
+def test_other_options_are_refused_on_resuming(city, run, capsys):
+    words = ["train", str(city), "--out", str(run), "--blocks", "4", *RECIPE, "--resume", "--seed", "7"]
+    assert main(words) == 2
+    assert "was made with train.seed = 0, not 7" in capsys.readouterr().err
+
+
+def test_blocks_with_few_views_join(city, serial, tmp_path, capsys):
+    words = ["split", str(city), "--out", str(tmp_path / "run"), "--from", str(serial), *RECIPE[4:]]
+    words[-1] = "0"
+    arguments = [*words, "--iterations", "10", "--blocks", "6", "--min-views", "30"]
+    assert main(arguments) == 0
+    plan = BlockPlan.read(tmp_path / "run")
+    assert 1 < len(plan.blocks) < 6 and min(len(block.train) for block in plan.blocks) >= 30
+    assert (
+        f"6 blocks would have fewer than 30 training views: the capture is split into {len(plan.blocks)}"
+        in (capsys.readouterr().out.replace("\n", " "))
+    )

@@ -1,0 +1,100 @@
+"""How much of an image a cell covers, by its airspace and by a coarse model; which Gaussians a camera may show."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.blocks.plan import Area, Cell, Ground
+from gsplat_edu.blocks.views import airspace_shares, in_any_view, seen_shares
+from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+
+GROUND = Ground((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)))
+AREA = Area(GROUND, (-10.0, -10.0), (10.0, 10.0), (0.0, 0.01))
+HALVES = [Cell((-math.inf, -math.inf), (0.0, math.inf)), Cell((0.0, -math.inf), (math.inf, math.inf))]
+
+
+def downwards(x, high=5.0):
+    eye = np.array([x, -high, 0.0])
+    return Camera(look_at(eye, [x, 0.0, 0.0], up=(0.0, 0.0, -1.0)), eye, 40.0, 40.0, 31.5, 23.5, 48, 64)
+
+
+def carpet(y=0.0, low=-8.0, high=8.0):
+    """Opaque flat Gaussians that cover the ground."""
+    a, b = np.meshgrid(np.arange(low, high, 0.25), np.arange(-8, 8, 0.25))
+    means = torch.tensor(np.stack([a.ravel(), np.full(a.size, y), b.ravel()], axis=1), dtype=torch.float32)
+    n = len(means)
+    return Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        log_scales=torch.log(torch.tensor([[0.2, 0.02, 0.2]])).repeat(n, 1),
+        sh0=torch.zeros(n, 1, 3),
+        sh_rest=torch.zeros(n, 0, 3),
+        logit_opacities=torch.full((n,), 5.0),
+    )
+
+
+def shows(gaussians, cameras, cells=HALVES):
+    def with_features(scene, camera, features):
+        return render(scene, camera, features=features, backend="cpu")
+
+    return seen_shares(AREA, gaussians, with_features, cameras, cells)
+
+
+@pytest.mark.parametrize("x", [0.0, 1.0, -2.0, 9.0])
+def test_both_measures_agree_on_flat_ground(x):
+    # From 5 above, the image is 64 / 40 * 5 = 8 wide: the edge at 0 is 4 + x from its left side.
+    left = np.clip((4 - x) / 8, 0, 1)
+    (air,) = airspace_shares(AREA, [downwards(x)], HALVES)
+    # 16 columns of rays; at 9 the ground ends inside of the image
+    assert air[0] == pytest.approx(left, abs=1 / 16)
+    if x < 9:
+        (seen,) = shows(carpet(), [downwards(x)])
+        assert seen[0] == pytest.approx(left, abs=0.03) and seen.sum() == pytest.approx(1, abs=0.03)
+
+
+def test_what_is_hidden_is_not_seen():
+    roof = carpet(y=-2.0, low=-8.0, high=0.0)  # all of it in the left half, higher than the ground of both
+    camera = downwards(-4.0)
+    # The roof, 3 below the camera, ends 4 to its right: beyond the image. Half of the image would show the ground at
+    # the right of 0 if the roof were not there.
+    ground = carpet(low=-2.0)
+    cells = [
+        Cell((-math.inf, -math.inf), (-2.0, math.inf)),
+        Cell((-2.0, -math.inf), (0.0, math.inf)),
+        HALVES[1],
+    ]
+    (bare,) = shows(carpet(), [camera], cells)
+    (hidden,) = shows(Gaussians.concatenated([roof, ground]), [camera], cells)
+    np.testing.assert_allclose(bare, [0.75, 0.25, 0.0], atol=0.03)
+    # seen from 3 above the roof, its part at the left of -2 covers (2 + 2.4) of 4.8 units
+    np.testing.assert_allclose(hidden, [4.4 / 4.8, 0.4 / 4.8, 0.0], atol=0.04)
+
+
+def test_more_cells_than_channels_are_measured_in_parts():
+    strips = [Cell((a, -math.inf), (a + 0.5, math.inf)) for a in np.arange(-10, 10, 0.5)]
+    (shares,) = shows(carpet(), [downwards(0.0)], strips)
+    assert len(strips) == 40 and shares.sum() == pytest.approx(1, abs=0.03)
+    inside = [i for i, cell in enumerate(strips) if -3.5 <= cell.low[0] < 3.0]
+    np.testing.assert_allclose(shares[inside], 0.5 / 8, atol=0.02)
+
+
+def test_only_gaussians_beside_the_view_are_left_out():
+    scene = carpet()
+    cameras = [downwards(-3.0), downwards(2.0, high=3.0)]
+    shown = in_any_view(scene, cameras)
+    assert 0.2 < shown.mean() < 0.9
+    kept = scene.map(lambda t: t[torch.from_numpy(shown)])
+    for (
+        camera
+    ) in cameras:  # a Gaussian ends where its alpha falls below 1/255: within 3.4 standard deviations
+        whole, part = (render(g, camera, backend="cpu").image for g in (scene, kept))
+        assert float((whole - part).abs().max()) < 0.01
+    drawn = np.zeros(len(scene), dtype=bool)
+    for camera in cameras:
+        drawn[render(scene, camera, backend="cpu").visible.numpy()] = True
+    lost = drawn & ~shown
+    assert lost.mean() < 0.02
