@@ -1,7 +1,7 @@
 """The recipe of the runs in blocks that the tests train."""
 
 RECIPE = [
-    *("--min-views", "8", "--iterations", "60", "--coarse-iterations", "40"),
+    *("--min-views", "8", "--iterations", "40", "--coarse-iterations", "30"),
     *("--strategy", "fast", "--max-gaussians", "3000", "--min-opacity", "0.005"),
     *("--appearance", "none", "--sky", "none", "--eval-every", "0", "--save-every", "10"),
 ]

@@ -43,6 +43,8 @@ FIRST = (
     "tests/runs/test_processes.py",
     "tests/train/test_batches.py",
     "tests/gpu/test_training.py",
+    "tests/blocks/test_cluster.py",
+    "tests/blocks/test_runs.py",
     "tests/sfm/test_training.py",
     "tests/viewer/test_page_controls.py",
     "tests/repo/test_scripts.py",

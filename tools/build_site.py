@@ -30,6 +30,7 @@ PACKAGE = ROOT / "src" / "gsplat_edu"
 USE = {
     "README.md": "Install and first run",
     "docs/GUIDE.md": "Guide",
+    "docs/SCALE.md": "Larger than one machine",
     "docs/CLI.md": "Command line",
     "docs/FORMATS.md": "Scene formats",
     "docs/RECIPE.md": "Training parameters",

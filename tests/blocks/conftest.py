@@ -1,6 +1,5 @@
 """A small city, split once; the tests train its blocks in copies of that folder."""
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -27,10 +26,8 @@ def split(city, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def serial(city, split, tmp_path_factory) -> Path:
-    """The blocks, trained one after the other in one process, and merged."""
+def serial(city, tmp_path_factory) -> Path:
+    """One command: split, the blocks one after the other in one process, merged."""
     folder = tmp_path_factory.mktemp("serial") / "run"
-    shutil.copytree(split, folder)
-    words = ["train", str(city), "--out", str(folder), "--blocks", "4", *RECIPE, "--resume"]
-    assert main(words) == 0
+    assert main(["train", str(city), "--out", str(folder), "--blocks", "4", *RECIPE]) == 0
     return folder

@@ -7,7 +7,7 @@ import pytest
 
 from gsplat_edu.cli.main import COMMANDS
 
-HEAVY = ("torch", "scipy", "cv2", "matplotlib", "PIL")
+HEAVY = ("torch", "scipy", "cv2", "matplotlib", "PIL", "dask", "distributed")
 
 PROBE = """
 import contextlib, io, sys
@@ -24,6 +24,9 @@ for line in sys.stdin.read().splitlines():
 
 NEEDED = {
     "train": "CAPTURE --out RUN",
+    "split": "CAPTURE --out RUN",
+    "block": "a 0",
+    "merge": "a",
     "sfm": "a b",
     "eval": "a",
     "render": "a",
@@ -43,6 +46,11 @@ OUT_OF_RANGE = [
     "train CAPTURE --out RUN --backend gpu",
     "train CAPTURE --out RUN --from nowhere.ply",
     "train nowhere --out RUN",
+    "train CAPTURE --out RUN --blocks 0",
+    "train CAPTURE --out RUN --workers 2",
+    "split CAPTURE --out RUN --blocks 3 --time-limit 5m",
+    "block nowhere 0",
+    "merge nowhere",
     "eval nowhere",
     "eval CAPTURE",
     "render a --backend gpu",

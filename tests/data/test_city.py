@@ -1,6 +1,9 @@
 """The city is what it says: cameras, points and photos agree, and a seed determines every byte."""
 
 import hashlib
+import runpy
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,6 +51,25 @@ def test_several_processes_write_the_same_bytes(written, tmp_path):
     for file in files:
         digests = {hashlib.sha256((place / file).read_bytes()).digest() for place in (written, tmp_path)}
         assert len(digests) == 1, file
+
+
+def test_the_tool_writes_it(tmp_path, monkeypatch, capsys):
+    words = [
+        "make_city.py",
+        str(tmp_path / "city"),
+        "--photos",
+        "3",
+        "--width",
+        "16",
+        "--workers",
+        "1",
+        "--seed",
+        "3",
+    ]
+    monkeypatch.setattr(sys, "argv", words)
+    runpy.run_path(str(Path(__file__).resolve().parents[2] / "tools" / "make_city.py"), run_name="__main__")
+    assert "3 photos of 16x12 px" in capsys.readouterr().out
+    assert len(list((tmp_path / "city" / "images").iterdir())) == 3
 
 
 def test_the_city_grows_with_the_photos_and_each_place_is_seen_often():

@@ -36,6 +36,7 @@ ELSEWHERE = {
     "chapter_figures.py": "tests/repo/test_notebooks.py",
     "check_objects.py": "tools/sanitize.sh",
     "house_limits.py": "tests/repo/test_house_limits.py",
+    "make_city.py": "tests/data/test_city.py",
     "neon.sh": "Makefile",
     "sanitize.sh": "Makefile",
     "set_up.sh": "Makefile",

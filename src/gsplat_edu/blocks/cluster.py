@@ -87,13 +87,13 @@ def run_on_cluster(
     distributed = _distributed()
     with _client(distributed, options, say) as client:
         _wait_for_workers(client, options)
-        threads = _threads(client)
+        share = _workers_on_one_host(client)
         futures = {
             number: client.submit(
                 _task,
                 str(folder.resolve()),
                 number,
-                threads,
+                share,
                 key=f"block {number}",
                 pure=False,
                 priority=-place,
@@ -106,7 +106,7 @@ def run_on_cluster(
         raise CheckpointError(f"{failed[0]} ({len(failed)} of {len(numbers)} blocks failed; {AGAIN})")
 
 
-def _task(folder: str, number: int, threads: int) -> dict[str, Any]:
+def _task(folder: str, number: int, share: int) -> dict[str, Any]:
     """Train a block on a worker; return its scene and digest, or what went wrong in one line."""
     import torch
 
@@ -115,7 +115,7 @@ def _task(folder: str, number: int, threads: int) -> dict[str, Any]:
     with (
         _ONE_AT_A_TIME
     ):  # a worker may have several threads, but the number of torch's is that of the process
-        torch.set_num_threads(threads)
+        torch.set_num_threads(max(_processors() // share, 1))
         try:
             # a worker that was cut off may still be at it: it finishes the block, or its end frees the lock
             done = train_block(Path(folder), number, patience=math.inf)
@@ -204,13 +204,14 @@ def _wait_for_workers(client: Any, options: ClusterOptions) -> None:  # noqa: AN
         ) from None
 
 
-def _threads(client: Any) -> int:  # noqa: ANN401
-    """Return the threads for each worker: the processors of this machine among the workers on it."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
-    hosts = [str(worker["host"]) for worker in workers]
-    most = max((hosts.count(host) for host in set(hosts)), default=1)
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(count // most, 1)
+def _workers_on_one_host(client: Any) -> int:  # noqa: ANN401
+    """Return the largest number of workers that share a computer."""
+    hosts = [str(worker["host"]) for worker in client.scheduler_info(n_workers=-1)["workers"].values()]
+    return max((hosts.count(host) for host in set(hosts)), default=1)
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _watch(client: Any, futures: Sequence[Any], options: ClusterOptions, watch: Callable[[], None]) -> None:  # noqa: ANN401

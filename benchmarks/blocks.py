@@ -1,0 +1,216 @@
+"""What do blocks cost in quality, memory and time, compared with one training of the whole capture?
+
+    python benchmarks/blocks.py [CAPTURE] [--photos N] [--width PX] [--blocks N] [--iterations N] [--gaussians N]
+                                [--keep FOLDER] [--smoke] [--out FILE.json]
+
+Without CAPTURE, writes a procedural city (`gsplat_edu.data.city`) from the air. The capture is trained as a whole, and
+in blocks: a coarse model takes a quarter of the iterations, and the blocks share the rest: both ways take as many in
+total. Every eighth photo is held out. The strips lie along the cuts; the depth of the merged scene says which pixels
+show them, for both scenes. PSNR of strips is that of all their pixels together. Other options go to all trainings.
+
+Each command runs in a process of its own, which tells its processor time and its largest memory. The overhead is the
+processor time of splitting (without the coarse training), of merging and writing, and of a local Dask cluster whose
+tasks find their blocks finished, as a fraction of the processor time of all trainings of blocks.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import hardware
+
+from gsplat_edu.blocks.cluster import ClusterOptions, run_on_cluster
+from gsplat_edu.blocks.layout import BlocksFolder
+from gsplat_edu.blocks.plan import BlockPlan
+from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
+from gsplat_edu.cli.arguments import run_command
+from gsplat_edu.data.city import City, write_city
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.images import save_png, side_by_side
+from gsplat_edu.evaluate.metrics import to_bytes
+from gsplat_edu.render.api import render
+from gsplat_edu.runs.dataset import run_dataset
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.runs.source import open_source
+
+COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
+
+CLUSTER = "import sys; sys.path.insert(0, sys.argv[1]); import blocks; blocks.schedule(sys.argv[2], int(sys.argv[3]))"
+
+COARSE = 0.25
+"""Share of all iterations that the coarse model takes."""
+
+
+def measured(*words: object, code: str = COMMAND) -> tuple[float, float]:
+    """Run a command in a process of its own; return its processor time, s, and its largest memory, MiB.
+
+    Raises:
+        ArgumentError: it failed.
+    """
+    process = subprocess.Popen([sys.executable, "-c", code, *map(str, words)], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise ArgumentError(f"{' '.join(map(str, words))}: ended with {process.returncode}; see above")
+    return usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
+
+
+def schedule(folder: str, count: int) -> None:
+    """Run the tasks of finished blocks on a local cluster of two workers."""
+    run_on_cluster(Path(folder), range(count), ClusterOptions(workers=2))
+
+
+def compared(whole: Path, merged: Path, pictures: Path | None) -> dict[str, Any]:
+    """Return the scores of both scenes on the held-out views, over all pixels and along the cuts."""
+    plan = BlockPlan.read(merged)
+    dataset = run_dataset(RunFolder(merged).read_config())
+    scenes = {"unsplit": open_source(whole), "blocks": open_source(merged)}
+    settings = replace(scenes["blocks"].settings, depth=True)
+    renderer = functools.partial(render, settings=settings, backend="cpu")
+    cameras = [view.camera for view in dataset.test]
+    masks = masks_of(plan.area, plan.cores, scenes["blocks"].scene.gaussians, cameras, renderer)
+    found: dict[str, Any] = {
+        "strip width": 2 * strip_width(plan.area, plan.cores),
+        "share of the strips": float(sum(mask.mean() for mask in masks) / len(masks)),
+    }
+    for name, folder in (("unsplit", whole), ("blocks", merged)):
+        gaussians = scenes[name].scene.gaussians
+        strips, rest = pooled_psnr(gaussians, dataset.test, masks, renderer, settings.background)
+        metrics = RunFolder(folder).read_metrics()
+        found[name] = {
+            "PSNR": metrics["test"]["psnr"],
+            "SSIM": metrics["test"]["ssim"],
+            "PSNR along the cuts": strips,
+            "PSNR elsewhere": rest,
+            "Gaussians": metrics["num_gaussians"],
+        }
+    if pictures is not None:
+        at = max(range(len(masks)), key=lambda i: float(masks[i].mean()))
+        images = [to_bytes(renderer(scene.scene.gaussians, cameras[at]).image) for scene in scenes.values()]
+        shown = masks[at][..., None] * 70
+        save_png(
+            pictures, side_by_side([*images, dataset.test[at].image, dataset.test[at].image // 2 + shown])
+        )
+    return found
+
+
+def measure(data: Path, folder: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Train a capture as a whole and in blocks, and compare them."""
+    total, count = given.iterations, given.blocks
+    coarse = round(COARSE * total)
+    each = (total - coarse) // count
+    recipe = [
+        "--strategy",
+        "fast",
+        "--max-gaussians",
+        given.gaussians,
+        "--appearance",
+        "none",
+        "--sky",
+        "none",
+    ]
+    recipe += ["--eval-every", "0", "--save-every", "0", *given.words]
+    whole, parts = folder / "whole", BlocksFolder(folder / "blocks")
+    seconds, memory = {}, {}
+    seconds["unsplit"], memory["unsplit"] = measured(
+        "train", data, "--out", whole, "--iterations", total, *recipe
+    )
+    words = [
+        "--blocks",
+        count,
+        "--iterations",
+        each,
+        "--coarse-iterations",
+        coarse,
+        "--min-views",
+        given.min_views,
+    ]
+    seconds["coarse and split"], memory["coarse and split"] = measured(
+        "split", data, "--out", parts.path, *words, *recipe
+    )
+    shutil.copytree(parts.path, folder / "again")
+    again = BlocksFolder(folder / "again")
+    shutil.rmtree(again.path / "starts")
+    again.plan.unlink()
+    # with the coarse model already trained, the same command only splits
+    seconds["split"], _ = measured("split", data, "--out", again.path, *words, *recipe, "--resume")
+    found = len(BlockPlan.read(parts.path).blocks)
+    for number in range(found):
+        seconds[f"block {number}"], memory[f"block {number}"] = measured("block", parts.path, number)
+    here = str(Path(__file__).resolve().parent)
+    if not given.smoke:
+        seconds["cluster"], _ = measured(here, parts.path, found, code=CLUSTER)
+    seconds["merge and score"], memory["merge and score"] = measured("merge", parts.path)
+    seconds["score"], _ = measured("eval", parts.path)
+    plan = BlockPlan.read(parts.path)
+    blocks = sum(seconds[f"block {number}"] for number in range(found))
+    extra = (
+        seconds["split"]
+        + seconds.get("cluster", 0.0)
+        + max(seconds["merge and score"] - seconds["score"], 0.0)
+    )
+    return {
+        "photos": sum(len(part) for part in _views(plan)),
+        "iterations": {"unsplit": total, "coarse": coarse, "each block": each},
+        "training views": [len(block.train) for block in plan.blocks],
+        "processor seconds": seconds,
+        "largest memory (MiB)": memory,
+        "overhead": extra / (blocks + seconds["coarse and split"] - seconds["split"]),
+        "scores": compared(whole, parts.path, folder / "seam.png"),
+    }
+
+
+def _views(plan: BlockPlan) -> tuple[set[str], set[str]]:
+    return (
+        {name for block in plan.blocks for name in block.train},
+        {name for block in plan.blocks for name in block.test},
+    )
+
+
+def main() -> int:
+    """Read the command line and measure."""
+    parser = hardware.parser("Blocks against one training of the whole: quality, memory and time.")
+    parser.add_argument("capture", nargs="?", type=Path, help="capture (default: a procedural city)")
+    for name, default, text in (
+        ("photos", 1_500, "photos of the city"),
+        ("width", 192, "their width, px"),
+        ("blocks", 4, "number of blocks"),
+        ("iterations", 30_000, "iterations in total"),
+        ("gaussians", 150_000, "cap on the Gaussians of the whole scene"),
+        ("min-views", 20, "fewest training views of a block"),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=default, help=f"{text} (default: %(default)s)")
+    parser.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="keep all runs and a picture of a seam here"
+    )
+    options, options.words = parser.parse_known_args()
+    if options.smoke:
+        options.capture, options.photos, options.width, options.gaussians = None, 32, 32, 2_000
+        options.blocks, options.iterations, options.min_views = 2, 80, 4
+        options.words = ["--min-opacity", "0.005"]
+
+    def run() -> None:
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = options.keep or Path(scratch)
+            data = options.capture
+            if data is None:
+                data = folder / "city"
+                write_city(data, City(options.photos, options.width))
+            result = measure(data, folder, options)
+            for name, value in result.items():
+                print(f"{name}: {value}")
+            hardware.report(result, options.out)
+
+    return run_command("blocks.py", run, debug=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
