@@ -9,18 +9,18 @@ total. Every eighth photo is held out. The strips lie along the cuts; the depth 
 show them, for both scenes. PSNR of strips is that of all their pixels together. Other options go to all trainings.
 
 Each command runs in a process of its own, which tells its processor time and its largest memory. The overhead is the
-processor time of splitting (without the coarse training), of merging and writing, and of a local Dask cluster whose
-tasks find their blocks finished, as a fraction of the processor time of all trainings of blocks.
+processor time of splitting (without the coarse training), of merging and writing, and of a local Dask cluster of two
+workers whose tasks find their blocks finished, as a fraction of that of the coarse training and the blocks.
 """
 
 from __future__ import annotations
 
 import functools
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,17 @@ import hardware
 
 from gsplat_edu.blocks.cluster import ClusterOptions, run_on_cluster
 from gsplat_edu.blocks.layout import BlocksFolder
+from gsplat_edu.blocks.merge import finished_blocks, merged
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
+from gsplat_edu.blocks.split import SplitOptions, coarse_scene, split_capture
+from gsplat_edu.blocks.task import block_options
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.city import City, write_city
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import to_bytes
+from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder
@@ -104,9 +108,8 @@ def compared(whole: Path, merged: Path, pictures: Path | None) -> dict[str, Any]
 
 def measure(data: Path, folder: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401
     """Train a capture as a whole and in blocks, and compare them."""
-    total, count = given.iterations, given.blocks
-    coarse = round(COARSE * total)
-    each = (total - coarse) // count
+    coarse = round(COARSE * given.iterations)
+    each = (given.iterations - coarse) // given.blocks
     recipe = [
         "--strategy",
         "fast",
@@ -119,53 +122,53 @@ def measure(data: Path, folder: Path, given: Any) -> dict[str, Any]:  # noqa: AN
     ]
     recipe += ["--eval-every", "0", "--save-every", "0", *given.words]
     whole, parts = folder / "whole", BlocksFolder(folder / "blocks")
-    seconds, memory = {}, {}
-    seconds["unsplit"], memory["unsplit"] = measured(
-        "train", data, "--out", whole, "--iterations", total, *recipe
-    )
-    words = [
-        "--blocks",
-        count,
-        "--iterations",
-        each,
-        "--coarse-iterations",
-        coarse,
-        "--min-views",
-        given.min_views,
-    ]
-    seconds["coarse and split"], memory["coarse and split"] = measured(
-        "split", data, "--out", parts.path, *words, *recipe
-    )
-    shutil.copytree(parts.path, folder / "again")
-    again = BlocksFolder(folder / "again")
-    shutil.rmtree(again.path / "starts")
-    again.plan.unlink()
-    # with the coarse model already trained, the same command only splits
-    seconds["split"], _ = measured("split", data, "--out", again.path, *words, *recipe, "--resume")
-    found = len(BlockPlan.read(parts.path).blocks)
-    for number in range(found):
-        seconds[f"block {number}"], memory[f"block {number}"] = measured("block", parts.path, number)
-    here = str(Path(__file__).resolve().parent)
-    if not given.smoke:
-        seconds["cluster"], _ = measured(here, parts.path, found, code=CLUSTER)
-    seconds["merge and score"], memory["merge and score"] = measured("merge", parts.path)
-    seconds["score"], _ = measured("eval", parts.path)
+    costs = {}
+    if not (whole / "report.html").is_file():
+        words = ["train", data, "--out", whole, "--iterations", given.iterations, *recipe]
+        costs["unsplit"] = measured(*words)
+    words = ["--blocks", given.blocks, "--iterations", each, "--coarse-iterations", coarse]
+    words += ["--min-views", given.min_views, *recipe]
+    costs["coarse and split"] = measured("split", data, "--out", parts.path, *words)
     plan = BlockPlan.read(parts.path)
-    blocks = sum(seconds[f"block {number}"] for number in range(found))
-    extra = (
-        seconds["split"]
-        + seconds.get("cluster", 0.0)
-        + max(seconds["merge and score"] - seconds["score"], 0.0)
+    found = len(plan.blocks)
+    for number in range(found):
+        costs[f"block {number}"] = measured("block", parts.path, number)
+    if not given.smoke:
+        here = str(Path(__file__).resolve().parent)
+        costs["cluster"] = measured(here, parts.path, found, code=CLUSTER)
+    costs["merge and score"] = measured("merge", parts.path)
+    seconds = {name: cost[0] for name, cost in costs.items()}
+    seconds |= overheads(parts, SplitOptions(given.blocks, given.min_views))
+    trained = (
+        sum(seconds[name] for name in seconds if name.startswith(("block", "coarse"))) - seconds["splitting"]
     )
     return {
         "photos": sum(len(part) for part in _views(plan)),
-        "iterations": {"unsplit": total, "coarse": coarse, "each block": each},
+        "iterations": {"unsplit": given.iterations, "coarse": coarse, "each block": each},
         "training views": [len(block.train) for block in plan.blocks],
         "processor seconds": seconds,
-        "largest memory (MiB)": memory,
-        "overhead": extra / (blocks + seconds["coarse and split"] - seconds["split"]),
+        "largest memory (MiB)": {name: cost[1] for name, cost in costs.items()},
+        "overhead": (seconds["splitting"] + seconds["merging"] + seconds.get("cluster", 0.0)) / trained,
         "scores": compared(whole, parts.path, folder / "seam.png"),
     }
+
+
+def overheads(parts: BlocksFolder, split: SplitOptions) -> dict[str, float]:
+    """Split and merge once more in this process; return the processor time of each, s, without the start of Python."""
+    plan = BlockPlan.read(parts.path)
+    one = block_options(parts, plan, 0)
+    settings = replace(one.data_settings, train_views=None, test_views=())
+    config = one.config.changed(max_gaussians=plan.recipe["train"]["max_gaussians"])
+    with tempfile.TemporaryDirectory() as scratch:
+        options = replace(
+            one, out=Path(scratch), data_settings=settings, config=config, scene=None, resume=False
+        )
+        began = time.process_time()
+        split_capture(options, coarse_scene(replace(options, out=parts.path)), split, lambda sentence: None)
+        between = time.process_time()
+        gaussians, _ = merged(parts, plan, finished_blocks(parts, plan))
+        save_ply(Path(scratch) / "scene.ply", gaussians, plan.origin)
+        return {"splitting": between - began, "merging": time.process_time() - between}
 
 
 def _views(plan: BlockPlan) -> tuple[set[str], set[str]]:

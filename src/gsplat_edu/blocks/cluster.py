@@ -8,6 +8,7 @@ program there: the local cluster listens on the loopback interface only.
 from __future__ import annotations
 
 import importlib
+import logging
 import math
 import os
 import threading
@@ -146,8 +147,7 @@ def _client(distributed: Any, options: ClusterOptions, say: Callable[[str], None
     """Connect to the scheduler, or start a cluster on this machine; close what was opened."""
     import dask
 
-    kept = {"distributed.scheduler.allowed-failures": FAILURES, "distributed.admin.log-format": "%(message)s"}
-    with dask.config.set(kept):
+    with dask.config.set({"distributed.scheduler.allowed-failures": FAILURES}), _quiet():
         if options.scheduler is None:
             # the nanny would restart a worker at 95 % of the memory; each process gets its share of the threads
             with (
@@ -177,6 +177,20 @@ def _client(distributed: Any, options: ClusterOptions, say: Callable[[str], None
             yield client
         finally:
             client.close(timeout=5)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Dask's tracebacks off the terminal: what they mean is said in one line."""
+    loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client", "distributed.core")]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
 
 
 def exposed(address: str) -> str | None:

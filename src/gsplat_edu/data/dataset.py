@@ -130,18 +130,16 @@ def load_dataset(
     path = Path(path)
     capture = read_capture(path)
     notes = [str(note) for note in capture.notes]
-    frames = sorted(capture.frames, key=lambda frame: frame.name)
-    frames, cloud, origin = _near_origin(frames, read_points_ply(points) if points else capture.cloud, notes)
-    if settings.train_views is not None:
-        frames = _listed(path, frames, (*settings.train_views, *settings.test_views))
+    given = read_points_ply(points) if points else capture.cloud
+    frames, cloud, origin = _near_origin(capture.frames, given, notes)
     header_of = functools.cache(image_header)
 
     def size_of(path: Path) -> tuple[int, int]:
         return header_of(path).size
 
-    frames = oriented(frames, size_of)
+    frames = oriented(_listed(path, frames, settings), size_of)
     made = [photo_file(frame, settings.resolution, settings.background, size_of) for frame in frames]
-    sources = [source for source, _, _ in made]
+    sources = [source for source, *_ in made]
     decoding = max(header_of(source.path).decoding for source in sources)
     store = ImageStore(settings.image_memory, sources, decoding)
     views = [
@@ -156,12 +154,7 @@ def load_dataset(
             "others are decoded again whenever they are used; raise --image-memory, or load smaller photos with "
             "--resolution"
         )
-    if settings.train_views is None:
-        train, test = _split(path, views, [frame.part for frame in frames], settings.test_every, notes)
-    else:
-        held_out = frozenset(settings.test_views)
-        train = tuple(view for view in views if view.name not in held_out)
-        test = tuple(view for view in views if view.name in held_out)
+    train, test = _split(path, views, [frame.part for frame in frames], settings, notes)
     start = cloud or _random_start(capture, [view.camera for view in views], notes, origin)
     files = tuple((frame.name, source) for frame, (source, _, _) in zip(frames, made, strict=True))
     return Dataset(
@@ -234,9 +227,10 @@ def read_capture(path: Path) -> Capture:
 
 
 def _near_origin(
-    frames: list[Frame], cloud: Cloud | None, notes: list[str]
+    found: Sequence[Frame], cloud: Cloud | None, notes: list[str]
 ) -> tuple[list[Frame], Cloud | None, Float64[np.ndarray, "3"]]:
-    """Move a scene with coordinates too large for float32, such as map coordinates, to the origin."""
+    """Sort frames by name, and move a scene whose coordinates are too large for float32, as on a map, to the origin."""
+    frames = sorted(found, key=lambda frame: frame.name)
     eyes = np.stack([frame.eye for frame in frames])
     if cloud is not None:
         cloud, note = finite_cloud(cloud)
@@ -250,8 +244,11 @@ def _near_origin(
     return frames, None if cloud is None else replace(cloud, points=cloud.points - origin), origin
 
 
-def _listed(path: Path, frames: Sequence[Frame], names: Sequence[str]) -> list[Frame]:
-    """Return the frames of these names; refuse a capture that lacks one."""
+def _listed(path: Path, frames: list[Frame], settings: DataSettings) -> list[Frame]:
+    """Return the frames that the settings name, all if they name none; refuse a capture that lacks one."""
+    if settings.train_views is None:
+        return frames
+    names = (*settings.train_views, *settings.test_views)
     by_name = {frame.name: frame for frame in frames}
     if missing := [name for name in names if name not in by_name]:
         raise DatasetError(
@@ -315,10 +312,15 @@ def _file_notes(
 
 
 def _split(
-    path: Path, views: Sequence[View], parts: Sequence[str], test_every: int | None, notes: list[str]
+    path: Path, views: Sequence[View], parts: Sequence[str], settings: DataSettings, notes: list[str]
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Divide views, sorted by name, into training and test views."""
-    if test_every is None and any(parts):
+    test_every = settings.test_every
+    if settings.train_views is not None:
+        held_out = frozenset(settings.test_views)
+        train = tuple(view for view in views if view.name not in held_out)
+        test = tuple(view for view in views if view.name in held_out)
+    elif test_every is None and any(parts):
         train, test = (
             tuple(v for v, p in zip(views, parts, strict=True) if p == part) for part in ("train", "test")
         )

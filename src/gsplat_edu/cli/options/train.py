@@ -380,7 +380,9 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
 def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, argparse.Namespace | None]:
     """Return the arguments of each block's run, and those of the coarse model's; None where --from gives one.
 
-    The resolution of the coarse run is divided by `COARSE_FACTOR`, and its length is --coarse-iterations.
+    The resolution of the coarse run is divided by `COARSE_FACTOR`, and its length is --coarse-iterations. The strategy
+    fast is used without its penalty on opacities: in a large capture, few views show a Gaussian, and it would fade in
+    between.
 
     Args:
         arguments: Those of a run in blocks.
@@ -389,9 +391,11 @@ def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, 
     of_block.resume, of_block.scene = False, arguments.scene or arguments.out
     for name in FOR_POINTS:
         setattr(of_block, name, None)
+    coarse = argparse.Namespace(**vars(arguments))
+    if _strategy(arguments) == "fast" and arguments.fast_opacity_weight is None:
+        of_block.fast_opacity_weight = coarse.fast_opacity_weight = 0.0
     if arguments.scene is not None:
         return of_block, None
-    coarse = argparse.Namespace(**vars(arguments))
     length = _length(arguments, _strategy(arguments))
     coarse.iterations = arguments.coarse_iterations or max(round(COARSE_SHARE * length), 1)
     coarse.quality, coarse.out = None, BlocksFolder(arguments.out).coarse
