@@ -39,6 +39,16 @@ def test_a_command_for_each_block_gives_the_bytes_of_one_command_for_all(city, r
     assert main([*words[:-1]]) == 2 and "already holds a run; add --resume" in capsys.readouterr().err
 
 
+def test_coarse_model_and_blocks_get_their_own_recipes(split):
+    plan, coarse = BlockPlan.read(split), json.loads((split / "coarse" / "config.json").read_text())
+    assert coarse["data"]["resolution"] == 2.0 and plan.recipe["data"]["resolution"] is None
+    assert (coarse["train"]["iterations"], plan.recipe["train"]["iterations"]) == (30, 40)
+    assert coarse["train"]["max_gaussians"] == 750, "a quarter of the pixels, a quarter of the Gaussians"
+    assert all(750 < block.max_gaussians <= 3000 for block in plan.blocks)
+    for train in (coarse["train"], plan.recipe["train"]):
+        assert train["fast_opacity_weight"] == 0, "what few views show would fade between two of them"
+
+
 def test_each_block_keeps_the_gaussians_of_its_cell(serial):
     plan, folder = BlockPlan.read(serial), BlocksFolder(serial)
     whole = load_ply(serial / "point_cloud" / "iteration_40" / "point_cloud.ply").means.numpy()
