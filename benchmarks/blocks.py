@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import hardware
+import numpy as np
 
 from gsplat_edu.blocks.cluster import ClusterOptions, run_on_cluster
 from gsplat_edu.blocks.layout import BlocksFolder
@@ -99,10 +100,9 @@ def compared(whole: Path, merged: Path, pictures: Path | None) -> dict[str, Any]
     if pictures is not None:
         at = max(range(len(masks)), key=lambda i: float(masks[i].mean()))
         images = [to_bytes(renderer(scene.scene.gaussians, cameras[at]).image) for scene in scenes.values()]
-        shown = masks[at][..., None] * 70
-        save_png(
-            pictures, side_by_side([*images, dataset.test[at].image, dataset.test[at].image // 2 + shown])
-        )
+        photo = to_bytes(dataset.test[at].image)
+        strips = photo // 2 + 70 * masks[at][..., None].astype(np.uint8)
+        save_png(pictures, side_by_side([*images, photo, strips]))
     return found
 
 

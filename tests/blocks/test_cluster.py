@@ -15,7 +15,7 @@ from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.status import statuses
 from gsplat_edu.cli.main import main
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.errors import ArgumentError, CheckpointError
 from processes import Program
 from slices import SEED
 
@@ -165,14 +165,26 @@ def names_of(plan):
     return sorted({name for block in plan.blocks for name in block.train})
 
 
-def test_no_scheduler_and_no_workers_are_one_line(split, tmp_path, capsys):
+def test_no_scheduler_no_workers_and_lost_workers_are_one_line(split, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(split, run)
+    log = BlocksFolder(run).run(0).log_file
     with Cluster(tmp_path / "cluster") as cluster:
         options = ClusterOptions(cluster.address, patience=2.0)
-        with pytest.raises(ArgumentError, match="no scheduler answers at tcp://127.0.0.1"):
-            run_on_cluster(split, [0], options)
+        with pytest.raises(ArgumentError, match=r"no scheduler answers at tcp://127\.0\.0\.1"):
+            run_on_cluster(run, [0], options)
         cluster.scheduler()
-        with pytest.raises(Exception, match=r"has no workers; start some with `dask worker ADDRESS`"):
-            run_on_cluster(split, [0], options)
+        with pytest.raises(CheckpointError, match=r"has no workers; start some with `dask worker ADDRESS`"):
+            run_on_cluster(run, [0], options)
+        worker = cluster.worker()
+
+        def lose_it():
+            if log.exists() and worker.runs:
+                kill(worker)
+
+        waiting = ClusterOptions(cluster.address, patience=20.0)
+        with pytest.raises(CheckpointError, match="all workers were lost; start some, and finished blocks"):
+            run_on_cluster(run, [0], waiting, watch=lose_it)
 
 
 def test_a_network_without_tls_gets_a_warning():

@@ -380,9 +380,8 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
 def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, argparse.Namespace | None]:
     """Return the arguments of each block's run, and those of the coarse model's; None where --from gives one.
 
-    The resolution of the coarse run is divided by `COARSE_FACTOR`, and its length is --coarse-iterations. The strategy
-    fast is used without its penalty on opacities: in a large capture, few views show a Gaussian, and it would fade in
-    between.
+    The coarse run has photos smaller by `COARSE_FACTOR`, and its own length. The strategy fast is used without its
+    penalty on opacities: in a large capture, few views show a Gaussian, and it would fade in between.
 
     Args:
         arguments: Those of a run in blocks.
@@ -391,6 +390,8 @@ def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, 
     of_block.resume, of_block.scene = False, arguments.scene or arguments.out
     for name in FOR_POINTS:
         setattr(of_block, name, None)
+    if arguments.means_rate is None:
+        of_block.means_rate = TrainConfig.means_rate  # a coarse model is not in place yet
     coarse = argparse.Namespace(**vars(arguments))
     if _strategy(arguments) == "fast" and arguments.fast_opacity_weight is None:
         of_block.fast_opacity_weight = coarse.fast_opacity_weight = 0.0
