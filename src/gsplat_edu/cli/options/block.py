@@ -8,7 +8,7 @@ from gsplat_edu.cli.arguments import whole_number_text
 from gsplat_edu.cli.options.blocks import add_run, check_run
 from gsplat_edu.validation import whole_number
 
-EXAMPLE = "example, in a Slurm array: gsplat-edu block runs/town $SLURM_ARRAY_TASK_ID"
+EXAMPLE = "example: gsplat-edu block runs/town 3"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
