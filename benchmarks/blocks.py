@@ -120,7 +120,6 @@ def measure(data: Path, folder: Path, given: Any) -> dict[str, Any]:  # noqa: AN
         "--sky",
         "none",
     ]
-    recipe += ["--fast-opacity-weight", "0"]  # else the whole city fades: few views show each Gaussian
     recipe += ["--eval-every", "0", "--save-every", "0", *given.words]
     whole, parts = folder / "whole", BlocksFolder(folder / "blocks")
     costs = {}

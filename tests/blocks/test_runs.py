@@ -45,8 +45,6 @@ def test_coarse_model_and_blocks_get_their_own_recipes(split):
     assert (coarse["train"]["iterations"], plan.recipe["train"]["iterations"]) == (30, 40)
     assert coarse["train"]["max_gaussians"] == 750, "a quarter of the pixels, a quarter of the Gaussians"
     assert all(750 < block.max_gaussians <= 3000 for block in plan.blocks)
-    for train in (coarse["train"], plan.recipe["train"]):
-        assert train["fast_opacity_weight"] == 0, "what few views show would fade between two of them"
 
 
 def test_each_block_keeps_the_gaussians_of_its_cell(serial):

@@ -20,8 +20,9 @@ from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.block_table import BlockTable
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
+from gsplat_edu.cli.options.block_parts import parts_of_blocks
 from gsplat_edu.cli.options.blocks import LEAST_VIEWS, block_count
-from gsplat_edu.cli.options.train import OPEN, left_open, options_from, parts_of_blocks
+from gsplat_edu.cli.options.train import OPEN, left_open, options_from
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.cli.train import (
     interruptible,

@@ -99,6 +99,9 @@ def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective
 
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale)
 
+    For fast, the mean is that of the Gaussians that the view shows. Adam moves a parameter by its full rate if all its
+    gradients agree, however small they are: where a view shows a twentieth of the scene, the others would fade.
+
     Args:
         config: The configuration.
         shell: Where far splats lie, whose scale is not regularised; None if there are none.
@@ -110,7 +113,7 @@ def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective
         terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
         terms["scale"] = MeanScale(config.mcmc.scale_weight, shell)
     if config.strategy == "fast" and config.fast.opacity_weight > 0:
-        terms["opacity"] = MeanOpacity(config.fast.opacity_weight, until=config.fast.stop)
+        terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, of_visible=True)
     return Objective(terms)
 
 
@@ -137,17 +140,20 @@ class MeanOpacity:
     Args:
         weight: lambda_o.
         until: The term is 0 from this iteration on; None for the whole run.
+        of_visible: The mean is that of the Gaussians that the view shows, not of all.
     """
 
     weight: float
     until: int | None = None
+    of_visible: bool = False
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight mean(opacity)."""
         if self.until is not None and rendered.iteration >= self.until:
             return rendered.gaussians.logit_opacities.new_zeros(())
+        visible = rendered.output.visible if self.of_visible else None
         value: Tensor = _MeanOpacity.apply(  # type: ignore[no-untyped-call]
-            rendered.gaussians.logit_opacities, self.weight
+            rendered.gaussians.logit_opacities, self.weight, visible
         )
         return value
 
@@ -173,26 +179,30 @@ class MeanScale:
 
 
 class _MeanOpacity(torch.autograd.Function):
-    """Compute weight mean(sigmoid(l)), with the gradient weight o (1 - o) / N, in reused buffers.
+    """Compute weight mean(sigmoid(l)) of all or some, with the gradient weight o (1 - o) / N, in reused buffers.
 
     The rounding of torch's sigmoid depends on the number of threads, so one thread computes it.
     """
 
     @staticmethod
-    def forward(ctx: Any, logits: Tensor, weight: float) -> Tensor:  # noqa: ANN401
-        count = max(logits.numel(), 1)
+    def forward(ctx: Any, logits: Tensor, weight: float, some: Tensor | None) -> Tensor:  # noqa: ANN401
         with one_thread():
-            opacities = torch.sigmoid(logits, out=reusable_tensor(logits.shape, logits))
+            chosen = logits if some is None else logits[some]
+            count = max(chosen.numel(), 1)
+            opacities = torch.sigmoid(chosen, out=reusable_tensor(chosen.shape, chosen))
             value = weight * opacities.sum() / count
-            others = torch.neg(opacities, out=reusable_tensor(logits.shape, logits)).add_(1)
-            ctx.save_for_backward(opacities.mul_(weight).mul_(others).div_(count))
+            others = torch.neg(opacities, out=reusable_tensor(chosen.shape, chosen)).add_(1)
+            gradient = opacities.mul_(weight).mul_(others).div_(count)
+            if some is not None:
+                gradient = reusable_tensor(logits.shape, logits).zero_().index_copy_(0, some, gradient)
+            ctx.save_for_backward(gradient)
             return value
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
-        return _scaled(gradient, grad), None
+        return _scaled(gradient, grad), None, None
 
 
 class _MeanScale(torch.autograd.Function):

@@ -6,12 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
-from gsplat_edu.cli.options.blocks import COARSE_FACTOR, COARSE_SHARE, add_blocks, add_cluster, check_blocks
+from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
 from gsplat_edu.cli.ranks import num_processes, restarts_are_allowed
-from gsplat_edu.data.settings import FACTOR_BELOW, DataSettings
+from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
@@ -377,40 +376,6 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
     return _options(arguments, resolve_backend(arguments.backend))
 
 
-def parts_of_blocks(arguments: argparse.Namespace) -> tuple[argparse.Namespace, argparse.Namespace | None]:
-    """Return the arguments of each block's run, and those of the coarse model's; None where --from gives one.
-
-    The coarse run has photos smaller by `COARSE_FACTOR`, and its own length. The strategy fast is used without its
-    penalty on opacities: in a large capture, few views show a Gaussian, and it would fade in between.
-
-    Args:
-        arguments: Those of a run in blocks.
-    """
-    of_block = argparse.Namespace(**vars(arguments))
-    of_block.resume, of_block.scene = False, arguments.scene or arguments.out
-    for name in FOR_POINTS:
-        setattr(of_block, name, None)
-    if arguments.means_rate is None:
-        of_block.means_rate = TrainConfig.means_rate  # a coarse model is not in place yet
-    coarse = argparse.Namespace(**vars(arguments))
-    if _strategy(arguments) == "fast" and arguments.fast_opacity_weight is None:
-        of_block.fast_opacity_weight = coarse.fast_opacity_weight = 0.0
-    if arguments.scene is not None:
-        return of_block, None
-    length = _length(arguments, _strategy(arguments))
-    coarse.iterations = arguments.coarse_iterations or max(round(COARSE_SHARE * length), 1)
-    coarse.quality, coarse.out = None, BlocksFolder(arguments.out).coarse
-    coarse.resume = RunFolder(coarse.out).exists()
-    if arguments.max_gaussians is not None:
-        coarse.max_gaussians = max(round(arguments.max_gaussians / COARSE_FACTOR**2), 1)
-    size = arguments.resolution
-    if size is None or size < FACTOR_BELOW:
-        coarse.resolution = min(COARSE_FACTOR * (size or 1.0), FACTOR_BELOW - 1)
-    else:
-        coarse.resolution = max(size / COARSE_FACTOR, FACTOR_BELOW)
-    return of_block, coarse
-
-
 def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
     config = _config(arguments)
     settings = DataSettings(
@@ -434,7 +399,7 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
 
 
 def _config(arguments: argparse.Namespace) -> TrainConfig:
-    strategy = _strategy(arguments)
+    strategy = strategy_of(arguments)
     changes: dict[str, Any] = {"strategy": strategy}
     for setting in SETTINGS:
         name = setting.name
@@ -458,14 +423,14 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
             flag = f"--{idle[0].replace('_', '-')}"
             raise ArgumentError(f"{flag}: only a start from points uses it, not --from; leave it out")
         changes = FROM_SCENE | (FAST_FROM_SCENE if strategy == "fast" else {}) | changes
-    iterations = _length(arguments, strategy)
+    iterations = length_of(arguments, strategy)
     config = recipe(iterations, rescale=not arguments.no_rescale, **changes)
     if config.strategy == "mcmc" and config.max_gaussians is None and not planned:
         raise ArgumentError("--max-gaussians: mcmc grows up to a cap; give one, for example 200000")
     return config
 
 
-def _strategy(arguments: argparse.Namespace) -> str:
+def strategy_of(arguments: argparse.Namespace) -> str:
     """Return the strategy: that given, that of the run to resume, or the default."""
     if arguments.strategy is not None:
         return str(arguments.strategy)
@@ -494,14 +459,14 @@ def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:
     """
     if arguments.resume and RunFolder(arguments.out).exists():
         return ()
-    default = OPEN_FOR_FAST if _strategy(arguments) == "fast" else ()
+    default = OPEN_FOR_FAST if strategy_of(arguments) == "fast" else ()
     names = [
         name for name in OPEN if (getattr(arguments, name) or (AUTO if name in default else None)) == AUTO
     ]
     return tuple(name for name in names if name != "sky" or arguments.scene is None)
 
 
-def _length(arguments: argparse.Namespace, strategy: str) -> int:
+def length_of(arguments: argparse.Namespace, strategy: str) -> int:
     """Return the iterations: those given, or those of the quality or the recipe, as whole batches."""
     fast, quality = strategy == "fast", arguments.quality
     if quality is not None:
