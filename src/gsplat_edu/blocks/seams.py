@@ -15,7 +15,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.validation import ArrayLike
 from gsplat_edu.views import View
 
-WIDTH = 0.05
+STRIP_SHARE = 0.05
 """Half the width of the strip along a cut, as a fraction of the mean side of the cells."""
 
 Mask = Bool[np.ndarray, "H W"]
@@ -29,7 +29,7 @@ def strip_width(area: Area, cells: Sequence[Cell]) -> float:
         cells: The cells.
     """
     parts = [cell.clipped(area.low, area.high) for cell in cells]
-    return WIDTH * float(np.mean([part.high[i] - part.low[i] for part in parts for i in range(2)]))
+    return STRIP_SHARE * float(np.mean([part.high[i] - part.low[i] for part in parts for i in range(2)]))
 
 
 def near_a_cut(
