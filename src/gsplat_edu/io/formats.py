@@ -17,7 +17,7 @@ class Format:
     """A scene format.
 
     Args:
-        suffix: Suffix of its files, in lower case.
+        suffix: Suffix of its files, in lower case; that of a folder with a fixed file is the file's whole name.
         module: Module of `gsplat_edu.io` with `read(path) -> Scene` and `write(path, scene)`.
         name: Its common name.
         sh_degree: Highest SH degree that it stores.
@@ -47,8 +47,12 @@ FORMATS = (
     Format(".spz", "spz", "Niantic SPZ"),
     Format(".sog", "sog.codec", "PlayCanvas SOG"),
     Format(".glb", "glb", "glTF with KHR_gaussian_splatting"),
+    Format("lod-meta.json", "lod.codec", "PlayCanvas streamed SOG"),
 )
 """The first matching suffix wins."""
+
+LOD_META = "lod-meta.json"
+"""File that represents a folder with levels of detail."""
 
 SOG_META = "meta.json"
 """File that represents a SOG stored as a folder."""
@@ -67,14 +71,18 @@ def format_of(path: str | Path) -> Format:
     if name == SOG_META:
         name = ".sog"
     for candidate in FORMATS:
-        if name.endswith(candidate.suffix):
+        if name == candidate.suffix or (candidate.suffix[0] == "." and name.endswith(candidate.suffix)):
             return candidate
     known = ", ".join(candidate.suffix for candidate in FORMATS)
     raise ArgumentError(f"{path}: unknown scene format; known are {known}")
 
 
 def stored_bytes(path: Path) -> int:
-    """Return the size of a scene on disk in bytes; for a meta.json, including its images."""
+    """Return the size of a scene on disk in bytes; for a meta.json or lod-meta.json, including its other files."""
+    if path.name.lower() == LOD_META:
+        from gsplat_edu.io.lod.codec import stored_bytes as of_all_levels
+
+        return of_all_levels(path)
     if path.name.lower() != SOG_META:
         return path.stat().st_size
     return sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix in (".json", ".webp"))
@@ -93,11 +101,21 @@ def losses(path: str | Path, scene: Scene) -> list[str]:
     return said
 
 
+def file_in(path: Path) -> Path:
+    """Return the file that represents a scene stored as a folder; any other path as it is."""
+    if path.is_dir():
+        for name in (SOG_META, LOD_META):
+            if (path / name).is_file():
+                return path / name
+    return path
+
+
 def read_scene(path: str | Path) -> Scene:
     """Read a scene of any format.
 
     Args:
-        path: The file; for a SOG folder, the folder or its meta.json.
+        path: The file; for a SOG folder, the folder or its meta.json; for levels of detail, of which the finest is
+            read, the folder or its lod-meta.json.
 
     Returns:
         The scene, float32, in this package's axes.
@@ -107,9 +125,7 @@ def read_scene(path: str | Path) -> Scene:
         SceneFormatError: the file does not match its suffix, or is damaged.
         OSError: the file cannot be read.
     """
-    path = Path(path)
-    if path.is_dir() and (path / SOG_META).is_file():
-        path = path / SOG_META
+    path = file_in(Path(path))
     found = format_of(path)
     scene = found.read(path)
     if not all(is_finite(tensor) for tensor in scene.gaussians.tensors().values()):

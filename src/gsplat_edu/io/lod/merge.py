@@ -37,7 +37,10 @@ from gsplat_edu.gaussians import Gaussians
 NEIGHBOURS = 8
 """Neighbours of a Gaussian that may become its partner."""
 
-COLOR_WEIGHT = 4.0
+PASSES = 3
+"""Passes over the pairs of a round; more need fewer rounds, but leave less choice."""
+
+COLOR_WEIGHT = 16.0
 """Price of a squared difference of colours (0 to 1 a channel) relative to the shape term."""
 
 LARGEST_LOG = 60.0
@@ -221,7 +224,8 @@ def _contracted(
 def _partners(blobs: Blobs) -> tuple[Int64[np.ndarray, " P"], Int64[np.ndarray, " P"]]:
     """Return disjoint pairs, at least one, cheapest first: each is the cheapest partner of the other.
 
-    The cheapest pair of all always qualifies, so there is progress in every round.
+    Those that are left without one look again among themselves, `PASSES` times in all. The cheapest pair always
+    qualifies, so there is progress in every round.
     """
     count = len(blobs.means)
     near = min(NEIGHBOURS + 1, count)
@@ -229,16 +233,25 @@ def _partners(blobs: Blobs) -> tuple[Int64[np.ndarray, " P"], Int64[np.ndarray, 
     rows = np.repeat(np.arange(count), near)
     ends = np.sort(np.stack([rows, found.reshape(-1)], axis=1), axis=1)
     ends = ends[ends[:, 0] != ends[:, 1]]  # itself; of many equal points it need not be the first
-    codes = np.unique(ends[:, 0].astype(np.int64) * count + ends[:, 1])
+    codes = np.sort(ends[:, 0].astype(np.int64) * count + ends[:, 1])
+    codes = codes[np.diff(codes, prepend=-1) > 0]
     i, j = codes // count, codes % count
-    rank = np.empty(len(codes), dtype=np.int64)
     order = np.argsort(_prices(blobs, i, j), kind="stable")
-    rank[order] = np.arange(len(codes))
-    best = np.full(count, len(codes))
-    np.minimum.at(best, i, rank)
-    np.minimum.at(best, j, rank)
-    chosen = order[(best[i] == rank)[order] & (best[j] == rank)[order]]
-    return i[chosen], j[chosen]
+    i, j = i[order], j[order]
+    pairs = []
+    free = np.ones(count, dtype=bool)
+    for _ in range(PASSES):
+        rank = np.arange(len(i))
+        best = np.full(count, len(i))
+        np.minimum.at(best, i, rank)
+        np.minimum.at(best, j, rank)
+        chosen = (best[i] == rank) & (best[j] == rank)
+        pairs.append(np.stack([i[chosen], j[chosen]]))
+        free[pairs[-1]] = False
+        left = free[i] & free[j]
+        i, j = i[left], j[left]
+    first, second = np.concatenate(pairs, axis=1)
+    return first, second
 
 
 def _prices(

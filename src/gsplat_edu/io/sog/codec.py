@@ -68,18 +68,13 @@ def read(path: Path) -> Scene:
         OSError: the file cannot be read.
     """
     source: files.Files = files.Folder(path) if _in_folder(path) else files.Bundle(path)
-    data = source.read(files.META_NAME)
-    if len(data) > files.META_LIMIT:
-        raise SceneFormatError(
-            f"{path}: its metadata has {len(data):,} bytes, too many for a scene; check its name"
-        )
-    meta = from_json(path, data)
+    meta = _read_meta(path, source)
     check_expansion(path, meta.scene_bytes(), source.stored((files.META_NAME, *meta.images)))
-    packed = {name: source.read(name) for name in meta.splat_images}
-    if len({files.check_size(path, name, data, meta.count) for name, data in packed.items()}) > 1:
+    stored = {name: source.read(name) for name in meta.splat_images}
+    if len({files.check_size(path, name, data, meta.count) for name, data in stored.items()}) > 1:
         raise SceneFormatError(f"{path}: its images differ in size; it is damaged, get it again")
     pixels = {
-        name: files.decode(path, name, data).reshape(-1, 4)[: meta.count] for name, data in packed.items()
+        name: files.decode(path, name, data).reshape(-1, 4)[: meta.count] for name, data in stored.items()
     }
     low, high = (pixels[name][:, :3].astype(np.uint16) for name in meta.means)
     quats, scales, colors = (pixels[name] for (name,) in (meta.quats, meta.log_scales, meta.colors))
@@ -97,6 +92,28 @@ def read(path: Path) -> Scene:
         logit_opacities=torch.from_numpy(byte_to_logit(colors[:, 3])),
     )
     return Scene(gaussians, meta.antialiased, meta.up)
+
+
+def read_meta(path: Path) -> Meta:
+    """Read only the meta.json of a SOG folder.
+
+    Args:
+        path: The meta.json.
+
+    Raises:
+        SceneFormatError: as for `read`.
+        OSError: the file cannot be read.
+    """
+    return _read_meta(path, files.Folder(path))
+
+
+def _read_meta(path: Path, source: files.Files) -> Meta:
+    data = source.read(files.META_NAME)
+    if len(data) > files.META_LIMIT:
+        raise SceneFormatError(
+            f"{path}: its metadata has {len(data):,} bytes, too many for a scene; check its name"
+        )
+    return from_json(path, data)
 
 
 def _in_folder(path: Path) -> bool:
@@ -143,6 +160,19 @@ def write(path: Path, scene: Scene) -> None:
             67,108,864 splats.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
+    (files.write_folder if _in_folder(path) else files.write_bundle)(path, packed(scene))
+
+
+def packed(scene: Scene, *, sort: bool = True) -> dict[str, bytes]:
+    """Return the files of a SOG by name, meta.json first.
+
+    Args:
+        scene: The scene, in this package's axes.
+        sort: Whether to sort the splats along a Morton curve; otherwise they keep their order.
+
+    Raises:
+        ArgumentError: as for `write`.
+    """
     if len(scene.gaussians) > MOST_SPLATS:
         raise ArgumentError(
             f"gaussians: are {len(scene.gaussians):,}, but a SOG has at most {MOST_SPLATS:,}; write a PLY or split them"
@@ -154,15 +184,13 @@ def write(path: Path, scene: Scene) -> None:
         raise ArgumentError(
             f"quats{first_index(zero)}: has zero length, so it is not a rotation; remove the splat"
         )
-    contents = _packed(Scene(gaussians, scene.antialiased, scene.up))
-    (files.write_folder if _in_folder(path) else files.write_bundle)(path, contents)
+    return _packed(Scene(gaussians, scene.antialiased, scene.up), sort)
 
 
-def _packed(scene: Scene) -> dict[str, bytes]:
-    """Return the files of a scene by name, meta.json first."""
+def _packed(scene: Scene, sort: bool) -> dict[str, bytes]:
     values = {name: tensor.numpy(force=True) for name, tensor in scene.gaussians.tensors().items()}
     steps, span = positions_to_steps(values["means"])
-    order = np.argsort(morton_codes(steps), kind="stable")
+    order = np.argsort(morton_codes(steps), kind="stable") if sort else np.arange(len(steps))
     steps = steps[order]
     values = {name: array[order] for name, array in values.items()}
     scales, sh0 = codebook(values["log_scales"]), codebook(values["sh0"])
@@ -178,9 +206,9 @@ def _packed(scene: Scene) -> dict[str, bytes]:
         meta.log_scales[0]: nearest_in_codebook(values["log_scales"], scales),
         meta.colors[0]: np.concatenate([nearest_in_codebook(values["sh0"][:, 0], sh0), opacities], axis=1),
     }
-    packed = {files.META_NAME: to_json(meta)}
-    packed |= {name: files.encode(pixels) for name, pixels in images.items()}
-    return packed | palette_images
+    contents = {files.META_NAME: to_json(meta)}
+    contents |= {name: files.encode(pixels) for name, pixels in images.items()}
+    return contents | palette_images
 
 
 def _weights(values: dict[str, Float32[np.ndarray, "..."]]) -> Float32[np.ndarray, " N"]:
