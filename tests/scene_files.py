@@ -7,7 +7,9 @@ import torch
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.formats import SOG_META, write_scene
+from gsplat_edu.io.formats import LOD_META, SOG_META, write_scene
+from gsplat_edu.io.lod import codec as lod
+from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.runs.folder import RunFolder
@@ -46,6 +48,13 @@ def small_folder(folder: Path) -> Path:
     """Write the same scene as a SOG in a folder; return its meta.json."""
     path = folder / "small" / SOG_META
     write_scene(path, random_scene(40, 3))
+    return path
+
+
+def small_levels(folder: Path) -> Path:
+    """Write the same scene at two levels of detail, in three files; return its lod-meta.json."""
+    path = folder / "levels" / LOD_META
+    lod.write(path, random_scene(40, 3), LodOptions(smallest=20, chunk=20, leaf=10))
     return path
 
 

@@ -182,3 +182,28 @@ def test_mistakes_are_one_line_and_nothing_is_written(convert, plain, tmp_path, 
 def test_a_scene_may_replace_itself(convert, plain):
     convert(plain, plain, "--sh-degree", 0)
     assert read_scene(plain).gaussians.sh_degree == 0
+
+
+def test_levels_of_detail_are_written_verified_and_described(convert, tmp_path, capsys):
+    write_scene(tmp_path / "in.ply", random_scene(300, 3))
+    out = tmp_path / "scene-lod" / "lod-meta.json"
+    said = convert(
+        tmp_path / "in.ply", out, "--lod-smallest", 80, "--lod-leaf", 100, "--lod-chunk", 150, "--verify"
+    )
+    assert f"wrote {out}: 300 splats, SH degree 1" in said
+    assert "levels of 300, 152, 76 splats; errors up to 0, 0." in said and "4 leaves, 5 files, " in said
+    assert float(re.search(r"PSNR ([\d.]+) dB over 8 views", said)[1]) > 40
+    size = sum(file.stat().st_size for file in out.parent.rglob("*.*"))
+    assert f"{size:,} bytes" in said
+    assert main(["info", str(out.parent)]) == 0
+    told = capsys.readouterr().out
+    assert "PlayCanvas streamed SOG" in told
+    assert "3 of 300, 152, 76 splats, 4 leaves in 5 files; the finest one is described here" in told
+    convert(out.parent, tmp_path / "again.ply")
+    assert len(read_scene(tmp_path / "again.ply").gaussians) == 300
+
+
+def test_options_of_levels_need_levels(convert, plain, tmp_path):
+    said = convert(plain, tmp_path / "out.ply", "--lod-leaf", 5, code=2)
+    assert "--lod-leaf:" in said and "has no levels of detail" in said
+    assert "smallest: " in convert(plain, tmp_path / "lod-meta.json", "--lod-smallest", 0, code=2)

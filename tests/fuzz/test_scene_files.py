@@ -9,7 +9,7 @@ import pytest
 import slices
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.io.formats import FORMATS, read_scene
-from scene_files import small_file
+from scene_files import small_file, small_levels
 
 FILES = slices.count("GSPLAT_EDU_FUZZ", 100, 20_000)
 """Mutated files per reader."""
@@ -91,3 +91,17 @@ def test_damage_inside_a_sog(tmp_path):
             for name, content in parts.items():
                 bundle.writestr(name, mutated(content, rng) if name == victim else content)
         check(path, seed)
+
+
+@pytest.mark.sliced
+def test_damage_inside_levels_of_detail(tmp_path):
+    """Half of the damage goes to the index, the rest to one of the files that it names."""
+    whole = small_levels(tmp_path)
+    files = sorted(file for file in whole.parent.rglob("*") if file.is_file())
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        victim = files[int(rng.integers(0, len(files)))] if rng.random() < 0.5 else whole
+        content = victim.read_bytes()
+        victim.write_bytes(mutated(content, rng))
+        check(whole, seed)
+        victim.write_bytes(content)

@@ -19,6 +19,8 @@ from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.keyframes import read_path
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
+from gsplat_edu.io.formats import LOD_META
+from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
@@ -45,6 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
             f"--path: only a page can play a camera path; {arguments.out} is none, use {export.PAGE}"
         )
     along = None if arguments.path is None else read_path(arguments.path)
+    options = _levels(arguments)
     console = Terminal()
     columns = (
         Field("{task.description}"),
@@ -71,16 +74,29 @@ def run(arguments: argparse.Namespace) -> None:
         if move is not IDENTITY:  # the page's views then have the coordinates of the moved scene
             source = replace(source, origin=ORIGIN)
         bar.update(steps, description=f"writing {arguments.out}")
-        export.write(arguments.out, source, along)
+        export.write(arguments.out, source, along, options)
         bar.advance(steps)
         count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
         say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}")
+        if export.has_levels(arguments.out):
+            say(export.levels_line(arguments.out))
         if arguments.scale is not None:
             say(
                 f"1 unit of {arguments.out.name} = 1 {given.unit}; it was {given.apart / given.length:.6g} units before"
             )
         if arguments.verify:
             check_and_say(arguments.out, source, backend, bar, say)
+
+
+def _levels(arguments: argparse.Namespace) -> LodOptions:
+    """Return the options of levels of detail; reject them for formats without levels."""
+    given = {name: getattr(arguments, f"lod_{name}") for name in ("smallest", "chunk", "leaf")}
+    given = {name: value for name, value in given.items() if value is not None}
+    if given and not export.has_levels(arguments.out):
+        raise ArgumentError(
+            f"--lod-{next(iter(given))}: {arguments.out} has no levels of detail; write FOLDER/{LOD_META}"
+        )
+    return LodOptions(**given)
 
 
 def _edited(source: Source, keep: Filter, move: Similarity) -> Source:

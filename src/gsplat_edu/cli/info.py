@@ -18,7 +18,8 @@ from gsplat_edu.data.scale import Scale
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io import ply
-from gsplat_edu.io.formats import SOG_META, format_of, read_scene, stored_bytes
+from gsplat_edu.io.formats import LOD_META, SOG_META, file_in, format_of, read_scene, stored_bytes
+from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.shells import far_shell
 from gsplat_edu.text import short_number
@@ -49,10 +50,9 @@ def run(arguments: argparse.Namespace) -> None:
     path: Path = arguments.path
     if not path.exists():
         raise ArgumentError(f"{path}: does not exist; give a dataset folder, a run folder or a scene file")
-    if (path / SOG_META).is_file():
-        path = path / SOG_META
+    path = file_in(path)
     # any other .json may be a dataset's transforms.json
-    if path.is_file() and (path.suffix.lower() != ".json" or path.name.lower() == SOG_META):
+    if path.is_file() and (path.suffix.lower() != ".json" or path.name.lower() in (SOG_META, LOD_META)):
         facts = _scene_facts(path)
     elif RunFolder(path).exists():
         facts = _run_facts(RunFolder(path))
@@ -76,6 +76,13 @@ def _scene_facts(path: Path) -> list[Fact]:
         ("splats", f"{count:,}, SH degree {gaussians.sh_degree}"),
         ("file", f"{size:,} bytes" + (f", {size / count:.1f} per splat" if count else "")),
     ]
+    if path.name.lower() == LOD_META:
+        index = read_index(path)
+        counts = ", ".join(f"{count:,}" for count in index.counts())
+        leaves = f"{len(index.regions)} leaves in {len(index.filenames)} files"
+        facts.append(
+            ("levels", f"{index.levels} of {counts} splats, {leaves}; the finest one is described here")
+        )
     if scene.antialiased is not None:
         facts.append(("render", f"{'with' if scene.antialiased else 'without'} antialiasing"))
     if scene.unit is not None:

@@ -27,7 +27,7 @@ from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
 from gsplat_edu.files import check_writable
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.formats import SOG_META, read_scene
+from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.render.maps import render_maps
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> None:
     if folder.exists():
         shot = _run_shot(arguments, folder, orbit)
         out = arguments.out or folder.renders / name
-    elif arguments.source.is_file() or (arguments.source / SOG_META).is_file():
+    elif file_in(arguments.source).is_file():
         shot = _file_shot(arguments, orbit)
         out = arguments.out or Path("out") / f"{arguments.source.stem}_{name}"
     elif arguments.source.exists():

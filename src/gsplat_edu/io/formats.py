@@ -17,7 +17,7 @@ class Format:
     """A scene format.
 
     Args:
-        suffix: Suffix of its files, in lower case; that of a folder with a fixed file is the file's whole name.
+        suffix: Suffix of its files, in lower case; for a folder, the whole name of the file that represents it.
         module: Module of `gsplat_edu.io` with `read(path) -> Scene` and `write(path, scene)`.
         name: Its common name.
         sh_degree: Highest SH degree that it stores.
@@ -47,22 +47,25 @@ FORMATS = (
     Format(".spz", "spz", "Niantic SPZ"),
     Format(".sog", "sog.codec", "PlayCanvas SOG"),
     Format(".glb", "glb", "glTF with KHR_gaussian_splatting"),
-    Format("lod-meta.json", "lod.codec", "PlayCanvas streamed SOG"),
 )
 """The first matching suffix wins."""
+
+
+SOG_META = "meta.json"
+"""File that represents a SOG stored as a folder."""
 
 LOD_META = "lod-meta.json"
 """File that represents a folder with levels of detail."""
 
-SOG_META = "meta.json"
-"""File that represents a SOG stored as a folder."""
+LOD_FORMATS = (Format(LOD_META, "lod.codec", "PlayCanvas streamed SOG"),)
+"""Folders with levels of detail, by the whole name of the file that represents them."""
 
 
 def format_of(path: str | Path) -> Format:
     """Return the format that a file's name indicates.
 
     Args:
-        path: The file's name; it need not exist. meta.json denotes a SOG folder.
+        path: The file's name; it need not exist. meta.json denotes a SOG folder, lod-meta.json levels of detail.
 
     Raises:
         ArgumentError: the name has no suffix of a scene format.
@@ -70,10 +73,10 @@ def format_of(path: str | Path) -> Format:
     name = Path(path).name.lower()
     if name == SOG_META:
         name = ".sog"
-    for candidate in FORMATS:
-        if name == candidate.suffix or (candidate.suffix[0] == "." and name.endswith(candidate.suffix)):
+    for candidate in (*LOD_FORMATS, *FORMATS):
+        if name.endswith(candidate.suffix) and (candidate in FORMATS or name == candidate.suffix):
             return candidate
-    known = ", ".join(candidate.suffix for candidate in FORMATS)
+    known = ", ".join(candidate.suffix for candidate in (*FORMATS, *LOD_FORMATS))
     raise ArgumentError(f"{path}: unknown scene format; known are {known}")
 
 
@@ -138,7 +141,7 @@ def write_scene(path: str | Path, scene: Scene) -> None:
     """Write a scene in the format that the file's name indicates; parent folders are created.
 
     Args:
-        path: The file; for a SOG folder, its meta.json.
+        path: The file; for a SOG folder, its meta.json; for levels of detail, lod-meta.json.
         scene: The scene, in this package's axes.
 
     Raises:

@@ -12,7 +12,7 @@ from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.paths import common_up, orbit_of_scene, resized
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.formats import SOG_META, read_scene
+from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.io.ply_comments import UNITS
 from gsplat_edu.io.scene import Scene
@@ -79,7 +79,7 @@ def open_source(path: str | Path) -> Source:
     of their file, or else the usual ones of captures.
 
     Args:
-        path: Scene file, SOG folder, or folder of a run.
+        path: Scene file, folder of a SOG or of levels of detail, or folder of a run.
 
     Raises:
         ArgumentError: the path names neither a scene nor a run.
@@ -87,8 +87,8 @@ def open_source(path: str | Path) -> Source:
         CheckpointError: the run is damaged, or has no scene yet.
         OSError: a file cannot be read.
     """
-    path = Path(path)
-    if path.is_dir() and not (path / SOG_META).is_file():
+    path = file_in(Path(path))
+    if path.is_dir():
         folder = RunFolder(path)
         if not folder.exists():
             raise ArgumentError(

@@ -8,7 +8,7 @@ from pathlib import Path
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io import ply
-from gsplat_edu.io.formats import SOG_META, format_of, read_scene
+from gsplat_edu.io.formats import file_in, format_of, read_scene
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.source import relative_to, run_of
 from gsplat_edu.train.config import TrainConfig
@@ -25,8 +25,8 @@ def scene_file(path: Path) -> Path:
     """
     if not path.exists():
         raise ArgumentError(f"--from: {path} does not exist; give a scene file or the folder of a run")
-    if not path.is_dir() or (path / SOG_META).is_file():
-        file = path / SOG_META if path.is_dir() else path
+    file = file_in(path)
+    if not file.is_dir():
         format_of(file)
         return file
     folder = RunFolder(path)

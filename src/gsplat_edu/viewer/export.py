@@ -14,7 +14,17 @@ from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.files import check_folder
 from gsplat_edu.io import formats
-from gsplat_edu.io.formats import FORMATS, SOG_META, format_of, read_scene, write_scene
+from gsplat_edu.io.formats import (
+    FORMATS,
+    LOD_FORMATS,
+    LOD_META,
+    SOG_META,
+    format_of,
+    read_scene,
+    write_scene,
+)
+from gsplat_edu.io.lod import codec as lod_codec
+from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
@@ -78,20 +88,29 @@ def check_target(name: str, path: Path) -> None:
         try:
             format_of(path)
         except ArgumentError:
-            known = ", ".join([*(found.suffix for found in FORMATS), PAGE, f"FOLDER/{SOG_META}"])
+            folders = [f"FOLDER/{name}" for name in (SOG_META, *(found.suffix for found in LOD_FORMATS))]
+            known = ", ".join([*(found.suffix for found in FORMATS), PAGE, *folders])
             raise ArgumentError(f"{name}: {path}: unknown scene format; known are {known}") from None
     if path.is_dir():
         raise ArgumentError(f"{name}: {path} is a folder; give a file name")
     check_folder(name, path.parent)
 
 
-def write(path: Path, source: Source, keyframes: KeyframePath | None = None) -> None:
+def has_levels(path: Path) -> bool:
+    """Return whether a path denotes a folder with levels of detail."""
+    return path.name.lower() in (found.suffix for found in LOD_FORMATS)
+
+
+def write(
+    path: Path, source: Source, keyframes: KeyframePath | None = None, options: LodOptions | None = None
+) -> None:
     """Write a scene in the format given by the file's name; a page also gets the cameras and settings.
 
     Args:
         path: Output file.
         source: The scene.
         keyframes: A camera path for the page to play, in the coordinates of the scene.
+        options: How levels of detail are made, for formats that have them; None for the usual way.
 
     Raises:
         ArgumentError: the suffix belongs to no format, or the format cannot hold the scene.
@@ -100,8 +119,20 @@ def write(path: Path, source: Source, keyframes: KeyframePath | None = None) -> 
     if path.suffix.lower() == PAGE:
         tour = page.Tour(keyframes, source.origin)
         page.write(path, source.scene, source.cameras, source.settings, source.held_out, tour)
+    elif path.name.lower() == LOD_META:
+        lod_codec.write(path, source.scene, options)
     else:
         write_scene(path, source.scene)
+
+
+def levels_line(path: Path) -> str:
+    """Describe the levels of a written lod-meta.json in one line."""
+    index = lod_codec.read_index(path)
+    counts = ", ".join(f"{count:,}" for count in index.counts())
+    errors = [max(region.errors[level] for region in index.regions) for level in range(index.levels)]
+    lengths = ", ".join(f"{error:.3g}" for error in errors)
+    size = f"{len(index.filenames)} files, {lod_codec.stored_bytes(path):,} bytes"
+    return f"levels of {counts} splats; errors up to {lengths} units; {len(index.regions)} leaves, {size}"
 
 
 def losses(path: Path, scene: Scene) -> list[str]:

@@ -22,7 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="OUT",
         help="file to write; its suffix selects the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb or .html"
-        " (a page that shows the scene); FOLDER/meta.json writes an unzipped SOG",
+        " (a page that shows the scene); FOLDER/meta.json writes an unzipped SOG, FOLDER/lod-meta.json levels of detail"
+        " (streamed SOG)",
     )
     parser.add_argument("--merge", action="store_true", help="join several scenes into one")
     parser.add_argument(
@@ -70,4 +71,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",
     )
+    _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json"))
     add_backend(parser)
+
+
+def _add_levels(group: argparse._ArgumentGroup) -> None:
+    """Add the options of levels of detail; their defaults are those of `gsplat_edu.io.lod.levels.LodOptions`."""
+    group.add_argument(
+        "--lod-smallest",
+        type=whole_number_text,
+        metavar="N",
+        help="halve the number of splats until a level has at most N (default: 1,000,000)",
+    )
+    group.add_argument(
+        "--lod-chunk",
+        type=whole_number_text,
+        metavar="N",
+        help="splats per file, at most (default: 524,288)",
+    )
+    group.add_argument(
+        "--lod-leaf",
+        type=whole_number_text,
+        metavar="N",
+        help="splats of the finest level per region, which viewers load and show at one level, at most"
+        " (default: 32,768)",
+    )

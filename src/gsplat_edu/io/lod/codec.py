@@ -3,14 +3,14 @@
     FOLDER/lod-meta.json     the tree of regions, and where the splats of each region and level are
     FOLDER/0_0/meta.json ... an unzipped SOG: level 0, the finest, file 0
 
-A file has splats of one level, and those of a leaf of the tree are consecutive, in Morton order. The name lod-meta.json is
-fixed; other names come from the list in it. `gsplat_edu.io.lod.levels` makes the levels and their errors.
+A file has splats of one level, and those of a leaf of the tree are consecutive, in Morton order. The name lod-meta.json
+is fixed; other names come from the list in it. `gsplat_edu.io.lod.levels` makes the levels and their errors.
 
 Boxes enclose the ellipsoids of one standard deviation of all levels, as those of PlayCanvas' own converter do. Axes and
 values are those of SOG. A scene read back is its finest level, with the environment (splats that are always drawn) of
 files of other programs.
 
-Source: PlayCanvas' specification of streamed SOG, version 1; the writer of its splat-transform, for what a box encloses.
+Source: PlayCanvas' specification of streamed SOG, version 1; its splat-transform, for what a box encloses.
 """
 
 from __future__ import annotations
@@ -91,15 +91,15 @@ def read_level(path: Path, index: LodMeta, level: int) -> Scene:
     scenes = []
     for name, size in names:
         file = file_of(path, name)
-        count = sog.read_meta(file).count
-        if size not in (-1, count):
-            raise SceneFormatError(
-                f"{path}: places {size:,} splats in {name}, which has {count:,}; it is damaged, get it again"
-            )
         try:
+            count = sog.read_meta(file).count
+            if size not in (-1, count):
+                raise SceneFormatError(
+                    f"holds {count:,} splats, where the index has {size:,}; get both again"
+                )
             scenes.append(sog.read(file))
         except SceneFormatError as error:
-            raise SceneFormatError(f"{path}: {error}") from None
+            raise SceneFormatError(f"{path}: {name}: {str(error).removeprefix(f'{file}: ')}") from None
     if not scenes:
         raise SceneFormatError(f"{path}: has no splats at level {level}; get it again")
     if len({scene.antialiased for scene in scenes} - {None}) > 1:
@@ -140,7 +140,11 @@ def named_files(path: Path) -> dict[str, Path]:
     found = {path.name: path}
     for name in (*index.filenames, *([index.environment] if index.environment else [])):
         found[name] = file_of(path, name)
-        for image in sog.read_meta(found[name]).images:
+        try:
+            images = sog.read_meta(found[name]).images
+        except SceneFormatError as error:
+            raise SceneFormatError(f"{path}: {name}: {str(error).removeprefix(f'{found[name]}: ')}") from None
+        for image in images:
             beside = name.removesuffix(META_NAME) + image
             found[beside] = file_of(path, beside)
     return found

@@ -1,8 +1,8 @@
 """A scene as a tree of regions, each at several levels of detail.
 
 The tree halves the Gaussians by the median along the axis in which most of them are spread, until a region has at most
-`leaf` of them; those are its leaves. Levels are made leaf by leaf, so a pair never crosses the border of a leaf, and all
-levels of a leaf cover the same region. A leaf of n Gaussians has ceil(n / 2^k) at level k. Level 0 is the scene itself.
+`leaf` of them; such a region is a leaf. Levels are made leaf by leaf, so a pair never crosses the border of a leaf, and
+all levels of a leaf cover the same region. A leaf of n Gaussians has ceil(n / 2^k) at level k. Level 0 is the scene.
 
 The error of a level in a leaf is a length: how far its Gaussians moved from the finest ones that they stand for,
 
@@ -38,7 +38,7 @@ MOST_LEVELS = 32
 """Levels are halved at most this many times."""
 
 INNER = (0.05, 0.95)
-"""Quantiles of the coordinates between which the spread of a region is measured, so that strays do not choose the axis."""
+"""Quantiles of the coordinates between which the spread of a region is measured: strays do not choose the axis."""
 
 CELLS = np.iinfo(np.uint16).max
 """Cells of a leaf's Morton curve along each axis, less one."""
@@ -153,7 +153,7 @@ def with_levels(node: Node, change: dict[int, list[Gaussians]]) -> Node:
 def in_morton_order(gaussians: Gaussians) -> Gaussians:
     """Sort Gaussians along a Morton curve through the box of their means."""
     order = torch.from_numpy(morton_order(gaussians.means.numpy(force=True)))
-    return gaussians.map(lambda tensor: tensor[order])
+    return _rows(gaussians, order)
 
 
 def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
@@ -211,11 +211,14 @@ def _built(gaussians: Gaussians, most: int, levels: int) -> Node:
     low, high = np.quantile(means.astype(np.float64), INNER, axis=0)
     order = np.argsort(means[:, int(np.argmax(high - low))], kind="stable")
     middle = (len(means) + 1) // 2
-    halves = [torch.from_numpy(np.sort(part)) for part in (order[:middle], order[middle:])]
-    left, right = (
-        _built(gaussians.map(lambda tensor, rows=rows: tensor[rows]), most, levels) for rows in halves
+    left, right = (torch.from_numpy(np.sort(part)) for part in (order[:middle], order[middle:]))
+    return Branch(
+        (_built(_rows(gaussians, left), most, levels), _built(_rows(gaussians, right), most, levels))
     )
-    return Branch((left, right))
+
+
+def _rows(gaussians: Gaussians, rows: torch.Tensor) -> Gaussians:
+    return gaussians.map(lambda tensor: tensor[rows])
 
 
 def _leaf(gaussians: Gaussians, count: int) -> Leaf:

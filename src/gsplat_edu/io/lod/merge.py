@@ -1,8 +1,7 @@
 """Halves the number of Gaussians: merges pairs that look alike, and keeps the moments of each pair.
 
 A Gaussian of opacity o and covariance Sigma weighs m = o A, with A = sqrt(((tr Sigma)^2 - tr Sigma^2) / 2). For scales
-a, b, c this is A = sqrt(a^2 b^2 + b^2 c^2 + c^2 a^2): what it covers on a screen, on average, up to a constant and 15 %.
-A pair becomes the Gaussian with the same moments:
+a, b, c this is A = sqrt(a^2 b^2 + b^2 c^2 + c^2 a^2): its squared areas in three orthogonal projections, added. A pair becomes the Gaussian with the same moments:
 
     mu    = sum_i (m_i / m) mu_i,    m = sum_i m_i
     Sigma = sum_i (m_i / m) (Sigma_i + (mu_i - mu)(mu_i - mu)')
@@ -13,9 +12,9 @@ The first bound keeps the weight, o A = m. The second one holds where the two ov
 both on top of each other.
 
 Which pairs merge: each round finds the nearest neighbours of each Gaussian, prices every pair, and merges the pairs in
-which each is the cheapest partner of the other, cheapest first, until half is left. So a dense cluster may lose more than
-half, and a detail without an equal nearby stays. The price is m_1 m_2 / m times a shape term A / (A_1 + A_2), which is
-1/2 for copies and grows with the gap between the two, plus a colour term.
+which each is the cheapest partner of the other, cheapest first, until half is left. So a dense cluster may lose more
+than half, and a detail without an equal nearby stays. The price is m_1 m_2 / m times a shape term A / (A_1 + A_2), which
+is 1/2 for copies and grows with the gap between the two, plus a colour term.
 
 Nothing is random or depends on the number of threads: neighbours come from a k-d tree, ties go to the lower index.
 """
@@ -77,13 +76,14 @@ class Blobs:
 
     @property
     def areas(self) -> Float64[np.ndarray, " N"]:
-        """A of each."""
+        """Area A of each."""
         return areas(self.covariances)
 
     @property
     def weights(self) -> Float64[np.ndarray, " N"]:
-        """m = o A of each."""
-        return self.opacities * self.areas
+        """Weight m = o A of each."""
+        weights: Float64[np.ndarray, " N"] = self.opacities * self.areas
+        return weights
 
 
 def areas(covariances: Float64[np.ndarray, "N 3 3"]) -> Float64[np.ndarray, " N"]:
@@ -111,18 +111,21 @@ def blobs_of(gaussians: Gaussians) -> Blobs:
     Returns:
         Their moments.
     """
-    values = {name: t.detach().numpy(force=True).astype(np.float64) for name, t in gaussians.tensors().items()}
+    values = {
+        name: t.detach().numpy(force=True).astype(np.float64) for name, t in gaussians.tensors().items()
+    }
     zero = ~values["quats"].any(axis=1)
     values["quats"][zero] = (1.0, 0.0, 0.0, 0.0)
     scales = np.exp(np.clip(values["log_scales"], -LARGEST_LOG, LARGEST_LOG))
     roots = quat_to_R_batch(values["quats"]) * scales[:, None, :]
     with np.errstate(over="ignore"):  # exp overflows to infinity: the opacity is 0
         opacities = 1.0 / (1.0 + np.exp(-values["logit_opacities"]))
+    sh = np.concatenate([values["sh0"], values["sh_rest"]], axis=1)
     return Blobs(
         np.clip(values["means"], -FARTHEST, FARTHEST),
         roots @ roots.transpose(0, 2, 1),
         np.clip(opacities, FAINTEST, MOST_OPAQUE),
-        np.concatenate([values["sh0"], values["sh_rest"]], axis=1).reshape(len(scales), -1),
+        sh.reshape(len(sh), sh.shape[1] * 3),
     )
 
 
@@ -263,7 +266,9 @@ def _prices(
     total = weights[i] + weights[j]
     share = weights[i] / total
     apart = blobs.means[i] - blobs.means[j]
-    covariances = share[:, None, None] * blobs.covariances[i] + (1 - share)[:, None, None] * blobs.covariances[j]
+    covariances = (
+        share[:, None, None] * blobs.covariances[i] + (1 - share)[:, None, None] * blobs.covariances[j]
+    )
     covariances += (share * (1 - share))[:, None, None] * (apart[:, :, None] * apart[:, None, :])
     shape = areas(covariances) / (covered[i] + covered[j])
     color = ((colors[i] - colors[j]) ** 2).sum(axis=1)

@@ -153,7 +153,8 @@ def from_json(path: Path, data: bytes) -> LodMeta:
         raise SceneFormatError(f"{path}: is not JSON ({reason}); get the file again") from None
     if not isinstance(document, dict):
         _refuse(path, "is no object")
-    if "version" in document and document["version"] != VERSION or isinstance(document.get("version"), bool):
+    version = document.get("version", VERSION)
+    if version != VERSION or isinstance(version, bool):
         raise SceneFormatError(
             f"{path}: is a streamed SOG of another version than {VERSION}; write it again with an older program"
         )
