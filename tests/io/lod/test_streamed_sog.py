@@ -112,10 +112,10 @@ def test_runs_fill_the_files_of_one_level_in_morton_order(written):
             assert bool((part.means + reach <= torch.tensor(leaf["bound"]["max"]) + slack).all())
             # rounding moves a few points to the next of 16 cells, so the curve through those mostly ascends
             cells = part.means.numpy() - part.means.numpy().min(axis=0)
-            cells = (cells / cells.max(axis=0) * 15).astype(np.uint16)
+            cells = (cells / cells.max(axis=0) * 65535).astype(np.uint16) >> 12
             codes = morton_codes(cells).astype(np.int64)
             if count > 60:
-                assert (np.diff(codes) < 0).mean() < 0.35, "a random order has a half"
+                assert (np.diff(codes) < 0).mean() < 0.15, "a random order has a half"
 
 
 def test_the_order_is_exactly_mortons():

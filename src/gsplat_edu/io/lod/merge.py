@@ -1,7 +1,8 @@
 """Halves the number of Gaussians: merges pairs that look alike, and keeps the moments of each pair.
 
 A Gaussian of opacity o and covariance Sigma weighs m = o A, with A = sqrt(((tr Sigma)^2 - tr Sigma^2) / 2). For scales
-a, b, c this is A = sqrt(a^2 b^2 + b^2 c^2 + c^2 a^2): its squared areas in three orthogonal projections, added. A pair becomes the Gaussian with the same moments:
+a, b, c this is A = sqrt(a^2 b^2 + b^2 c^2 + c^2 a^2): its squared areas in three orthogonal projections, added up.
+A pair becomes the Gaussian with the same moments:
 
     mu    = sum_i (m_i / m) mu_i,    m = sum_i m_i
     Sigma = sum_i (m_i / m) (Sigma_i + (mu_i - mu)(mu_i - mu)')
@@ -12,9 +13,9 @@ The first bound keeps the weight, o A = m. The second one holds where the two ov
 both on top of each other.
 
 Which pairs merge: each round finds the nearest neighbours of each Gaussian, prices every pair, and merges the pairs in
-which each is the cheapest partner of the other, cheapest first, until half is left. So a dense cluster may lose more
-than half, and a detail without an equal nearby stays. The price is m_1 m_2 / m times a shape term A / (A_1 + A_2), which
-is 1/2 for copies and grows with the gap between the two, plus a colour term.
+which each is the cheapest partner of the other, until half is left. So a dense cluster may lose more than half, and a
+detail without an equal nearby stays. The price is m_1 m_2 / m times a shape term A / (A_1 + A_2), which is 1/2 for
+copies and grows with the gap between the two, plus a colour term.
 
 Nothing is random or depends on the number of threads: neighbours come from a k-d tree, ties go to the lower index.
 """
