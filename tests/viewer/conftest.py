@@ -30,6 +30,12 @@ def described(camera):
     return {"R": camera.R.tolist(), "eye": camera.eye.tolist(), **numbers}
 
 
+def picture_of(tab, camera):
+    """Return the picture that a tab's page draws from this camera, (H, W, 3) float32."""
+    encoded = tab.evaluate(PIXELS, described(camera))
+    return np.frombuffer(base64.b64decode(encoded), "<f4").reshape(camera.H, camera.W, 3)
+
+
 class Visit:
     """An open page. It records the console messages, errors and requests."""
 
@@ -72,8 +78,13 @@ class Visit:
 
     def picture(self, camera):
         """Return the page's picture from this camera, (H, W, 3) float32."""
-        encoded = self.tab.evaluate(PIXELS, described(camera))
-        return np.frombuffer(base64.b64decode(encoded), "<f4").reshape(camera.H, camera.W, 3)
+        return picture_of(self.tab, camera)
+
+
+@pytest.fixture
+def picture():
+    """What a tab of any page draws from a camera."""
+    return picture_of
 
 
 @pytest.fixture(scope="module")

@@ -14,28 +14,25 @@ import numpy as np
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.keyframes import read_path
+from gsplat_edu.io.formats import LOD_META, file_in
+from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import export, page
 from gsplat_edu.viewer.serve import PageServer, exposure
+from gsplat_edu.viewer.stream import folder_page
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     console = Terminal()
     _check_is_no_page(arguments.source)
+    file = file_in(arguments.source)
+    levels = file.name.lower() == LOD_META
+    if arguments.budget is not None and not levels:
+        raise ArgumentError(f"--budget: {arguments.source} has no levels of detail; convert it to {LOD_META}")
     # first: report a port in use before loading the scene
-    with PageServer(b"", arguments.host, arguments.port, policy=page.policy()) as server:
-        along = None if arguments.path is None else read_path(arguments.path)
-        source = open_source(arguments.source)
-        if along is not None:
-            along = along.shifted(-np.array(source.origin))
-        title, tour = _title(arguments.source), page.Tour(along, source.origin)
-        server.page = page.html(source.scene, source.cameras, source.settings, title, source.held_out, tour)
-        cameras = f", {len(source.cameras)} cameras" if source.cameras else ""
-        console.print(
-            f"{source.path}: {len(source.scene.gaussians):,} Gaussians{cameras}, {len(server.page):,} bytes",
-            soft_wrap=True,
-        )
+    with PageServer(b"", arguments.host, arguments.port, policy=page.policy(levels)) as server:
+        (_prepare_levels if levels else _prepare)(server, console, arguments)
         if warning := exposure(arguments.host, "sees the scene"):
             console.print(warning, soft_wrap=True)
         console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
@@ -46,6 +43,32 @@ def run(arguments: argparse.Namespace) -> None:
             server.serve_forever()
         except KeyboardInterrupt:
             console.print("ended")
+
+
+def _prepare(server: PageServer, console: Terminal, arguments: argparse.Namespace) -> None:
+    """Put a page with the whole scene on the server."""
+    along = None if arguments.path is None else read_path(arguments.path)
+    source = open_source(arguments.source)
+    if along is not None:
+        along = along.shifted(-np.array(source.origin))
+    title, tour = _title(arguments.source), page.Tour(along, source.origin)
+    server.page = page.html(source.scene, source.cameras, source.settings, title, source.held_out, tour)
+    cameras = f", {len(source.cameras)} cameras" if source.cameras else ""
+    console.print(
+        f"{source.path}: {len(source.scene.gaussians):,} Gaussians{cameras}, {len(server.page):,} bytes",
+        soft_wrap=True,
+    )
+
+
+def _prepare_levels(server: PageServer, console: Terminal, arguments: argparse.Namespace) -> None:
+    """Put a page on the server that loads levels of detail, and the files of their folder."""
+    if arguments.path is not None:
+        raise ArgumentError("--path: a page with levels of detail plays no path; view the scene itself")
+    path = file_in(arguments.source)
+    server.page, server.served = folder_page(path, _title(path.parent), arguments.budget)
+    index = read_index(path)
+    counts = ", ".join(f"{count:,}" for count in index.counts())
+    console.print(f"{path}: levels of {counts} splats, {len(server.served)} files", soft_wrap=True)
 
 
 def _check_is_no_page(path: Path) -> None:

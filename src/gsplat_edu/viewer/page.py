@@ -52,6 +52,9 @@ SCRIPTS = (
 )
 """The page's scripts in loading order; they share one scope."""
 
+LEVEL_SCRIPTS = (*SCRIPTS[:-1], "levels.js", "main.js")
+"""The same for a page that loads levels of detail."""
+
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
 
 SHADER_CONSTANTS = (
@@ -147,9 +150,27 @@ def html(
     return b"".join(_pieces(title, scene, views, settings, held_out, tour or Tour()))
 
 
-def policy() -> str:
-    """Return the Content-Security-Policy of every page: its scripts, its style, and a sorting worker."""
-    return content_policy(map(_web, SCRIPTS), [_web("style.css")], workers=True)
+def policy(levels: bool = False) -> str:
+    """Return the Content-Security-Policy of every page: its scripts, its style, and its workers.
+
+    Args:
+        levels: Whether the page loads levels of detail, from its own server.
+    """
+    scripts = LEVEL_SCRIPTS if levels else SCRIPTS
+    return content_policy(map(_web, scripts), [_web("style.css")], workers=True, own_server=levels)
+
+
+def levels_html(scene: Scene, levels: dict[str, Any], title: str) -> bytes:
+    """Return a page without splats that loads those of a folder with levels of detail from its server.
+
+    Args:
+        scene: Any level of the scene, for the first camera and the metadata.
+        levels: Description of the regions, for `viewer/web/levels.js`; see `gsplat_edu.viewer.stream`.
+        title: Heading of the page.
+    """
+    facts = _facts(title, scene, (), file_settings(scene), (), Tour()) | {"count": 0, "lod": levels}
+    head, tail = _web("index.html").split("{{splats}}\n")
+    return (_filled(head, title, facts) + tail).encode("utf-8", errors="replace")
 
 
 def read(path: Path) -> Scene:
@@ -246,15 +267,19 @@ def _camera(camera: Camera) -> dict[str, Any]:
 def _filled(template: str, title: str, facts: dict[str, Any]) -> str:
     """Fill in the part before the splats."""
     style = _web("style.css")
-    scripts = [_web(name) for name in SCRIPTS]
+    levels = "lod" in facts
+    scripts = [_web(name) for name in (LEVEL_SCRIPTS if levels else SCRIPTS)]
+    workers = [_text_element("sort-worker", _web("sort_worker.js"))]
+    if levels:
+        workers.append(_text_element("lod-worker", _web("lod_worker.js")))
     texts = {
         "title": html_text.escape(title),
-        "policy": policy_element(policy()),
+        "policy": policy_element(policy(levels)),
         "style": style,
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         "shaders": "\n".join(_text_element(name, _shader(name)) for name in SHADERS),
-        "worker": _text_element("sort-worker", _web("sort_worker.js")),
+        "worker": "\n".join(workers),
         "scripts": "\n".join(f"<script>{script}</script>" for script in scripts),
     }
     # One pass over the template only: placeholders inside inserted text stay unchanged.

@@ -1,4 +1,4 @@
-"""Serve one page from memory to browsers on this computer. The server gives no access to files."""
+"""Serve one page from memory to browsers on this computer, and files that were listed before; no others."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ import socket
 import socketserver
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.reading import read_bytes
 from gsplat_edu.validation import whole_number
 
 LOOPBACK = "127.0.0.1"
@@ -25,6 +27,9 @@ LOCAL_NAME = r"(?:127(?:\.\d{1,3}){3}|localhost|\[::1\])(?::\d+)?"
 """Names by which a browser on this computer addresses it, as a regular expression; a tunnel may change the port."""
 
 HIGHEST_PORT = 65_535
+
+TYPES = {".json": "application/json", ".webp": "image/webp"}
+"""Content types of files by suffix."""
 
 CHUNK = 1 << 20
 """Bytes per write. The time limit holds for each chunk, not for a page of many MB."""
@@ -46,7 +51,7 @@ PRIVATE_SUFFIXES = (".local", ".localdomain", ".lan", ".home", ".home.arpa", ".i
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves one page at `/` and nothing else.
+    """Serves one page at `/`, the listed files at their addresses, and nothing else.
 
     It accepts connections once created; `serve_forever` answers them. A server bound to a loopback address answers only
     requests whose Host names this computer. Otherwise an external page could let its own name resolve to this address
@@ -61,6 +66,7 @@ class PageServer(ThreadingHTTPServer):
         port: Port; 0 picks a free one.
         names: The user's names for host and port, for messages.
         policy: Content-Security-Policy of the page, also sent as a header; empty sends none.
+        served: Further files by address; only requests for exactly these addresses are answered.
 
     Raises:
         ArgumentError: the address does not belong to this computer, or the port is in use or out of range.
@@ -76,8 +82,10 @@ class PageServer(ThreadingHTTPServer):
         port: int = 0,
         names: tuple[str, str] = ("--host", "--port"),
         policy: str = "",
+        served: Mapping[str, Path] | None = None,
     ) -> None:
         self.page, self.policy = page, policy
+        self.served = dict(served or {})
         self.bound_host = host
         self._room = threading.Semaphore(MOST_CONNECTIONS)
         self.address_family, address = checked_address(host, port, names)
@@ -157,25 +165,30 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer()
 
     def do_GET(self) -> None:
-        if self._answer():
-            page = memoryview(self.server.page)
-            for begin in range(0, len(page), CHUNK):
-                self.wfile.write(page[begin : begin + CHUNK])
+        body = memoryview(self._answer())
+        for begin in range(0, len(body), CHUNK):
+            self.wfile.write(body[begin : begin + CHUNK])
 
-    def _answer(self) -> bool:
-        """Send the page's headers and return true, or send an error and return false."""
+    def _answer(self) -> bytes:
+        """Send the headers of the page or a file and return its bytes, or send an error and return nothing."""
         hosts = self.headers.get_all("Host") or []
         if len(hosts) != 1 or not names_this_computer(hosts[0], self.server.bound_host):
             self._say(http.HTTPStatus.FORBIDDEN)
-            return False
-        if self.path != "/":
-            self._say(http.HTTPStatus.NOT_FOUND)
-            return False
+            return b""
+        if self.path == "/":
+            body, kind = self.server.page, "text/html; charset=utf-8"
+        else:
+            try:
+                body = read_bytes(self.server.served[self.path])
+            except (KeyError, OSError):
+                self._say(http.HTTPStatus.NOT_FOUND)
+                return b""
+            kind = TYPES.get(self.server.served[self.path].suffix, "application/octet-stream")
         self.send_response(http.HTTPStatus.OK)
         if self.server.policy:
             self.send_header("Content-Security-Policy", f"{self.server.policy}; frame-ancestors 'none'")
-        self._headers("text/html; charset=utf-8", len(self.server.page))
-        return True
+        self._headers(kind, len(body))
+        return body
 
     def _say(self, status: http.HTTPStatus) -> None:
         text = f"{status.value} {status.phrase}\n".encode("ascii")

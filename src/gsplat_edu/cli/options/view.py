@@ -15,7 +15,12 @@ PORT = 8080
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("source", type=Path, metavar="SCENE|RUN", help="scene file or run folder")
+    parser.add_argument(
+        "source",
+        type=Path,
+        metavar="SCENE|RUN",
+        help="scene file, run folder, or folder with levels of detail",
+    )
     parser.add_argument(
         "--host",
         default=LOOPBACK,
@@ -34,5 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="keyframes, as for render --path, that the page plays",
+    )
+    parser.add_argument(
+        "--budget",
+        type=whole_number_text,
+        metavar="N",
+        help="splats drawn at once of a scene with levels of detail (default: by the machine that shows the page:"
+        " 1,000,000 on a phone, 2,000,000 with up to 4 GB of memory, else 4,000,000)",
     )
     parser.add_argument("--no-open", action="store_true", help="print the URL without opening a browser")

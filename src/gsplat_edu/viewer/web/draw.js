@@ -28,15 +28,42 @@ class Renderer {
     gl.disable(gl.DITHER);
   }
 
-  // Copies an array into a texture, row by row.
-  uploaded({ channels, texels, type }, values) {
+  // Formats of a texture: stored, given, and the type of a number.
+  kind(type, channels) {
     const gl = this.gl;
-    const [stored, format, kind] = {
+    return {
       [`${Float32Array.name}3`]: [gl.RGB32F, gl.RGB, gl.FLOAT],
       [`${Int16Array.name}4`]: [gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT],
       [`${Uint16Array.name}3`]: [gl.RGB16F, gl.RGB, gl.HALF_FLOAT],
       [`${Uint16Array.name}1`]: [gl.R16F, gl.RED, gl.HALF_FLOAT],
     }[`${type.name}${channels}`];
+  }
+
+  // Copies `count` splats, from index `from` of some arrays, to index `to` of the textures.
+  write(arrays, from, to, count) {
+    const gl = this.gl;
+    const width = this.textureWidth;
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    layout(this.facts).forEach(({ name, type, channels, texels }, unit) => {
+      const [, format, kind] = this.kind(type, channels);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, this.textures[unit]);
+      for (let done = 0; done < count * texels; ) {
+        const place = to * texels + done;
+        const [row, column] = [Math.floor(place / width), place % width];
+        const here = Math.min(count * texels - done, width - column);
+        const begin = channels * (from * texels + done);
+        const values = arrays[name].subarray(begin, begin + channels * here);
+        gl.texSubImage2D(gl.TEXTURE_2D, 0, column, row, here, 1, format, kind, values);
+        done += here;
+      }
+    });
+  }
+
+  // Copies an array into a texture, row by row.
+  uploaded({ channels, texels, type }, values) {
+    const gl = this.gl;
+    const [stored, format, kind] = this.kind(type, channels);
     const width = this.textureWidth;
     const used = this.facts.count * texels;
     const height = Math.max(1, Math.ceil(used / width));
@@ -47,6 +74,7 @@ class Renderer {
     const full = Math.floor(used / width);
     const rest = used % width;
     const split = full * width * channels;
+    if (!values) return texture; // filled by write()
     if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, full, format, kind, values.subarray(0, split));
     if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, kind, values.subarray(split));
     return texture;

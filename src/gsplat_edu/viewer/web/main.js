@@ -6,8 +6,9 @@ const REST = 400; // milliseconds without a frame after which the view counts as
 const LONGEST_STEP = 0.1; // most seconds of movement per frame for a held key, however long the frame took
 
 class Viewer {
-  constructor(facts, splats) {
+  constructor(facts, splats, levels = null) {
     this.facts = facts;
+    this.levels = levels; // of detail
     this.settings = { ...facts.settings };
     this.canvas = element("canvas");
     this.renderer = new Renderer(this.canvas, splats, facts);
@@ -26,6 +27,7 @@ class Viewer {
     this.journey = null; // the curve and the time it began, while the camera path is played
     this.controls = new Controls(this.canvas, this.view, actions);
     this.panel.mark(this.cameraIndex);
+    this.levels?.attach(this.renderer, this.sorter);
     addEventListener("resize", () => this.askFrame());
     this.canvas.addEventListener("webglcontextlost", () => this.lose());
     this.askFrame();
@@ -76,8 +78,15 @@ class Viewer {
   // Resolves once the picture shows the current camera with its splats sorted.
   async settled() {
     const camera = this.camera();
+    await this.levels?.load(camera);
     await this.sorter.sort(camera);
     this.draw(camera);
+  }
+
+  // Other splats are shown now.
+  changed() {
+    this.panel.showing(this.levels.count);
+    this.askFrame();
   }
 
   reset() {
@@ -154,6 +163,7 @@ class Viewer {
     if (this.journey) this.follow(now);
     const camera = this.camera();
     this.draw(camera);
+    this.levels?.load(camera).catch((error) => this.levels.fail(error));
     if (!this.sorter.running && !this.sorter.fits(camera)) this.sorter.sort(camera).then(() => this.askFrame(), fail);
     this.time(now, seconds);
   }
@@ -180,6 +190,7 @@ class Viewer {
 
   lose() {
     this.lost = true;
+    if (this.levels) this.levels.stopped = true;
     say("The graphics processor stopped drawing this page; reload it.");
   }
 }
@@ -189,10 +200,30 @@ function fail(error) {
 }
 
 async function start() {
-  const viewer = new Viewer(FACTS, await unpackSplats(FACTS));
-  await viewer.settled();
-  say("");
+  const viewer = FACTS.lod ? streamed(FACTS) : new Viewer(FACTS, await unpackSplats(FACTS));
+  if (viewer.levels) await viewer.sorter.sort(viewer.camera()); // the first picture comes before the last splat
+  else await viewer.settled();
   window.viewer = viewer;
+  if (!viewer.levels?.regions.some(({ levels }) => levels.length)) say("");
+}
+
+// A viewer that loads levels of detail from the folder of this page's server.
+function streamed(facts) {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) throw new Error("This page needs WebGL2, which this browser does not support or has disabled.");
+  const budget = facts.lod.budget ?? machineBudget(gl, facts.sh_degree);
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  let viewer = null;
+  const levels = new Levels(facts, budget, () => {
+    say("");
+    viewer.changed();
+  });
+  viewer = new Viewer({ ...facts, count: levels.capacity }, { means: hidden(levels.capacity) }, levels);
+  return viewer;
+}
+
+function hidden(count) {
+  return new Float32Array(3 * count).fill(NaN);
 }
 
 addEventListener("error", (event) => fail(event.error));

@@ -15,13 +15,19 @@ class Panel {
   constructor(facts, actions) {
     this.facts = facts;
     const splats = facts.count === 1 ? "1 splat" : `${facts.count.toLocaleString("en")} splats`;
-    element("count").textContent = splats;
+    if (!facts.lod) element("count").textContent = splats;
     element("fly").addEventListener("click", () => actions.fly());
     element("reset").addEventListener("click", () => actions.reset());
     element("help-button").addEventListener("click", () => this.help());
     this.fillDegrees(actions);
     this.fillCameras(actions);
     this.atRest();
+  }
+
+  // How many splats of a scene with levels of detail are shown.
+  showing(count) {
+    const all = this.facts.lod.finest.toLocaleString("en");
+    element("count").textContent = `${count.toLocaleString("en")} of ${all} splats`;
   }
 
   fillDegrees(actions) {

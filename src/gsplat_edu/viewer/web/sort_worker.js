@@ -2,7 +2,7 @@
 //
 // Positive float32 values sort like their bits, so two counting sorts of 16 bits each, low half first, give the exact
 // order. Among equal depths the last index comes first: drawn far to near, this matches the renderer's near-to-far
-// order.
+// order. NaN counts as behind the camera.
 "use strict";
 
 let means, near, keys, byLow;
@@ -12,6 +12,10 @@ self.onmessage = ({ data }) => {
     ({ means, near } = data);
     keys = new Uint32Array(means.length / 3);
     byLow = new Uint32Array(means.length / 3);
+    return;
+  }
+  if (data.replaced) {
+    means.set(data.replaced, 3 * data.at);
     return;
   }
   const order = new Uint32Array(data.order);

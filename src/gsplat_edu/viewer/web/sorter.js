@@ -12,13 +12,15 @@ class Sorter {
     this.onOrder = onOrder;
     this.running = null;
     this.sorted = "";
+    this.version = 0; // of the means
+    this.camera = null; // of the last sort
     const copy = means.slice(); // transferred to the worker, which keeps it
     this.worker.postMessage({ means: copy, near }, [copy.buffer]);
   }
 
   // Whether the current order was made for this camera.
   fits(camera) {
-    return this.sorted === Sorter.key(camera);
+    return this.sorted === this.version + Sorter.key(camera);
   }
 
   // An order depends only on depth.
@@ -26,14 +28,32 @@ class Sorter {
     return JSON.stringify([camera.R[2], camera.eye]);
   }
 
+  // Replaces means, beginning with splat `at`.
+  write(means, at) {
+    ++this.version;
+    this.worker.postMessage({ replaced: means, at }, [means.buffer]);
+  }
+
+  // Takes splats out of the order.
+  hide(at, count) {
+    this.write(new Float32Array(3 * count).fill(NaN), at);
+  }
+
+  // Sorts again for the last camera if there was one.
+  async refresh() {
+    if (this.camera) await this.sort(this.camera);
+  }
+
   async sort(camera) {
     while (this.running) await this.running;
     if (this.fits(camera)) return;
+    this.camera = camera;
+    const key = this.version + Sorter.key(camera);
     this.running = new Promise((resolve, reject) => {
       this.worker.onerror = () => reject(new Error("The sorting thread failed; reload the page."));
       this.worker.onmessage = ({ data }) => {
         this.order = data.order;
-        this.sorted = Sorter.key(camera);
+        this.sorted = key;
         this.running = null;
         this.onOrder(new Uint32Array(data.order, 0, data.count));
         resolve();

@@ -1,0 +1,220 @@
+"""The page of a folder with levels of detail, in a real browser: what it draws, loads and is given."""
+
+import http.client
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.lod import codec
+from gsplat_edu.io.lod.levels import LodOptions
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.api import render
+from gsplat_edu.runs.source import file_settings
+from gsplat_edu.viewer import page
+from gsplat_edu.viewer.serve import PageServer
+from gsplat_edu.viewer.stream import folder_page
+
+ALIKE = 55.0
+"""Required PSNR against our renderer, dB: that of the plain page is 60, and positions are decoded in float32 here."""
+
+COUNT = 3000
+
+PATIENCE = 120e3
+
+WATCH = """() => {
+  const { levels, renderer } = viewer;
+  return [levels.count, levels.most, renderer.count, levels.regions.map(({ shown }) => shown), levels.free.length];
+}"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Random splats in 16 leaves of five levels; positions, sizes and colours like those of a scene."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    gaussians = Gaussians(
+        0.6 * normal(COUNT, 3),
+        normal(COUNT, 4),
+        0.5 * normal(COUNT, 3) - 3.4,
+        normal(COUNT, 1, 3),
+        0.2 * normal(COUNT, 8, 3),
+        2.0 * normal(COUNT),
+    )
+    path = tmp_path_factory.mktemp("lod") / "scene" / "lod-meta.json"
+    codec.write(path, Scene(gaussians, antialiased=False), LodOptions(smallest=200, chunk=1000, leaf=200))
+    (path.parent / "secret.json").write_text("{}", encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def served(folder):
+    """Make a server of the folder with a budget."""
+    servers = []
+
+    def make(budget):
+        server = PageServer(b"", policy=page.policy(levels=True))
+        server.page, server.served = folder_page(folder, "scene", budget)
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        servers.append((server, thread))
+        return server
+
+    yield make
+    for server, thread in servers:
+        server.shutdown()
+        thread.join(10)
+        server.server_close()
+
+
+@pytest.fixture
+def open_page(served, browser):
+    """Open the folder's page with a budget; no complaint and no request to elsewhere is allowed."""
+    complaints, urls, tabs = [], [], []
+
+    def make(budget):
+        server = served(budget)
+        tab = browser.new_page(viewport={"width": 320, "height": 200})
+        tabs.append((tab, server.url))
+        tab.on("console", lambda message: complaints.append(message.text))
+        tab.on("pageerror", lambda error: complaints.append(str(error)))
+        tab.on("request", lambda request: urls.append(request.url))
+        tab.goto(server.url, timeout=PATIENCE)
+        tab.wait_for_selector("#message", state="hidden", timeout=PATIENCE)
+        tab.set_default_timeout(PATIENCE)
+        return tab
+
+    make.urls = urls
+    yield make
+    for tab, url in tabs:
+        tab.close()
+        assert [one for one in urls if not one.startswith((url, "blob:", "data:"))] == []
+    assert complaints == []
+
+
+def drawn(scene, camera):
+    return render(scene.gaussians, camera, settings=file_settings(scene)).image.numpy().clip(0, 1)
+
+
+def test_with_room_for_all_the_page_draws_the_finest_level(
+    folder, open_page, camera, record_property, picture
+):
+    tab = open_page(COUNT)
+    seen = picture(tab, camera)
+    count, most, _, shown, _ = tab.evaluate(WATCH)
+    assert count == most == COUNT and set(shown) == {0}
+    found = psnr(seen, drawn(codec.read(folder), camera))
+    record_property("psnr", found)
+    assert found >= ALIKE
+    assert tab.inner_text("#count") == "3,000 of 3,000 splats"
+
+
+def test_with_a_small_budget_everything_is_there_coarsely(
+    folder, open_page, camera, three_views, record_property, picture
+):
+    """From several sides; nothing is left out, and the budget holds at any time."""
+    index = codec.read_index(folder)
+    least = index.counts()[-1]
+    budget = 2 * least + 50
+    tab = open_page(budget)
+    for _, view in [("", camera), *three_views]:
+        picture(tab, view)
+        count, most, order, shown, _ = tab.evaluate(WATCH)
+        assert least <= count <= most <= budget and order <= budget
+        assert min(shown) >= 0, "a region is missing"
+        assert len(set(shown)) > 1 and max(shown) >= 3, "the budget allows finer levels only in some places"
+    # nearly all of the picture is like the coarsest level drawn alone, or better
+    exact = drawn(codec.read(folder), camera)
+    coarse = psnr(drawn(codec.read_level(folder, index, index.levels - 1), camera), exact)
+    mixed = psnr(picture(tab, camera), exact)
+    assert mixed > coarse
+
+
+def test_nearer_regions_are_finer(folder, open_page, camera, picture):
+    tab = open_page(1200)
+    picture(tab, camera)
+    nearness = """(eye) => viewer.levels.regions.map(
+      (region) => [viewer.levels.distance(region, eye), region.shown])"""
+    found = sorted(tab.evaluate(nearness, camera.eye.tolist()))
+    half = len(found) // 2
+    assert np.mean([level for _, level in found[:half]]) < np.mean([level for _, level in found[half:]]) - 0.3
+
+
+def test_memory_is_given_back(open_page, three_views, picture):
+    tab = open_page(700)
+    for _ in range(3):
+        for _, view in three_views:
+            picture(tab, view)
+    count, _, _, _, free = tab.evaluate(WATCH)
+    slots, held = tab.evaluate(
+        "() => [viewer.levels.capacity / 32, viewer.levels.regions.flatMap(({ slots }) => slots)]"
+    )
+    assert len(set(held)) == len(held) and free + len(held) == slots
+    assert len(held) * 32 >= count
+
+
+def test_a_budget_below_the_coarsest_level_leaves_out_the_farthest(folder, open_page, camera, picture):
+    budget = codec.read_index(folder).counts()[-1] // 2
+    tab = open_page(budget)
+    picture(tab, camera)
+    count, most, *_ = tab.evaluate(WATCH)
+    assert 0 < count <= most <= budget
+
+
+def test_coarse_files_are_loaded_first(folder, open_page, camera, picture):
+    tab = open_page(COUNT)
+    picture(tab, camera)
+    index = codec.read_index(folder)
+    asked = [url.split("/")[-2] for url in open_page.urls if url.endswith("/meta.json")]
+    assert asked[0].startswith(f"{index.levels - 1}_") and asked[-1].startswith("0_")
+
+
+def test_a_file_that_vanished_is_named(folder, served, browser):
+    server = served(COUNT)
+    del server.served["/0_0/meta.json"]
+    tab = browser.new_page(viewport={"width": 320, "height": 200})
+    tab.goto(server.url, timeout=PATIENCE)
+    tab.wait_for_selector('#message:has-text("/0_0/meta.json could not be loaded (404).")', timeout=PATIENCE)
+    tab.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/", 200),
+        ("/lod-meta.json", 200),
+        ("/0_0/meta.json", 200),
+        ("/0_0/means_l.webp", 200),
+        ("/secret.json", 404),
+        ("/0_0/", 404),
+        ("/0_0/../secret.json", 404),
+        ("/../scene/lod-meta.json", 404),
+        ("/%6cod-meta.json", 404),
+        ("/lod-meta.json?x", 404),
+    ],
+)
+def test_only_files_that_the_index_names_are_served(folder, served, path, status):
+    server = served(COUNT)
+    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
+    connection.request("GET", path)
+    answer = connection.getresponse()
+    body = answer.read()
+    assert answer.status == status
+    if status == 200:
+        assert answer.headers["Content-Security-Policy"].startswith("default-src 'none'; ")
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    if status == 200 and path != "/":
+        assert body == (folder.parent / path[1:]).read_bytes()
+    connection.close()
+
+
+def test_only_a_page_of_levels_may_load_anything():
+    assert "connect-src 'self';" in page.policy(levels=True)
+    assert "connect-src 'none';" in page.policy()
+    assert "unsafe" not in page.policy(levels=True)
