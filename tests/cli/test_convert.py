@@ -207,3 +207,11 @@ def test_options_of_levels_need_levels(convert, plain, tmp_path):
     said = convert(plain, tmp_path / "out.ply", "--lod-leaf", 5, code=2)
     assert "--lod-leaf:" in said and "has no levels of detail" in said
     assert "smallest: " in convert(plain, tmp_path / "lod-meta.json", "--lod-smallest", 0, code=2)
+
+
+def test_tiles_are_written_but_not_verified(convert, plain, tmp_path):
+    out = tmp_path / "tiles" / "tileset.json"
+    said = convert(plain, out, "--lod-leaf", 100)
+    assert "7 tiles, " in said and "not placed on the globe" in said
+    assert "cannot be read back" in convert(plain, out, "--verify", code=2)
+    assert "a tile is a file" in convert(plain, out, "--lod-chunk", 5, code=2)

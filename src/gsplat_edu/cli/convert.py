@@ -19,8 +19,9 @@ from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.keyframes import read_path
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
-from gsplat_edu.io.formats import LOD_META
+from gsplat_edu.io.formats import LOD_META, TILESET
 from gsplat_edu.io.lod.levels import LodOptions
+from gsplat_edu.io.lod.tiles import tile_options
 from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
@@ -94,9 +95,15 @@ def _levels(arguments: argparse.Namespace) -> LodOptions:
     given = {name: value for name, value in given.items() if value is not None}
     if given and not export.has_levels(arguments.out):
         raise ArgumentError(
-            f"--lod-{next(iter(given))}: {arguments.out} has no levels of detail; write FOLDER/{LOD_META}"
+            f"--lod-{next(iter(given))}: {arguments.out} has no levels of detail; write FOLDER/{LOD_META} or {TILESET}"
         )
-    return LodOptions(**given)
+    if arguments.out.name.lower() != TILESET:
+        return LodOptions(**given)
+    if "chunk" in given:
+        raise ArgumentError("--lod-chunk: a tile is a file; set --lod-leaf")
+    if arguments.verify:
+        raise ArgumentError(f"--verify: {arguments.out} cannot be read back; verify another format")
+    return tile_options(**given)
 
 
 def _edited(source: Source, keep: Filter, move: Similarity) -> Source:

@@ -57,7 +57,13 @@ SOG_META = "meta.json"
 LOD_META = "lod-meta.json"
 """File that represents a folder with levels of detail."""
 
-LOD_FORMATS = (Format(LOD_META, "lod.codec", "PlayCanvas streamed SOG"),)
+TILESET = "tileset.json"
+"""File that represents a folder of 3D Tiles, which is written only."""
+
+LOD_FORMATS = (
+    Format(LOD_META, "lod.codec", "PlayCanvas streamed SOG"),
+    Format(TILESET, "lod.tiles", "3D Tiles"),
+)
 """Folders with levels of detail, by the whole name of the file that represents them."""
 
 
@@ -86,6 +92,8 @@ def stored_bytes(path: Path) -> int:
         from gsplat_edu.io.lod.codec import stored_bytes as of_all_levels
 
         return of_all_levels(path)
+    if path.name.lower() == TILESET:
+        return sum(file.stat().st_size for file in (path, *(path.parent / "tiles").glob("*.glb")))
     if path.name.lower() != SOG_META:
         return path.stat().st_size
     return sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix in (".json", ".webp"))

@@ -24,15 +24,17 @@ Source: load-spz.cc, the README and extensions/README of Niantic's spz library.
 
 from __future__ import annotations
 
+import gzip
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import zstandard
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from gsplat_edu.camera import WORLD_UP
 from gsplat_edu.errors import ArgumentError, SceneFormatError
@@ -274,7 +276,37 @@ def write(path: Path, scene: Scene) -> None:
         ArgumentError: a mean is beyond the format's range, or a quaternion has zero length.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
-    turned = half_turned(scene.gaussians)
+    degree = scene.gaussians.sh_degree
+    bits, streams = _encoded(scene.gaussians, values.write_smallest_three)
+    contents = [stream.tobytes() for stream in streams if stream.size]
+    packed = [zstandard.ZstdCompressor(level=LEVEL).compress(content) for content in contents]
+    flags = ANTIALIASED if scene.antialiased else 0
+    header = HEADER_4.pack(MAGIC, 4, len(scene.gaussians), degree, bits, flags, len(packed), HEADER_4.size)
+    table = [TABLE_ROW.pack(len(a), len(b)) for a, b in zip(packed, contents, strict=True)]
+    with written_aside(path) as aside:
+        aside.write_bytes(b"".join([header, *table, *packed]))
+
+
+def packed_version_2(scene: Scene) -> bytes:
+    """Return an SPZ file of version 2, in one gzip, which is the version that glTF embeds.
+
+    Args:
+        scene: The scene, in this package's axes, with finite parameters.
+
+    Raises:
+        ArgumentError: as for `write`.
+    """
+    bits, streams = _encoded(scene.gaussians, values.write_first_three)
+    flags = ANTIALIASED if scene.antialiased else 0
+    header = HEADER.pack(MAGIC, 2, len(scene.gaussians), scene.gaussians.sh_degree, bits, flags)
+    return gzip.compress(b"".join([header, *(stream.tobytes() for stream in streams)]), mtime=0)
+
+
+def _encoded(
+    gaussians: Gaussians, write_quats: Callable[[Float[np.ndarray, "N 4"]], UInt8[np.ndarray, "N B"]]
+) -> tuple[int, tuple[UInt8[np.ndarray, "..."], ...]]:
+    """Return the fractional bits of positions, and the streams in the format's axes and order."""
+    turned = half_turned(gaussians)
     arrays = {name: tensor.numpy(force=True) for name, tensor in turned.tensors().items()}
     bits = values.fractional_bits(arrays["means"])
     if bits is None:
@@ -283,21 +315,14 @@ def write(path: Path, scene: Scene) -> None:
             f"means: one is {far:,.0f} units from the origin along an axis, but SPZ ends at {values.LARGEST_FIXED:,};"
             " scale the scene down or move it"
         )
-    streams = (
+    return bits, (
         values.write_fixed(arrays["means"], bits),
         logit_to_byte(np.clip(arrays["logit_opacities"], -100, 100).astype(np.float32)),
         values.write_colors(arrays["sh0"]),
         values.write_scales(arrays["log_scales"]),
-        values.write_smallest_three(arrays["quats"]),
+        write_quats(arrays["quats"]),
         values.write_harmonics(arrays["sh_rest"]),
     )
-    contents = [stream.tobytes() for stream in streams if stream.size]
-    packed = [zstandard.ZstdCompressor(level=LEVEL).compress(content) for content in contents]
-    flags = ANTIALIASED if scene.antialiased else 0
-    header = HEADER_4.pack(MAGIC, 4, len(turned), turned.sh_degree, bits, flags, len(packed), HEADER_4.size)
-    table = [TABLE_ROW.pack(len(a), len(b)) for a, b in zip(packed, contents, strict=True)]
-    with written_aside(path) as aside:
-        aside.write_bytes(b"".join([header, *table, *packed]))
 
 
 def _damaged(path: Path, how: str) -> SceneFormatError:

@@ -78,6 +78,12 @@ def read_first_three(data: UInt8[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 4
     return np.concatenate([w, xyz], axis=1).astype(np.float32)
 
 
+def write_first_three(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 3"]:
+    """Encode quaternions (w, x, y, z) of nonzero length as versions 1 and 2 do: x, y and z of that with w >= 0."""
+    unit = unit_quats(quats)
+    return _to_bytes(np.where(unit[:, :1] < 0, -unit[:, 1:], unit[:, 1:]) * 127.5 + 127.5)
+
+
 def read_smallest_three(data: UInt8[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
     """Decode rotations of versions 3 and 4 to quaternions (w, x, y, z) with a positive largest component.
 

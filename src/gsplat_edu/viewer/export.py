@@ -19,11 +19,13 @@ from gsplat_edu.io.formats import (
     LOD_FORMATS,
     LOD_META,
     SOG_META,
+    TILESET,
     format_of,
     read_scene,
     write_scene,
 )
 from gsplat_edu.io.lod import codec as lod_codec
+from gsplat_edu.io.lod import tiles
 from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
@@ -121,12 +123,18 @@ def write(
         page.write(path, source.scene, source.cameras, source.settings, source.held_out, tour)
     elif path.name.lower() == LOD_META:
         lod_codec.write(path, source.scene, options)
+    elif path.name.lower() == TILESET:
+        tiles.write(path, source.scene, options)
     else:
         write_scene(path, source.scene)
 
 
 def levels_line(path: Path) -> str:
-    """Describe the levels of a written lod-meta.json in one line."""
+    """Describe the levels of a written lod-meta.json, or the tiles of a tileset.json, in one line."""
+    if path.name.lower() == TILESET:
+        count = len(list((path.parent / "tiles").glob("*.glb")))
+        size = f"{formats.stored_bytes(path):,} bytes"
+        return f"{count} tiles, {size}; upright, but not placed on the globe: no capture stores where on Earth it is"
     index = lod_codec.read_index(path)
     counts = ", ".join(f"{count:,}" for count in index.counts())
     errors = [max(region.errors[level] for region in index.regions) for level in range(index.levels)]

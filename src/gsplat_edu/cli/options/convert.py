@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="OUT",
         help="file to write; its suffix selects the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb or .html"
         " (a page that shows the scene); FOLDER/meta.json writes an unzipped SOG, FOLDER/lod-meta.json levels of detail"
-        " (streamed SOG)",
+        " (streamed SOG), FOLDER/tileset.json 3D Tiles for Cesium",
     )
     parser.add_argument("--merge", action="store_true", help="join several scenes into one")
     parser.add_argument(
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",
     )
-    _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json"))
+    _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json and OUT/tileset.json"))
     add_backend(parser)
 
 
@@ -81,7 +81,8 @@ def _add_levels(group: argparse._ArgumentGroup) -> None:
         "--lod-smallest",
         type=whole_number_text,
         metavar="N",
-        help="halve the number of splats until a level has at most N (default: 1,000,000)",
+        help="halve the number of splats until a level has at most N (default: 1,000,000; one tile for"
+        " tileset.json)",
     )
     group.add_argument(
         "--lod-chunk",

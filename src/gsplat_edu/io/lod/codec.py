@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import named_failure, written_aside
@@ -263,7 +264,7 @@ def _described(root: Node, placed: list[dict[int, int]]) -> dict[str, Any]:
     return described(root)
 
 
-def _outward(corner: np.ndarray[Any, np.dtype[np.float64]], side: float) -> list[float]:
+def _outward(corner: Float64[np.ndarray, "3"], side: float) -> list[float]:
     """Round to the digits of the format, away from the inside of the box."""
     rounded_corner = []
     for value in corner.tolist():
