@@ -39,7 +39,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.scale is not None:
         given = points_of(arguments.scale)
         move = Similarity(np.eye(3), given.length / given.apart, np.zeros(3)).after(move)
-    backend = resolve_backend(arguments.backend) if arguments.verify else ""
+    _check_refining(arguments)
+    backend = resolve_backend(arguments.backend) if arguments.verify or arguments.lod_refine else ""
     export.check_target("OUT", arguments.out)
     if len(arguments.sources) > 1 and not arguments.merge:
         raise ArgumentError("IN: several scenes given; add --merge to join them, or convert one at a time")
@@ -75,7 +76,10 @@ def run(arguments: argparse.Namespace) -> None:
         if move is not IDENTITY:  # the page's views then have the coordinates of the moved scene
             source = replace(source, origin=ORIGIN)
         bar.update(steps, description=f"writing {arguments.out}")
-        export.write(arguments.out, source, along, options)
+        if arguments.lod_refine is None:
+            export.write(arguments.out, source, along, options)
+        else:
+            export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
         bar.advance(steps)
         count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
         say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}")
@@ -104,6 +108,27 @@ def _levels(arguments: argparse.Namespace) -> LodOptions:
     if arguments.verify:
         raise ArgumentError(f"--verify: {arguments.out} cannot be read back; verify another format")
     return tile_options(**given)
+
+
+def _check_refining(arguments: argparse.Namespace) -> None:
+    """Reject --lod-refine for what has no levels or no longer matches its photos."""
+    if arguments.lod_refine is None:
+        return
+    if arguments.lod_refine < 1:
+        raise ArgumentError(f"--lod-refine: is {arguments.lod_refine}, but has to be at least 1")
+    if arguments.out.name.lower() != LOD_META:
+        raise ArgumentError(f"--lod-refine: {arguments.out} cannot be refined; write FOLDER/{LOD_META}")
+    changes = {
+        "several scenes": len(arguments.sources) > 1,
+        "--transform": arguments.transform,
+        "--scale": arguments.scale is not None,
+        "--crop": arguments.crop is not None,
+    }
+    for name, given in changes.items():
+        if given:
+            raise ArgumentError(
+                f"--lod-refine: the photos do not show the scene after {name}; refine without it"
+            )
 
 
 def _edited(source: Source, keep: Filter, move: Similarity) -> Source:

@@ -26,10 +26,11 @@ from gsplat_edu.io.formats import (
 )
 from gsplat_edu.io.lod import codec as lod_codec
 from gsplat_edu.io.lod import tiles
-from gsplat_edu.io.lod.levels import LodOptions
+from gsplat_edu.io.lod.levels import LodOptions, build
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
+from gsplat_edu.runs.lod_refinement import LevelScore, refine_levels
 from gsplat_edu.runs.source import Source
 from gsplat_edu.viewer import page
 
@@ -127,6 +128,33 @@ def write(
         tiles.write(path, source.scene, options)
     else:
         write_scene(path, source.scene)
+
+
+def write_refined(
+    path: Path, source: Source, options: LodOptions, steps: int, backend: str, say: Callable[[str], None]
+) -> list[LevelScore]:
+    """Write a lod-meta.json whose levels are refined against photos; see `gsplat_edu.runs.lod_refinement`.
+
+    Args:
+        path: The lod-meta.json.
+        source: The scene, of a run or without photos.
+        options: How levels are made.
+        steps: Iterations per level.
+        backend: Backend of the renders.
+        say: Called with a line per level.
+
+    Returns:
+        The score of each level.
+
+    Raises:
+        CheckpointError: the run is damaged, or its capture is gone.
+        DatasetError: a photo cannot be read.
+        OSError: a file cannot be written. Existing files stay unchanged.
+    """
+    source.scene.gaussians.check_finite()
+    root, scores = refine_levels(source, build(source.scene.gaussians, options), steps, backend, say)
+    lod_codec.write_levels(path, root, source.scene, options.chunk)
+    return scores
 
 
 def levels_line(path: Path) -> str:

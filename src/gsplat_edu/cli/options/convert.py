@@ -14,6 +14,10 @@ EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 -
 MOVES = "scale=S, rotate=AXIS:DEGREES (x:90), move=X,Y,Z or matrix=FILE (12 or 16 numbers, row by row)"
 
 
+LOD_STEPS = 300
+"""Iterations per level of `--lod-refine` without a number."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("sources", type=Path, nargs="+", metavar="IN", help="scene file or run folder")
@@ -96,4 +100,13 @@ def _add_levels(group: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="splats of the finest level per region, which viewers load and show at one level, at most"
         " (default: 32,768)",
+    )
+    group.add_argument(
+        "--lod-refine",
+        type=whole_number_text,
+        nargs="?",
+        const=LOD_STEPS,
+        metavar="STEPS",
+        help="train each coarser level against the run's photos, reduced to the size at which it is shown (renders of"
+        f" the scene for a scene file), and print PSNR per level (default: {LOD_STEPS} steps); for lod-meta.json",
     )
