@@ -4,7 +4,6 @@ import re
 
 import numpy as np
 import pytest
-import torch
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
@@ -70,12 +69,24 @@ def test_a_scene_without_photos_is_compared_with_its_renders(tmp_path, capsys):
     pattern = r"level (\d), (\d+) splats, against renders of the scene reduced by [\d.]+: ([\d.]+) dB, refined ([\d.]+)"
     found = [tuple(map(float, one)) for one in re.findall(pattern, said)]
     assert [one[:2] for one in found] == [(1, 60), (2, 30)]
-    assert all(after > before > 10 for *_, before, after in found)
-    index = codec.read_index(out)
-    assert index.counts() == [120, 60, 30]
-    plain = leaves_of(build(random_scene(120, 3).gaussians, LodOptions(smallest=30)))[0].levels[1]
-    refined = codec.read_level(out, index, 1).gaussians
-    assert float(torch.cdist(refined.means, plain.means).amin(dim=1).max()) < 0.1, "nothing moved far"
+    assert all(min(before, after) > 10 for *_, before, after in found)
+    assert said.count("so it stays as merged") == sum(after <= before for *_, before, after in found)
+    assert codec.read_index(out).counts() == [120, 60, 30]
+
+
+def test_a_level_that_training_makes_worse_stays_as_merged(run, monkeypatch):
+    def spoilt(source, gaussians, views, steps, backend):
+        return gaussians.map(lambda tensor: tensor + 1.0)
+
+    monkeypatch.setattr(lod_refinement, "_trained", spoilt)
+    source = open_source(run)
+    root = build(source.scene.gaussians, OPTIONS)
+    said = []
+    same, scores = refine_levels(source, root, 5, "cpu", said.append)
+    assert all(score.after < score.before for score in scores[1:])
+    assert all(line.endswith(", so it stays as merged") for line in said[1:])
+    for before, after in zip(leaves_of(root), leaves_of(same), strict=True):
+        assert all(a is b for a, b in zip(before.levels, after.levels, strict=True))
 
 
 @pytest.mark.parametrize(

@@ -39,15 +39,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.scale is not None:
         given = points_of(arguments.scale)
         move = Similarity(np.eye(3), given.length / given.apart, np.zeros(3)).after(move)
-    _check_refining(arguments)
     backend = resolve_backend(arguments.backend) if arguments.verify or arguments.lod_refine else ""
-    export.check_target("OUT", arguments.out)
-    if len(arguments.sources) > 1 and not arguments.merge:
-        raise ArgumentError("IN: several scenes given; add --merge to join them, or convert one at a time")
-    if arguments.path is not None and arguments.out.suffix.lower() != export.PAGE:
-        raise ArgumentError(
-            f"--path: only a page can play a camera path; {arguments.out} is none, use {export.PAGE}"
-        )
+    _check(arguments)
     along = None if arguments.path is None else read_path(arguments.path)
     options = _levels(arguments)
     console = Terminal()
@@ -91,6 +84,18 @@ def run(arguments: argparse.Namespace) -> None:
             )
         if arguments.verify:
             check_and_say(arguments.out, source, backend, bar, say)
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Check OUT and the options that do not suit every OUT."""
+    export.check_target("OUT", arguments.out)
+    if len(arguments.sources) > 1 and not arguments.merge:
+        raise ArgumentError("IN: several scenes given; add --merge to join them, or convert one at a time")
+    if arguments.path is not None and arguments.out.suffix.lower() != export.PAGE:
+        raise ArgumentError(
+            f"--path: only a page can play a camera path; {arguments.out} is none, use {export.PAGE}"
+        )
+    _check_refining(arguments)
 
 
 def _levels(arguments: argparse.Namespace) -> LodOptions:

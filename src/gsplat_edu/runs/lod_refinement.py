@@ -56,7 +56,8 @@ class LevelScore:
         count: Its splats.
         factor: By how much the photos are reduced.
         before: PSNR of the merged splats, dB.
-        after: PSNR after refining, dB; that of the scene itself for level 0.
+        after: PSNR after refining, dB; that of the scene itself for level 0. If it is not higher, the level stays as it
+            was.
     """
 
     level: int
@@ -73,6 +74,8 @@ class LevelScore:
         """
         size = f"{against} reduced by {self.factor:.3g}" if self.level else against
         found = f"{self.before:.2f} dB, refined {self.after:.2f} dB" if self.level else f"{self.after:.2f} dB"
+        if self.level and self.after <= self.before:
+            found += ", so it stays as merged"
         return f"level {self.level}, {self.count:,} splats, against {size}: {found}"
 
 
@@ -84,6 +87,8 @@ def refine_levels(
     source: Source, root: Node, steps: int, backend: str, say: Callable[[str], None]
 ) -> tuple[Node, list[LevelScore]]:
     """Train every level but the finest for a short time, without density control, and score all levels.
+
+    A level that comes out no better, judged by held-out views, stays as it was.
 
     Args:
         source: The scene that the levels were made from; a run, or a scene without photos.
@@ -112,8 +117,8 @@ def refine_levels(
         if level:
             refined = _trained(source, merged, views[0], steps, backend)
             after = _score(source, refined, views[1] or views[0], backend)
-            sizes = [len(leaf.levels[level]) for leaf in leaves]
-            changed[level] = _split(refined, sizes)
+            if after > before:
+                changed[level] = _split(refined, [len(leaf.levels[level]) for leaf in leaves])
         scores.append(LevelScore(level, len(merged), factor, before, after))
         say(scores[-1].line(against))
     return with_levels(root, changed), scores
