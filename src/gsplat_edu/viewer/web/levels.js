@@ -1,5 +1,5 @@
-// Which level of each region of a streamed SOG is shown: the coarsest everywhere first, then finer ones where their
-// error is largest on the screen, nearest first, as far as the budget of splats goes.
+// Which level of each region of a streamed SOG is shown: the coarsest everywhere first, then finer ones where the error
+// on the screen is largest for the number of splats, as far as the budget of splats goes; the nearest are loaded first.
 //
 // A new level is written beside the old one, sorted, and only then shown in its place. So a picture is complete at any
 // time, and at most `budget` splats are drawn. Memory for one more batch is reserved.
@@ -10,7 +10,7 @@ const BATCH = 65536; // most splats that are decoded and sorted at once, unless 
 const PHONE = 1e6; // budgets, in splats
 const MODEST = 2e6; // up to 4 GB of memory
 const USUAL = 4e6;
-const BEHIND = 0.1; // weight of the error of a region behind the camera
+const OUTSIDE = 0.05; // weight of the error of a region outside the picture, to which the camera may turn
 
 // Budget of this machine: a phone's is a million; no more than its textures hold.
 function machineBudget(gl, degree) {
@@ -61,14 +61,16 @@ class Levels {
     return Math.max(this.facts.near, Math.hypot(...gaps));
   }
 
-  // Error of a level on the screen, in pixels; for a file without errors, a guess by the distance between splats.
+  // Error of a level on the screen, in pixels per splat. A region is seen from half its own reach at least: the camera
+  // may stand in its box, but not in all of its splats. Without errors, a guess by the distance between splats.
   error(region, level, camera) {
     const { low, high, errors } = region;
-    const middle = low.map((x, i) => (x + high[i]) / 2 - camera.eye[i]);
+    const count = Math.max(1, this.size(region, level));
     const reach = Math.hypot(...low.map((x, i) => high[i] - x)) / 2;
-    const guess = (reach / Math.cbrt(1 + this.size(region, level))) * Number(level > 0);
-    const weight = dot(middle, camera.R[2]) < -reach ? BEHIND : 1;
-    return (weight * camera.fx * (errors.length ? errors[level] : guess)) / this.distance(region, camera.eye);
+    const guess = (reach / Math.cbrt(count)) * Number(level > 0);
+    const weight = visible(region, camera, this.facts.near) ? 1 : OUTSIDE;
+    const distance = Math.max(this.distance(region, camera.eye), reach / 2);
+    return (weight * camera.fx * (errors.length ? errors[level] : guess)) / distance / count;
   }
 
   // Chooses a level for every region.
@@ -197,6 +199,21 @@ class Levels {
     }
     return slots;
   }
+}
+
+// Whether a region's box may be in the picture: no side of it has all corners beyond.
+function visible({ low, high }, camera, near) {
+  const inside = [0, 0, 0, 0, 0]; // corners in front, and before the left, right, upper and lower side
+  for (let corner = 0; corner < 8; ++corner) {
+    const offset = low.map((x, i) => (corner & (1 << i) ? high[i] : x) - camera.eye[i]);
+    const [x, y, z] = camera.R.map((axis) => dot(axis, offset));
+    inside[0] += z > near;
+    inside[1] += camera.fx * x + camera.cx * z >= 0;
+    inside[2] += camera.fx * x + (camera.cx - camera.W) * z <= 0;
+    inside[3] += camera.fy * y + camera.cy * z >= 0;
+    inside[4] += camera.fy * y + (camera.cy - camera.H) * z <= 0;
+  }
+  return inside.every((count) => count > 0);
 }
 
 // Begin and end of each stretch of consecutive numbers, in their order.
