@@ -27,6 +27,8 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import page
+from gsplat_edu.viewer.stream import folder_page
+from scene_files import small_levels
 from splats import splats_on
 
 COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())", "view"]
@@ -124,6 +126,16 @@ def test_a_scene_of_another_format_has_no_cameras(made):
     )
 
 
+@own_process
+def test_levels_of_detail_are_served_with_their_files(tmp_path):
+    path = small_levels(tmp_path)
+    with viewing(path.parent, "--port", "0", "--no-open", "--budget", "30") as (printed, url):
+        assert fetched(url) == folder_page(path, "levels", 30)[0]
+        assert fetched(f"{url}lod-meta.json") == path.read_bytes()
+        assert fetched(f"{url}0_1/quats.webp") == (path.parent / "0_1" / "quats.webp").read_bytes()
+    assert printed.splitlines()[0] == f"{path}: levels of 40, 20 splats, 25 files"
+
+
 @pytest.mark.skipif(shutil.which("sh") is None or sys.platform == "win32", reason="needs sh and a terminal")
 @own_process
 def test_the_browser_opens_for_a_user_at_a_screen(made, tmp_path):
@@ -178,6 +190,8 @@ def test_the_browser_opens_for_a_user_at_a_screen(made, tmp_path):
         (["gone.html"], "gone.html: does not exist"),
         (["unfinished"], "unfinished: contains no scene"),
         (["cut.ply", "--path", "notes.txt"], "notes.txt: is not JSON"),
+        (["desk.splat", "--budget", "5"], "--budget: desk.splat has no levels of detail"),
+        (["levels", "--path", "notes.txt"], "--path: a page with levels of detail plays no path"),
         (["nowhere", "--port", "70000"], "--port: is 70000"),
         (["nowhere", "--port", "many"], "argument --port: 'many' is not a whole number"),
         (["nowhere", "--host", "no such host"], "--host: 'no such host' is not an address"),
@@ -191,6 +205,7 @@ def test_what_cannot_be_shown_costs_one_line(tmp_path, monkeypatch, capsys, word
     (tmp_path / "desk.html").write_bytes(page.html(Scene(splats_on(np.zeros((1, 3)), np.zeros((1, 3))))))
     (tmp_path / "cut.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement ver")
     RunFolder(tmp_path / "unfinished").write_config({"render": {}})
+    small_levels(tmp_path)
     default = [] if "--port" in words else ["--port", "0"]
     try:
         code = command_line.main(["view", *words, *default])
