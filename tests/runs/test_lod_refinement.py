@@ -10,7 +10,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.lod import codec
-from gsplat_edu.io.lod.levels import LodOptions, build, leaves_of
+from gsplat_edu.io.lod.levels import LodOptions, build_levels, leaves_of
 from gsplat_edu.runs import lod_refinement
 from gsplat_edu.runs.lod_refinement import refine_levels
 from gsplat_edu.runs.source import open_source
@@ -31,7 +31,7 @@ def run(tmp_path_factory):
 
 def test_refined_levels_match_the_photos_better(run):
     source = open_source(run)
-    root = build(source.scene.gaussians, OPTIONS)
+    root = build_levels(source.scene.gaussians, OPTIONS)
     said = []
     refined, scores = refine_levels(source, root, 80, "cpu", said.append)
     assert len(scores) == len(said) == len(leaves_of(root)[0].levels) >= 3
@@ -80,7 +80,7 @@ def test_a_level_that_training_makes_worse_stays_as_merged(run, monkeypatch):
 
     monkeypatch.setattr(lod_refinement, "_trained", spoilt)
     source = open_source(run)
-    root = build(source.scene.gaussians, OPTIONS)
+    root = build_levels(source.scene.gaussians, OPTIONS)
     said = []
     same, scores = refine_levels(source, root, 5, "cpu", said.append)
     assert all(score.after < score.before for score in scores[1:])

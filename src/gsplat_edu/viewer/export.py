@@ -26,7 +26,7 @@ from gsplat_edu.io.formats import (
 )
 from gsplat_edu.io.lod import codec as lod_codec
 from gsplat_edu.io.lod import tiles
-from gsplat_edu.io.lod.levels import LodOptions, build
+from gsplat_edu.io.lod.levels import LodOptions, build_levels
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
@@ -152,7 +152,7 @@ def write_refined(
         OSError: a file cannot be written. Existing files stay unchanged.
     """
     source.scene.gaussians.check_finite()
-    root, scores = refine_levels(source, build(source.scene.gaussians, options), steps, backend, say)
+    root, scores = refine_levels(source, build_levels(source.scene.gaussians, options), steps, backend, say)
     lod_codec.write_levels(path, root, source.scene, options.chunk)
     return scores
 

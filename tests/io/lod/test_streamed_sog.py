@@ -13,7 +13,6 @@ from gsplat_edu.io.formats import format_of, read_scene, stored_bytes, write_sce
 from gsplat_edu.io.lod import codec
 from gsplat_edu.io.lod.levels import (
     LodOptions,
-    build,
     counts_of,
     leaves_of,
     level_of,
@@ -119,7 +118,7 @@ def test_runs_fill_the_files_of_one_level_in_morton_order(written):
 
 
 def test_the_order_is_exactly_mortons():
-    leaf = leaves_of(build(random_scene(700, 0).gaussians, LodOptions(smallest=100)))[0]
+    leaf = leaves_of(build_levels(random_scene(700, 0).gaussians, LodOptions(smallest=100)))[0]
     for level in leaf.levels:
         means = level.means.double().numpy()
         low, high = means.min(axis=0), means.max(axis=0)
@@ -130,7 +129,7 @@ def test_the_order_is_exactly_mortons():
 
 def test_the_finest_level_is_the_scene_and_a_leaf_covers_the_same_region_at_all_levels():
     scene = random_scene(1000, 3)
-    root = build(scene.gaussians, LodOptions(smallest=100, leaf=130))
+    root = build_levels(scene.gaussians, LodOptions(smallest=100, leaf=130))
     finest = level_of(root, 0)
     rows = torch.cdist(finest.means, scene.gaussians.means).argmin(dim=1)
     assert sorted(rows.tolist()) == list(range(1000))
@@ -181,7 +180,7 @@ def test_levels_end_with_one_splat_a_leaf(tmp_path):
 
 def test_other_levels_take_the_place_of_some():
     """As refining does: boxes follow, the order is Morton's again, other levels stay."""
-    root = build(random_scene(400, 0).gaussians, LodOptions(smallest=120, leaf=100))
+    root = build_levels(random_scene(400, 0).gaussians, LodOptions(smallest=120, leaf=100))
     old = leaves_of(root)
     moved = [leaf.levels[1].map(lambda t: t.flip(0)) for leaf in old]
     for part in moved:

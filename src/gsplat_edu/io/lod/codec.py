@@ -29,7 +29,7 @@ from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.files import named_failure, written_aside
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.edit import joined
-from gsplat_edu.io.lod.levels import Branch, Leaf, LodOptions, Node, build, counts_of, leaves_of
+from gsplat_edu.io.lod.levels import Branch, Leaf, LodOptions, Node, build_levels, counts_of, leaves_of
 from gsplat_edu.io.lod.meta import LodMeta, from_json, rounded, to_json
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.sog import codec as sog
@@ -170,7 +170,7 @@ def write(path: Path, scene: Scene, options: LodOptions | None = None) -> None:
     """
     options = options or LodOptions()
     scene.gaussians.check_finite()
-    write_levels(path, build(scene.gaussians, options), scene, options.chunk)
+    write_levels(path, build_levels(scene.gaussians, options), scene, options.chunk)
 
 
 def write_levels(

@@ -116,7 +116,7 @@ def level_of(node: Node, level: int) -> Gaussians:
     return Gaussians.concatenated([leaf.levels[level] for leaf in leaves_of(node)])
 
 
-def build(gaussians: Gaussians, options: LodOptions) -> Node:
+def build_levels(gaussians: Gaussians, options: LodOptions) -> Node:
     """Make the tree of a scene and its levels.
 
     Args:

@@ -43,7 +43,7 @@ from gsplat_edu.files import named_failure, written_aside
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.glb import CHUNK_HEADER, EXTENSION, FILE_HEADER, FLOAT, POINTS
-from gsplat_edu.io.lod.levels import Leaf, LodOptions, Node, build, leaves_of, level_of
+from gsplat_edu.io.lod.levels import Leaf, LodOptions, Node, build_levels, leaves_of, level_of
 from gsplat_edu.io.lod.meta import rounded
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.spz import packed_version_2
@@ -75,7 +75,7 @@ def write(path: Path, scene: Scene, options: LodOptions | None = None) -> None:
         raise ArgumentError("gaussians: are none, but a tileset needs a box around some; keep more splats")
     scene.gaussians.check_finite()
     options = options or tile_options()
-    root = build(scene.gaussians, options)
+    root = build_levels(scene.gaussians, options)
     with ExitStack() as stack:  # exits in reverse order of entering
         aside = stack.enter_context(written_aside(path))
         tiles: list[Gaussians] = []
