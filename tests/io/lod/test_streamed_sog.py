@@ -13,6 +13,7 @@ from gsplat_edu.io.formats import format_of, read_scene, stored_bytes, write_sce
 from gsplat_edu.io.lod import codec
 from gsplat_edu.io.lod.levels import (
     LodOptions,
+    build_levels,
     counts_of,
     leaves_of,
     level_of,
