@@ -1,6 +1,7 @@
 """The parts of a step that can be replaced: named terms, view models, and the reduction of gradients over views."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -71,16 +72,16 @@ def test_regularisers_match_the_paper(capture):
     assert torch.equal(with_all["means"], run.gaussians.means.grad)
 
 
-def test_fast_weighs_the_opacity_of_what_a_view_shows(capture):
+def test_fast_weighs_the_opacity_of_what_a_view_shows_if_that_is_little(capture):
     """Value and gradient against autograd of the mean over those. The others get none, so Adam leaves them alone.
 
-    Half of the Gaussians are where no camera looks. A gradient that is tiny but always there would move them by the
-    full rate in each step: 60 steps at 0.1 would take them from an opacity of 0.1 to below 0.001.
+    Four fifths of the Gaussians are where no camera looks. A gradient that is tiny but always there would move them by
+    the full rate in each step: 60 steps at 0.1 would take them from an opacity of 0.1 to below 0.001.
     """
     views, points, colors = capture
-    more = np.concatenate([points, points + np.array([0.0, 100.0, 0.0])])
-    config = recipe(60, strategy="fast", max_gaussians=2 * len(points), sh_degree=0)
-    run, seen = trainer((views, more, np.concatenate([colors, colors])), config), []
+    more = np.concatenate([points, *(points + np.array([0.0, 100.0 + 10 * k, 0.0]) for k in range(4))])
+    config = recipe(60, strategy="fast", max_gaussians=5 * len(points), sh_degree=0)
+    run, seen = trainer((views, more, np.concatenate([colors] * 5)), config), []
     run._objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
     run.gradients([run._feed.next()])
     (rendered,) = seen
@@ -96,7 +97,19 @@ def test_fast_weighs_the_opacity_of_what_a_view_shows(capture):
     far = run.gaussians.means[:, 1] > 50
     before = run.gaussians.logit_opacities[far].detach().clone()
     run.run()
-    assert torch.equal(run.gaussians.logit_opacities[far], before) and len(before) == len(points)
+    assert torch.equal(run.gaussians.logit_opacities[far], before) and len(before) == 4 * len(points)
+
+
+def test_fast_weighs_the_opacity_of_all_if_a_view_shows_many(capture):
+    run, seen = trainer(capture, recipe(60, strategy="fast", max_gaussians=100, sh_degree=0)), []
+    run._objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
+    run.gradients([run._feed.next()])
+    (rendered,) = seen
+    output = rendered.output
+    few = replace(rendered, output=replace(output, visible=output.visible[:20], radii=output.radii[:20]))
+    term, opacities = make_objective(run.config).terms["opacity"], run.gaussians.opacities
+    assert 0.25 * len(opacities) < 20 < len(output.visible)
+    torch.testing.assert_close(term(few), 0.002 * opacities.mean())
 
 
 def _rendered_again(run, rendered):

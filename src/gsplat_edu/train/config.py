@@ -239,7 +239,7 @@ class FastConfig:
     opacity_weight: float = _number(
         0.002,
         _not_negative,
-        "Weight of the mean opacity of what a view shows, until `fast_stop`: what no photo needs fades and is pruned.",
+        "Weight of the mean opacity in the objective until `fast_stop`: what no photo needs fades and is pruned.",
         "ours",
     )
     decay: float = _number(

@@ -25,6 +25,10 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.feed import Draw, Target
 
+LEAST_SHARE = 0.25
+"""A view that shows less than this share of the Gaussians weighs the opacity of those only. Views of one subject show
+a third and more of the start's Gaussians, those of an aerial capture of a city a tenth (benchmarks/RESULTS.md)."""
+
 PHOTO = "photo"
 """Name of the term that compares image and photo; logs and progress call it the loss."""
 
@@ -99,8 +103,9 @@ def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective
 
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale)
 
-    For fast, the mean is that of the Gaussians that the view shows. Adam moves a parameter by its full rate if all its
-    gradients agree, however small they are: where a view shows a twentieth of the scene, the others would fade.
+    For fast, the mean is that of the Gaussians that the view shows if they are few. Adam moves a parameter by its full
+    rate if all its gradients agree, however small they are: where a view shows a twentieth of the scene, the others
+    would fade before a photo needs them. In smaller scenes it is as well that what few photos show fades.
 
     Args:
         config: The configuration.
@@ -113,7 +118,7 @@ def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective
         terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
         terms["scale"] = MeanScale(config.mcmc.scale_weight, shell)
     if config.strategy == "fast" and config.fast.opacity_weight > 0:
-        terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, of_visible=True)
+        terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, LEAST_SHARE)
     return Objective(terms)
 
 
@@ -140,21 +145,20 @@ class MeanOpacity:
     Args:
         weight: lambda_o.
         until: The term is 0 from this iteration on; None for the whole run.
-        of_visible: The mean is that of the Gaussians that the view shows, not of all.
+        least_share: If the view shows a smaller share of the Gaussians than this, the mean is that of those it shows.
     """
 
     weight: float
     until: int | None = None
-    of_visible: bool = False
+    least_share: float = 0.0
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return weight mean(opacity)."""
         if self.until is not None and rendered.iteration >= self.until:
             return rendered.gaussians.logit_opacities.new_zeros(())
-        visible = rendered.output.visible if self.of_visible else None
-        value: Tensor = _MeanOpacity.apply(  # type: ignore[no-untyped-call]
-            rendered.gaussians.logit_opacities, self.weight, visible
-        )
+        logits, visible = rendered.gaussians.logit_opacities, rendered.output.visible
+        some = visible if len(visible) < self.least_share * len(logits) else None
+        value: Tensor = _MeanOpacity.apply(logits, self.weight, some)  # type: ignore[no-untyped-call]
         return value
 
 
