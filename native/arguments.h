@@ -170,12 +170,12 @@ class Arguments {
 
     // `count` numbers; infinity is allowed, NaN is not.
     void numbers(const char *name, double *out, size_t count) {
-        const nb::object sequence = nb::steal(PySequence_Fast(take(name).ptr(), ""));
+        const nb::object sequence = nb::steal(PySequence_Tuple(take(name).ptr()));
         PyErr_Clear();
-        if (!sequence.is_valid() || size_t(PySequence_Fast_GET_SIZE(sequence.ptr())) != count)
+        if (!sequence.is_valid() || size_t(PyTuple_Size(sequence.ptr())) != count)
             fail(name, "has to be " + std::to_string(count) + " numbers");
         for (size_t k = 0; k < count; ++k) {
-            out[k] = real(name, PySequence_Fast_GET_ITEM(sequence.ptr(), Py_ssize_t(k)));
+            out[k] = real(name, PyTuple_GetItem(sequence.ptr(), Py_ssize_t(k)));
             if (std::isnan(out[k])) fail(name, "is NaN");
         }
     }

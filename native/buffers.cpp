@@ -1,7 +1,5 @@
 #include "buffers.h"
 
-#include <pthread.h>
-
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
@@ -10,6 +8,8 @@
 #include <new>
 #include <utility>
 #include <vector>
+
+#include "system.h"
 
 namespace gsplat {
 namespace {
@@ -46,7 +46,7 @@ struct Spare {
 // Spare blocks live as long as the process, since frames may be freed during exit.
 // A forked child gets a new mutex: the thread that held the old one may not exist there.
 std::mutex *spares_lock = new std::mutex;
-[[maybe_unused]] const int registered = pthread_atfork(nullptr, nullptr, [] { spares_lock = new std::mutex; });
+[[maybe_unused]] const bool registered = after_fork_in_child([] { spares_lock = new std::mutex; });
 
 std::vector<Spare> &spares() {
     static auto *list = [] {
@@ -81,7 +81,7 @@ Buffer::~Buffer() {
     if (spares().size() > MAX_SPARES) {
         auto smallest =
             std::min_element(spares().begin(), spares().end(), [](const Spare &a, const Spare &b) { return a.capacity < b.capacity; });
-        std::free(smallest->data);
+        free_pages(smallest->data);
         spares().erase(smallest);
     }
 }
@@ -103,13 +103,13 @@ void *Buffer::reserve(size_t bytes) {
     for (auto it = spares().begin(); it != spares().end(); ++it)
         if (it->capacity < bytes && (grow == spares().end() || it->capacity > grow->capacity)) grow = it;
     if (grow != spares().end()) {
-        std::free(grow->data);
+        free_pages(grow->data);
         spares().erase(grow);
     }
     lock.unlock();  // the query may wait for Python, which may wait for this lock
     const size_t rounded = (bytes + bytes / 4 + 4095) / 4096 * 4096;
     check_room(rounded);
-    data_ = std::aligned_alloc(4096, rounded);
+    data_ = allocate_pages(rounded);
     if (!data_) throw std::bad_alloc();
     capacity_ = rounded;
     return data_;

@@ -1,8 +1,5 @@
 #include "threads.h"
 
-#include <pthread.h>
-#include <time.h>
-#include <unistd.h>
 #if defined(__SSE2__)
 #include <immintrin.h>
 #endif
@@ -14,6 +11,8 @@
 #include <mutex>
 #include <thread>
 #include <vector>
+
+#include "system.h"
 
 namespace gsplat {
 namespace {
@@ -107,7 +106,7 @@ class Pool {
 
 // Held while a round runs. A forked child gets a new mutex: the thread that held the old one may not exist there.
 std::mutex *pool_mutex = new std::mutex;
-[[maybe_unused]] const int registered = pthread_atfork(nullptr, nullptr, [] { pool_mutex = new std::mutex; });
+[[maybe_unused]] const bool registered = after_fork_in_child([] { pool_mutex = new std::mutex; });
 
 thread_local ParallelTime time_in_parallel;
 
@@ -122,12 +121,6 @@ class Clock {
 
 }  // namespace
 
-double thread_seconds() {
-    timespec now{};
-    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
-    return double(now.tv_sec) + 1e-9 * double(now.tv_nsec);
-}
-
 const ParallelTime &parallel_time() { return time_in_parallel; }
 
 void parallel(int threads, int64_t count, const Task &task) {
@@ -138,11 +131,11 @@ void parallel(int threads, int64_t count, const Task &task) {
         return;
     }
     static Pool *pool = nullptr;
-    static pid_t owner = 0;
+    static int64_t owner = -1;
     std::lock_guard<std::mutex> lock(*pool_mutex);
-    if (owner != getpid()) {  // a forked child does not have its parent's threads
+    if (owner != process_id()) {  // a forked child does not have its parent's threads
         pool = new Pool;
-        owner = getpid();
+        owner = process_id();
     }
     pool->run(threads, count, task);
 }

@@ -11,10 +11,7 @@ namespace gsplat {
 using Task = std::function<void(int64_t, int)>;
 void parallel(int threads, int64_t count, const Task &task);
 
-// Seconds of processor time that this thread has taken so far; on a busy machine steadier than the time that has passed.
-double thread_seconds();
-
-// Those seconds in calls of `parallel`, and how many calls there were.
+// Seconds of processor time of this thread in calls of `parallel`, and how many calls there were.
 struct ParallelTime {
     double seconds = 0;
     int64_t calls = 0;

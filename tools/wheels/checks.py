@@ -1,0 +1,93 @@
+"""What a wheel has to be before anyone installs it: its tag is true, it is small, and it names no folder of the machine."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+MAX_BYTES = 10_000_000
+ROOT = Path(__file__).resolve().parents[2]
+
+SYSTEM_LIBRARIES = {
+    "Darwin": {"/usr/lib/libSystem.B.dylib", "/usr/lib/libc++.1.dylib"},
+    "Windows": {"kernel32.dll", "ntdll.dll", "msvcrt.dll", "python3.dll", "advapi32.dll", "user32.dll", "ws2_32.dll"},
+}
+"""Libraries that a module may load; every such system has them, or Python brings them along."""
+
+
+def own_folders() -> list[str]:
+    """Return the folders of this machine that a wheel must not name."""
+    home = str(Path.home())
+    folders = [str(ROOT), str(Path(sys.prefix).resolve()), sysconfig.get_paths()["include"]]
+    return folders + ([home] if len(home) > 5 else [])
+
+
+def named_folders(wheel: Path) -> list[str]:
+    """List "file: folder" for every folder of this machine that a file of a wheel names."""
+    found = []
+    with zipfile.ZipFile(wheel) as archive:
+        for name in archive.namelist():
+            data = archive.read(name)
+            found += [f"{name}: {folder}" for folder in own_folders() if folder.encode() in data]
+            for part in re.findall(rb"(?:/tmp|/home|/var/folders)/[\w./-]{3,}", data) if name.endswith((".so", ".pyd")) else ():
+                found.append(f"{name}: {part.decode()}")
+    return found
+
+
+def wrong_hashes(wheel: Path) -> list[str]:
+    """List the files of a wheel that differ from its RECORD, or are missing there."""
+    import base64
+    import hashlib
+
+    with zipfile.ZipFile(wheel) as archive:
+        (record,) = (name for name in archive.namelist() if name.endswith(".dist-info/RECORD"))
+        rows = [line.rsplit(",", 2) for line in archive.read(record).decode().splitlines()]
+        stated = {name: digest for name, digest, _ in rows}
+        found = []
+        for name in archive.namelist():
+            digest = base64.urlsafe_b64encode(hashlib.sha256(archive.read(name)).digest()).rstrip(b"=").decode()
+            if name not in stated or (name != record and stated[name] != f"sha256={digest}"):
+                found.append(name)
+    return found
+
+
+def audit(wheel: Path) -> list[str]:
+    """Check the symbols of a wheel's module; return what is wrong.
+
+    auditwheel finds the oldest glibc for Linux, abi3audit the symbols outside the stable ABI, for every system.
+    """
+    found = []
+    folder = Path(sys.executable).parent
+    if "manylinux" in wheel.name:
+        done = subprocess.run([folder / "auditwheel", "show", wheel], capture_output=True, text=True, check=False)
+        policies = re.findall(r"manylinux_2_\d+_\w+", done.stdout)
+        tag = wheel.stem.rsplit("-", 1)[1]
+        if done.returncode or not policies:
+            found.append(f"auditwheel: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
+        elif _glibc(policies[0]) > _glibc(tag):
+            found.append(f"auditwheel: it is {policies[0]}, but its tag says {tag}")
+    if "abi3" in wheel.name:
+        done = subprocess.run(
+            [folder / "abi3audit", "--strict", "--summary", wheel], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            found.append(f"abi3audit: {(done.stdout + done.stderr).strip()}")
+    return found
+
+
+def _glibc(tag: str) -> int:
+    return int(tag.split("_")[2])
+
+
+def problems(wheel: Path) -> list[str]:
+    """Return every reason why a wheel may not be given away; none if it may."""
+    found = audit(wheel)
+    if wheel.stat().st_size > MAX_BYTES:
+        found.append(f"it has {wheel.stat().st_size} bytes, at most {MAX_BYTES}")
+    found += [f"names a folder of this machine: {line}" for line in named_folders(wheel)]
+    found += [f"differs from RECORD: {name}" for name in wrong_hashes(wheel)]
+    return found
