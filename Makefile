@@ -11,7 +11,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist 
 BENCH := $(if $(SMOKE),--smoke)
 export PYTHON
 
-.PHONY: help demo test soak check sanitize bench notebooks site clean
+.PHONY: help demo test soak check sanitize bench notebooks site wheels clean
 
 help:
 	@echo "make demo        train the sphere; writes $(OUT), curves and scene"
@@ -22,6 +22,7 @@ help:
 	@echo "make bench       benchmarks; prints tables and writes out/bench/*.json (SMOKE=1: only check that they run)"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
 	@echo "make site        build the site: chapters, documents and reference, out/site/index.html"
+	@echo "make wheels      build and check wheels for every platform that this machine can build for: dist/; 10 minutes and more"
 	@echo "make clean       remove .venv, out and caches"
 
 demo:
@@ -83,6 +84,11 @@ site:
 	@tools/set_up.sh dev
 	@echo "== site: chapters, documents and reference"
 	@$(BIN)/python tools/build_site.py
+
+wheels:
+	@tools/set_up.sh wheels
+	@echo "== wheels: building dist/*.whl"
+	@$(BIN)/python tools/build_wheels.py $(if $(TARGETS),--targets $(TARGETS))
 
 clean:
 	rm -rf .venv out build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

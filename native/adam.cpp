@@ -12,7 +12,11 @@ GSPLAT_INLINE void step(const AdamArgs<T> &a, int64_t begin, int64_t end) {
     const AdamNumbers &n = a.numbers;
     const T b1 = T(n.beta1), b2 = T(n.beta2), n1 = T(1 - n.beta1), n2 = T(1 - n.beta2);
     const T rate = T(n.rate), eps = T(n.eps), c1 = T(1 / n.correction1), c2 = T(1 / n.correction2);
+#if defined(__clang__)
+#pragma clang loop vectorize(assume_safety)
+#else
 #pragma GCC ivdep
+#endif
     for (int64_t i = begin; i < end; ++i) {
         const T g = EXTRA ? a.gradient[i] + a.extra[i] : a.gradient[i];
         const T m = b1 * a.first[i] + n1 * g, v = b2 * a.second[i] + n2 * g * g;

@@ -55,7 +55,7 @@ GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const AlphaClamp<T> &clamp
             if constexpr (MODE >= WITH_FEATURES) store(weights + at, w);
             if constexpr (MODE == WITH_ALL) {
                 const V half = splat(T(0.5)), median = load<V>(tile.median.values + at);
-                store(tile.median.values + at, (t >= half) & (t - w < half) ? splat(s.depth) : median);
+                store(tile.median.values + at, ((t >= half) & (t - w < half)) ? splat(s.depth) : median);
             }
             falloff.step(row - first);
         }

@@ -9,6 +9,7 @@
 #include "dispatch.h"
 #include "scan.h"
 #include "sort.h"
+#include "system.h"
 #include "threads.h"
 
 namespace gsplat {

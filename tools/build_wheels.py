@@ -58,7 +58,7 @@ def run(words: list[object], log: Path, cwd: Path = ROOT) -> None:
         print(shlex.join(map(str, words)), file=file, flush=True)
         done = subprocess.run([*map(str, words)], cwd=cwd, stdout=file, stderr=subprocess.STDOUT, check=False)
     if done.returncode:
-        lines = [line for line in log.read_text(errors="replace").splitlines() if re.search(r"error|Error", line)]
+        lines = [line for line in log.read_text(errors="replace").splitlines() if re.search(r"\berror:|Error:|CMake Error", line)]
         raise NotBuilt(f"{lines[0].strip() if lines else 'the build failed'} (all of it in {os.path.relpath(log)})")
 
 
@@ -110,8 +110,8 @@ def build_module(build: Path, target: Target, version: str, python: Path) -> byt
     """Compile the module for a target with the headers of an interpreter of this machine; return the file."""
     abi3 = version != "3.11"
     tools = compilers(build, target)
-    folder = build / target.name / ("abi3" if abi3 else "cp311")
-    log = folder.with_suffix(".log")
+    folder = build / target.name / "cmake"  # of both wheels: the kernels do not depend on Python
+    log = build / target.name / f"{'abi3' if abi3 else 'cp311'}.log"
     log.unlink(missing_ok=True)
     include = Path(
         subprocess.run(
@@ -124,6 +124,7 @@ def build_module(build: Path, target: Target, version: str, python: Path) -> byt
     import nanobind
 
     options = [
+        *("-UPython*", "-U_Python*", "-Unanobind*", "-USKBUILD*"),  # what an earlier run found
         f"-DPython_EXECUTABLE={python}",
         f"-Dnanobind_ROOT={nanobind.cmake_dir()}",
         f"-DCMAKE_CXX_COMPILER={tools['c++']}",
@@ -139,6 +140,8 @@ def build_module(build: Path, target: Target, version: str, python: Path) -> byt
     ]
     beside = Path(sys.executable).parent
     cmake = beside / "cmake"
+    for stale in folder.glob("_native*"):
+        stale.unlink()
     run([cmake, "-S", ROOT, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={beside / 'ninja'}", *options], log)
     run([cmake, "--build", folder, "--target", "_native"], log)
     (made,) = (path for path in folder.glob("_native*") if path.suffix in (".so", ".pyd", ".dylib", ".dll"))

@@ -10,7 +10,7 @@ ISA_FREE = {
     *("arguments.h", "bindings.cpp", "structures.h"),
     *(
         f"{name}.{end}"
-        for name in ("buffers", "dispatch", "frame", "loss", "scan", "sort", "threads")
+        for name in ("buffers", "dispatch", "frame", "loss", "scan", "sort", "system", "threads")
         for end in ("cpp", "h")
     ),
 }
@@ -38,3 +38,10 @@ def test_kernel_files_include_only_c_standard_headers():
     assert len(files) > 8
     for path in files:
         assert set(re.findall(r"#include <(.*)>", path.read_text())) <= allowed, path.name
+
+
+def test_only_one_file_asks_the_operating_system():
+    """So a port to another system changes that file alone."""
+    asked = re.compile(r"#include <(pthread|unistd|time|sys/.*|windows|malloc)\.h>|\b(aligned_alloc|getpid|_WIN32|__APPLE__)\b")
+    found = {path.name for path in NATIVE.iterdir() if asked.search(path.read_text())}
+    assert found == {"system.cpp"}

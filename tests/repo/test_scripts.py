@@ -33,8 +33,10 @@ ELSEWHERE = {
     "build_recipe_table.py": "tests/repo/test_recipe_document.py",
     "build_notebooks.py": "tests/repo/test_notebooks.py",
     "build_site.py": "tests/repo/test_site.py",
+    "build_wheels.py": "tests/repo/test_wheels.py",
     "chapter_figures.py": "tests/repo/test_notebooks.py",
     "check_objects.py": "tools/sanitize.sh",
+    "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",
     "make_city.py": "tests/data/test_city.py",
     "neon.sh": "Makefile",
@@ -117,7 +119,7 @@ def test_every_make_target_is_explained_and_run():
     """.ci/run, this file or a test of the same tool runs each target. Targets that take hours are run by hand."""
     explained = run("make", "help").stdout
     ci = (ROOT / ".ci" / "run").read_text()
-    elsewhere = {"help", "clean", "notebooks", "site", "bench", "soak"}
+    elsewhere = {"help", "clean", "notebooks", "site", "bench", "soak", "wheels"}
     for name in targets():
         assert name == "help" or re.search(rf"^make {name} ", explained, re.M), name
         assert name in elsewhere or re.search(rf"^make .*\b{name}\b", ci, re.M), name

@@ -1,0 +1,175 @@
+"""Wheels: one of this machine's module is packed, installed where nothing else is, and used.
+
+The module is the one that the set-up compiled from this checkout. `make wheels` compiles others, which takes minutes.
+"""
+
+import base64
+import email.parser
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import gsplat_edu._native
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
+
+import build_wheels
+from wheels import checks
+from wheels.contents import nanobind_parts
+from wheels.pack import pack
+
+FAST_TESTS = (
+    *("tests/test_camera.py", "tests/test_sh.py", "tests/test_files.py", "tests/io/test_ply.py"),
+    *("tests/io/test_spz.py", "tests/native/test_parity.py", "tests/viewer/test_content_policy.py"),
+)
+"""Of the references, the kernels, the formats, and the files of the package that are not Python."""
+
+ONLY_INSTALLED = """
+from pathlib import Path
+import sys, gsplat_edu, gsplat_edu._native as native
+for module in (gsplat_edu, native):
+    assert Path(module.__file__).is_relative_to(sys.prefix), module.__file__
+"""
+
+
+@pytest.fixture(scope="module")
+def module():
+    """Name and bytes of the compiled module."""
+    path = Path(gsplat_edu._native.__file__)
+    return path.name, path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def pure(tmp_path_factory):
+    return build_wheels.pure_wheel(tmp_path_factory.mktemp("build"))
+
+
+@pytest.fixture(scope="module")
+def wheel(module, pure, tmp_path_factory):
+    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    tag = f"cp3{sys.version_info.minor}-cp3{sys.version_info.minor}-{platform}"
+    return pack(pure, module, tag, nanobind_parts(), tmp_path_factory.mktemp("dist"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """A virtual environment with the wheel; it sees the dependencies of this one, but not this one's gsplat_edu."""
+    folder = tmp_path_factory.mktemp("installed") / "venv"
+    venv.create(folder, symlinks=True)
+    python = folder / "bin" / "python"
+    words = ["install", "--quiet", "--no-deps", "--no-index", "--disable-pip-version-check", wheel]
+    done = subprocess.run([sys.executable, "-m", "pip", "--python", python, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (site,) = folder.glob("lib/python3.*/site-packages")
+    # A folder named by a .pth file comes after `site`, and its own .pth files, the editable installation, do nothing.
+    (site / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
+    return folder
+
+
+def run_installed(installed, *words, cwd):
+    """Run a program of the environment; PATH holds that environment only, and so no compiler."""
+    env = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "GSPLAT"))}
+    env |= {"PATH": str(installed / "bin"), "OMP_NUM_THREADS": "1"}
+    return subprocess.run([installed / "bin" / words[0], *words[1:]], cwd=cwd, env=env, capture_output=True, text=True)
+
+
+def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
+    done = run_installed(installed, "python", "-c", ONLY_INSTALLED, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = run_installed(installed, "gsplat-edu", "demo", "--iters", "50", "--size", "48", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"sphere.png", "sphere_curves.png", "sphere.ply"}
+
+
+def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
+    (tmp_path / "only_installed.py").write_text(ONLY_INSTALLED)  # a plugin: it stops the run if it is not
+    words = [f"--rootdir={ROOT}", f"--config-file={ROOT / 'pyproject.toml'}", "-o", "pythonpath=tests conformance"]
+    words += ["-q", "-x", "-p", "no:cacheprovider", "-p", "only_installed", "-m", "not own_process"]
+    done = run_installed(installed, "python", "-m", "pytest", *words, *(ROOT / name for name in FAST_TESTS), cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " passed" in done.stdout
+
+
+def test_a_wheel_has_every_file_of_the_package(wheel):
+    package = ROOT / "src" / "gsplat_edu"
+    wanted = {
+        f"gsplat_edu/{path.relative_to(package).as_posix()}"
+        for path in package.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".so"
+    }
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert {n for n in names if n.startswith("gsplat_edu/")} == wanted | {f"gsplat_edu/{Path(gsplat_edu._native.__file__).name}"}
+
+
+def test_the_same_content_makes_the_same_wheel(wheel, module, tmp_path):
+    """The package is packed again by the build backend too, which must not add a time or a folder of its own."""
+    again = pack(build_wheels.pure_wheel(tmp_path), module, "-".join(wheel.stem.split("-")[-3:]), nanobind_parts(), tmp_path)
+    assert again.name == wheel.name
+    assert hashlib.sha256(again.read_bytes()).hexdigest() == hashlib.sha256(wheel.read_bytes()).hexdigest()
+
+
+def test_the_time_of_every_file_is_the_one_asked_for(module, pure, tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    made = pack(pure, module, "cp311-cp311-linux_x86_64", [], tmp_path)
+    assert {entry.date_time for entry in zipfile.ZipFile(made).infolist()} == {(2023, 11, 14, 22, 13, 20)}
+
+
+def test_the_record_lists_every_file_with_its_hash(wheel):
+    """By the format's definition, not by the tool's own check."""
+    archive = zipfile.ZipFile(wheel)
+    (record,) = (name for name in archive.namelist() if name.endswith("/RECORD"))
+    rows = dict(line.rsplit(",", 2)[:2] for line in archive.read(record).decode().splitlines())
+    assert rows.pop(record) == ""
+    assert set(rows) | {record} == set(archive.namelist())
+    for name, stated in rows.items():
+        raw = base64.urlsafe_b64encode(hashlib.sha256(archive.read(name)).digest()).decode().rstrip("=")
+        assert stated == f"sha256={raw}", name
+
+
+def test_the_bill_of_materials_names_what_is_linked_and_what_is_required(wheel, module):
+    archive = zipfile.ZipFile(wheel)
+    (name,) = (name for name in archive.namelist() if name.endswith(".cdx.json"))
+    assert ".dist-info/sboms/" in name
+    bill = json.loads(archive.read(name))
+    (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+    stated = email.parser.Parser().parsestr(archive.read(metadata).decode())
+    assert (bill["bomFormat"], bill["specVersion"]) == ("CycloneDX", "1.6")
+    assert bill["metadata"]["component"]["version"] == stated["Version"] == gsplat_edu.__version__
+    by_name = {component["name"]: component for component in bill["components"]}
+    assert by_name["nanobind"]["licenses"] == [{"expression": "BSD-3-Clause"}]
+    required = {line.split(">")[0] for line in stated.get_all("Requires-Dist") if ";" not in line}
+    assert {n for n, component in by_name.items() if component.get("scope") == "required"} == required
+    assert by_name[f"gsplat_edu/{module[0]}"]["hashes"][0]["content"] == hashlib.sha256(module[1]).hexdigest()
+    refs = {component["bom-ref"] for component in bill["components"]}
+    assert len(refs) == len(bill["components"])
+    assert set(bill["dependencies"][0]["dependsOn"]) == refs
+
+
+def test_the_licence_of_everything_linked_is_in_the_wheel(wheel):
+    archive = zipfile.ZipFile(wheel)
+    texts = {Path(n).name: archive.read(n).decode() for n in archive.namelist() if ".dist-info/licenses/" in n}
+    assert "Apache License" in texts["LICENSE"]
+    assert "Wenzel Jakob" in texts["nanobind.txt"]
+    assert "Permission is hereby granted" in texts["robin-map.txt"]
+
+
+def test_the_module_names_no_folder_of_this_machine(wheel):
+    assert checks.named_folders(wheel) == []
+
+
+def test_a_folder_and_a_changed_file_are_found(module, pure, tmp_path):
+    bad = pack(pure, (module[0], module[1] + bytes(ROOT)), "cp311-cp311-linux_x86_64", [], tmp_path)
+    assert any(str(ROOT) in line for line in checks.named_folders(bad))
+    assert checks.wrong_hashes(bad) == []
+    with zipfile.ZipFile(bad, "a") as archive:
+        archive.writestr("gsplat_edu/added.py", "")
+    assert checks.wrong_hashes(bad) == ["gsplat_edu/added.py"]
