@@ -1,10 +1,15 @@
 // Selects the instruction set: the best one of this machine, or the one named by GSPLAT_EDU_ISA.
+#include <algorithm>
 #include <cstdlib>
 #include <cstring>
+#include <initializer_list>
 #include <stdexcept>
 #include <string>
 
 #include "dispatch.h"
+#if defined(__x86_64__)
+#include <cpuid.h>
+#endif
 
 namespace gsplat {
 
@@ -30,12 +35,30 @@ struct Candidates {
     int count;
 };
 
+#if defined(__x86_64__)
+// The level of the x86-64 psABI that processor and operating system have, by CPUID: what compilers offer for this depends on
+// their runtime library, which zig replaces.
+int level() {
+    unsigned a = 0, b = 0, c = 0, d = 0, extended = 0, ignored = 0;
+    const auto has = [](unsigned word, std::initializer_list<int> bits) {
+        return std::all_of(bits.begin(), bits.end(), [word](int bit) { return word >> bit & 1; });
+    };
+    if (!__get_cpuid(1, &a, &b, &c, &d) || !__get_cpuid(0x80000001, &a, &b, &extended, &d)) return 1;
+    if (!has(c, {0, 9, 13, 19, 20, 23}) || !has(extended, {0})) return 1;  // SSE3, SSSE3, CX16, SSE4.1, SSE4.2, POPCNT; LAHF
+    // FMA, MOVBE, OSXSAVE, AVX, F16C; LZCNT; BMI1, AVX2, BMI2
+    if (!has(c, {12, 22, 27, 28, 29}) || !has(extended, {5})) return 2;
+    if (!__get_cpuid_count(7, 0, &a, &b, &ignored, &d) || !has(b, {3, 5, 8})) return 2;
+    unsigned saved, high;  // the registers that the operating system saves; macOS adds those of AVX-512 on first use only
+    asm volatile("xgetbv" : "=a"(saved), "=d"(high) : "c"(0));
+    if (!has(saved, {1, 2})) return 2;
+    return has(saved, {5, 6, 7}) && has(b, {16, 17, 28, 30, 31}) ? 4 : 3;  // AVX-512 F, DQ, CD, BW, VL
+}
+#endif
+
 const Candidates &candidates() {
 #if defined(__x86_64__)
-    static const Candidates all{{{&v2::table, bool(__builtin_cpu_supports("x86-64-v2"))},
-                                 {&v3::table, bool(__builtin_cpu_supports("x86-64-v3"))},
-                                 {&v4::table, bool(__builtin_cpu_supports("x86-64-v4"))}},
-                                3};
+    static const int found = level();
+    static const Candidates all{{{&v2::table, found >= 2}, {&v3::table, found >= 3}, {&v4::table, found >= 4}}, 3};
 #elif defined(__aarch64__)
     static const Candidates all{{{&neon::table, true}, {nullptr, false}, {nullptr, false}}, 1};
 #else

@@ -29,6 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "src" / "gsplat_edu"
 USE = {
     "README.md": "Install and first run",
+    "docs/INSTALL.md": "Wheels and platforms",
     "docs/GUIDE.md": "Guide",
     "docs/SCALE.md": "Larger than one machine",
     "docs/CLI.md": "Command line",
@@ -50,6 +51,8 @@ BUILD_ON = {
     "conformance/README.md": "Conformance kit",
     "conformance/SPECIFICATION.md": "Specification of a renderer",
     "CONTRIBUTING.md": "Contributing",
+    "SECURITY.md": "Security",
+    "docs/LICENCES.md": "Licences",
     "CHANGELOG.md": "Changelog",
 }
 """Documents for developers; the two indices are written here."""

@@ -177,7 +177,7 @@ def imported(wheel: Path, python: Path) -> str:
     )
     with tempfile.TemporaryDirectory() as folder:
         shutil.unpack_archive(wheel, folder, "zip")
-        (module,) = Path(folder).glob("gsplat_edu/_native*")
+        (module,) = (path for path in Path(folder).glob("gsplat_edu/_native*") if path.suffix in (".so", ".pyd"))
         done = subprocess.run([python, "-I", "-c", code, module], capture_output=True, text=True, check=False)
     return "" if done.returncode == 0 else done.stderr.strip().splitlines()[-1]
 
