@@ -2,10 +2,11 @@
 
     python tools/build_wheels.py [--out dist] [--targets linux-x86_64 ...] [--build build/wheels]
 
-zig compiles and links for every platform: for Linux against glibc 2.17, for macOS and Windows against the interfaces that it
-ships. The wheel cp312-abi3 serves Python 3.12 and newer and needs an interpreter from 3.12 on here; the wheel cp311 needs
-Python 3.11. PATH and pyenv's folder are searched for both. Every wheel is checked (tools/wheels/checks.py); a wheel for
-this machine is also imported by each Python found. Exits with 1 if a wheel was asked for and did not come out.
+zig compiles and links for every platform: for Linux against glibc 2.17, for macOS and Windows against the interfaces
+that it ships. The wheel cp312-abi3 serves Python 3.12 and newer and needs an interpreter from 3.12 on here; the wheel
+cp311 needs Python 3.11. PATH and pyenv's folder are searched for both. Every wheel is checked (tools/wheels/checks.py);
+a wheel for this machine is also imported by each Python found. Exits with 1 if a wheel was asked for and did not come
+out.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from wheels.pack import pack  # noqa: E402
 from wheels.targets import TARGETS, WINDOWS_PYCONFIG, Target  # noqa: E402
 
 
-class NotBuilt(Exception):
+class NotBuiltError(Exception):
     """A wheel could not be built; the message says why in one line."""
 
 
@@ -53,13 +54,19 @@ def pythons() -> dict[str, Path]:
 
 
 def run(words: list[object], log: Path, cwd: Path = ROOT) -> None:
-    """Run a command, its output into a file; raise NotBuilt with its last line if it fails."""
+    """Run a command, its output into a file; raise NotBuiltError with its last line if it fails."""
     with log.open("a") as file:
         print(shlex.join(map(str, words)), file=file, flush=True)
         done = subprocess.run([*map(str, words)], cwd=cwd, stdout=file, stderr=subprocess.STDOUT, check=False)
     if done.returncode:
-        lines = [line for line in log.read_text(errors="replace").splitlines() if re.search(r"\berror:|Error:|CMake Error", line)]
-        raise NotBuilt(f"{lines[0].strip() if lines else 'the build failed'} (all of it in {os.path.relpath(log)})")
+        lines = [
+            line
+            for line in log.read_text(errors="replace").splitlines()
+            if re.search(r"\berror:|Error:|CMake Error", line)
+        ]
+        raise NotBuiltError(
+            f"{lines[0].strip() if lines else 'the build failed'} (all of it in {os.path.relpath(log)})"
+        )
 
 
 def pure_wheel(build: Path) -> Path:
@@ -67,7 +74,7 @@ def pure_wheel(build: Path) -> Path:
     folder = build / "pure"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    code = "import sys; from scikit_build_core.build import build_wheel; build_wheel(sys.argv[1], {'wheel.cmake': 'false'})"
+    code = "import sys, scikit_build_core.build as b; b.build_wheel(sys.argv[1], {'wheel.cmake': 'false'})"
     run([sys.executable, "-c", code, folder], build / "pure.log")
     (made,) = folder.glob("*.whl")
     return made
@@ -100,7 +107,10 @@ def windows_python(build: Path, target: Target, include: Path) -> list[str]:
     definition = folder / "python3.def"
     definition.write_text("\n".join(["LIBRARY python3.dll", "EXPORTS", *lines, ""]))
     library = folder / "libpython3.a"
-    run([sys.executable, "-m", "ziglang", "dlltool", "-m", "i386:x86-64", "-d", definition, "-l", library], folder / "dlltool.log")
+    run(
+        [sys.executable, "-m", "ziglang", "dlltool", "-m", "i386:x86-64", "-d", definition, "-l", library],
+        folder / "dlltool.log",
+    )
     return [f"-DPython_{name}={library}" for name in ("LIBRARY", "SABI_LIBRARY")] + [
         f"-DPython_INCLUDE_DIR={folder / 'include'}"
     ]
@@ -123,6 +133,8 @@ def build_module(build: Path, target: Target, version: str, python: Path) -> byt
     )
     import nanobind
 
+    # CMake asks for a tool that would edit paths of libraries, which these modules do not have.
+    unused = [f"-DCMAKE_INSTALL_NAME_TOOL={shutil.which('true')}"] if target.system == "Darwin" else []
     options = [
         *("-UPython*", "-U_Python*", "-Unanobind*", "-USKBUILD*"),  # what an earlier run found
         f"-DPython_EXECUTABLE={python}",
@@ -135,6 +147,7 @@ def build_module(build: Path, target: Target, version: str, python: Path) -> byt
         f"-DCMAKE_SYSTEM_NAME={target.system}",
         f"-DCMAKE_SYSTEM_PROCESSOR={target.processor}",
         "-DCMAKE_BUILD_TYPE=Release",
+        *unused,
         *(["-DSKBUILD_SABI_COMPONENT=Development.SABIModule"] if abi3 else []),
         *(windows_python(build, target, include) if target.windows else [f"-DPython_INCLUDE_DIR={include}"]),
     ]
@@ -142,7 +155,20 @@ def build_module(build: Path, target: Target, version: str, python: Path) -> byt
     cmake = beside / "cmake"
     for stale in folder.glob("_native*"):
         stale.unlink()
-    run([cmake, "-S", ROOT, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={beside / 'ninja'}", *options], log)
+    run(
+        [
+            cmake,
+            "-S",
+            ROOT,
+            "-B",
+            folder,
+            "-G",
+            "Ninja",
+            f"-DCMAKE_MAKE_PROGRAM={beside / 'ninja'}",
+            *options,
+        ],
+        log,
+    )
     run([cmake, "--build", folder, "--target", "_native"], log)
     (made,) = (path for path in folder.glob("_native*") if path.suffix in (".so", ".pyd", ".dylib", ".dll"))
     return made.read_bytes()
@@ -152,32 +178,28 @@ def build_wheel(build: Path, pure: Path, target: Target, version: str, python: P
     """Build, pack and check one wheel."""
     abi3 = version != "3.11"
     data = build_module(build, target, version, python)
-    if target.windows:
-        module = "_native.pyd"
-    else:
-        module = "_native.abi3.so" if abi3 else _cp311_name(target)
+    unix = "_native.abi3.so" if abi3 else f"_native.cpython-311-{target.processor}-linux-gnu.so"
+    module = "_native.pyd" if target.windows else unix
     tag = f"{'cp312-abi3' if abi3 else 'cp311-cp311'}-{target.tag}"
     wheel = pack(pure, (module, data), tag, nanobind_parts() + zig_parts(target.windows), out)
     wrong = problems(wheel)
     if wrong:
         wheel.unlink()
-        raise NotBuilt("; ".join(wrong))
+        raise NotBuiltError("; ".join(wrong))
     return wheel
-
-
-def _cp311_name(target: Target) -> str:
-    return f"_native.cpython-311-{target.processor}-linux-gnu.so"
 
 
 def imported(wheel: Path, python: Path) -> str:
     """Import a wheel's module with an interpreter that has no packages; return "" or what went wrong."""
     code = (
-        "import sys, importlib.util as u; s = u.spec_from_file_location('_native', sys.argv[1]); m = u.module_from_spec(s);"
-        " s.loader.exec_module(m); assert m.isas(), 'no instruction set'"
+        "import sys, importlib.util as u; s = u.spec_from_file_location('_native', sys.argv[1]);"
+        " m = u.module_from_spec(s); s.loader.exec_module(m); assert m.isas(), 'no instruction set'"
     )
     with tempfile.TemporaryDirectory() as folder:
         shutil.unpack_archive(wheel, folder, "zip")
-        (module,) = (path for path in Path(folder).glob("gsplat_edu/_native*") if path.suffix in (".so", ".pyd"))
+        (module,) = (
+            path for path in Path(folder).glob("gsplat_edu/_native*") if path.suffix in (".so", ".pyd")
+        )
         done = subprocess.run([python, "-I", "-c", code, module], capture_output=True, text=True, check=False)
     return "" if done.returncode == 0 else done.stderr.strip().splitlines()[-1]
 
@@ -200,22 +222,26 @@ def make(args: argparse.Namespace) -> list[str]:
             start = time.monotonic()
             try:
                 if version == "3.11" and not target.cross_cp311:
-                    print(f"{label}: not built here; without the stable ABI it needs that system's own Python headers")
+                    print(
+                        f"{label}: not built here; without the stable ABI it needs that system's own Python headers"
+                    )
                     continue
                 if python_version not in found:
-                    raise NotBuilt(f"there is no Python {version} here; its headers are needed")
+                    raise NotBuiltError(f"there is no Python {version} here; its headers are needed")
                 wheel = build_wheel(args.build, pure, target, version, found[python_version], args.out)
                 line = f"{label}: {wheel.name}, {wheel.stat().st_size / 1e6:.2f} MB, {time.monotonic() - start:.0f} s"
                 if native_here(target):
                     able = [v for v in found if (v == "3.11") == (version == "3.11")]
                     wrong = {v: imported(wheel, found[v]) for v in able}
                     if any(wrong.values()):
-                        raise NotBuilt("; ".join(f"Python {v}: {text}" for v, text in wrong.items() if text))
+                        raise NotBuiltError(
+                            "; ".join(f"Python {v}: {text}" for v, text in wrong.items() if text)
+                        )
                     line += f"; imported by Python {', '.join(sorted(able))}"
                 else:
                     line += "; not run here"
                 print(line, flush=True)
-            except NotBuilt as error:
+            except NotBuiltError as error:
                 failed.append(f"{label}: {error}")
                 print(f"{label}: NOT BUILT: {error}", flush=True)
     return failed
@@ -225,7 +251,9 @@ def main() -> int:
     """Run the tool."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     names = [target.name for target in TARGETS]
-    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder of the wheels (default: dist)")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "dist", help="folder of the wheels (default: dist)"
+    )
     parser.add_argument("--build", type=Path, default=ROOT / "build" / "wheels", help="folder of the builds")
     parser.add_argument("--targets", nargs="+", choices=names, default=names, help="platforms (default: all)")
     args = parser.parse_args()

@@ -2,7 +2,8 @@
 
     python tools/list_licences.py [--check]
 
-Writes docs/LICENCES.md. A licence that is not in COMPATIBLE stops it with exit code 1, unless the package is in EXCEPTIONS. --check writes nothing and fails if the document is out of date.
+Writes docs/LICENCES.md. A licence that is not in COMPATIBLE stops it with exit code 1, unless the package is in
+EXCEPTIONS. --check writes nothing and fails if the document is out of date.
 """
 
 from __future__ import annotations
@@ -22,7 +23,19 @@ EXTRAS = ("viewer", "sfm", "heic")
 """Extras that users install. Those of developers are tools, which nothing that we give away contains."""
 
 COMPATIBLE = {
-    *("0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "HPND", "ISC", "MIT", "MIT-0", "MIT-CMU"),
+    *(
+        "0BSD",
+        "Apache-2.0",
+        "BSD-2-Clause",
+        "BSD-3-Clause",
+        "BSL-1.0",
+        "CC0-1.0",
+        "HPND",
+        "ISC",
+        "MIT",
+        "MIT-0",
+        "MIT-CMU",
+    ),
     *("PSF-2.0", "Python-2.0", "Unlicense", "Zlib", "bzip2-1.0.6", "Apache-2.0 WITH LLVM-exception"),
     "GPL-3.0-or-later WITH GCC-exception-3.1",  # libraries of the compiler, whose exception frees what uses them
     "MPL-2.0",  # obliges only those who change the package's own files
@@ -83,7 +96,9 @@ def installed() -> dict[str, Distribution]:
         found[name] = package
         for line in package.requires or ():
             wanted = Requirement(line)
-            if any(wanted.marker is None or wanted.marker.evaluate({"extra": extra}) for extra in {"", *extras}):
+            if any(
+                wanted.marker is None or wanted.marker.evaluate({"extra": extra}) for extra in {"", *extras}
+            ):
                 waiting.append((canonicalize_name(wanted.name), frozenset(wanted.extras)))
     del found["gsplat-edu"]
     return dict(sorted(found.items()))
@@ -131,17 +146,18 @@ def incompatible() -> list[str]:
 def document() -> str:
     """Return the text of docs/LICENCES.md."""
     rows = [
-        f"| {name} | {licence(package)} | {NOTES.get(name, '')} |"
-        for name, package in installed().items()
+        f"| {name} | {licence(package)} | {NOTES.get(name, '')} |" for name, package in installed().items()
     ]
     return "\n".join(
         [
             "# Licences of other packages",
             "",
-            "What pip installs with gsplat_edu and its extras " + ", ".join(f"`{extra}`" for extra in EXTRAS) + " on Linux.",
-            "`tools/list_licences.py` writes this page from the metadata of the installed packages, and a test fails when a",
-            "licence is not compatible with ours, Apache-2.0. Metadata speak for the code of a package. Its wheels may contain",
-            "libraries under other licences; the notes name those that we know of. Our wheels contain none of these packages.",
+            "What pip installs with gsplat_edu and its extras "
+            + ", ".join(f"`{extra}`" for extra in EXTRAS)
+            + " on Linux.",
+            "`tools/list_licences.py` writes this page from the metadata of the installed packages. A test fails when a",
+            "licence is not compatible with ours, Apache-2.0. Metadata speak for the code of a package; its wheels may",
+            "contain libraries under other licences; the notes name those that we know of. Our wheels contain none of them.",
             "They contain nanobind (BSD-3-Clause) with robin-map (MIT) and the C++ library of LLVM (Apache-2.0 with",
             "LLVM's exception); the texts are in the wheel's `licenses`, and `sboms/gsplat_edu.cdx.json` lists them.",
             "",

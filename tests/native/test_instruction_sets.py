@@ -8,7 +8,6 @@ import pytest
 
 from gsplat_edu import _native
 
-
 LEVELS = {
     "v2": "cx16 lahf_lm popcnt pni sse4_1 sse4_2 ssse3",
     "v3": "abm avx avx2 bmi1 bmi2 f16c fma movbe xsave",
@@ -17,7 +16,9 @@ LEVELS = {
 """Linux's names for what each level of the x86-64 psABI adds."""
 
 
-@pytest.mark.skipif(not Path("/proc/cpuinfo").exists() or platform.machine() != "x86_64", reason="Linux on x86-64 only")
+@pytest.mark.skipif(
+    not Path("/proc/cpuinfo").exists() or platform.machine() != "x86_64", reason="Linux on x86-64 only"
+)
 def test_the_instruction_sets_are_those_that_the_system_reports():
     flags = set(re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.M)[1].split())
     offered = []

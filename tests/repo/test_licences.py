@@ -1,5 +1,6 @@
 """Licences of what pip installs with the package."""
 
+import importlib
 import sys
 from email.message import Message
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 
-import list_licences
+list_licences = importlib.import_module("list_licences")
 
 
 def test_every_dependency_is_compatible_with_apache_2():

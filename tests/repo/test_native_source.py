@@ -42,6 +42,8 @@ def test_kernel_files_include_only_c_standard_headers():
 
 def test_only_one_file_asks_the_operating_system():
     """So a port to another system changes that file alone."""
-    asked = re.compile(r"#include <(pthread|unistd|time|sys/.*|windows|malloc)\.h>|\b(aligned_alloc|getpid|_WIN32|__APPLE__)\b")
+    asked = re.compile(
+        r"#include <(pthread|unistd|time|sys/.*|windows|malloc)\.h>|\b(aligned_alloc|getpid|_WIN32|__APPLE__)\b"
+    )
     found = {path.name for path in NATIVE.iterdir() if asked.search(path.read_text())}
     assert found == {"system.cpp"}

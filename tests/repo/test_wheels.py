@@ -6,6 +6,7 @@ The module is the one that the set-up compiled from this checkout. `make wheels`
 import base64
 import email.parser
 import hashlib
+import importlib
 import json
 import os
 import subprocess
@@ -22,10 +23,10 @@ import gsplat_edu._native
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 
-import build_wheels
-from wheels import checks
-from wheels.contents import nanobind_parts
-from wheels.pack import pack
+build_wheels = importlib.import_module("build_wheels")
+checks = importlib.import_module("wheels.checks")
+nanobind_parts = importlib.import_module("wheels.contents").nanobind_parts
+pack = importlib.import_module("wheels.pack").pack
 
 FAST_TESTS = (
     *("tests/test_camera.py", "tests/test_sh.py", "tests/test_files.py", "tests/io/test_ply.py"),
@@ -67,7 +68,9 @@ def installed(wheel, tmp_path_factory):
     venv.create(folder, symlinks=True)
     python = folder / "bin" / "python"
     words = ["install", "--quiet", "--no-deps", "--no-index", "--disable-pip-version-check", wheel]
-    done = subprocess.run([sys.executable, "-m", "pip", "--python", python, *words], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", "--python", python, *words], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     (site,) = folder.glob("lib/python3.*/site-packages")
     # A folder named by a .pth file comes after `site`, and its own .pth files, the editable installation, do nothing.
@@ -79,7 +82,14 @@ def run_installed(installed, *words, cwd):
     """Run a program of the environment; PATH holds that environment only, and so no compiler."""
     env = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "GSPLAT"))}
     env |= {"PATH": str(installed / "bin"), "OMP_NUM_THREADS": "1"}
-    return subprocess.run([installed / "bin" / words[0], *words[1:]], cwd=cwd, env=env, capture_output=True, text=True)
+    return subprocess.run(
+        [installed / "bin" / words[0], *words[1:]],
+        cwd=cwd,
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
@@ -87,16 +97,27 @@ def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
     assert done.returncode == 0, done.stderr
     done = run_installed(installed, "gsplat-edu", "demo", "--iters", "50", "--size", "48", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"sphere.png", "sphere_curves.png", "sphere.ply"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "sphere.png",
+        "sphere_curves.png",
+        "sphere.ply",
+    }
 
 
 def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
     # A plugin, which fails the run at its end if it tested anything else.
     lines = "".join(f"    {line}\n" for line in ONLY_INSTALLED.splitlines())
     (tmp_path / "only_installed.py").write_text(f"def pytest_sessionfinish():\n{lines}")
-    words = [f"--rootdir={ROOT}", f"--config-file={ROOT / 'pyproject.toml'}", "-o", "pythonpath=tests conformance"]
+    words = [
+        f"--rootdir={ROOT}",
+        f"--config-file={ROOT / 'pyproject.toml'}",
+        "-o",
+        "pythonpath=tests conformance",
+    ]
     words += ["-q", "-x", "-p", "no:cacheprovider", "-p", "only_installed", "-m", "not own_process"]
-    done = run_installed(installed, "python", "-m", "pytest", *words, *(ROOT / name for name in FAST_TESTS), cwd=tmp_path)
+    done = run_installed(
+        installed, "python", "-m", "pytest", *words, *(ROOT / name for name in FAST_TESTS), cwd=tmp_path
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert " passed" in done.stdout
 
@@ -109,12 +130,20 @@ def test_a_wheel_has_every_file_of_the_package(wheel):
         if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".so"
     }
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {n for n in names if n.startswith("gsplat_edu/")} == wanted | {f"gsplat_edu/{Path(gsplat_edu._native.__file__).name}"}
+    assert {n for n in names if n.startswith("gsplat_edu/")} == wanted | {
+        f"gsplat_edu/{Path(gsplat_edu._native.__file__).name}"
+    }
 
 
 def test_the_same_content_makes_the_same_wheel(wheel, module, tmp_path):
     """The package is packed again by the build backend too, which must not add a time or a folder of its own."""
-    again = pack(build_wheels.pure_wheel(tmp_path), module, "-".join(wheel.stem.split("-")[-3:]), nanobind_parts(), tmp_path)
+    again = pack(
+        build_wheels.pure_wheel(tmp_path),
+        module,
+        "-".join(wheel.stem.split("-")[-3:]),
+        nanobind_parts(),
+        tmp_path,
+    )
     assert again.name == wheel.name
     assert hashlib.sha256(again.read_bytes()).hexdigest() == hashlib.sha256(wheel.read_bytes()).hexdigest()
 
@@ -158,7 +187,9 @@ def test_the_bill_of_materials_names_what_is_linked_and_what_is_required(wheel, 
 
 def test_the_licence_of_everything_linked_is_in_the_wheel(wheel):
     archive = zipfile.ZipFile(wheel)
-    texts = {Path(n).name: archive.read(n).decode() for n in archive.namelist() if ".dist-info/licenses/" in n}
+    texts = {
+        Path(n).name: archive.read(n).decode() for n in archive.namelist() if ".dist-info/licenses/" in n
+    }
     assert "Apache License" in texts["LICENSE"]
     assert "Wenzel Jakob" in texts["nanobind.txt"]
     assert "Permission is hereby granted" in texts["robin-map.txt"]

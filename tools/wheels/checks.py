@@ -1,4 +1,4 @@
-"""What a wheel has to be before anyone installs it: its tag is true, it is small, and it names no folder of the machine."""
+"""Checks of a wheel before anyone installs it: its tag is true, it is small, it names no folder of the machine."""
 
 from __future__ import annotations
 
@@ -11,12 +11,6 @@ from pathlib import Path
 
 MAX_BYTES = 10_000_000
 ROOT = Path(__file__).resolve().parents[2]
-
-SYSTEM_LIBRARIES = {
-    "Darwin": {"/usr/lib/libSystem.B.dylib", "/usr/lib/libc++.1.dylib"},
-    "Windows": {"kernel32.dll", "ntdll.dll", "msvcrt.dll", "python3.dll", "advapi32.dll", "user32.dll", "ws2_32.dll"},
-}
-"""Libraries that a module may load; every such system has them, or Python brings them along."""
 
 
 def own_folders() -> list[str]:
@@ -33,7 +27,11 @@ def named_folders(wheel: Path) -> list[str]:
         for name in archive.namelist():
             data = archive.read(name)
             found += [f"{name}: {folder}" for folder in own_folders() if folder.encode() in data]
-            for part in re.findall(rb"(?:/tmp|/home|/var/folders)/[\w./-]{3,}", data) if name.endswith((".so", ".pyd")) else ():
+            for part in (
+                re.findall(rb"(?:/tmp|/home|/var/folders)/[\w./-]{3,}", data)
+                if name.endswith((".so", ".pyd"))
+                else ()
+            ):
                 found.append(f"{name}: {part.decode()}")
     return found
 
@@ -49,7 +47,9 @@ def wrong_hashes(wheel: Path) -> list[str]:
         stated = {name: digest for name, digest, _ in rows}
         found = []
         for name in archive.namelist():
-            digest = base64.urlsafe_b64encode(hashlib.sha256(archive.read(name)).digest()).rstrip(b"=").decode()
+            digest = (
+                base64.urlsafe_b64encode(hashlib.sha256(archive.read(name)).digest()).rstrip(b"=").decode()
+            )
             if name not in stated or (name != record and stated[name] != f"sha256={digest}"):
                 found.append(name)
     return found
@@ -63,7 +63,9 @@ def audit(wheel: Path) -> list[str]:
     found = []
     folder = Path(sys.executable).parent
     if "manylinux" in wheel.name:
-        done = subprocess.run([folder / "auditwheel", "show", wheel], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [folder / "auditwheel", "show", wheel], capture_output=True, text=True, check=False
+        )
         policies = re.findall(r"manylinux_2_\d+_\w+", done.stdout)
         tag = wheel.stem.rsplit("-", 1)[1]
         if done.returncode or not policies:
@@ -72,7 +74,10 @@ def audit(wheel: Path) -> list[str]:
             found.append(f"auditwheel: it is {policies[0]}, but its tag says {tag}")
     if "abi3" in wheel.name:
         done = subprocess.run(
-            [folder / "abi3audit", "--strict", "--summary", wheel], capture_output=True, text=True, check=False
+            [folder / "abi3audit", "--strict", "--summary", wheel],
+            capture_output=True,
+            text=True,
+            check=False,
         )
         if done.returncode:
             found.append(f"abi3audit: {(done.stdout + done.stderr).strip()}")

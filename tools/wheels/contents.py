@@ -28,7 +28,12 @@ def nanobind_parts() -> list[dict[str, str]]:
         raise SystemExit("wheels: nanobind's robin_map.h does not start with its licence")
     mit = "\n".join(line.strip().removeprefix("*").strip() for line in text[1].strip().splitlines())
     return [
-        {"name": "nanobind", "version": nanobind.__version__, "licence": "BSD-3-Clause", "text": _licence_of("nanobind")},
+        {
+            "name": "nanobind",
+            "version": nanobind.__version__,
+            "licence": "BSD-3-Clause",
+            "text": _licence_of("nanobind"),
+        },
         {"name": "robin-map", "version": "", "licence": "MIT", "text": mit + "\n"},
     ]
 
@@ -50,14 +55,8 @@ def zig_parts(windows: bool) -> list[dict[str, str]]:
     ]
 
 
-def sbom(metadata: Message, module: tuple[str, bytes], bundled: list[dict[str, str]], seconds: int) -> dict[str, object]:
-    """Return the bill of materials of a wheel, in CycloneDX 1.6.
-
-    Components are what the module contains; dependencies that pip installs stand beside them with scope "required" and
-    the range that is asked for.
-    """
-    name, version = metadata["Name"], metadata["Version"]
-    own = f"pkg:pypi/{name}@{version}"
+def _components(metadata: Message, bundled: list[dict[str, str]]) -> list[dict[str, object]]:
+    """Return the parts that are linked into the module, and the dependencies that pip installs."""
     components: list[dict[str, object]] = []
     for part in bundled:
         component: dict[str, object] = {
@@ -85,6 +84,20 @@ def sbom(metadata: Message, module: tuple[str, bytes], bundled: list[dict[str, s
                 "properties": [{"name": "gsplat_edu:range", "value": parsed[2].strip()}],
             }
         )
+    return components
+
+
+def sbom(
+    metadata: Message, module: tuple[str, bytes], bundled: list[dict[str, str]], seconds: int
+) -> dict[str, object]:
+    """Return the bill of materials of a wheel, in CycloneDX 1.6.
+
+    Components are what the module contains; dependencies that pip installs stand beside them with scope "required" and
+    the range that is asked for.
+    """
+    name, version = metadata["Name"], metadata["Version"]
+    own = f"pkg:pypi/{name}@{version}"
+    components = _components(metadata, bundled)
     components.append(
         {
             "type": "file",
@@ -98,7 +111,9 @@ def sbom(metadata: Message, module: tuple[str, bytes], bundled: list[dict[str, s
         "specVersion": "1.6",
         "version": 1,
         "metadata": {
-            "timestamp": datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "timestamp": datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime(
+                "%Y-%m-%dT%H:%M:%SZ"
+            ),
             "component": {
                 "type": "library",
                 "bom-ref": own,

@@ -25,7 +25,9 @@ def epoch() -> int:
     done = subprocess.run(
         ["git", "log", "-1", "--format=%ct"], cwd=ROOT, capture_output=True, text=True, check=False
     )
-    return int(done.stdout) if done.returncode == 0 and done.stdout.strip() else 315532800  # 1980, zip's first year
+    return (
+        int(done.stdout) if done.returncode == 0 and done.stdout.strip() else 315532800
+    )  # 1980, zip's first year
 
 
 def _entry(name: str, seconds: int) -> zipfile.ZipInfo:
@@ -59,7 +61,9 @@ def pack(pure: Path, module: tuple[str, bytes], tag: str, bundled: list[dict[str
     del files[record]
     metadata = Parser().parsestr(files[f"{info}/METADATA"].decode(), headersonly=True)
     files[f"gsplat_edu/{module[0]}"] = module[1]
-    files[f"{info}/WHEEL"] = f"Wheel-Version: 1.0\nGenerator: gsplat_edu\nRoot-Is-Purelib: false\nTag: {tag}\n".encode()
+    files[f"{info}/WHEEL"] = (
+        f"Wheel-Version: 1.0\nGenerator: gsplat_edu\nRoot-Is-Purelib: false\nTag: {tag}\n".encode()
+    )
     for part in bundled:
         files[f"{info}/licenses/{part['name']}.txt"] = part["text"].encode()
     seconds = epoch()

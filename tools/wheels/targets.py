@@ -70,4 +70,4 @@ WINDOWS_PYCONFIG = """\
 #define ALIGNOF_SIZE_T 8
 #define ALIGNOF_MAX_ALIGN_T 8
 """
-"""What Python's headers ask of a Windows machine, for modules of the stable ABI: sizes of C types in the LLP64 model."""
+"""What Python's headers ask of a Windows machine, for modules of the stable ABI: sizes of C types in LLP64."""
