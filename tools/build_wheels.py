@@ -31,6 +31,10 @@ from wheels.contents import nanobind_parts, zig_parts  # noqa: E402
 from wheels.pack import pack  # noqa: E402
 from wheels.targets import TARGETS, WINDOWS_PYCONFIG, Target  # noqa: E402
 
+WITHOUT_LISTS = 'for word; do shift; case "$word" in -Wl,@*) ;; *) set -- "$@" "$word" ;; esac; done\n'
+"""Shell: drop the files of linker options, which zig cannot read. nanobind's lists symbols that Python will have, which
+the linker option for all undefined symbols covers."""
+
 
 class NotBuiltError(Exception):
     """A wheel could not be built; the message says why in one line."""
@@ -87,7 +91,8 @@ def compilers(build: Path, target: Target) -> dict[str, Path]:
     scripts = {}
     for tool, options in (("c++", f"-target {target.zig}"), ("ar", ""), ("ranlib", ""), ("rc", "")):
         path = folder / f"zig-{tool}"
-        path.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m ziglang {tool} {options} "$@"\n')
+        command = f'exec {shlex.quote(sys.executable)} -m ziglang {tool} {options} "$@"'
+        path.write_text(f"#!/bin/sh\n{WITHOUT_LISTS if target.system == 'Darwin' else ''}{command}\n")
         path.chmod(0o755)
         scripts[tool] = path
     return scripts

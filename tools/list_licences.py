@@ -155,11 +155,13 @@ def document() -> str:
             "What pip installs with gsplat_edu and its extras "
             + ", ".join(f"`{extra}`" for extra in EXTRAS)
             + " on Linux.",
-            "`tools/list_licences.py` writes this page from the metadata of the installed packages. A test fails when a",
-            "licence is not compatible with ours, Apache-2.0. Metadata speak for the code of a package; its wheels may",
-            "contain libraries under other licences; the notes name those that we know of. Our wheels contain none of them.",
-            "They contain nanobind (BSD-3-Clause) with robin-map (MIT) and the C++ library of LLVM (Apache-2.0 with",
-            "LLVM's exception); the texts are in the wheel's `licenses`, and `sboms/gsplat_edu.cdx.json` lists them.",
+            "`tools/list_licences.py` writes this page from the metadata of the installed packages. A test fails",
+            "when a licence is not compatible with ours, Apache-2.0. Metadata speak for the code of a package; its",
+            "wheels may contain libraries under other licences, and the notes name those that we know of.",
+            "",
+            "Our wheels contain none of these packages. They contain nanobind (BSD-3-Clause) with robin-map (MIT) and",
+            "the C++ library of LLVM (Apache-2.0 with LLVM's exception). The texts are in the wheel's `licenses`, and",
+            "`sboms/gsplat_edu.cdx.json` lists them.",
             "",
             "| package | licence | note |",
             "| --- | --- | --- |",

@@ -9,6 +9,7 @@ import hashlib
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -206,3 +207,10 @@ def test_a_folder_and_a_changed_file_are_found(module, pure, tmp_path):
     with zipfile.ZipFile(bad, "a") as archive:
         archive.writestr("gsplat_edu/added.py", "")
     assert checks.wrong_hashes(bad) == ["gsplat_edu/added.py"]
+
+
+def test_every_document_states_the_same_version():
+    for name in ("CITATION.cff", "packaging/conda/recipe.yaml"):
+        (stated,) = re.findall(r"^ *version: \"?(\d[\d.]*)", (ROOT / name).read_text(), re.M)
+        assert stated == gsplat_edu.__version__, name
+    assert f"gsplat_edu-{gsplat_edu.__version__}-" in (ROOT / "docs" / "INSTALL.md").read_text()
