@@ -41,6 +41,7 @@ FIRST = (
     "tests/viewer/test_live_browser.py",
     "tests/runs/test_training.py",
     "tests/runs/test_processes.py",
+    "tests/repo/test_wheels.py",
     "tests/train/test_batches.py",
     "tests/gpu/test_training.py",
     "tests/blocks/test_cluster.py",

@@ -106,10 +106,10 @@ def installed() -> dict[str, Distribution]:
 
 def licence(package: Distribution) -> str:
     """Return a package's licence as an SPDX expression; what it says itself if that is not one."""
-    expression = package.metadata["License-Expression"]
+    expression = package.metadata.get("License-Expression")  # KeyError with the backport that dask imports
     if expression:
         return expression
-    stated = (package.metadata["License"] or "").strip()
+    stated = (package.metadata.get("License") or "").strip()
     if stated and "\n" not in stated and len(stated) < 60:
         return WORDS.get(stated, stated)
     named = [

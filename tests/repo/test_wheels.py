@@ -30,8 +30,8 @@ nanobind_parts = importlib.import_module("wheels.contents").nanobind_parts
 pack = importlib.import_module("wheels.pack").pack
 
 FAST_TESTS = (
-    *("tests/test_camera.py", "tests/test_sh.py", "tests/test_files.py", "tests/io/test_ply.py"),
-    *("tests/io/test_spz.py", "tests/native/test_parity.py", "tests/viewer/test_content_policy.py"),
+    *("tests/test_camera.py", "tests/io/test_ply.py"),
+    *("tests/native/test_parity.py", "tests/viewer/test_content_policy.py"),
 )
 """Of the references, the kernels, the formats, and the files of the package that are not Python."""
 

@@ -239,7 +239,8 @@ def _watch(client: Any, futures: Sequence[Any], options: ClusterOptions, watch: 
     while not all(future.status in ("finished", "error") for future in futures):
         time.sleep(POLL)
         watch()
-        if client.status != "running" or any(future.status in ("cancelled", "lost") for future in futures):
+        # A future whose worker took its answer along is "lost" until another worker gives the answer again.
+        if client.status != "running" or any(future.status == "cancelled" for future in futures):
             raise CheckpointError(f"{place}: the scheduler was lost; {AGAIN}")
         try:
             workers = client.scheduler_info(n_workers=-1)["workers"]
