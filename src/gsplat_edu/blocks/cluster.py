@@ -27,7 +27,7 @@ from gsplat_edu.headroom import shortage
 LOOPBACK = "127.0.0.1"
 
 FAILURES = 20
-"""A block is given up after this many workers were lost while they trained it. Each goes on from its checkpoint."""
+"""How many workers a block may lose before it is abandoned. Each next worker resumes from the last checkpoint."""
 
 PATIENCE = 60.0
 """Seconds without a worker or a scheduler after which the command ends."""
@@ -35,7 +35,7 @@ PATIENCE = 60.0
 POLL = 0.5
 """Seconds between two looks at the cluster."""
 
-AGAIN = "finished blocks and checkpoints are kept: run the same command with --resume to go on"
+AGAIN = "finished blocks and checkpoints are kept: run the same command with --resume to continue"
 
 _ONE_AT_A_TIME = threading.Lock()
 
@@ -72,7 +72,7 @@ def run_on_cluster(
 ) -> None:
     """Train blocks on a cluster.
 
-    A lost worker's block goes on elsewhere from its last checkpoint. If a block fails, the others are still trained.
+    If a worker is lost, another resumes its block from the last checkpoint. If a block fails, the others are still trained.
 
     Args:
         folder: The run in blocks, under the same path on every worker.

@@ -62,7 +62,7 @@ def recipe_of(options: RunOptions) -> dict[str, Any]:
 
 
 def check_recipe(folder: Path, plan: BlockPlan, options: RunOptions) -> None:
-    """Compare the options of a command that goes on with those of the plan.
+    """Compare the options of a resumed command with those of the plan.
 
     Raises:
         CheckpointError: one differs; the message names it.

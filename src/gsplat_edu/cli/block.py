@@ -28,6 +28,6 @@ def run(arguments: argparse.Namespace) -> None:
         done = train_block(path, number, arguments.data, say, interrupted)
     if done is None:
         raise KeyboardInterrupt(
-            f"interrupted in block {number}; the same command goes on from its checkpoint"
+            f"interrupted in block {number}; the same command resumes from its checkpoint"
         )
     say(f"block {number}: {done.iterations} iterations in {done.seconds:.1f} s, {done.gaussians:,} Gaussians")
