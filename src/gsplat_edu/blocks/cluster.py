@@ -72,7 +72,8 @@ def run_on_cluster(
 ) -> None:
     """Train blocks on a cluster.
 
-    If a worker is lost, another resumes its block from the last checkpoint. If a block fails, the others are still trained.
+    If a worker is lost, another resumes its block from the last checkpoint. If a block fails, the others are still
+    trained.
 
     Args:
         folder: The run in blocks, under the same path on every worker.
