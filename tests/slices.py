@@ -2,9 +2,10 @@
 
 A test marked `sliced(n)` has more cases than a change should wait for. A run draws n of them with the commit's hash as
 seed, so the choice varies between commits and is the same in all processes of a run. `sliced(n, by="is_named")` draws n
-for each value of that parameter, and tests marked `sliced(n, group="name")` share their n. Fuzzers also derive the seed
-of their first damaged file from the commit. With GSPLAT_EDU_SOAK=1 (`make soak`) every case runs. conftest.py imports
-the hooks from here.
+for each value of that parameter, and tests marked `sliced(n, group="name")` share their n. With `together=True`, the
+tests of a file that are marked for a group count as one case, because they share an expensive fixture. Fuzzers also
+derive the seed of their first damaged file from the commit. With GSPLAT_EDU_SOAK=1 (`make soak`) every case runs.
+conftest.py imports the hooks from here.
 """
 
 import os
@@ -83,17 +84,22 @@ def split(items: list[pytest.Item], seed: int) -> tuple[list[pytest.Item], list[
     Returns:
         The tests to run, in their original order, and the others.
     """
-    cases: dict[str, list[pytest.Item]] = {}
+    groups: dict[str, dict[str, list[pytest.Item]]] = {}
+    sizes: dict[str, int] = {}
     for item in items:
         if marker := item.get_closest_marker("sliced"):
             kind = item.callspec.params[marker.kwargs["by"]] if "by" in marker.kwargs else ""
-            name = marker.kwargs.get("group", item.nodeid.partition("[")[0])
-            cases.setdefault(f"{name} {kind}", []).append(item)
+            name = f"{marker.kwargs.get('group', item.nodeid.partition('[')[0])} {kind}"
+            case = item.nodeid.partition("::")[0] if marker.kwargs.get("together") else item.nodeid
+            groups.setdefault(name, {}).setdefault(case, []).append(item)
+            if marker.args:
+                sizes[name] = marker.args[0]
     left_out: set[pytest.Item] = set()
-    for name, group in cases.items():
-        size = next(iter(group[0].get_closest_marker("sliced").args), len(group))
-        drawn = random.Random(f"{seed} {name}").sample(group, min(size, len(group)))
-        left_out |= set(group) - set(drawn)
+    for name, cases in groups.items():
+        drawn = random.Random(f"{seed} {name}").sample(
+            list(cases), min(sizes.get(name, len(cases)), len(cases))
+        )
+        left_out |= {item for case, tests in cases.items() if case not in drawn for item in tests}
     return [item for item in items if item not in left_out], [item for item in items if item in left_out]
 
 

@@ -85,8 +85,8 @@ def broken(pages, out):
     return found
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_no_link_is_broken_and_nothing_is_loaded_from_elsewhere(site):
     pages, out = site
     assert broken(pages, out) == []
@@ -96,6 +96,7 @@ def test_no_link_is_broken_and_nothing_is_loaded_from_elsewhere(site):
 
 
 @pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_every_chapter_document_and_module_has_a_page(site):
     pages, out = site
     names = {str(path.relative_to(out).with_suffix("")) for path in pages}
@@ -108,6 +109,7 @@ def test_every_chapter_document_and_module_has_a_page(site):
 
 
 @pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_landing_page_shows_pictures_and_three_ways_in(site):
     pages, out = site
     text = (out / "index.html").read_text()
@@ -122,6 +124,7 @@ def test_the_landing_page_shows_pictures_and_three_ways_in(site):
 
 
 @pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_reference_begins_with_the_public_api_and_links_every_name(site):
     _, out = site
     text = (out / "reference" / "index.html").read_text()
@@ -135,6 +138,7 @@ def test_the_reference_begins_with_the_public_api_and_links_every_name(site):
 
 
 @pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_set_up_cells_are_folded_and_others_are_not(site):
     _, out = site
     for path in (out / "notebooks").glob("*.html"):
@@ -145,6 +149,7 @@ def test_set_up_cells_are_folded_and_others_are_not(site):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1440, 390])
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_no_line_of_code_is_cut_off(site, width, browser):
     """Code and printed output fit or wrap."""
     _, out = site
@@ -162,6 +167,7 @@ def test_no_line_of_code_is_cut_off(site, width, browser):
 
 
 @pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_broken_links_are_found(site, tmp_path):
     texts = {"a": '<a href="b.html#here"><a href="gone.html#x">', "b": '<p id="there"><img src="c.png">'}
     for name, text in texts.items():
@@ -170,8 +176,8 @@ def test_broken_links_are_found(site, tmp_path):
     assert broken(pages, tmp_path) == ["a.html: b.html#here", "a.html: gone.html#x", "b.html: c.png"]
 
 
-@pytest.mark.sliced(1)
 @pytest.mark.slow
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_no_equation_and_no_docstring_is_garbled(site):
     pages, _ = site
     for path, page in pages.items():

@@ -66,6 +66,17 @@ def test_the_tests_of_a_group_share_what_is_drawn():
     assert set().union(*drawn) == set(names(items))
 
 
+def test_tests_that_share_a_fixture_are_drawn_together():
+    mark = pytest.mark.sliced(1, group="built", together=True)
+    items = [
+        *cases("a.py::one", mark, range(2)),
+        *cases("a.py::two", mark, range(1)),
+        *cases("b.py::one", mark, range(2)),
+    ]
+    drawn = {tuple(names(slices.split(items, seed)[0])) for seed in range(100)}
+    assert drawn == {("a.py::one[0]", "a.py::one[1]", "a.py::two[0]"), ("b.py::one[0]", "b.py::one[1]")}
+
+
 @pytest.mark.parametrize(("mark", "count"), [(pytest.mark.sliced(0), 0), (pytest.mark.sliced, 4)])
 def test_a_test_may_run_only_in_a_soak_or_always(mark, count):
     """sliced(0) runs only in a soak. A test sliced without a number selects its own files."""

@@ -93,6 +93,7 @@ def run_installed(installed, *words, cwd):
     )
 
 
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
     done = run_installed(installed, "python", "-c", ONLY_INSTALLED, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -105,6 +106,7 @@ def test_the_demo_runs_from_the_wheel_without_a_compiler(installed, tmp_path):
     }
 
 
+@pytest.mark.sliced(1, group="built whole", together=True)
 def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
     # A plugin, which fails the run at its end if it tested anything else.
     lines = "".join(f"    {line}\n" for line in ONLY_INSTALLED.splitlines())

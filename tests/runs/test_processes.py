@@ -181,7 +181,7 @@ WORDS = (
 
 
 @pytest.mark.own_process
-@pytest.mark.sliced(1)
+@pytest.mark.sliced(2, group="several processes")
 @pytest.mark.parametrize(("size", "victim"), [(2, 0), (2, 1), (4, None), (4, 3)])
 def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tmp_path, size, victim):
     assert main(["train", str(capture), "--out", str(tmp_path / "alone"), *WORDS]) == 0

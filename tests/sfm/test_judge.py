@@ -6,7 +6,10 @@ import pytest
 
 from sfm.engine_check import printed
 
-pytestmark = pytest.mark.usefixtures("colmap")
+pytestmark = [
+    pytest.mark.usefixtures("colmap"),
+    pytest.mark.sliced(4, group="captures from photos", together=True),
+]
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,10 @@ from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.sfm import mapping
 from sfm.engine_check import printed
 
-pytestmark = pytest.mark.usefixtures("colmap")
+pytestmark = [
+    pytest.mark.usefixtures("colmap"),
+    pytest.mark.sliced(4, group="captures from photos", together=True),
+]
 
 SOUND, ALL = 26, 40
 

@@ -13,7 +13,10 @@ from gsplat_edu.data.textured_box import align_cameras, box_camera, photograph_b
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from sfm.textured_box import cameras_of
 
-pytestmark = pytest.mark.usefixtures("colmap")
+pytestmark = [
+    pytest.mark.usefixtures("colmap"),
+    pytest.mark.sliced(4, group="captures from photos", together=True),
+]
 
 
 def captured(folder, photos, **options):

@@ -207,6 +207,7 @@ def test_masks_of_things_that_move_are_found_before_the_step_that_has_their_imag
 
 @pytest.mark.parametrize("name", [*CONFIGS])
 @pytest.mark.parametrize("extra", [{}, {"appearance": "exposure", "refine": "both"}], ids=["plain", "models"])
+@pytest.mark.sliced(2)
 def test_ranks_train_to_the_same_bits(name, extra):
     """Gaussians change their number, and with it the ranges that the ranks move."""
     settings = config(name, **extra) if not extra else config(name, **extra, random_background=False)
@@ -332,6 +333,7 @@ def test_what_does_not_fit_a_batch_is_refused():
         )
 
 
+@pytest.mark.sliced(3, group="quality that comes back")
 def test_batches_learn_as_well_from_as_many_images():
     """Measured: 29.5, 29.3 and 29.3 dB for batches of 1, 2 and 4; at the rates of one view 29.5, 28.5 and 27.3 dB."""
     views, points, colors = procedural_capture(24, 9, splats=300)
