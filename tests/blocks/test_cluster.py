@@ -95,7 +95,7 @@ def wait_for(condition):
         time.sleep(0.02)
 
 
-@pytest.mark.sliced(2, group="several processes")
+@pytest.mark.sliced(1, group="several processes")
 def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(city, split, serial, tmp_path):
     draw = random.Random(SEED)
     moments = sorted(draw.sample(range(5, 140), 2))
@@ -135,7 +135,7 @@ def test_a_killed_worker_and_a_killed_scheduler_lose_nothing(city, split, serial
     assert {n: folder.record(n).stat().st_mtime_ns for n in finished} == finished, "nothing is done again"
 
 
-@pytest.mark.sliced(2, group="several processes")
+@pytest.mark.sliced(1, group="several processes")
 def test_a_local_cluster_gives_the_bytes_too_and_names_what_fails(city, split, serial, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(split, run)

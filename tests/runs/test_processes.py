@@ -120,6 +120,7 @@ def test_processes_that_compute_differently_are_refused(name):
 
 
 @pytest.mark.parametrize("size", [2, 4])
+@pytest.mark.sliced(1)
 def test_a_run_of_several_processes_has_the_bytes_of_one(capture, alone, tmp_path, size):
     together(size, lambda team: train(options(capture, tmp_path / "run"), team))
     assert scene(tmp_path / "run") == scene(alone)
@@ -181,7 +182,7 @@ WORDS = (
 
 
 @pytest.mark.own_process
-@pytest.mark.sliced(2, group="several processes")
+@pytest.mark.sliced(1, group="several processes")
 @pytest.mark.parametrize(("size", "victim"), [(2, 0), (2, 1), (4, None), (4, 3)])
 def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tmp_path, size, victim):
     assert main(["train", str(capture), "--out", str(tmp_path / "alone"), *WORDS]) == 0

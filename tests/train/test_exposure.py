@@ -53,7 +53,7 @@ def fitted(run, views):
     return summarize(scores)["psnr_fitted"]
 
 
-@pytest.mark.sliced(3, group="quality that comes back")
+@pytest.mark.sliced(2, group="quality that comes back")
 def test_exposures_come_back_and_the_held_out_quality_with_them(capture):
     even, uneven, *_, scales = capture
     held_out = even[HELD_OUT]
