@@ -110,6 +110,7 @@ class EditServer(PageServer):
 
 class _Handler(PageHandler):
     server: EditServer
+    _known = False  # whether the request brought the token
 
     def _answer(self) -> bytes:
         if (fault := self._fault()) is not None:
@@ -133,7 +134,7 @@ class _Handler(PageHandler):
         return body
 
     def end_headers(self) -> None:
-        if self._fault() is None:
+        if self._known:
             cookie = f"{self.server.cookie}={self.server.token}; Path=/; HttpOnly; SameSite=Strict"
             self.send_header("Set-Cookie", cookie)
         self.send_header("Referrer-Policy", "no-referrer")  # the URL is a secret
@@ -175,8 +176,6 @@ class _Handler(PageHandler):
 
     def _fault(self) -> str | None:
         """Return why a request is refused; None if it is not."""
-        if getattr(self, "headers", None) is None:  # the request cannot even be parsed
-            return "no headers"
         if not self._is_for_us():
             return "unknown host name for this server"
         given = [*urllib.parse.parse_qs(urllib.parse.urlsplit(self.path).query).get("token", [])]
@@ -189,6 +188,7 @@ class _Handler(PageHandler):
                 given.append(cookies[self.server.cookie].value)
         if not any(secrets.compare_digest(one.encode(), self.server.token.encode()) for one in given):
             return "open the URL that the command printed, including its token"
+        self._known = True
         return None
 
     def _foreign(self) -> str | None:

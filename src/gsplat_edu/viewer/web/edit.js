@@ -26,7 +26,7 @@ class Editor {
     this.history = new EditHistory(scene.values, operations);
     this.stored = this.text();
     this.lengthText = (length) => this.textOf(length);
-    this.texture = new FlagTexture(viewer.renderer, scene.count);
+    this.texture = viewer.renderer.flags ??= new FlagTexture(viewer.renderer);
     this.overlay = new Overlay(viewer);
     const { start: camera, pivot, up } = viewer.view;
     this.opened = { camera, pivot, up, path: viewer.keyframes.path, text: "" };

@@ -6,19 +6,14 @@ const HANDLE = 7; // pixels
 
 // The states as a texture that the shader reads: hidden and deleted splats are not drawn, selected ones are coloured.
 class FlagTexture {
-  constructor(renderer, count) {
+  constructor(renderer) {
     const gl = renderer.gl;
     this.renderer = renderer;
     this.width = renderer.textureWidth;
     this.unit = layout(renderer.facts).length;
     gl.activeTexture(gl.TEXTURE0 + this.unit);
     this.texture = nearestTexture(gl);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R8UI, this.width, Math.max(1, Math.ceil(count / this.width)));
-    const setUniforms = renderer.setUniforms.bind(renderer);
-    renderer.setUniforms = (camera, settings) => {
-      setUniforms(camera, settings);
-      this.bind();
-    };
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R8UI, this.width, Math.max(1, Math.ceil(renderer.facts.count / this.width)));
   }
 
   bind() {
@@ -44,6 +39,14 @@ class FlagTexture {
     }
   }
 }
+
+// Every renderer of the page gets the texture, from its first picture on: the shader needs it.
+const drawsWithoutFlags = Renderer.prototype.setUniforms;
+Renderer.prototype.setUniforms = function (camera, settings) {
+  drawsWithoutFlags.call(this, camera, settings);
+  this.flags ??= new FlagTexture(this);
+  this.flags.bind();
+};
 
 // Lines above the picture. Its methods take CSS pixels, or points of the scene.
 class Overlay {

@@ -330,14 +330,16 @@ function describeOperation(operation) {
   const { op, how, by, name, note } = operation;
   const verbs = { replace: "select", add: "add", subtract: "subtract", intersect: "intersect" };
   if (op === "select") return by === "all" ? "select all" : `${verbs[how]} by ${by === "color" ? "colour" : by}`;
-  const points = operation.points && length3(plus(operation.points[0], operation.points[1], -1));
+  if (op === "scale") {
+    const apart = length3(plus(...operation.points, -1));
+    return `scale: ${shortNumber(apart)} units = ${operation.length} ${operation.unit}`;
+  }
   const texts = {
     deselect: "select none",
     invert: "invert",
     crop: "crop to box",
     show: "show hidden",
     upright: "turn upright",
-    scale: `scale: ${shortNumber(points)} units = ${operation.length} ${operation.unit}`,
     start: "start view",
     view: `view ${name}`,
     remove_view: `remove view ${name}`,

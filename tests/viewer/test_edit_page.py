@@ -1,0 +1,202 @@
+"""The editor in a real browser: what it selects, deletes and stores is what Python applies, to the last splat."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.cli.main import main
+from gsplat_edu.edits.apply import DELETED, HIDDEN, SELECTED, flags_after, placed, views_after
+from gsplat_edu.edits.document import read_edits
+from gsplat_edu.io.formats import read_scene, write_scene
+from gsplat_edu.io.scene import Scene
+from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.runs.source import Source
+from gsplat_edu.viewer import page
+from gsplat_edu.viewer.edit_page import editing_of
+
+SEEDS = 20
+GESTURES = 25
+SIZE = (360, 240)
+"""Small, so that a picture takes little time. The panel takes the lower part."""
+
+# Plays gestures by the events that a browser sends: clicks of buttons, input into fields, pointers on the canvas.
+PLAY = """async (gestures) => {
+  const canvas = document.getElementById("canvas");
+  const fire = (target, kind, [x, y], keys = {}) => target.dispatchEvent(new PointerEvent(kind, {
+    bubbles: true, cancelable: true, pointerId: 7, button: 0, clientX: x, clientY: y, ...keys }));
+  for (const { click, fill, drag, keys, key, turn } of gestures) {
+    if (click) document.querySelector(click).click();
+    if (fill) {
+      const field = document.querySelector(fill[0]);
+      field.value = fill[1];
+      field.dispatchEvent(new Event("input", { bubbles: true }));
+    }
+    if (key) canvas.dispatchEvent(new KeyboardEvent("keydown", { key, code: key, bubbles: true, cancelable: true }));
+    if (turn) {
+      viewer.view.orbit(...turn);
+      viewer.moved(-1);
+    }
+    if (drag) {
+      await viewer.settled();
+      fire(canvas, "pointerdown", drag[0], keys);
+      for (const point of drag.slice(1)) fire(canvas, "pointermove", point, keys);
+      fire(canvas, "pointerup", drag[drag.length - 1], keys);
+    }
+  }
+}"""
+
+STATE = """() => ({ text: editor.text(), flags: [...editor.history.flags] })"""
+
+
+def source_of(gaussians, path="scene.ply", origin=(0.0, 0.0, 0.0)):
+    return Source(path, Scene(gaussians), (), RenderSettings(jacobian_limit=1.3, depth=False), origin)
+
+
+@pytest.fixture
+def edit(visit, tmp_path):
+    """Write a scene and its page with the editor; open the page."""
+
+    def make(gaussians, origin=(0.0, 0.0, 0.0), width=SIZE[0], height=SIZE[1], **options):
+        source = source_of(gaussians, tmp_path / "scene.ply", origin)
+        editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
+        html = page.html(source.scene, (), source.settings, "scene", (), page.Tour(None, origin), editing)
+        (tmp_path / "edit.html").write_bytes(html)
+        write_scene(tmp_path / "scene.ply", source.scene)
+        shown = visit(width=width, height=height, **options).open(tmp_path / "edit.html").ready()
+        shown.tab.wait_for_selector("#edit")
+        return shown
+
+    return make
+
+
+def state(shown):
+    found = shown.tab.evaluate(STATE)
+    return found["text"], np.array(found["flags"], dtype=np.uint8)
+
+
+def gestures_of(seed):
+    """Random gestures with every tool. Selections come often, so that deleting has something to delete."""
+    rng = np.random.default_rng(seed)
+    W, H = SIZE
+
+    def point():
+        return (np.array([W / 2, 0.29 * H]) + rng.uniform(-45, 45, 2)).tolist()
+
+    def stroke(most):
+        steps = rng.normal(0, 12, (int(rng.integers(2, most)), 2)).cumsum(axis=0)
+        return [point(), *np.clip(steps + point(), (1, 1), (W - 1, H - 1)).tolist()]
+
+    def keys():
+        return {"shiftKey": bool(rng.random() < 0.2), "ctrlKey": bool(rng.random() < 0.2)}
+
+    def tool(name):
+        return {"click": f"[data-tool={name}]"}
+
+    def does(name):
+        return {"click": f"[data-do={name}]"}
+
+    def fill(name, value):
+        return {"fill": [f"#{name}", str(value)]}
+
+    kinds = {
+        "rectangle": lambda: [tool("rectangle"), {"drag": [point(), point(), point()], "keys": keys()}],
+        "lasso": lambda: [tool("lasso"), {"drag": stroke(30), "keys": keys()}],
+        "brush": lambda: [
+            tool("brush"),
+            fill("edit-radius", int(rng.integers(5, 30))),
+            {"drag": stroke(12), "keys": keys()},
+        ],
+        "sphere": lambda: [tool("sphere"), {"drag": [point(), point()]}, does("select-shape")],
+        "box": lambda: [
+            tool("box"),
+            {"fill": ["#edit-half input", str(rng.uniform(0.1, 1.0))]},
+            {"fill": ["#edit-center label:last-child input", str(rng.uniform(-0.5, 0.5))]},
+            does("select-shape"),
+        ],
+        "color": lambda: [
+            tool("color"),
+            {"drag": [point()]},
+            fill("edit-tolerance", int(rng.integers(20, 120))),
+            does("select-color"),
+        ],
+        "opacity": lambda: [
+            fill("edit-opacity-low", round(0.5 * float(rng.random()), 2)),
+            fill("edit-opacity-high", round(0.5 + 0.5 * float(rng.random()), 2)),
+            does("select-opacity"),
+        ],
+        "size": lambda: [
+            fill("edit-size-low", round(0.1 * float(rng.random()), 3)),
+            fill("edit-size-high", ""),
+            does("select-size"),
+        ],
+        "how": lambda: [{"click": f"[data-how={rng.choice(['replace', 'add', 'subtract', 'intersect'])}]"}],
+        "state": lambda: [does(rng.choice(["all", "none", "invert", "delete", "hide", "show"]))],
+        "delete": lambda: [does("delete")],
+        "turn": lambda: [{"turn": rng.normal(0, 0.8, 2).tolist()}],
+        "undo": lambda: [does("undo"), does("undo"), does("redo")],
+        "crop": lambda: [tool("box"), {"fill": ["#edit-half input", "2.5"]}, does("crop")],
+        "floor": lambda: [tool("floor"), *({"drag": [point()]} for _ in range(3))],
+        "scale": lambda: [
+            tool("scale"),
+            *({"drag": [point()]} for _ in range(2)),
+            fill("edit-length", 1.5),
+            does("scale"),
+        ],
+        "measure": lambda: [tool("measure"), *({"drag": [point()]} for _ in range(2)), does("measure")],
+        "view": lambda: [fill("edit-name", f"view {rng.integers(3)}"), does("view"), does("start")],
+        "path": lambda: [{"key": "k"}, {"turn": [0.2, 0.1]}, {"key": "k"}],
+    }
+    weights = np.array(
+        [3 if name in ("rectangle", "lasso", "brush", "sphere", "turn") else 1 for name in kinds]
+    )
+    chosen = rng.choice(list(kinds), GESTURES, p=weights / weights.sum())
+    return [gesture for name in chosen for gesture in kinds[name]()]
+
+
+def test_random_sequences_select_and_delete_the_same_splats_as_the_command(edit, random_gaussians, tmp_path):
+    """The page and `convert --edits` agree on every splat; undoing all returns the first bytes, redoing the last."""
+    kinds, states = set(), set()
+    for seed in range(SEEDS):
+        gaussians = random_gaussians(300, rest=(0, 3, 8, 15)[seed % 4], seed=seed)
+        shown = edit(gaussians)
+        opened = state(shown)
+        assert not opened[1].any()
+        shown.tab.evaluate(PLAY, gestures_of(seed))
+        assert shown.complaints == []
+        text, flags = state(shown)
+        (tmp_path / "edits.json").write_text(text)
+        edits = read_edits(tmp_path / "edits.json")
+        np.testing.assert_array_equal(flags_after(edits.operations, gaussians), flags, err_msg=f"seed {seed}")
+        kinds |= {(entry["op"], entry.get("by")) for entry in json.loads(text)["operations"]}
+        states |= set(flags.tolist())
+        words = ["convert", str(tmp_path / "scene.ply"), "--edits", str(tmp_path / "edits.json")]
+        left = flags <= SELECTED
+        assert main([*words, str(tmp_path / "out.ply")]) == (0 if left.any() else 2)
+        if left.any():
+            kept = Scene(gaussians.map(lambda tensor, left=left: tensor[torch.from_numpy(left)]))
+            expected = placed(kept, views_after(edits.operations)).gaussians.tensors()
+            for name, tensor in read_scene(tmp_path / "out.ply").gaussians.tensors().items():
+                assert torch.equal(tensor, expected[name]), (seed, name)
+        if seed % 2:  # without what was remembered, undo repeats the operations before
+            shown.tab.evaluate("editor.history.changes.forEach((_, i) => editor.history.forget(i))")
+        count = len(edits.operations)
+        shown.tab.evaluate(
+            f"for (let i = 0; i < {count}; ++i) document.querySelector('[data-do=undo]').click()"
+        )
+        undone = state(shown)
+        assert undone[0] == opened[0] and not undone[1].any()
+        shown.tab.evaluate(
+            f"for (let i = 0; i < {count}; ++i) document.querySelector('[data-do=redo]').click()"
+        )
+        redone = state(shown)
+        assert redone[0] == text
+        np.testing.assert_array_equal(redone[1], flags)
+        shown.leave()
+        shown.__init__(shown.tab)
+    assert states == {0, SELECTED, HIDDEN, DELETED}
+    selects = {"rectangle", "lasso", "brush", "sphere", "box", "color", "opacity", "size", "all"}
+    others = ["deselect", "invert", "delete", "hide", "show", "crop"]
+    others += ["upright", "scale", "measure", "view", "start", "path"]
+    assert kinds == {("select", by) for by in selects} | {(op, None) for op in others}
