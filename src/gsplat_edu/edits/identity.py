@@ -11,12 +11,15 @@ import torch
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.json_fields import check_keys, mapping, numbers, shown, whole
+from gsplat_edu.json_fields import check_keys, mapping, numbers_within, shown, whole
 
 ORDER = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 """Parameters in the order in which they are hashed."""
 
 MOST_SPLATS = 1 << 32
+
+FARTHEST_ORIGIN = 1e30
+"""World units, along each axis."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class Identity:
         digest = entry["sha256"]
         if not isinstance(digest, str) or len(digest) != 64 or set(digest) - set("0123456789abcdef"):
             raise ArgumentError(f"{where}.sha256: is {shown(digest)}, but has to be 64 hexadecimal digits")
-        x, y, z = numbers(f"{where}.origin", entry["origin"], 3)
+        x, y, z = numbers_within(f"{where}.origin", entry["origin"], 3, FARTHEST_ORIGIN)
         return cls(whole(f"{where}.count", entry["count"], 0, MOST_SPLATS), digest, (x, y, z))
 
     def difference(self, other: Identity) -> str | None:
