@@ -1,13 +1,12 @@
 """The editor in a real browser: what it selects, deletes and stores is what Python applies, to the last splat."""
 
-import json
 
 import numpy as np
 import pytest
 import torch
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.edits.apply import DELETED, HIDDEN, SELECTED, flags_after, placed, views_after
+from gsplat_edu.edits.apply import SELECTED, flags_after, placed, views_after
 from gsplat_edu.edits.document import read_edits
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.scene import Scene
