@@ -1,4 +1,4 @@
-"""The editor's server, with real sockets: only its own page may write, only edits of its scene, only the newest."""
+"""The editor's server, with real sockets: only its own page may write, and only valid, newest edits of its scene."""
 
 import http.client
 import json
