@@ -1,13 +1,17 @@
 """The editor in a real browser: what it selects, deletes and stores is what Python applies, to the last splat."""
 
+import json
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.edits.apply import SELECTED, flags_after, placed, views_after
-from gsplat_edu.edits.document import read_edits
+from gsplat_edu.edits.document import parse_edits, read_edits
+from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.edits.membership import Values, members
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
@@ -201,7 +205,6 @@ def test_random_sequences_select_and_delete_the_same_splats_as_the_command(
 
 
 def test_the_random_sequences_hold_every_gesture():
-    """Each gesture performs its operation where it meets a splat, as `test_each_gesture` shows."""
     gestures = [gesture for seed in range(SEEDS) for gesture in gestures_of(seed)]
     clicked = {gesture["click"].split("=")[1].strip("]") for gesture in gestures if "click" in gesture}
     assert clicked >= {"rectangle", "lasso", "brush", "sphere", "box", "color", "floor", "scale", "measure"}
@@ -218,3 +221,86 @@ def test_the_random_sequences_hold_every_gesture():
         "undo",
         "redo",
     }
+
+
+HOLDS = """([regions, { count, ...arrays }]) => {
+  const values = { count, ...Object.fromEntries(Object.entries(arrays).map(([k, v]) => [k, new Float32Array(v)])) };
+  return regions.map((region) => [...members(region, values)]);
+}"""
+
+
+def random_regions(rng, count):
+    """Regions as a file has them, with numbers of every kind: whole, tiny, huge, and exactly those of splats."""
+
+    def numbers(n, spread=1.0):
+        return (spread * rng.normal(size=n)).round(int(rng.integers(0, 17))).tolist()
+
+    def rotation():
+        return Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix().tolist()
+
+    def camera():
+        at = numbers(3, 2.0)
+        sizes = dict(zip(("fx", "fy", "cx", "cy"), rng.uniform(10, 300, 4).tolist(), strict=True))
+        return {"position": at, "rotation": rotation(), **sizes, "width": 300, "height": 200}
+
+    made = []
+    for _ in range(count):
+        u0, u1, v0, v1 = *np.sort(rng.uniform(-50, 350, 2)), *np.sort(rng.uniform(-50, 250, 2))
+        low, high = sorted(numbers(2))
+        points = rng.uniform(-20, 320, (int(rng.integers(3, 40)), 2))
+        half = np.abs(numbers(3)) + 0.01
+        made += [
+            {"by": "rectangle", "camera": camera(), "corners": [float(x) for x in (u0, v0, u1, v1)]},
+            {"by": "lasso", "camera": camera(), "points": points.tolist()},
+            {"by": "lasso", "camera": camera(), "points": points.round().tolist()},
+            {
+                "by": "brush",
+                "camera": camera(),
+                "radius": 10.0,
+                "points": points[: len(points) // 3 + 1].tolist(),
+            },
+            {"by": "sphere", "center": numbers(3), "radius": float(10.0 ** rng.uniform(-2, 30))},
+            {"by": "sphere", "center": [0, 0, 0], "radius": 1},
+            {"by": "box", "center": numbers(3), "rotation": rotation(), "half": half.tolist()},
+            {"by": "color", "low": [-1, low, -1e6], "high": [1, 1e6, high]},
+            {"by": "opacity", "low": low},
+            {"by": "size", "low": low, "high": high},
+        ]
+    return made
+
+
+def test_both_languages_find_the_same_splats_whatever_their_values(edit, random_gaussians):
+    """NaN, infinity, denormal and huge numbers, and centres exactly on borders."""
+    rng, n = np.random.default_rng(0), 400
+    odd = np.array([np.nan, np.inf, -np.inf, 3e38, -1e-45, 0.0, 1.0, -1.0, 0.1], dtype=np.float32)
+
+    def mixed(*shape):
+        values = rng.normal(size=shape).astype(np.float32)
+        where = rng.random(shape) < 0.15
+        values[where] = rng.choice(odd, int(where.sum()))
+        return values
+
+    arrays = {"means": mixed(n, 3), "log_scales": mixed(n, 3), "logits": mixed(n), "sh0": mixed(n, 3)}
+    regions = random_regions(rng, 12)
+    given = {name: array.ravel().tolist() for name, array in arrays.items()}
+    found = edit(random_gaussians(5)).tab.evaluate(HOLDS, [regions, {"count": n, **given}])
+    values = Values(**{name: array.astype(np.float64) for name, array in arrays.items()})
+    scene = identity_of(random_gaussians(5)).document()
+    operations = [{"op": "select", "how": "add", **region} for region in regions]
+    content = {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": operations}
+    edits = parse_edits(json.dumps(content).encode(), "e.json")
+    some = 0
+    for select, region, inside in zip(edits.operations, regions, found, strict=True):
+        expected = members(select.region, values)
+        np.testing.assert_array_equal(np.array(inside, bool), expected, err_msg=str(region))
+        some += 0 < expected.sum() < n
+    assert some > 80, "most regions hold some splats and not others"
+
+
+def test_a_scene_without_splats_can_be_opened(edit, random_gaussians):
+    shown = edit(random_gaussians(0))
+    gestures = [{"click": f"[data-do={name}]"} for name in ("all", "invert", "undo", "redo")]
+    shown.tab.evaluate(PLAY, [*gestures, {"click": "[data-tool=sphere]"}, {"drag": [[50, 50], [60, 60]]}])
+    assert shown.tab.inner_text("#edit-count") == "0 selected · 0 of 0 left"
+    assert "nothing at that point" in shown.tab.inner_text("#edit-message")
+    assert state(shown)[1].size == 0 and state(shown)[0].count('"op"') == 2
