@@ -286,7 +286,7 @@ class EditTools {
     const types = target.closest?.("input, textarea, select");
     if (types || event.altKey) return;
     if (event.ctrlKey || event.metaKey) {
-      const undone = { z: event.shiftKey ? "redo" : "undo", y: "redo", s: "save" }[key.toLowerCase()];
+      const undone = { z: event.shiftKey ? "redo" : "undo", y: "redo", s: "store" }[key.toLowerCase()];
       if (!undone) return;
       this.take(event);
       this.editor[undone]();
