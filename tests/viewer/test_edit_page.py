@@ -79,83 +79,93 @@ def state(shown):
     return found["text"], np.array(found["flags"], dtype=np.uint8)
 
 
+def tool(name):
+    return {"click": f"[data-tool={name}]"}
+
+
+def does(name):
+    return {"click": f"[data-do={name}]"}
+
+
+def fill(name, value):
+    return {"fill": [f"#{name}", str(value)]}
+
+
+class Hand:
+    """Random gestures."""
+
+    def __init__(self, seed):
+        self.rng = np.random.default_rng(seed)
+
+    def point(self):
+        return (np.array([SIZE[0] / 2, 0.29 * SIZE[1]]) + self.rng.uniform(-45, 45, 2)).tolist()
+
+    def stroke(self, most):
+        steps = self.rng.normal(0, 12, (int(self.rng.integers(2, most)), 2)).cumsum(axis=0) + self.point()
+        return {
+            "drag": [self.point(), *np.clip(steps, 1, (SIZE[0] - 1, SIZE[1] - 1)).tolist()],
+            **self.keys(),
+        }
+
+    def clicks(self, count):
+        return [{"drag": [self.point()]} for _ in range(count)]
+
+    def keys(self):
+        return {"keys": {name: bool(self.rng.random() < 0.2) for name in ("shiftKey", "ctrlKey")}}
+
+    def number(self, low, high):
+        return round(float(self.rng.uniform(low, high)), 3)
+
+    def shapes(self):
+        """Gestures that select."""
+        half, center = "#edit-half input", "#edit-center label:last-child input"
+        return {
+            "rectangle": [tool("rectangle"), self.stroke(4)],
+            "lasso": [tool("lasso"), self.stroke(30)],
+            "brush": [tool("brush"), fill("edit-radius", self.rng.integers(5, 30)), self.stroke(12)],
+            "sphere": [tool("sphere"), {"drag": [self.point(), self.point()]}, does("select-shape")],
+            "box": [
+                tool("box"),
+                {"fill": [half, str(self.number(0.1, 1))]},
+                {"fill": [center, str(self.number(-0.5, 0.5))]},
+                does("select-shape"),
+            ],
+            "color": [tool("color"), *self.clicks(1), fill("edit-tolerance", 70), does("select-color")],
+            "opacity": [
+                fill("edit-opacity-low", self.number(0, 0.5)),
+                fill("edit-opacity-high", self.number(0.5, 1)),
+                does("select-opacity"),
+            ],
+            "size": [fill("edit-size-low", self.number(0, 0.1)), does("select-size")],
+        }
+
+    def others(self):
+        """Everything else."""
+        how = self.rng.choice(["replace", "add", "subtract", "intersect"])
+        state = self.rng.choice(["all", "none", "invert", "delete", "hide", "show"])
+        name = f"view {self.rng.integers(3)}"
+        return {
+            "how": [{"click": f"[data-how={how}]"}],
+            "state": [does(state)],
+            "delete": [does("delete")],
+            "turn": [{"turn": self.rng.normal(0, 0.8, 2).tolist()}],
+            "undo": [does("undo"), does("undo"), does("redo")],
+            "crop": [tool("box"), {"fill": ["#edit-half input", "2.5"]}, does("crop")],
+            "floor": [tool("floor"), *self.clicks(3)],
+            "scale": [tool("scale"), *self.clicks(2), fill("edit-length", 1.5), does("scale")],
+            "measure": [tool("measure"), *self.clicks(2), does("measure")],
+            "view": [fill("edit-name", name), does("view"), does("start")],
+            "path": [{"key": "k"}, {"turn": [0.2, 0.1]}, {"key": "k"}],
+        }
+
+
 def gestures_of(seed):
-    """Random gestures with every tool. Selections come often, so that deleting has something to delete."""
-    rng = np.random.default_rng(seed)
-    W, H = SIZE
-
-    def point():
-        return (np.array([W / 2, 0.29 * H]) + rng.uniform(-45, 45, 2)).tolist()
-
-    def stroke(most):
-        steps = rng.normal(0, 12, (int(rng.integers(2, most)), 2)).cumsum(axis=0)
-        return [point(), *np.clip(steps + point(), (1, 1), (W - 1, H - 1)).tolist()]
-
-    def keys():
-        return {"shiftKey": bool(rng.random() < 0.2), "ctrlKey": bool(rng.random() < 0.2)}
-
-    def tool(name):
-        return {"click": f"[data-tool={name}]"}
-
-    def does(name):
-        return {"click": f"[data-do={name}]"}
-
-    def fill(name, value):
-        return {"fill": [f"#{name}", str(value)]}
-
-    kinds = {
-        "rectangle": lambda: [tool("rectangle"), {"drag": [point(), point(), point()], "keys": keys()}],
-        "lasso": lambda: [tool("lasso"), {"drag": stroke(30), "keys": keys()}],
-        "brush": lambda: [
-            tool("brush"),
-            fill("edit-radius", int(rng.integers(5, 30))),
-            {"drag": stroke(12), "keys": keys()},
-        ],
-        "sphere": lambda: [tool("sphere"), {"drag": [point(), point()]}, does("select-shape")],
-        "box": lambda: [
-            tool("box"),
-            {"fill": ["#edit-half input", str(rng.uniform(0.1, 1.0))]},
-            {"fill": ["#edit-center label:last-child input", str(rng.uniform(-0.5, 0.5))]},
-            does("select-shape"),
-        ],
-        "color": lambda: [
-            tool("color"),
-            {"drag": [point()]},
-            fill("edit-tolerance", int(rng.integers(20, 120))),
-            does("select-color"),
-        ],
-        "opacity": lambda: [
-            fill("edit-opacity-low", round(0.5 * float(rng.random()), 2)),
-            fill("edit-opacity-high", round(0.5 + 0.5 * float(rng.random()), 2)),
-            does("select-opacity"),
-        ],
-        "size": lambda: [
-            fill("edit-size-low", round(0.1 * float(rng.random()), 3)),
-            fill("edit-size-high", ""),
-            does("select-size"),
-        ],
-        "how": lambda: [{"click": f"[data-how={rng.choice(['replace', 'add', 'subtract', 'intersect'])}]"}],
-        "state": lambda: [does(rng.choice(["all", "none", "invert", "delete", "hide", "show"]))],
-        "delete": lambda: [does("delete")],
-        "turn": lambda: [{"turn": rng.normal(0, 0.8, 2).tolist()}],
-        "undo": lambda: [does("undo"), does("undo"), does("redo")],
-        "crop": lambda: [tool("box"), {"fill": ["#edit-half input", "2.5"]}, does("crop")],
-        "floor": lambda: [tool("floor"), *({"drag": [point()]} for _ in range(3))],
-        "scale": lambda: [
-            tool("scale"),
-            *({"drag": [point()]} for _ in range(2)),
-            fill("edit-length", 1.5),
-            does("scale"),
-        ],
-        "measure": lambda: [tool("measure"), *({"drag": [point()]} for _ in range(2)), does("measure")],
-        "view": lambda: [fill("edit-name", f"view {rng.integers(3)}"), does("view"), does("start")],
-        "path": lambda: [{"key": "k"}, {"turn": [0.2, 0.1]}, {"key": "k"}],
-    }
-    weights = np.array(
-        [3 if name in ("rectangle", "lasso", "brush", "sphere", "turn") else 1 for name in kinds]
-    )
-    chosen = rng.choice(list(kinds), GESTURES, p=weights / weights.sum())
-    return [gesture for name in chosen for gesture in kinds[name]()]
+    """Random gestures with every tool; selections come often, so that deleting has something to delete."""
+    hand, found = Hand(seed), []
+    for _ in range(GESTURES):
+        kinds = hand.shapes() if hand.rng.random() < 0.55 else hand.others()
+        found += kinds[hand.rng.choice(list(kinds))]
+    return found
 
 
 def exported(folder, edits, gaussians, left):
@@ -281,7 +291,7 @@ def test_both_languages_find_the_same_splats_whatever_their_values(edit, random_
         return values
 
     arrays = {"means": mixed(n, 3), "log_scales": mixed(n, 3), "logits": mixed(n), "sh0": mixed(n, 3)}
-    regions = random_regions(rng, 12)
+    regions = random_regions(rng, 8)
     given = {name: array.ravel().tolist() for name, array in arrays.items()}
     found = edit(random_gaussians(5)).tab.evaluate(HOLDS, [regions, {"count": n, **given}])
     values = Values(**{name: array.astype(np.float64) for name, array in arrays.items()})
@@ -294,7 +304,7 @@ def test_both_languages_find_the_same_splats_whatever_their_values(edit, random_
         expected = members(select.region, values)
         np.testing.assert_array_equal(np.array(inside, bool), expected, err_msg=str(region))
         some += 0 < expected.sum() < n
-    assert some > 80, "most regions hold some splats and not others"
+    assert some > 50, "most regions hold some splats and not others"
 
 
 def test_a_scene_without_splats_can_be_opened(edit, random_gaussians):
@@ -304,3 +314,21 @@ def test_a_scene_without_splats_can_be_opened(edit, random_gaussians):
     assert shown.tab.inner_text("#edit-count") == "0 selected · 0 of 0 left"
     assert "nothing at that point" in shown.tab.inner_text("#edit-message")
     assert state(shown)[1].size == 0 and state(shown)[0].count('"op"') == 2
+
+
+DEPTHS = """async (places) => {
+  await viewer.settled();
+  const camera = viewer.camera();
+  const few = places.map(([u, v]) => editor.tools.depthAt(camera, u, v));
+  const all = places.map(([u, v]) => viewer.renderer.surface(camera, viewer.settings, u, v));
+  return [few, all];
+}"""
+
+
+def test_a_click_finds_the_surface_that_all_splats_show(edit, random_gaussians):
+    """Drawing only the splats near a pixel leaves its depth as it was, for thin, large and tilted splats."""
+    shown = edit(random_gaussians(900), width=120, height=120)
+    places = [[u, v] for u in range(2, 118, 9) for v in range(3, 68, 13)]
+    few, all_of_them = shown.tab.evaluate(DEPTHS, places)
+    assert few == all_of_them
+    assert sum(depth is None for depth in few) > 5 and sum(depth is not None for depth in few) > 20

@@ -21,7 +21,7 @@ from gsplat_edu.edits.document import Edits, read_edits
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.edits.operations import Measure
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.keyframes import read_path
+from gsplat_edu.evaluate.keyframes import KeyframePath, read_path
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.io.formats import LOD_META, TILESET
 from gsplat_edu.io.lod.levels import LodOptions
@@ -31,7 +31,7 @@ from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.sfm.scale_text import points_of
-from gsplat_edu.viewer import export
+from gsplat_edu.viewer import export, page
 from gsplat_edu.viewer.edit_page import tour_of
 
 
@@ -75,14 +75,9 @@ def run(arguments: argparse.Namespace) -> None:
         for note in (*_origins(sources), *export.losses(arguments.out, source.scene)):
             say(note)
         total = move if views.move is IDENTITY else move.after(views.move)
-        along = views.path if along is None else along.shifted(-np.array(source.origin))
-        if along is not None:
-            along = along.placed(total.R, total.s, total.t)
-        if total is not IDENTITY:  # the page's views then have the coordinates of the moved scene
-            source = replace(source, origin=ORIGIN)
         for measure in views.measures:
             say(_measured(measure, total.s, source.scene.unit))
-        tour = tour_of(source, views, total, along)
+        source, tour = _toured(source, views, total, along)
         bar.update(steps, description=f"writing {arguments.out}")
         if arguments.lod_refine is None:
             export.write(arguments.out, source, tour, options)
@@ -114,6 +109,18 @@ def _after_edits(source: Source, edits: Edits, views: Views, arguments: argparse
     if views.move is not IDENTITY:
         cameras = tuple((name, views.move.camera(camera)) for name, camera in cameras)
     return replace(source, scene=placed(left, views), cameras=cameras)
+
+
+def _toured(
+    source: Source, views: Views, move: Similarity, along: KeyframePath | None
+) -> tuple[Source, page.Tour]:
+    """Return the scene with the origin of its coordinates after all moves, and the tour of its page."""
+    path = views.path if along is None else along.shifted(-np.array(source.origin))
+    if path is not None:
+        path = path.placed(move.R, move.s, move.t)
+    if move is not IDENTITY:  # the page's views then have the coordinates of the moved scene
+        source = replace(source, origin=ORIGIN)
+    return source, tour_of(source, views, move, path)
 
 
 def _measured(measure: Measure, scale: float, unit: str | None) -> str:

@@ -71,6 +71,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="keyframes, as for render --path, that the page (OUT.html) plays; in the coordinates of IN",
     )
+    _add_edits(parser)
+    parser.add_argument(
+        "--verify",
+        action="store_true",
+        help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",
+    )
+    _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json and OUT/tileset.json"))
+    add_backend(parser)
+
+
+def _add_edits(parser: argparse.ArgumentParser) -> None:
+    """Add the options of edits files."""
     parser.add_argument(
         "--edits",
         type=Path,
@@ -82,13 +94,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="apply --edits to another scene than it was made for, if it selects by positions only",
     )
-    parser.add_argument(
-        "--verify",
-        action="store_true",
-        help="read OUT back, render it and the original from some of the run's cameras (or an orbit), print the PSNR",
-    )
-    _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json and OUT/tileset.json"))
-    add_backend(parser)
 
 
 def _add_levels(group: argparse._ArgumentGroup) -> None:

@@ -170,10 +170,21 @@ class EditTools {
   // The visible surface at a point of the picture; null where there is none.
   surface({ camera, at: { u, v } }) {
     const [column, row] = [Math.round(u), Math.round(v)].map((x, i) => Math.min(Math.max(x, 0), [camera.W, camera.H][i] - 1));
-    const depth = this.viewer.lost ? null : this.viewer.renderer.surface(camera, this.viewer.settings, column, row);
+    const depth = this.viewer.lost ? null : this.depthAt(camera, column, row);
     this.viewer.askFrame(); // the search has drawn over the picture
     this.editor.say(depth === null ? "There is nothing at that point; choose one on the scene." : "");
     return depth === null ? null : { point: pointAt(camera, u, v, depth), depth };
+  }
+
+  // The search draws many times, so it draws only the splats that may cover the pixel.
+  depthAt(camera, column, row) {
+    const { renderer, sorter, settings, facts } = this.viewer;
+    const { values, history } = this.editor;
+    const count = renderer.count;
+    renderer.setOrder(splatsAt(values, history.flags, camera, column, row, facts.near));
+    const depth = renderer.surface(camera, settings, column, row);
+    if (!sorter.running) renderer.setOrder(new Uint32Array(sorter.order, 0, count)); // otherwise a new order comes
+    return depth;
   }
 
   sphereBegins(stroke) {
