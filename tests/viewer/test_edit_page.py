@@ -328,7 +328,7 @@ DEPTHS = """async (places) => {
 def test_a_click_finds_the_surface_that_all_splats_show(edit, random_gaussians):
     """Drawing only the splats near a pixel leaves its depth as it was, for thin, large and tilted splats."""
     shown = edit(random_gaussians(900), width=120, height=120)
-    places = [[u, v] for u in range(2, 118, 9) for v in range(3, 68, 13)]
+    places = [[u, v] for u in range(2, 118, 24) for v in range(3, 68, 13)]
     few, all_of_them = shown.tab.evaluate(DEPTHS, places)
     assert few == all_of_them
-    assert sum(depth is None for depth in few) > 5 and sum(depth is not None for depth in few) > 20
+    assert sum(depth is None for depth in few) > 2 and sum(depth is not None for depth in few) > 5

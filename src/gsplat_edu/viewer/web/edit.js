@@ -21,6 +21,7 @@ class Editor {
   constructor(viewer, scene, operations, save) {
     Object.assign(this, { viewer, scene, values: scene.values });
     this.save = save;
+    this.overlayAsked = 0;
     this.how = "replace";
     this.radius = 24; // of the brush, CSS pixels
     this.history = new EditHistory(scene.values, operations);
@@ -69,8 +70,12 @@ class Editor {
     this.tools.draw(this.overlay);
   }
 
+  // Draws the overlay again. The splats below are not drawn again, which takes much longer without a graphics processor.
   redraw() {
-    this.viewer.askFrame();
+    this.overlayAsked ||= requestAnimationFrame(() => {
+      this.overlayAsked = 0;
+      this.drawOverlay(this.viewer.camera());
+    });
   }
 
   // The tool, or what it has drawn, has changed.
@@ -116,6 +121,7 @@ class Editor {
     this.panel.list();
     this.panel.saved(this.text() === this.stored ? "" : "not saved");
     this.changed();
+    this.viewer.askFrame();
   }
 
   // Brings the page's up direction, start view and path to where the operations have them.

@@ -171,12 +171,12 @@ class EditTools {
   surface({ camera, at: { u, v } }) {
     const [column, row] = [Math.round(u), Math.round(v)].map((x, i) => Math.min(Math.max(x, 0), [camera.W, camera.H][i] - 1));
     const depth = this.viewer.lost ? null : this.depthAt(camera, column, row);
-    this.viewer.askFrame(); // the search has drawn over the picture
     this.editor.say(depth === null ? "There is nothing at that point; choose one on the scene." : "");
     return depth === null ? null : { point: pointAt(camera, u, v, depth), depth };
   }
 
-  // The search draws many times, so it draws only the splats that may cover the pixel.
+  // The search draws many times, so it draws only the splats that may cover the pixel. It draws over that pixel of the
+  // renderer's image, but not on the screen.
   depthAt(camera, column, row) {
     const { renderer, sorter, settings, facts } = this.viewer;
     const { values, history } = this.editor;
