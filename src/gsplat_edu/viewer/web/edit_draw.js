@@ -71,6 +71,7 @@ class Overlay {
     this.scale = [across / camera.W, down / camera.H];
     this.dense = dense;
     this.context.clearRect(0, 0, across, down);
+    this.canvas.hidden = true; // a browser may keep showing what was on a canvas that is only cleared
   }
 
   // Place on this canvas of a column and row of the picture.
@@ -81,6 +82,7 @@ class Overlay {
   // Strokes a path twice, dark below and bright above, so that it shows on any picture.
   stroke(color = "#ffd24a", dashed = false) {
     const { context, dense } = this;
+    this.canvas.hidden = false;
     context.setLineDash(dashed ? [6 * dense, 4 * dense] : []);
     for (const [width, style] of [[3.5, "#000a"], [1.5, color]]) {
       context.lineWidth = width * dense;
@@ -100,6 +102,7 @@ class Overlay {
   // A stroke of a brush, as wide as it is.
   band(points, radius) {
     const { context } = this;
+    this.canvas.hidden = false;
     context.save();
     Object.assign(context, { lineCap: "round", lineJoin: "round", strokeStyle: "#ffd24a66" });
     context.setLineDash([]);
