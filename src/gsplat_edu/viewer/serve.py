@@ -90,7 +90,7 @@ class PageServer(ThreadingHTTPServer):
         self._room = threading.Semaphore(MOST_CONNECTIONS)
         self.address_family, address = checked_address(host, port, names)
         try:
-            super().__init__(address, _Handler)
+            super().__init__(address, PageHandler)
         except OSError as error:
             raise _refusal(host, port, names, error) from None
 
@@ -133,6 +133,10 @@ class _Request(io.RawIOBase):
         self._until = time.monotonic() + REQUEST_SECONDS
         self._room = REQUEST_BYTES
 
+    def allow(self, seconds: float, count: int) -> None:
+        """Give the rest of the request this time and number of bytes."""
+        self._until, self._room = time.monotonic() + seconds, count
+
     def readable(self) -> bool:
         return True
 
@@ -146,11 +150,14 @@ class _Request(io.RawIOBase):
         return count
 
 
-class _Handler(BaseHTTPRequestHandler):
+class PageHandler(BaseHTTPRequestHandler):
+    """Answers one request of a `PageServer`."""
+
     server: PageServer
     server_version, sys_version = "gsplat-edu", ""
 
     def setup(self) -> None:
+        """Limit the request in time and size."""
         super().setup()
         self.rfile.close()
         self.rfile = io.BufferedReader(_Request(self.connection))
@@ -162,17 +169,18 @@ class _Handler(BaseHTTPRequestHandler):
         raise AttributeError(name)
 
     def do_HEAD(self) -> None:
+        """Answer with the headers only."""
         self._answer()
 
     def do_GET(self) -> None:
+        """Answer with the page or a file."""
         body = memoryview(self._answer())
         for begin in range(0, len(body), CHUNK):
             self.wfile.write(body[begin : begin + CHUNK])
 
     def _answer(self) -> bytes:
         """Send the headers of the page or a file and return its bytes, or send an error and return nothing."""
-        hosts = self.headers.get_all("Host") or []
-        if len(hosts) != 1 or not names_this_computer(hosts[0], self.server.bound_host):
+        if not self._is_for_us():
             self._say(http.HTTPStatus.FORBIDDEN)
             return b""
         if self.path == "/":
@@ -189,6 +197,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Security-Policy", f"{self.server.policy}; frame-ancestors 'none'")
         self._headers(kind, len(body))
         return body
+
+    def _is_for_us(self) -> bool:
+        """Return whether the request names this computer."""
+        hosts = self.headers.get_all("Host") or []
+        return len(hosts) == 1 and names_this_computer(hosts[0], self.server.bound_host)
 
     def _say(self, status: http.HTTPStatus) -> None:
         text = f"{status.value} {status.phrase}\n".encode("ascii")

@@ -13,7 +13,7 @@ class Viewer {
     this.canvas = element("canvas");
     this.renderer = new Renderer(this.canvas, splats, facts);
     this.sorter = new Sorter(splats.means, facts.near, (order) => this.renderer.setOrder(order));
-    const eyes = facts.cameras.map(({ eye }) => eye);
+    const eyes = facts.cameras.filter(({ saved }) => !saved).map(({ eye }) => eye);
     this.view = new View(facts.start, eyes);
     this.cameraIndex = facts.start.index;
     this.exact = null; // the camera given to setCamera, until the user moves
@@ -200,11 +200,13 @@ function fail(error) {
 }
 
 async function start() {
-  const viewer = FACTS.lod ? streamed(FACTS) : new Viewer(FACTS, await unpackSplats(FACTS));
+  const splats = FACTS.lod ? null : await unpackSplats(FACTS);
+  const viewer = splats ? new Viewer(FACTS, splats) : streamed(FACTS);
   if (viewer.levels) await viewer.sorter.sort(viewer.camera()); // the first picture comes before the last splat
   else await viewer.settled();
   window.viewer = viewer;
   if (!viewer.levels?.regions.some(({ levels }) => levels.length)) say("");
+  dispatchEvent(new CustomEvent("viewer", { detail: { viewer, splats } })); // for further parts of the page
 }
 
 // A viewer that loads levels of detail from the folder of this page's server.
