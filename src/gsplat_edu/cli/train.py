@@ -46,7 +46,9 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
+from gsplat_edu.viewer.live_folder import LiveFolder
 from gsplat_edu.viewer.serve import LOOPBACK, exposure, free_port
+from gsplat_edu.viewer.snapshots import Broadcast, FolderWatcher, page_facts
 
 LINES = 20
 """Number of progress lines if there is no terminal for a progress bar."""
@@ -132,6 +134,9 @@ def _run(
             pace = Pace(capture, deadline, extend=chosen.by_time, say=say)
             callbacks.append(pace)
             ends = functools.partial(_either, interrupted, pace.over)
+        watchers = [_folder_watcher(capture, say, closing)] if team.size == 1 else []
+        broadcast = Broadcast(capture, interrupted, watchers)
+        callbacks.append(broadcast.show)
         view = None
         if live is not None:
             view = closing.enter_context(live.LiveView(capture, interrupted, host, port))
@@ -154,6 +159,7 @@ def _run(
                         "interrupted during the evaluation; the scene is saved, and --resume repeats the evaluation"
                     )
                 bar.advance(task)
+                broadcast.update("evaluating")
                 if view is not None:
                     view.update("evaluating")
 
@@ -164,6 +170,13 @@ def _run(
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
             view.stay()
+
+
+def _folder_watcher(capture: CaptureRun, say: Callable[[str], None], closing: ExitStack) -> FolderWatcher:
+    """Let another process watch by files in the run's folder; they are removed in the end."""
+    watcher = FolderWatcher(LiveFolder(capture.folder.path), functools.partial(page_facts, capture), say)
+    closing.callback(watcher.close)
+    return watcher
 
 
 def _is_over(options: RunOptions, team: Member, say: Callable[[str], None]) -> bool:

@@ -20,6 +20,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from gsplat_edu import constants
 from gsplat_edu.camera import Camera
 from gsplat_edu.content_policy import content_policy, policy_element
@@ -33,7 +36,8 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.viewer import page_data
-from gsplat_edu.viewer.page_start import first_camera, start_of
+from gsplat_edu.viewer.page_start import Start, first_camera, start_among, start_of
+from gsplat_edu.views import View
 
 FORMAT = "gsplat-edu page"
 VERSION = 1
@@ -227,9 +231,7 @@ def _facts(
     tour: Tour,
 ) -> dict[str, Any]:
     cameras = [camera for _, camera in views]
-    trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
-    first = first_camera(cameras, trained or range(len(views))) if views else 0
-    start = start_of(scene, cameras, first)
+    start = start_of(scene, cameras, _first(views, held_out))
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -238,6 +240,56 @@ def _facts(
         "sh_degree": scene.gaussians.sh_degree,
         "antialiased": scene.antialiased,
         "up": None if scene.up is None else [float(x) for x in scene.up],
+        "origin": [float(x) for x in tour.origin],
+        "path": None if tour.path is None else tour.path.document(),
+        **_shown(views, settings, held_out, start),
+    }
+
+
+def live_facts(
+    title: str,
+    train: Sequence[View],
+    test: Sequence[View],
+    points: Float[np.ndarray, "N 3"],
+    settings: RenderSettings,
+) -> dict[str, Any]:
+    """Return the facts of a page whose splats come later and change.
+
+    Args:
+        title: Heading of the page.
+        train: Training views, at least one.
+        test: Test views.
+        points: (N, 3) points of the scene; may be empty.
+        settings: Render settings of the finished scene.
+    """
+    views = sorted(((view.name, view.camera) for view in (*train, *test)), key=lambda view: view[0])
+    held_out = {view.name for view in test}
+    start = start_among([camera for _, camera in views], _first(views, held_out), points)
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "title": title,
+        "count": 0,
+        "sh_degree": int(settings.sh_degree),
+        "antialiased": bool(settings.antialiased),
+        "up": start.up.tolist(),
+        "origin": list(ORIGIN),
+        "path": None,
+        **_shown(views, settings, held_out, start),
+    }
+
+
+def _first(views: Sequence[NamedCamera], held_out: Collection[str]) -> int:
+    """Return the index of the camera that a page starts at; 0 if there are none."""
+    trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
+    return first_camera([camera for _, camera in views], trained or range(len(views))) if views else 0
+
+
+def _shown(
+    views: Sequence[NamedCamera], settings: RenderSettings, held_out: Collection[str], start: Start
+) -> dict[str, Any]:
+    """Return the facts about how a scene is shown."""
+    return {
         "settings": {
             "background": [float(x) for x in settings.background],
             "sh_degree": int(settings.sh_degree),
@@ -251,8 +303,6 @@ def _facts(
             "up": start.up.tolist(),
             "index": start.index,
         },
-        "origin": [float(x) for x in tour.origin],
-        "path": None if tour.path is None else tour.path.document(),
         "cameras": [
             {"name": name, "held_out": name in held_out, **_camera(camera)} for name, camera in views
         ],

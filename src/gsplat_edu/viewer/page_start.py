@@ -82,19 +82,37 @@ def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
         cameras: The capture's cameras, if any.
         index: The camera to start at.
     """
-    up = np.array(scene.up or WORLD_UP, dtype=np.float64)
-    up = common_up(cameras) if scene.up is None and cameras else up / np.linalg.norm(up)
+    up = None if scene.up is None else np.array(scene.up, dtype=np.float64)
     if cameras:
         opaque = scene.gaussians.logit_opacities > 0
         means = scene.gaussians.means[opaque].double().numpy(force=True)
-        near = means[~far_shell(means)]  # a sky is no subject
-        return Start(cameras[index], pivot_of(cameras, index, near), up, index)
+        return start_among(cameras, index, means, up)
+    up = np.array(WORLD_UP, dtype=np.float64) if up is None else up / np.linalg.norm(up)
     if len(scene.gaussians):
         orbit = orbit_of_scene(scene.gaussians, ORBIT, SIDE, up)
     else:
         orbit = [Camera.looking_at((0.0, 0.0, -1.0), np.zeros(3), SIDE, SIDE, SIDE, SIDE)]
     centre = Geometry(orbit, np.zeros((0, 3))).centre
     return Start(orbit[0], np.zeros(3) if centre is None else centre, up, -1)
+
+
+def start_among(
+    cameras: Sequence[Camera],
+    index: int,
+    points: Float[np.ndarray, "N 3"],
+    up: Float64[np.ndarray, "3"] | None = None,
+) -> Start:
+    """Start at a camera of the capture.
+
+    Args:
+        cameras: The capture's cameras, at least one.
+        index: The camera to start at.
+        points: (N, 3) points of the scene; may be empty.
+        up: (3,) up direction; None takes that of the cameras.
+    """
+    up = common_up(cameras) if up is None else up / np.linalg.norm(up)
+    near = points[~far_shell(points)]  # a sky is no subject
+    return Start(cameras[index], pivot_of(cameras, index, near), up, index)
 
 
 def pivot_of(
