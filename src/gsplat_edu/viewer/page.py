@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from gsplat_edu import constants
@@ -29,6 +30,7 @@ from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.files import written_aside
+from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.reading import parse_json, read_bytes
@@ -36,8 +38,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.viewer import page_data
-from gsplat_edu.viewer.page_start import Start, first_camera, start_among, start_of
-from gsplat_edu.views import View
+from gsplat_edu.viewer.page_start import first_camera, start_among, start_of
 
 FORMAT = "gsplat-edu page"
 VERSION = 1
@@ -58,6 +59,11 @@ SCRIPTS = (
 
 LEVEL_SCRIPTS = (*SCRIPTS[:-1], "levels.js", "main.js")
 """The same for a page that loads levels of detail."""
+
+LIVE_SCRIPTS = (*SCRIPTS[:-1], "live_curves.js", "live_pictures.js", "live.js", "main.js")
+"""The same for a page that shows a training."""
+
+STYLE, LIVE_STYLE = "style.css", "live.css"
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
 
@@ -154,14 +160,54 @@ def html(
     return b"".join(_pieces(title, scene, views, settings, held_out, tour or Tour()))
 
 
-def policy(levels: bool = False) -> str:
+def policy(levels: bool = False, live: bool = False) -> str:
     """Return the Content-Security-Policy of every page: its scripts, its style, and its workers.
 
     Args:
         levels: Whether the page loads levels of detail, from its own server.
+        live: Whether it shows a training, which it loads from its own server.
     """
-    scripts = LEVEL_SCRIPTS if levels else SCRIPTS
-    return content_policy(map(_web, scripts), [_web("style.css")], workers=True, own_server=levels)
+    scripts = LIVE_SCRIPTS if live else LEVEL_SCRIPTS if levels else SCRIPTS
+    return content_policy(map(_web, scripts), [_style(live)], workers=True, own_server=levels or live)
+
+
+def live_facts(
+    title: str,
+    views: Sequence[NamedCamera],
+    held_out: Collection[str],
+    points: Float[np.ndarray, "N 3"],
+    settings: RenderSettings,
+    origin: Sequence[float] = ORIGIN,
+) -> dict[str, Any]:
+    """Return the facts of a page whose splats come later and change.
+
+    Args:
+        title: Heading of the page.
+        views: As for `write`; at least one.
+        held_out: As for `write`.
+        points: (N, 3) points of the scene; may be empty.
+        settings: Render settings of the finished scene.
+        origin: As for `Tour`.
+    """
+    nothing = Scene(Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (1, 3), (0, 3), ()))))
+    facts = _facts(title, nothing, views, settings, held_out, Tour(origin=origin))
+    index = facts["start"]["index"]
+    start = start_among([camera for _, camera in views], index, points)
+    facts["start"] |= {"pivot": start.pivot.tolist(), "up": start.up.tolist()}
+    return facts | {"up": start.up.tolist(), "sh_degree": int(settings.sh_degree)}
+
+
+def live_html(facts: dict[str, Any], at: str = "") -> bytes:
+    """Return a page that shows a training: without splats, which it asks its server for.
+
+    Args:
+        facts: From `live_facts`.
+        at: Address of the training on the server, relative to the page; `gsplat_edu.viewer.live` lists what is there.
+    """
+    head, tail = _web("index.html").split("{{splats}}\n")
+    nothing = SPLATS_OPEN + base64.b64encode(gzip.compress(b"", mtime=0)) + CLOSE + b"\n"
+    filled = _filled(head, str(facts["title"]), facts | {"live": {"at": at}})
+    return filled.encode("utf-8", errors="replace") + nothing + tail.encode("utf-8")
 
 
 def levels_html(scene: Scene, levels: dict[str, Any], title: str) -> bytes:
@@ -231,7 +277,9 @@ def _facts(
     tour: Tour,
 ) -> dict[str, Any]:
     cameras = [camera for _, camera in views]
-    start = start_of(scene, cameras, _first(views, held_out))
+    trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
+    first = first_camera(cameras, trained or range(len(views))) if views else 0
+    start = start_of(scene, cameras, first)
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -240,56 +288,6 @@ def _facts(
         "sh_degree": scene.gaussians.sh_degree,
         "antialiased": scene.antialiased,
         "up": None if scene.up is None else [float(x) for x in scene.up],
-        "origin": [float(x) for x in tour.origin],
-        "path": None if tour.path is None else tour.path.document(),
-        **_shown(views, settings, held_out, start),
-    }
-
-
-def live_facts(
-    title: str,
-    train: Sequence[View],
-    test: Sequence[View],
-    points: Float[np.ndarray, "N 3"],
-    settings: RenderSettings,
-) -> dict[str, Any]:
-    """Return the facts of a page whose splats come later and change.
-
-    Args:
-        title: Heading of the page.
-        train: Training views, at least one.
-        test: Test views.
-        points: (N, 3) points of the scene; may be empty.
-        settings: Render settings of the finished scene.
-    """
-    views = sorted(((view.name, view.camera) for view in (*train, *test)), key=lambda view: view[0])
-    held_out = {view.name for view in test}
-    start = start_among([camera for _, camera in views], _first(views, held_out), points)
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "title": title,
-        "count": 0,
-        "sh_degree": int(settings.sh_degree),
-        "antialiased": bool(settings.antialiased),
-        "up": start.up.tolist(),
-        "origin": list(ORIGIN),
-        "path": None,
-        **_shown(views, settings, held_out, start),
-    }
-
-
-def _first(views: Sequence[NamedCamera], held_out: Collection[str]) -> int:
-    """Return the index of the camera that a page starts at; 0 if there are none."""
-    trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
-    return first_camera([camera for _, camera in views], trained or range(len(views))) if views else 0
-
-
-def _shown(
-    views: Sequence[NamedCamera], settings: RenderSettings, held_out: Collection[str], start: Start
-) -> dict[str, Any]:
-    """Return the facts about how a scene is shown."""
-    return {
         "settings": {
             "background": [float(x) for x in settings.background],
             "sh_degree": int(settings.sh_degree),
@@ -303,6 +301,8 @@ def _shown(
             "up": start.up.tolist(),
             "index": start.index,
         },
+        "origin": [float(x) for x in tour.origin],
+        "path": None if tour.path is None else tour.path.document(),
         "cameras": [
             {"name": name, "held_out": name in held_out, **_camera(camera)} for name, camera in views
         ],
@@ -316,16 +316,15 @@ def _camera(camera: Camera) -> dict[str, Any]:
 
 def _filled(template: str, title: str, facts: dict[str, Any]) -> str:
     """Fill in the part before the splats."""
-    style = _web("style.css")
-    levels = "lod" in facts
-    scripts = [_web(name) for name in (LEVEL_SCRIPTS if levels else SCRIPTS)]
+    levels, live = "lod" in facts, "live" in facts
+    scripts = [_web(name) for name in (LIVE_SCRIPTS if live else LEVEL_SCRIPTS if levels else SCRIPTS)]
     workers = [_text_element("sort-worker", _web("sort_worker.js"))]
     if levels:
         workers.append(_text_element("lod-worker", _web("lod_worker.js")))
     texts = {
         "title": html_text.escape(title),
-        "policy": policy_element(policy(levels)),
-        "style": style,
+        "policy": policy_element(policy(levels, live)),
+        "style": _style(live),
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         "shaders": "\n".join(_text_element(name, _shader(name)) for name in SHADERS),
@@ -342,6 +341,10 @@ def _text_element(name: str, text: str) -> str:
 
 def _web(name: str) -> str:
     return (files("gsplat_edu.viewer") / "web" / name).read_text("utf-8")
+
+
+def _style(live: bool) -> str:
+    return _web(STYLE) + (_web(LIVE_STYLE) if live else "")
 
 
 def _shader(name: str) -> str:

@@ -90,7 +90,7 @@ class PageServer(ThreadingHTTPServer):
         self._room = threading.Semaphore(MOST_CONNECTIONS)
         self.address_family, address = checked_address(host, port, names)
         try:
-            super().__init__(address, _Handler)
+            super().__init__(address, PageHandler)
         except OSError as error:
             raise _refusal(host, port, names, error) from None
 
@@ -146,11 +146,14 @@ class _Request(io.RawIOBase):
         return count
 
 
-class _Handler(BaseHTTPRequestHandler):
+class PageHandler(BaseHTTPRequestHandler):
+    """Answers one request of a `PageServer`."""
+
     server: PageServer
     server_version, sys_version = "gsplat-edu", ""
 
     def setup(self) -> None:
+        """Limit the request in time and size."""
         super().setup()
         self.rfile.close()
         self.rfile = io.BufferedReader(_Request(self.connection))
@@ -162,9 +165,11 @@ class _Handler(BaseHTTPRequestHandler):
         raise AttributeError(name)
 
     def do_HEAD(self) -> None:
+        """Answer with the headers only."""
         self._answer()
 
     def do_GET(self) -> None:
+        """Answer with the page or a file."""
         body = memoryview(self._answer())
         for begin in range(0, len(body), CHUNK):
             self.wfile.write(body[begin : begin + CHUNK])

@@ -393,9 +393,12 @@ def snapshot_of(trainer: Trainer) -> bytes:
 def page_facts(capture: CaptureRun) -> dict[str, Any]:
     """Return the facts of the page that shows a training."""
     options, dataset = capture.options, capture.dataset
-    return live_facts(
-        options.out.resolve().name, dataset.train, dataset.test, dataset.points, options.render_settings
-    ) | {"origin": dataset.origin.tolist()}
+    views = sorted(
+        ((view.name, view.camera) for view in (*dataset.train, *dataset.test)), key=lambda view: view[0]
+    )
+    held_out = {view.name for view in dataset.test}
+    title, settings = options.out.resolve().name, options.render_settings
+    return live_facts(title, views, held_out, dataset.points, settings, dataset.origin.tolist())
 
 
 def _all_finite(gaussians: Gaussians) -> bool:
