@@ -95,7 +95,7 @@ class LiveView:
         self._asked_at = self._seen_at = -math.inf
         self._hold_from: float = math.inf  # the training waits from this iteration on
         self._wanted: Camera | None = None
-        self._picture: bytes | str | None = None
+        self._picture: bytes | str = ""
         self._one_picture = threading.Lock()
 
     def __enter__(self) -> LiveView:
@@ -169,9 +169,13 @@ class LiveView:
             return self._state if found else None
 
     def newer_scene(self, iteration: int) -> bytes | None:
-        """Wait for a snapshot of another iteration; None if there is none within `WAIT` seconds."""
+        """Wait for a snapshot of another iteration; None if there is none within `WAIT` seconds.
+
+        A page that has none (-1) gets the last one at once, and asks for a newer one then.
+        """
         with self._news:
-            if self._shown != iteration and self._shown == self._trainer.iteration:
+            is_newest = self._shown == self._trainer.iteration
+            if self._shown != iteration and (is_newest or iteration < 0):
                 return self._snapshot
             before = self._shown
             self._asked_at = time.perf_counter()
@@ -193,10 +197,10 @@ class LiveView:
     def picture(self, camera: Camera) -> bytes | str:
         """Return a JPEG from a camera, or why there is none. One page waits at a time."""
         with self._one_picture, self._news:
-            self._wanted, self._picture = camera, None
-            came = self._news.wait_for(lambda: self._picture is not None, PICTURE_WAIT)
-            self._wanted, picture = None, self._picture
-            return picture if came and picture is not None else "not drawn: the training is busy"
+            self._wanted, self._picture = camera, ""
+            self._news.wait_for(lambda: self._picture != "", PICTURE_WAIT)
+            self._wanted = None
+            return self._picture or "not drawn: the training is busy"
 
 
 class _LiveHandler(PageHandler):

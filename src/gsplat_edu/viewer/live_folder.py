@@ -11,6 +11,9 @@ The training writes these, each under a temporary name that is then renamed, and
 
     page.json   the facts of `gsplat_edu.viewer.page` without splats: cameras, start, settings, up, title. It is written
                 once, and a reader may keep it as long as `pid` in state.json stays the same.
+    page.html   the page that shows the training, with its own Content-Security-Policy. It asks, relative to its own
+                address, for what `gsplat_edu.viewer.live` lists: a server in front of these files has to answer
+                `state?after=V`, `scene?after=I` and `control`, all but `picture`.
     state.json  strict JSON on one line; see `gsplat_edu.viewer.snapshots.state_of`. It is written at most twice a
                 second, less often if that would slow the training, and while the training waits at least every two.
     scene.bin   the newest Gaussians. It begins with four bytes, the length H of a header as uint32, little-endian; H is
@@ -79,6 +82,11 @@ class LiveFolder:
     def page(self) -> Path:
         """The facts of the page."""
         return self.path / "page.json"
+
+    @property
+    def html(self) -> Path:
+        """The page."""
+        return self.path / "page.html"
 
     @property
     def state(self) -> Path:
@@ -150,14 +158,14 @@ class LiveFolder:
         with written_aside(path) as aside:
             aside.write_text(json.dumps(value, allow_nan=False, separators=(",", ":")) + "\n", "utf-8")
 
-    def write_scene(self, snapshot: bytes) -> None:
-        """Write scene.bin.
+    def write_bytes(self, path: Path, data: bytes) -> None:
+        """Write scene.bin or page.html.
 
         Raises:
             OSError: the file cannot be written. An existing file is unchanged.
         """
-        with written_aside(self.scene) as aside:
-            aside.write_bytes(snapshot)
+        with written_aside(path) as aside:
+            aside.write_bytes(data)
 
     def clear(self) -> None:
         """Remove what the training wrote, and the folder if nothing else is in it.
@@ -165,7 +173,7 @@ class LiveFolder:
         Raises:
             OSError: a file cannot be removed.
         """
-        for path in (self.page, self.state, self.scene):
+        for path in (self.page, self.html, self.state, self.scene):
             path.unlink(missing_ok=True)
         if self.path.is_dir() and not any(self.path.iterdir()):
             self.path.rmdir()

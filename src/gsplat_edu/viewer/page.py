@@ -38,7 +38,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.viewer import page_data
-from gsplat_edu.viewer.page_start import first_camera, start_among, start_of
+from gsplat_edu.viewer.page_start import first_camera, start_among, start_of, subjects_of
 
 FORMAT = "gsplat-edu page"
 VERSION = 1
@@ -194,19 +194,20 @@ def live_facts(
     index = facts["start"]["index"]
     start = start_among([camera for _, camera in views], index, points)
     facts["start"] |= {"pivot": start.pivot.tolist(), "up": start.up.tolist()}
+    _add_subjects(facts, [camera for _, camera in views], start.camera, points)
     return facts | {"up": start.up.tolist(), "sh_degree": int(settings.sh_degree)}
 
 
-def live_html(facts: dict[str, Any], at: str = "") -> bytes:
+def live_html(facts: dict[str, Any], step: bool = True) -> bytes:
     """Return a page that shows a training: without splats, which it asks its server for.
 
     Args:
         facts: From `live_facts`.
-        at: Address of the training on the server, relative to the page; `gsplat_edu.viewer.live` lists what is there.
+        step: Whether the server can take a single step.
     """
     head, tail = _web("index.html").split("{{splats}}\n")
     nothing = SPLATS_OPEN + base64.b64encode(gzip.compress(b"", mtime=0)) + CLOSE + b"\n"
-    filled = _filled(head, str(facts["title"]), facts | {"live": {"at": at}})
+    filled = _filled(head, str(facts["title"]), facts | {"live": {"step": step}})
     return filled.encode("utf-8", errors="replace") + nothing + tail.encode("utf-8")
 
 
@@ -280,7 +281,7 @@ def _facts(
     trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
     first = first_camera(cameras, trained or range(len(views))) if views else 0
     start = start_of(scene, cameras, first)
-    return {
+    facts = {
         "format": FORMAT,
         "version": VERSION,
         "title": title,
@@ -307,6 +308,19 @@ def _facts(
             {"name": name, "held_out": name in held_out, **_camera(camera)} for name, camera in views
         ],
     }
+    opaque = scene.gaussians.logit_opacities > 0
+    _add_subjects(facts, cameras, start.camera, scene.gaussians.means[opaque].double().numpy(force=True))
+    return facts
+
+
+def _add_subjects(
+    facts: dict[str, Any], cameras: Sequence[Camera], first: Camera, points: Float[np.ndarray, "N 3"]
+) -> None:
+    """Tell the page where the subject is in the images of the capture and of the start."""
+    *others, start = subjects_of(cameras, [*cameras, first], points)
+    facts["start"]["camera"]["subject"] = start
+    for entry, subject in zip(facts["cameras"], others, strict=True):
+        entry["subject"] = subject
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from gsplat_edu.train.schedule import sh_degree
 from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live_folder import LiveFolder, framed
-from gsplat_edu.viewer.page import live_facts
+from gsplat_edu.viewer.page import live_facts, live_html
 
 SHARE = 0.02
 """Largest fraction of the training's time spent on snapshots and figures. The page spends some of the same processor on
@@ -103,7 +103,7 @@ class FolderWatcher:
         self._folder, self._facts, self._say = run, facts, say
         self._looked_at, self._wanted, self._paused = -math.inf, False, False
         self._has_page = self._failed = False
-        self._shown = -1
+        self._shown, self._version = -1, 0
         self._try(self._folder.clear)  # what a killed training left
 
     def watches(self) -> bool:
@@ -121,19 +121,23 @@ class FolderWatcher:
         return self._paused
 
     def take_state(self, state: Mapping[str, Any]) -> None:
-        """Write state.json, and page.json before the first one."""
+        """Write state.json, and the page before the first one."""
 
         def write() -> None:
             if not self._has_page:
-                self._folder.write(self._folder.page, self._facts())
+                facts = dict(self._facts())
+                self._folder.write(self._folder.page, facts)
+                self._folder.write_bytes(self._folder.html, live_html(facts, step=False))
                 self._has_page = True
-            self._folder.write(self._folder.state, {**state, "scene": self._shown, "pid": os.getpid()})
+            self._version += 1
+            more = {"version": self._version, "scene": self._shown, "pid": os.getpid()}
+            self._folder.write(self._folder.state, {**state, **more})
 
         self._try(write)
 
     def take_scene(self, iteration: int, snapshot: bytes) -> None:
         """Write scene.bin."""
-        self._try(lambda: self._folder.write_scene(snapshot))
+        self._try(lambda: self._folder.write_bytes(self._folder.scene, snapshot))
         self._shown = iteration
 
     def camera(self) -> Camera | None:
@@ -340,8 +344,8 @@ def state_of(
         history       at most `MOST_POINTS` points of the curves so far: lists iteration, loss, psnr and count
         time          Unix time of this state
 
-    A file has two more: `scene`, the iteration of scene.bin (-1: none), and `pid`, the number of the training's
-    process.
+    What a page receives has `version` as well, a number that rises with each state. In a file there are two more:
+    `scene`, the iteration of scene.bin (-1: none), and `pid`, the number of the training's process.
 
     Args:
         trainer: The trainer.

@@ -6,6 +6,7 @@
 const REST_FACTOR = 20;
 const SHORTEST_REST = 500; // milliseconds
 const LONGEST_REST = 60000;
+const PHOTOS_VARY = 0.25; // weight of the newest photo in the curves of its loss and PSNR
 const TRIES = 4; // to reach the server again before the page gives up
 const TRY_EVERY = 1000; // milliseconds
 
@@ -25,10 +26,11 @@ function unframed(buffer) {
 }
 
 class Live {
-  constructor(viewer, at) {
-    Object.assign(this, { viewer, at, state: null, over: false, wake: () => {} });
+  constructor(viewer, { step }) {
+    Object.assign(this, { viewer, state: null, over: false, wake: () => {} });
     this.draws = viewer.renderer instanceof Renderer;
     this.build();
+    this.step.hidden = !step;
     history.replaceState(null, "", location.pathname); // without the token
     this.watch();
     if (this.draws) this.follow().catch(fail);
@@ -38,10 +40,11 @@ class Live {
     this.title = created("p", { class: "state", role: "status" }, "waiting for the first iteration");
     this.bar = created("progress", { max: 1, value: 0, "aria-label": "iterations" });
     this.left = created("p", { class: "left" }, "\u00a0");
+    this.photos = created("p", { title: "Size that is trained on, and its share of the full width" }, "\u00a0");
     this.curves = {
-      loss: new Curve("loss", (value) => value.toPrecision(3)),
-      psnr: new Curve("PSNR", (value) => `${value.toFixed(2)} dB`),
-      count: new Curve("splats", whole),
+      loss: new Curve("loss", (value) => value.toPrecision(3), PHOTOS_VARY),
+      psnr: new Curve("PSNR", (value) => `${value.toFixed(2)} dB`, PHOTOS_VARY),
+      count: new Curve("splats", whole, 1),
     };
     this.pause = created("button", { title: "Wait after this iteration, or continue" }, "pause");
     this.step = created("button", { title: "One more iteration, then wait" }, "step");
@@ -51,8 +54,9 @@ class Live {
     const buttons = created("p", { class: "row" }, this.pause, this.step);
     const curves = Object.values(this.curves).map((curve) => curve.element);
     const section = created("section", { id: "live", "aria-label": "training" });
-    section.append(this.title, this.bar, this.left, ...curves, buttons, this.note);
+    section.append(this.title, this.bar, this.left, buttons, this.note);
     element("tools").before(section);
+    element("tools").prepend(created("section", { id: "curves", "aria-label": "curves" }, ...curves, this.photos));
     this.noted(this.draws ? "" : "This browser has no WebGL2, so the training's computer draws the pictures.");
   }
 
@@ -62,7 +66,7 @@ class Live {
   }
 
   async control(what) {
-    await fetch(`${this.at}control`, { method: "POST", body: JSON.stringify({ do: what }) }).catch(() => {});
+    await fetch("control", { method: "POST", body: JSON.stringify({ do: what }) }).catch(() => {});
   }
 
   // Shows states until the server is gone.
@@ -70,7 +74,7 @@ class Live {
     let [version, failures] = [-1, 0];
     while (failures < TRIES) {
       try {
-        const answer = await fetch(`${this.at}state?after=${version}`);
+        const answer = await fetch(`state?after=${version}`);
         if (!answer.ok) throw new Error(answer.statusText);
         failures = 0;
         if (answer.status === 204) continue;
@@ -94,9 +98,9 @@ class Live {
     const { iteration, iterations, history, seconds_left: left } = state;
     this.title.textContent = `${state.state}, iteration ${whole(iteration)} of ${whole(iterations)}`;
     [this.bar.max, this.bar.value] = [iterations, iteration];
-    const shown = state.photo_factor === 1 ? "" : `, 1/${Number(state.photo_factor.toFixed(2))} of their width`;
-    const photos = state.width ? `photos of ${state.width} × ${state.height} px${shown}` : "";
-    this.left.textContent = [left === null ? "" : `${duration(left)} left`, photos].filter(Boolean).join(", ") || "\u00a0";
+    this.left.textContent = left === null ? "\u00a0" : `${duration(left)} left`;
+    const share = state.photo_factor === 1 ? "" : ` (1/${Number(state.photo_factor.toFixed(2))})`;
+    this.photos.textContent = state.width ? `photos of ${state.width} × ${state.height} px${share}` : "\u00a0";
     for (const [name, curve] of Object.entries(this.curves)) curve.show(state[name], history.iteration, history[name]);
     this.pause.textContent = state.state === "paused" ? "resume" : "pause";
     this.pause.disabled = this.step.disabled = !["training", "paused"].includes(state.state);
@@ -117,7 +121,7 @@ class Live {
     say("Waiting for the first splats ...");
     while (!this.over) {
       await this.visible();
-      const answer = await fetch(`${this.at}scene?after=${iteration}`).catch(() => null);
+      const answer = await fetch(`scene?after=${iteration}`).catch(() => null);
       if (!answer?.ok || answer.status === 204) {
         if (!answer?.ok) await this.rest(TRY_EVERY);
         continue;
@@ -130,6 +134,7 @@ class Live {
       this.viewer.renderer.finish();
       if (iteration < 0) say("");
       iteration = header.iteration;
+      element("count").textContent += ` after ${whole(iteration)} iterations`;
       const spent = performance.now() - began;
       await this.rest(Math.min(LONGEST_REST, Math.max(SHORTEST_REST, REST_FACTOR * spent)));
     }
@@ -152,4 +157,4 @@ class Live {
   }
 }
 
-addEventListener("viewer", ({ detail }) => (window.live = new Live(detail.viewer, FACTS.live.at)));
+addEventListener("viewer", ({ detail }) => (window.live = new Live(detail.viewer, FACTS.live)));

@@ -14,9 +14,9 @@ function created(name, attributes = {}, ...children) {
 
 // One curve with its name and newest value.
 class Curve {
-  // shown(value) makes the text of a value.
-  constructor(name, shown) {
-    [this.name, this.shown] = [name, shown];
+  // shown(value) makes the text of a value. weight: that of the newest value in a moving mean, at most 1.
+  constructor(name, shown, weight) {
+    Object.assign(this, { name, shown, weight });
     this.line = created("polyline", { fill: "none" });
     const box = { viewBox: `0 0 ${CURVE_WIDTH} ${CURVE_HEIGHT}`, preserveAspectRatio: "none", role: "img" };
     this.drawing = created("svg", box, this.line);
@@ -29,6 +29,7 @@ class Curve {
   show(value, iterations, values) {
     this.value.textContent = value === null ? "–" : this.shown(value);
     const points = iterations.map((x, i) => [x, values[i]]).filter(([, y]) => y !== null);
+    for (let i = 1; i < points.length; ++i) points[i][1] += (1 - this.weight) * (points[i - 1][1] - points[i][1]);
     const heights = points.map(([, y]) => y);
     const [low, high] = [Math.min(...heights), Math.max(...heights)];
     const [first, last] = [points[0]?.[0] ?? 0, points.at(-1)?.[0] ?? 0];

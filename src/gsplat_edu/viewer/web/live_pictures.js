@@ -6,8 +6,8 @@ const STILL_SIDE = 1600; // while it waits or is finished
 
 // Takes the place of Renderer.
 class Pictures {
-  constructor(canvas, at) {
-    Object.assign(this, { canvas, at, asking: false, wanted: null, still: false, failure: "" });
+  constructor(canvas) {
+    Object.assign(this, { canvas, asking: false, wanted: null, still: false, failure: "" });
     this.context = canvas.getContext("2d");
   }
 
@@ -36,7 +36,7 @@ class Pictures {
       const side = (length) => Math.max(1, Math.round(share * length));
       const { R, eye, fx, fy, cx, cy, W, H } = fitted(camera, side(camera.W), side(camera.H));
       try {
-        const answer = await fetch(`${this.at}picture`, {
+        const answer = await fetch("picture", {
           method: "POST",
           body: JSON.stringify({ R, eye, fx, fy, cx, cy, W, H }),
         });
@@ -64,7 +64,7 @@ addEventListener("DOMContentLoaded", (event) => {
   event.stopImmediatePropagation();
   class PictureViewer extends Viewer {
     makeRenderer() {
-      return new Pictures(this.canvas, FACTS.live.at);
+      return new Pictures(this.canvas);
     }
   }
   const viewer = new PictureViewer({ ...FACTS, sh_degree: 0 }, { means: new Float32Array(0) });
