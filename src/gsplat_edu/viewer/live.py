@@ -90,7 +90,7 @@ class LiveView:
         self._closing = ExitStack()
         self._closing.callback(self._server.server_close)
         self._news = threading.Condition()
-        self._state: dict[str, Any] = {"state": "loading", "version": 0}
+        self._state: dict[str, Any] = {}
         self._version, self._shown, self._snapshot = 0, -1, b""
         self._asked_at = self._seen_at = -math.inf
         self._hold_from: float = math.inf  # the training waits from this iteration on
@@ -165,7 +165,7 @@ class LiveView:
     def newer_state(self, version: int) -> dict[str, Any] | None:
         """Wait for a state of another version; None if there is none within `WAIT` seconds."""
         with self._news:
-            found = self._news.wait_for(lambda: self._version != version, WAIT)
+            found = self._news.wait_for(lambda: self._version not in (0, version), WAIT)
             return self._state if found else None
 
     def newer_scene(self, iteration: int) -> bytes | None:
@@ -234,6 +234,7 @@ class _LiveHandler(PageHandler):
         self.server.view.noticed()
         length = _number(self.headers.get("Content-Length", ""))
         if not 0 <= length <= LONGEST_BODY:
+            self.rfile.read(min(max(length, 0), 8 * LONGEST_BODY))  # an answer before it would be lost
             self._refuse(http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
             return
         try:
