@@ -18,7 +18,7 @@ from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live import LiveView
 from gsplat_edu.viewer.snapshots import Broadcast
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 """Seconds after which a wait fails."""
 
 GROWING = ["--max-gaussians", "600", "--densify-start", "5", "--densify-every", "10"]
