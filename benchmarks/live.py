@@ -1,16 +1,19 @@
 """By how much does a watching page slow a training?
 
-    python benchmarks/live.py [CAPTURE] [--from SCENE] [--resolution R] [--turns N] [--seconds S] [--smoke] [--out FILE.json]
+    python benchmarks/live.py [CAPTURE] [--from SCENE] [--resolution R] [--turns N] [--seconds S] [--smoke]
+                              [--out FILE.json]
 
 Trains with a live view. In turns, a headless Chromium shows the page, or an empty one, for some seconds each; the first
 seconds of a turn do not count. Prints the iterations per second of each turn, and the median over pairs of neighbours
-of the share that is lost. Without a graphics processor, the page draws on the same cores as the training.
+of the share that is lost. Without a graphics processor, the page draws on the same cores as the training. What other
+programs take from these disturbs the rates, so the processor time of the browser, on Linux, is printed beside them.
 
 --smoke requests states and snapshots without a browser.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 import statistics
 import threading
@@ -34,6 +37,23 @@ from gsplat_edu.viewer.snapshots import Broadcast
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SETTLING = GRACE + 3.0
 """Seconds at the start of a turn that do not count: the page loads, or is forgotten."""
+
+
+def browser_seconds() -> float:
+    """Return the processor time of all processes below this one, s; 0 where there is no /proc."""
+    parents, seconds = {}, {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        parents[int(stat.parent.name)] = int(fields[1])
+        seconds[int(stat.parent.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    below, found = {os.getpid()}, 0.0
+    while children := {pid for pid, parent in parents.items() if parent in below} - below:
+        below |= children
+        found += sum(seconds[child] for child in children)
+    return found
 
 
 @contextmanager
@@ -98,20 +118,26 @@ def main() -> None:
         words += [] if arguments.scene is None else ["--from", str(arguments.scene)]
         run, view = stack.enter_context(training(words, threading.Event()))
         show = stack.enter_context(page(arguments.smoke))
-        rates = []
+        rates: list[float] = []
+        busy: list[float] = []
         for turn in range(turns):
             show(view.url if turn % 2 else "about:blank")
             time.sleep(settling)
-            before, began = run.trainer.iteration, time.perf_counter()
+            before, began, used = run.trainer.iteration, time.perf_counter(), browser_seconds()
             time.sleep(seconds)
-            rates.append((run.trainer.iteration - before) / (time.perf_counter() - began))
+            taken = time.perf_counter() - began
+            rates.append((run.trainer.iteration - before) / taken)
+            busy.append((browser_seconds() - used) / taken)
         count = len(run.trainer.gaussians)
         print(f"{count} Gaussians at the end; the last scene shown is of iteration {view.shown()}")
     pairs = [1.0 - watched / alone for alone, watched in zip(rates[::2], rates[1::2], strict=False) if alone]
     lost = statistics.median(pairs) if pairs else 0.0
-    hardware.report({"rates": rates, "lost": lost, "count": count}, arguments.out)
+    hardware.report({"rates": rates, "browser": busy, "lost": lost, "count": count}, arguments.out)
     for name, part in (("alone", rates[::2]), ("watched", rates[1::2])):
         print(f"{name:>8}: {'  '.join(f'{rate:.2f}' for rate in part)} iterations/s")
+    print(
+        f"  browser: {'  '.join(f'{part:.3f}' for part in busy[1::2])} processor seconds per second, watching"
+    )
     print(f"lost by watching: {100 * lost:.1f} % (median of {len(pairs)} pairs)")
 
 

@@ -223,8 +223,8 @@ def _add_view(group: argparse._ArgumentGroup) -> None:
         "--view",
         action="store_true",
         help="show the training in the browser, with curves, pause and single step. Snapshots take at most 2 %% of the"
-        " time and do not change the result. The printed URL contains a token that is required for access. After the training"
-        " the view stays open until the last browser is closed, or Ctrl-C",
+        " time and do not change the result. The printed URL contains a token that is required for access. After the"
+        " training the view stays open until the last browser is closed, or Ctrl-C",
     )
     group.add_argument(
         "--view-host",

@@ -3,7 +3,7 @@
 
 // Drawing other splats takes this computer's time, which the training needs as well. So the page waits this many times
 // as long as it worked before it asks for the next ones.
-const REST_FACTOR = 20;
+const REST_FACTOR = 30;
 const SHORTEST_REST = 500; // milliseconds
 const LONGEST_REST = 60000;
 const PHOTOS_VARY = 0.25; // weight of the newest photo in the curves of its loss and PSNR
@@ -126,9 +126,9 @@ class Live {
         if (!answer?.ok) await this.rest(TRY_EVERY);
         continue;
       }
+      const began = performance.now();
       const buffer = await answer.arrayBuffer().catch(() => null);
       if (!buffer) continue; // the server ended
-      const began = performance.now();
       const { header, splats } = unframed(buffer);
       await this.viewer.replace({ count: header.count, sh_degree: header.sh_degree }, splats);
       this.viewer.renderer.finish();
