@@ -46,7 +46,7 @@ FRESH = 5.0
 SNAPSHOT_FORMAT = "gsplat-edu snapshot"
 SNAPSHOT_VERSION = 1
 
-LENGTH = struct.Struct("<I")
+HEADER_LENGTH = struct.Struct("<I")
 ALIGNMENT = 4
 """The header's length is a multiple of this, so that the float32 behind it can be read in place."""
 
@@ -197,7 +197,7 @@ def framed(iteration: int, count: int, sh_degree: int, packed: bytes) -> bytes:
     }
     text = json.dumps(header).encode("ascii")
     text += b" " * (-len(text) % ALIGNMENT)
-    return LENGTH.pack(len(text)) + text + packed
+    return HEADER_LENGTH.pack(len(text)) + text + packed
 
 
 def header_of(path: Path) -> dict[str, Any] | None:
@@ -212,8 +212,8 @@ def header_of(path: Path) -> dict[str, Any] | None:
     """
     try:
         with open_file(path) as file:
-            begin = file.read(LENGTH.size)
-            length = LENGTH.unpack(begin)[0] if len(begin) == LENGTH.size else 0
+            begin = file.read(HEADER_LENGTH.size)
+            length = HEADER_LENGTH.unpack(begin)[0] if len(begin) == HEADER_LENGTH.size else 0
             text = file.read(min(length, LONGEST_HEADER))
     except FileNotFoundError:
         return None
