@@ -1,30 +1,26 @@
-"""Helpers for tests of the live view: trainings that have one, and a client of its WebSocket."""
+"""Helpers for tests of the live view: trainings that have one, and a client of its server."""
 
-import io
-import re
+import http.client
+import json
 import threading
 import time
+import urllib.parse
 from contextlib import contextmanager
+from pathlib import Path
 
-import msgspec
 import numpy as np
-import viser
-import websockets.sync.client
-import zstandard
-from PIL import Image
 
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.main import build_parser
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.live import LiveView
+from gsplat_edu.viewer.snapshots import Broadcast
 
-PATIENCE = 180.0
+PATIENCE = 60.0
 """Seconds after which a wait fails."""
 
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-CANVAS = (120, 80)
-POSE = {"wxyz": LEVEL, "position": (0.1, -0.05, -3.0), "fov": 0.8, "image_width": 120, "image_height": 80}
 GROWING = ["--max-gaussians", "600", "--densify-start", "5", "--densify-every", "10"]
 STRATEGIES = {
     "adc": ["--strategy", "adc", "--densify-stop", "150", "--grad-threshold", "1e-4", "--reset-every", "60"],
@@ -42,20 +38,26 @@ def until(true, what):
     return found
 
 
+def made_run(capture, out, *words):
+    """Make the run of a command line."""
+    words = ["train", str(capture), "--out", str(out), "--seed", "3", *GROWING, *words]
+    return CaptureRun(plan(options_from(build_parser(["train"]).parse_args(words)), Limits()).options)
+
+
 class Training:
     """A training in its own thread, with its live view."""
 
     def __init__(self, capture, out, *words):
-        parsed = build_parser(["train"]).parse_args(["train", str(capture), "--out", str(out), *words])
-        self.run = CaptureRun(plan(options_from(parsed), Limits()).options)
+        self.run = made_run(capture, out, *words)
         self.stopped = threading.Event()
-        self.view = LiveView(self.run, self.stopped.is_set, port=0)
+        self.view = LiveView(self.run, port=0)
+        self.broadcast = Broadcast(self.run, self.stopped.is_set, [self.view])
         self.failure = None
         self.thread = threading.Thread(target=self._train)
 
     def _train(self):
         try:
-            self.run.train(self.stopped.is_set, [self.view.show])
+            self.run.train(self.stopped.is_set, [self.broadcast.show])
         except BaseException as error:
             self.failure = error
 
@@ -71,7 +73,7 @@ class Training:
 
 @contextmanager
 def training(capture, out, *words):
-    made = Training(capture, out, "--seed", "3", *GROWING, *words)
+    made = Training(capture, out, *words)
     with made.view:
         made.thread.start()
         try:
@@ -82,92 +84,62 @@ def training(capture, out, *words):
         made.ended()
 
 
-OWN = object()
-"""The origin of the view's own page."""
-
-
 class Client:
-    """The part of viser's browser client that these tests need: a WebSocket that carries MessagePack."""
+    """A page's requests, without a browser."""
 
-    def __init__(self, view, origin=OWN, url=None, **headers):
-        self.socket = websockets.sync.client.connect(
-            (url or view.url).replace("http", "ws", 1),
-            subprotocols=[f"viser-v{viser.__version__}"],
-            origin=view.url.partition("/?")[0] if origin is OWN else origin,
-            additional_headers=headers,
-            compression=None,
-            max_size=None,
-            open_timeout=PATIENCE,
-        )
-        self.buttons, self.text, self.shared = {}, "", []
-        self.pictures = []
-        self.lists, self.moved = {}, {}
+    def __init__(self, url):
+        parts = urllib.parse.urlsplit(url)
+        self.host, self.port = parts.hostname, parts.port
+        self.token = urllib.parse.parse_qs(parts.query)["token"][0]
+        self.own = {
+            "Cookie": f"gsplat_edu_{self.port}={self.token}",
+            "Origin": f"http://{self.host}:{self.port}",
+        }
 
-    def __enter__(self):
-        return self
+    def ask(self, method, path, body=None, headers=None):
+        """Return status, headers and body of one request; with the page's own headers unless others are given."""
+        connection = http.client.HTTPConnection(self.host, self.port, timeout=PATIENCE)
+        try:
+            connection.request(method, path, body, self.own if headers is None else headers)
+            answer = connection.getresponse()
+            return answer.status, answer.headers, answer.read()
+        finally:
+            connection.close()
 
-    def __exit__(self, *_):
-        self.socket.close()
+    def state(self, after=-1):
+        """Return the next state whose version is not `after`."""
+        answer = until(lambda: (a := self.ask("GET", f"/state?after={after}"))[0] == 200 and a, "a state")
+        return json.loads(answer[2])
 
-    def send(self, kind, **fields):
-        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+    def states(self, **wanted):
+        """Return the next state with these values."""
+        state = self.state()
+        while any(state[name] != value for name, value in wanted.items()):
+            state = self.state(state["version"])
+        return state
 
-    def move(self, **changes):
-        ignored = {"near": 0.01, "far": 1000.0, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, -1.0, 0.0)}
-        self.send("ViewerCameraMessage", **{**POSE, **ignored, **changes})
+    def scene(self, after=-1):
+        """Return header and Gaussians of the next scene whose iteration is not `after`."""
+        answer = until(lambda: (a := self.ask("GET", f"/scene?after={after}"))[0] == 200 and a, "a scene")
+        return unframed(answer[2])
 
-    def press(self, label):
-        until(lambda: label in self.listened().buttons, label)
-        self.send("GuiUpdateMessage", uuid=self.buttons[label], updates={"value": True})
+    def control(self, what):
+        """Press a button; return the status."""
+        return self.ask("POST", "/control", json.dumps({"do": what}))[0]
 
-    def options(self, label):
-        """Return the options of a dropdown list."""
-        return until(lambda: self.listened().lists.get(label), label)[1]
 
-    def choose(self, label, option):
-        assert option in self.options(label)
-        self.send("GuiUpdateMessage", uuid=self.lists[label][0], updates={"value": option})
+def unframed(data):
+    """Return header and Gaussians of the bytes of scene.bin, read as their description says."""
+    length = int.from_bytes(data[:4], "little")
+    assert length % 4 == 0
+    header = json.loads(data[4 : 4 + length])
+    assert (header["format"], header["version"]) == ("gsplat-edu snapshot", 1)
+    return header, page_data.unpacked(
+        Path("scene.bin"), data[4 + length :], header["count"], header["sh_degree"]
+    )
 
-    def listened(self):
-        """Read all messages that have arrived so far."""
-        while True:
-            try:
-                data = self.socket.recv(timeout=0.01)
-            except TimeoutError:
-                return self
-            size = int.from_bytes(data[8:16], "little")
-            for message in msgspec.msgpack.decode(zstandard.decompress(data[16 : 16 + size]))["messages"]:
-                self._note(message)
 
-    def _note(self, message):
-        if message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None:
-            self.pictures.append(np.asarray(Image.open(io.BytesIO(message["rgb_data"]))))
-        elif message["type"] == "GuiButtonMessage":
-            self.buttons[message["props"]["label"]] = message["uuid"]
-        elif message["type"] == "GuiUpdateMessage":
-            self.text = message["updates"].get("_markdown", self.text)
-            label = message["updates"].get("label")
-            if label is not None:
-                self.buttons = {name: uuid for name, uuid in self.buttons.items() if uuid != message["uuid"]}
-                self.buttons[label] = message["uuid"]
-        elif message["type"] == "GuiDropdownMessage":
-            self.lists[message["props"]["label"]] = (message["uuid"], list(message["props"]["options"]))
-        elif message["type"].startswith("SetCamera") and not message.get("initial"):
-            self.moved[message["type"]] = message
-        elif message["type"].startswith("ShareUrl"):
-            self.shared.append(message)
-
-    def picture(self, width=None):
-        """Return the next picture, or the next one of a given width."""
-        self.pictures.clear()
-        return until(
-            lambda: [p for p in self.listened().pictures if width in (None, p.shape[1])], "a picture"
-        )[-1]
-
-    def paused_at(self):
-        """Wait until the training is paused, and return its iteration."""
-        return self.says(r"\*\*paused\*\*\s+iteration ([\d,]+) of")
-
-    def says(self, pattern):
-        found = until(lambda: re.search(pattern, self.listened().text), pattern)
-        return int(found[1].replace(",", "")) if found.groups() else found
+def camera_json(camera):
+    """Return a camera as the page sends it."""
+    numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "H", "W")}
+    return json.dumps({"R": np.asarray(camera.R).tolist(), "eye": np.asarray(camera.eye).tolist(), **numbers})

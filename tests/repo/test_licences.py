@@ -16,7 +16,7 @@ list_licences = importlib.import_module("list_licences")
 
 def test_every_dependency_is_compatible_with_apache_2():
     found = list_licences.installed()
-    assert {"numpy", "torch", "scipy", "matplotlib", "kiwisolver", "viser", "pycolmap"} <= set(found)
+    assert {"numpy", "torch", "scipy", "matplotlib", "kiwisolver", "pycolmap"} <= set(found)
     assert list_licences.incompatible() == []
 
 

@@ -15,7 +15,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.runs.source import open_source
-from gsplat_edu.viewer import page
+from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 
@@ -44,7 +44,7 @@ def served(tmp_path):
     scene, file = tmp_path / "wall.ply", tmp_path / "edits.json"
     write_scene(scene, Scene(wall()))
     source = open_source(scene)
-    with EditServer("127.0.0.1", 0, page.policy(editing=True), file) as server:
+    with EditServer("127.0.0.1", 0, page_parts.policy(page_parts.EDITOR), file) as server:
         server.prepare(identity_of(source.scene.gaussians))
         editing = editing_of(source, scene, file, ADDRESS)
         server.page = page.html(source.scene, (), source.settings, "wall", editing=editing)

@@ -14,7 +14,7 @@ from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.source import file_settings
-from gsplat_edu.viewer import page
+from gsplat_edu.viewer import page_parts
 from gsplat_edu.viewer.serve import PageServer
 from gsplat_edu.viewer.stream import folder_page
 
@@ -59,7 +59,7 @@ def served(folder):
     servers = []
 
     def make(budget):
-        server = PageServer(b"", policy=page.policy(levels=True))
+        server = PageServer(b"", policy=page_parts.policy(page_parts.LEVELS))
         server.page, server.served = folder_page(folder, "scene", budget)
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -215,6 +215,6 @@ def test_only_files_that_the_index_names_are_served(folder, served, path, status
 
 
 def test_only_a_page_of_levels_may_load_anything():
-    assert "connect-src 'self';" in page.policy(levels=True)
-    assert "connect-src 'none';" in page.policy()
-    assert "unsafe" not in page.policy(levels=True)
+    assert "connect-src 'self';" in page_parts.policy(page_parts.LEVELS)
+    assert "connect-src 'none';" in page_parts.policy()
+    assert "unsafe" not in page_parts.policy(page_parts.LEVELS)

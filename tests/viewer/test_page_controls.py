@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.camera import Camera, look_at
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.viewer import page
@@ -170,7 +170,7 @@ def test_the_captures_cameras(tour, three_views):
 def test_a_window_of_any_shape_keeps_the_middle_of_the_photo(tour, three_views, width, height):
     tour.tab.set_viewport_size({"width": width, "height": height})
     for index, (_, camera) in enumerate(three_views):
-        tour.tab.evaluate(f"viewer.goTo({index})")
+        tour.tab.evaluate(f"delete viewer.facts.cameras[{index}].subject; viewer.goTo({index})")
         shown = tour.camera()
         scale = shown.fx / camera.fx
         assert width == shown.W and height == shown.H
@@ -184,6 +184,72 @@ def test_a_window_of_any_shape_keeps_the_middle_of_the_photo(tour, three_views, 
         else:  # wide: shows at least four fifths of the height, and the whole width
             assert bottom - top >= 0.8 * camera.H - 1e-9 and bottom - top <= camera.H + 1e-9
             assert right - left >= camera.W - 1e-9
+
+
+def test_a_narrow_window_shows_the_subject_and_is_filled_by_it(visit, tmp_path, random_gaussians):
+    """Twelve cameras surround a ball; each photo shows it in its left half, and a wall on the right."""
+    ball = random_gaussians(300)
+    ball.means.mul_(0.35 / 0.6)
+    ball.logit_opacities.fill_(3.0)
+    views = []
+    for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        eye = (4 * np.sin(angle), -0.5, -4 * np.cos(angle))
+        views.append(
+            (f"{angle:.2f}", Camera(look_at(eye, (0, 0, 0)), eye, 300.0, 300.0, 80.0, 120.0, H=240, W=400))
+        )
+    page.write(tmp_path / "ball.html", Scene(ball), views)
+    seen = visit(390, 844).open(tmp_path / "ball.html").ready()
+    inner = ball.means.double().numpy()
+    inner = inner[np.linalg.norm(inner, axis=1) < 0.6]
+    for index in (None, 3, 8):
+        if index is not None:
+            seen.tab.evaluate(f"viewer.goTo({index})")
+        shown = seen.camera()
+        u, v, _ = shown.project(shown.world_to_cam(inner))
+        assert u.min() > 0 and u.max() < 390 and v.min() > 0 and v.max() < 844, "all of it is in view"
+        assert u.max() - u.min() > 0.5 * 390, "and fills the window"
+        assert abs(u.max() + u.min() - 390) < 0.2 * 390, "in the middle"
+
+
+def test_the_scene_cannot_be_lost(tour):
+    """Zooming and panning end somewhere, and R goes back."""
+    start, farthest = tour.camera(), max(np.linalg.norm(eye) for eye in ((2.0, -0.5, 0.3), (-1.0, -0.4, 2.0)))
+    tour.tab.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(1.2); viewer.moved(-1)")
+    out = np.linalg.norm(tour.camera().eye - pivot(tour))
+    assert farthest < out < 4 * farthest
+    tour.tab.evaluate(
+        "for (let i = 0; i < 200; ++i) viewer.view.pan(300, 100, viewer.camera()); viewer.moved(-1)"
+    )
+    assert farthest < np.linalg.norm(pivot(tour)) < 5 * farthest
+    tour.tab.evaluate("for (let i = 0; i < 200; ++i) viewer.view.zoom(0.8); viewer.moved(-1)")
+    near = np.linalg.norm(tour.camera().eye - pivot(tour))
+    assert 0.005 * farthest < near < 0.05 * farthest
+    drag(tour, 50, 20)
+    tour.tab.keyboard.press("r")
+    np.testing.assert_allclose(tour.camera().eye, start.eye, atol=1e-12)
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_the_page_fits_a_phone_and_follows_its_colours(
+    visit, tmp_path, random_gaussians, three_views, scheme
+):
+    page.write(tmp_path / "a.html", Scene(random_gaussians(9)), three_views)
+    seen = visit(390, 844, color_scheme=scheme, has_touch=True).open(tmp_path / "a.html").ready()
+    assert not seen.tab.is_visible("#tools"), "the scene has the room first"
+    seen.tab.click("#fold")
+    ground = seen.tab.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, ground[4:-1].split(","))) > 384) == (scheme == "light")
+    for name in ("cameras", "path"):
+        seen.tab.click(f"#{name} summary")
+    boxes = seen.tab.evaluate(
+        "[...document.querySelectorAll('button, select, summary')].filter((one) => one.checkVisibility())"
+        ".map((one) => one.getBoundingClientRect())"
+        ".map(({ left, right, height, width }) => [left, right, height, width])"
+    )
+    assert len(boxes) > 8
+    for left, right, height, width in boxes:
+        assert height >= 40 and width >= 40 and left >= 0 and right <= 390
+    assert seen.tab.evaluate("document.documentElement.scrollWidth") == 390
 
 
 def test_held_out_cameras_are_marked_and_none_is_the_start(visit, tmp_path, random_gaussians, three_views):
@@ -337,6 +403,7 @@ def test_one_click_or_two_far_apart_set_nothing(wall):
 )
 def test_the_help_matches_the_visitors_device(show, random_gaussians, options, shown):
     seen = show(random_gaussians(9), width=390, height=600, fresh=True, **options)
+    seen.tab.click("#fold")
     seen.tab.click("#help-button")
     visible = seen.tab.locator("#help tr:visible")
     assert visible.count() > 3

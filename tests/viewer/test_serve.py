@@ -14,7 +14,7 @@ from PIL import Image
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.viewer import page, serve
+from gsplat_edu.viewer import page, page_parts, serve
 from gsplat_edu.viewer.serve import (
     PageServer,
     exposure,
@@ -248,8 +248,8 @@ def test_a_browser_that_disconnects_midway_does_no_harm(server, capsys):
 
 def test_a_browser_draws_the_page_without_complaint(server, browser, random_gaussians):
     server.page = page.html(Scene(random_gaussians(300)), settings=RenderSettings(background=ORANGE))
-    server.policy = page.policy()
-    assert ask(server)[1]["Content-Security-Policy"] == f"{page.policy()}; frame-ancestors 'none'"
+    server.policy = page_parts.policy()
+    assert ask(server)[1]["Content-Security-Policy"] == f"{page_parts.policy()}; frame-ancestors 'none'"
     complaints, urls = [], []
     tab = browser.new_page(viewport={"width": 320, "height": 240})
     tab.on("console", lambda message: complaints.append(message.text))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import functools
-import importlib
 import math
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
-from types import ModuleType
 from typing import Any
 
 from rich.console import Console
@@ -46,7 +44,10 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
+from gsplat_edu.viewer.live import NAMES, PORT, LiveView
+from gsplat_edu.viewer.live_folder import LiveFolder
 from gsplat_edu.viewer.serve import LOOPBACK, exposure, free_port
+from gsplat_edu.viewer.snapshots import Broadcast, FolderWatcher, Watcher, page_facts
 
 LINES = 20
 """Number of progress lines if there is no terminal for a progress bar."""
@@ -65,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
     def say(sentence: str) -> None:
         console.print(sentence, soft_wrap=True)
 
-    live = _live(arguments)
+    _check_view(arguments)
     for path in arguments.export:
         check_target("--export", path)
     size = num_processes()
@@ -78,7 +79,7 @@ def run(arguments: argparse.Namespace) -> None:
             _follow(arguments, team)
             return
         with locked("--out", arguments.out, "gsplat-edu train", say):
-            _run(arguments, console, say, live, team)
+            _run(arguments, console, say, team)
 
 
 def _follow(arguments: argparse.Namespace, team: Member) -> None:
@@ -110,7 +111,6 @@ def _run(
     arguments: argparse.Namespace,
     console: Console,
     say: Callable[[str], None],
-    live: ModuleType | None,
     team: Member,
 ) -> None:
     seconds = arguments.time_limit
@@ -120,10 +120,10 @@ def _run(
         options = chosen.options
         if _is_over(options, team, say):
             return
-        host = arguments.view_host or LOOPBACK
-        if live is not None:
-            port = live.PORT if arguments.view_port is None else arguments.view_port
-            free_port(host, port, live.NAMES)  # before the run writes anything
+        host, port = arguments.view_host or LOOPBACK, arguments.view_port
+        if arguments.view:
+            port = PORT if port is None else port
+            free_port(host, port, NAMES)  # before the run writes anything
         with progress_bar(console, "") as bar:
             capture = CaptureRun(options, say, photos_read(bar, interrupted), team)
         callbacks: list[Callback] = []
@@ -132,14 +132,11 @@ def _run(
             pace = Pace(capture, deadline, extend=chosen.by_time, say=say)
             callbacks.append(pace)
             ends = functools.partial(_either, interrupted, pace.over)
-        view = None
-        if live is not None:
-            view = closing.enter_context(live.LiveView(capture, interrupted, host, port))
-            say(f"live view: {view.url}")
-            if warning := exposure(host, "sees the training and can pause it", token=True):
-                say(warning)
+        view = _view(capture, host, port, say, closing) if arguments.view else None
+        watchers: list[Watcher] = [_folder_watcher(capture, say, closing)] if team.size == 1 else []
+        broadcast = Broadcast(capture, interrupted, watchers if view is None else [*watchers, view])
         with progress_bar(console, "{task.fields[state]}") as bar:
-            ended = train_with_bar(capture, bar, ends, callbacks if view is None else [*callbacks, view.show])
+            ended = train_with_bar(capture, bar, ends, [*callbacks, broadcast.show])
         if interrupted() or (ended and team.size > 1 and not ends()):  # or another process was
             raise KeyboardInterrupt(
                 f"interrupted after {capture.trainer.iteration} iterations;"
@@ -154,8 +151,7 @@ def _run(
                         "interrupted during the evaluation; the scene is saved, and --resume repeats the evaluation"
                     )
                 bar.advance(task)
-                if view is not None:
-                    view.update("evaluating")
+                broadcast.update("evaluating")
 
             export = functools.partial(export_all, arguments.export, bar, options.backend, say)
             clean = _cleaner(capture, say) if arguments.clean else None
@@ -163,7 +159,25 @@ def _run(
         _report(capture, result, say)
         if view is not None and view.watched:
             say("the live view stays open until its last browser is closed, or Ctrl-C")
-            view.stay()
+            broadcast.stay(lambda: view.watched)
+
+
+def _view(
+    capture: CaptureRun, host: str, port: int, say: Callable[[str], None], closing: ExitStack
+) -> LiveView:
+    """Open the live view and say where it is."""
+    view = closing.enter_context(LiveView(capture, host, port))
+    say(f"live view: {view.url}")
+    if warning := exposure(host, "sees the training and can pause it", token=True):
+        say(warning)
+    return view
+
+
+def _folder_watcher(capture: CaptureRun, say: Callable[[str], None], closing: ExitStack) -> FolderWatcher:
+    """Let another process watch by files in the run's folder; they are removed in the end."""
+    watcher = FolderWatcher(LiveFolder(capture.folder.path), functools.partial(page_facts, capture), say)
+    closing.callback(watcher.close)
+    return watcher
 
 
 def _is_over(options: RunOptions, team: Member, say: Callable[[str], None]) -> bool:
@@ -275,20 +289,11 @@ def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None])
         say(f"the time limit ended training before iteration {planned}; --resume continues it: {folder}")
 
 
-def _live(arguments: argparse.Namespace) -> ModuleType | None:
-    """Import the live view if requested; it needs viser, which is optional."""
-    if not arguments.view:
-        for flag, value in (("--view-host", arguments.view_host), ("--view-port", arguments.view_port)):
-            if value is not None:
-                raise ArgumentError(f"{flag}: has an effect only with --view; add --view, or omit {flag}")
-        return None
-    try:
-        return importlib.import_module("gsplat_edu.viewer.live")
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("gsplat_edu"):
-            raise
-        how = "pip install -c constraints.txt 'gsplat-edu[viewer]'"
-        raise ArgumentError(f"--view: {error.name} is not installed; {how}, or omit --view") from None
+def _check_view(arguments: argparse.Namespace) -> None:
+    """Refuse options of the live view without it."""
+    for flag, value in (("--view-host", arguments.view_host), ("--view-port", arguments.view_port)):
+        if value is not None and not arguments.view:
+            raise ArgumentError(f"{flag}: has an effect only with --view; add --view, or omit {flag}")
 
 
 def train_with_bar(

@@ -21,7 +21,7 @@ from gsplat_edu.io.formats import LOD_META, file_in
 from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
-from gsplat_edu.viewer import export, page
+from gsplat_edu.viewer import export, page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 from gsplat_edu.viewer.serve import PageServer, exposure
@@ -59,10 +59,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _server(arguments: argparse.Namespace, levels: bool) -> PageServer:
     if arguments.edit is None:
-        return PageServer(b"", arguments.host, arguments.port, policy=page.policy(levels))
+        kind = page_parts.LEVELS if levels else page_parts.PLAIN
+        return PageServer(b"", arguments.host, arguments.port, policy=page_parts.policy(kind))
     file = _edits_file(arguments)
     check_writable("--edit", file)
-    return EditServer(arguments.host, arguments.port, page.policy(editing=True), file)
+    return EditServer(arguments.host, arguments.port, page_parts.policy(page_parts.EDITOR), file)
 
 
 def _edits_file(arguments: argparse.Namespace) -> Path:

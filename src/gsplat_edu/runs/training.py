@@ -341,7 +341,7 @@ class CaptureRun:
             ) from None
         finally:
             self._log.close()
-        self.seconds, self._began = self._elapsed(), None
+        self.seconds, self._began = self.elapsed, None
         self.save()
         return asked
 
@@ -378,7 +378,7 @@ class CaptureRun:
         All processes of the run have to call it. The first one writes the file and returns its path.
         """
         if self._leads:
-            return save_checkpoint(self.folder.checkpoints, self.trainer, self._elapsed())
+            return save_checkpoint(self.folder.checkpoints, self.trainer, self.elapsed)
         self.trainer.state()  # sends the moments that this process holds
         return None
 
@@ -429,12 +429,14 @@ class CaptureRun:
         if self._began is not None:
             self._began += time.perf_counter() - before
 
-    def _elapsed(self) -> float:
+    @property
+    def elapsed(self) -> float:
+        """Wall time of the training so far, without the blocks of `clock_stopped` that are over."""
         return self.seconds if self._began is None else time.perf_counter() - self._began
 
     def _record(self, trainer: Trainer, event: Event) -> None:
         if self._leads:
-            self._log.record(event, self._elapsed())
+            self._log.record(event, self.elapsed)
         if not len(trainer.gaussians):
             raise ArgumentError(
                 f"iteration {trainer.iteration}: every Gaussian was pruned; lower --min-opacity or the learning rates"

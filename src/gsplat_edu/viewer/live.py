@@ -1,131 +1,76 @@
-"""Watch a training in the browser while it runs, rendered from the browser's camera.
+"""Watch a training in the browser while it runs: our page, from a server on this computer.
 
-viser serves its client and a WebSocket from its own threads, which only record the browsers' input. The training thread
-reads this input between two steps, while nothing else touches the Gaussians, and renders there. Rendering changes
-nothing, so a watched training gives the same bits as an unwatched one.
+The server's threads only record what the page asks for. The training thread packs snapshots and renders pictures
+between two iterations; see `gsplat_edu.viewer.snapshots`. `gsplat_edu.viewer.guard` checks every request.
 
-viser opens one TCP port for its client's files and the WebSocket. Its tunnel to a public server is disabled here, and
-`gsplat_edu.viewer.live_guard` checks every request.
+    GET  /                   the page; needs the token in the URL or the cookie
+    GET  /state?after=V      the state as JSON (`gsplat_edu.viewer.snapshots.state_of`, and `version`) as soon as its
+                             version is not V; 204 after `WAIT` seconds without one
+    GET  /scene?after=I      the Gaussians (`gsplat_edu.viewer.live_folder`: scene.bin) as soon as their iteration is
+                             not I; 204 after `WAIT` seconds. Nothing is packed unless somebody asks here
+    POST /control            {"do": "pause" | "resume" | "step"}; 204
+    POST /picture            a camera as in the page's facts; a JPEG of what it sees, for browsers that cannot draw
 """
 
 from __future__ import annotations
 
-import functools
-import logging
+import http
+import io
+import json
 import math
-import queue
+import threading
 import time
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+import urllib.parse
+from collections.abc import Mapping
+from contextlib import ExitStack
 from types import TracebackType
+from typing import Any
 
 import numpy as np
-import rich
 import torch
-import viser
-import viser.transforms
-from jaxtyping import Float64
+from PIL import Image
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.errors import ArgumentError, SplatError
-from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.evaluate.paths import common_up
-from gsplat_edu.gaussian_math import quat_to_R
+from gsplat_edu.reading import parse_json
+from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.training import CaptureRun
-from gsplat_edu.train.events import Event, StepEvent
-from gsplat_edu.train.trainer import Trainer
-from gsplat_edu.validation import ArrayLike, in_range, whole_number
-from gsplat_edu.viewer.live_guard import Guard
-from gsplat_edu.viewer.page_start import pivot_of
-from gsplat_edu.viewer.serve import LOOPBACK, free_port, url_of
-from gsplat_edu.views import View
+from gsplat_edu.validation import in_range, whole_number
+from gsplat_edu.viewer import page, page_parts
+from gsplat_edu.viewer.guard import Guard
+from gsplat_edu.viewer.serve import CHUNK, LOOPBACK, PageHandler, PageServer, url_of
+from gsplat_edu.viewer.snapshots import page_facts
 
 PORT = 8080
 
 NAMES = ("--view-host", "--view-port")
 """The user's names for host and port."""
 
-SHARE = 0.2
-"""Largest fraction of the time spent on browsers during training."""
-
-WIDTHS = (160, 1920)
-"""Smallest and largest width that the browser can choose, px; the image is never wider than the browser's own."""
-
-START_WIDTH = 800
-"""Initial width of the image, px."""
-
-MOVING = 0.4
-"""Fraction of the width that is rendered while the camera moves."""
-
-SETTLED = 0.3
-"""Seconds without a move after which the camera counts as still."""
-
-STILL_EVERY = 0.2
-"""Seconds between two images for a still camera while the training changes the scene."""
-
-FIGURES_EVERY = 0.5
-"""Seconds between two updates of loss and PSNR."""
-
-POLL = 0.03
-"""Seconds between two polls of the browsers while the training is paused."""
+WAIT = 2.0
+"""Seconds that a request waits for something new."""
 
 GRACE = 5.0
-"""Seconds after which a disconnected browser is not expected to return; reloading a page takes one or two."""
+"""Seconds after the last request during which a browser is expected to return; reloading a page takes one or two."""
+
+PICTURE_WAIT = 20.0
+"""Seconds that a request for a picture waits for the training thread."""
+
+WIDEST = 1920
+"""Longest side of a picture, px."""
+
+LONGEST_BODY = 8 << 10
+"""Bytes of a request's body; a camera takes less than one KB."""
 
 JPEG_QUALITY = 85
 
-MOST_ASPECT = 4.0
-"""Largest aspect ratio of a browser's image, in either direction."""
-
-WIDEST_FOV = math.radians(170.0)
-
-
-def browser_camera(
-    wxyz: ArrayLike, position: ArrayLike, fov: float, canvas: tuple[int, int], width: int
-) -> Camera:
-    """Convert viser's camera. Its axes agree with ours (+z forward, y down); only the rotation is inverted.
-
-    Args:
-        wxyz: (4,) quaternion of the camera-to-world rotation.
-        position: (3,) camera centre, world units.
-        fov: Vertical field of view, radians.
-        canvas: Width and height of the browser's image, px.
-        width: Width of the image to render, px; at most the browser's.
-
-    Returns:
-        A camera whose image, stretched over the browser's, shows the same view to the pixel.
-
-    Raises:
-        ArgumentError: the browser sent values that do not form a camera.
-    """
-    columns, rows = whole_number("width", canvas[0], 1), whole_number("height", canvas[1], 1)
-    aspect = in_range("aspect", columns / rows, 1 / MOST_ASPECT, MOST_ASPECT)
-    tangent = math.tan(in_range("fov", fov, 0.0, WIDEST_FOV, open_low=True) / 2)
-    W = min(whole_number("width", width, 1), columns)
-    H = max(1, round(W / aspect))
-    fx, fy = W / 2 / (tangent * aspect), H / 2 / tangent  # pixels are not quite square where H was rounded
-    return Camera(quat_to_R(wxyz).T, position, fx, fy, (W - 1) / 2, (H - 1) / 2, H, W)
-
-
-@dataclass
-class _Browser:
-    """A connected browser and its last image: time stamp of the camera, width, iteration, and time of sending."""
-
-    handle: viser.ClientHandle
-    stamp: float
-    moved_at: float = -math.inf
-    drawn: tuple[float, int, int] | None = None
-    drawn_at: float = -math.inf
-
 
 class LiveView:
-    """Shows a training to browsers and lets them pause it.
+    """The page of a training and the server that it comes from; a `gsplat_edu.viewer.snapshots.Watcher`.
+
+    It listens once created, and answers inside its `with` block.
 
     Args:
-        capture: The run; its dataset is loaded, its trainer may come later.
-        stop: Returns whether the program should end.
+        capture: The run; its dataset is loaded.
         host: Address to listen on.
         port: Port; 0 picks a free one.
 
@@ -136,312 +81,260 @@ class LiveView:
         url: The view's address, including the token that grants access.
     """
 
-    def __init__(
-        self, capture: CaptureRun, stop: Callable[[], bool], host: str = LOOPBACK, port: int = PORT
-    ) -> None:
-        self._capture, self._stop = capture, stop
-        self._render = capture.options.renderer
-        self._trainer: Trainer | None = None
-        self._event: StepEvent | None = None
-        self._browsers: dict[int, _Browser] = {}
-        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._left = math.inf  # iterations until the training pauses
-        self._free_at = self._figures_at = -math.inf
-        self._seen_at = -math.inf
-        self._state = self._said = self._failure = ""
-        with ExitStack() as closing:
-            self._server, token = _server(host, port, closing)
-            self.url = f"{url_of(host, self._server.get_port())}?token={token}"
-            self._set_scene()
-            self._add_panel()
-            self._closing = closing.pop_all()
+    def __init__(self, capture: CaptureRun, host: str = LOOPBACK, port: int = PORT) -> None:
+        self._trainer = capture.trainer
+        html = page.live_html(page_facts(capture))
+        self._server = _LiveServer(self, html, page_parts.policy(page_parts.LIVE), host, port)
+        token = self._server.guard.token
+        self.url = f"{url_of(host, self._server.server_port)}?token={token}"
+        self._closing = ExitStack()
+        self._closing.callback(self._server.server_close)
+        self._news = threading.Condition()
+        self._state: dict[str, Any] = {}
+        self._version, self._shown, self._snapshot = 0, -1, b""
+        self._asked_at = self._seen_at = -math.inf
+        self._hold_from: float = math.inf  # the training waits from this iteration on
+        self._wanted: Camera | None = None
+        self._picture: bytes | str = ""
+        self._one_picture = threading.Lock()
 
     def __enter__(self) -> LiveView:
-        """Return the view itself; it has been listening since its creation."""
+        """Start answering."""
+        thread = threading.Thread(
+            target=self._server.serve_forever, args=(0.05,), name="live view", daemon=True
+        )
+        thread.start()
+        self._closing.callback(thread.join)
+        self._closing.callback(self._server.shutdown)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the server and every connection."""
+        """Close the server."""
         self._closing.close()
 
     @property
     def watched(self) -> bool:
         """Whether a browser is connected, or disconnected so recently that it may return."""
-        now = time.perf_counter()
-        self._poll_browsers(now)
-        return now - self._seen_at <= GRACE
+        return time.perf_counter() - self._seen_at <= GRACE
 
-    def show(self, trainer: Trainer, event: Event) -> None:
-        """Serve the browsers after a training step, in the trainer's thread; block while the training is paused.
+    def watches(self) -> bool:
+        """Return whether a browser is connected."""
+        return self.watched
 
-        A callback of the trainer. It takes at most `SHARE` of the time, and microseconds if no browser is connected.
+    def shown(self) -> int | None:
+        """Return the iteration of the newest snapshot; None if no page waits for one."""
+        waiting = time.perf_counter() - self._asked_at <= WAIT
+        return self._shown if waiting else None
+
+    def holds(self, iteration: int) -> bool:
+        """Return whether the training has to wait; never if nobody is left to resume it."""
+        if self._hold_from != math.inf and not self.watched:
+            self._hold_from = math.inf
+        return iteration >= self._hold_from
+
+    def take_state(self, state: Mapping[str, Any]) -> None:
+        """Offer a state to the pages."""
+        with self._news:
+            self._version += 1
+            self._state = {**state, "version": self._version}
+            self._news.notify_all()
+
+    def take_scene(self, iteration: int, snapshot: bytes) -> None:
+        """Offer a snapshot to the pages."""
+        with self._news:
+            self._shown, self._snapshot, self._asked_at = iteration, snapshot, -math.inf
+            self._news.notify_all()
+
+    def camera(self) -> Camera | None:
+        """Return the camera of the picture that a page waits for."""
+        return self._wanted
+
+    def take_picture(self, output: RenderOutput | str) -> None:
+        """Give the picture to the page that waits for it."""
+        picture = output if isinstance(output, str) else _jpeg(output)
+        with self._news:
+            self._wanted, self._picture = None, picture
+            self._news.notify_all()
+
+    def noticed(self) -> None:
+        """Note that a browser is connected."""
+        self._seen_at = time.perf_counter()
+
+    def newer_state(self, version: int) -> dict[str, Any] | None:
+        """Wait for a state of another version; None if there is none within `WAIT` seconds."""
+        with self._news:
+            found = self._news.wait_for(lambda: self._version not in (0, version), WAIT)
+            return self._state if found else None
+
+    def newer_scene(self, iteration: int) -> bytes | None:
+        """Wait for a snapshot of another iteration; None if there is none within `WAIT` seconds.
+
+        A page that has none (-1) gets the last one at once, and asks for a newer one then.
         """
-        if not isinstance(event, StepEvent):
+        with self._news:
+            is_newest = self._shown == self._trainer.iteration
+            if self._shown != iteration and (is_newest or iteration < 0):
+                return self._snapshot
+            before = self._shown
+            self._asked_at = time.perf_counter()
+            found = self._news.wait_for(lambda: self._shown not in (before, iteration), WAIT)
+            return self._snapshot if found else None
+
+    def control(self, what: object) -> bool:
+        """Pause, resume or take a single step; return whether the command is known."""
+        if what == "pause":
+            self._hold_from = -math.inf
+        elif what == "resume":
+            self._hold_from = math.inf
+        elif what == "step":
+            self._hold_from = self._trainer.iteration + 1
+        else:
+            return False
+        return True
+
+    def picture(self, camera: Camera) -> bytes | str:
+        """Return a JPEG from a camera, or why there is none. One page waits at a time."""
+        with self._one_picture, self._news:
+            self._wanted, self._picture = camera, ""
+            self._news.wait_for(lambda: self._picture != "", PICTURE_WAIT)
+            self._wanted = None
+            return self._picture or "not drawn: the training is busy"
+
+
+class _LiveHandler(PageHandler):
+    server: _LiveServer
+
+    def do_HEAD(self) -> None:
+        self._refuse(http.HTTPStatus.METHOD_NOT_ALLOWED)
+
+    def do_GET(self) -> None:
+        if not self._let_in():
             return
-        self._trainer, self._event = trainer, event
-        self._left = max(self._left - 1, 0)
-        with self._capture.clock_stopped():
-            self.update()
-            if self._left == 0:
-                self._hold()
+        view, target = self.server.view, urllib.parse.urlsplit(self.path)
+        view.noticed()
+        after = _number(urllib.parse.parse_qs(target.query).get("after", [""])[0])
+        if target.path == "/":
+            policy = f"{self.server.policy}; frame-ancestors 'none'"
+            more = {"Set-Cookie": self.server.guard.cookie, "Content-Security-Policy": policy}
+            self._reply(http.HTTPStatus.OK, self.server.page, "text/html; charset=utf-8", more)
+        elif target.path == "/state":
+            state = view.newer_state(after)
+            self._offer(None if state is None else json.dumps(state).encode("ascii"), "application/json")
+        elif target.path == "/scene":
+            self._offer(view.newer_scene(after), "application/octet-stream")
+        else:
+            self._refuse(http.HTTPStatus.NOT_FOUND)
+        view.noticed()
 
-    def update(self, state: str = "training") -> None:
-        """Serve the browsers once if an image is due.
-
-        Args:
-            state: The program's current activity, shown in the panel.
-        """
-        while not self._commands.empty():
-            self._commands.get()()
-        now = time.perf_counter()
-        self._poll_browsers(now)
-        if not self._browsers or now < self._free_at:
+    def do_POST(self) -> None:
+        if not self._let_in():
             return
-        if now - self._figures_at >= FIGURES_EVERY:
-            self._figures_at = now
-            self._say(state)
-        self._draw(now)
-        self._free_at = now + (time.perf_counter() - now) / SHARE
-
-    def stay(self) -> None:
-        """Show the finished scene until no browser is connected or the program should end."""
-        self._left = math.inf
-        self._pause.disabled = self._step.disabled = True
-        self._wait("finished", lambda: False)
-
-    def _hold(self) -> None:
-        """Wait for a single step, a resume, the last browser to leave, or the end of the program."""
-        self._pause.label = "Resume"
-        self._wait("paused", lambda: self._left > 0)
-        if self._left == 0:  # no browser is left to resume it
-            self._left = math.inf
-        if self._left == math.inf:
-            self._pause.label = "Pause"
-
-    def _wait(self, state: str, over: Callable[[], bool]) -> None:
-        """Serve the browsers until `over` returns true, the program should end, or no browser is left."""
-        self._say(state)
-        while not (over() or self._stop()):
-            if not self.watched:
-                return
-            self._draw(time.perf_counter())
-            try:
-                self._commands.get(timeout=POLL)()
-            except queue.Empty:
-                continue
-
-    def _poll_browsers(self, now: float) -> None:
-        """Update the list of browsers and detect moved cameras."""
-        handles = self._server.get_clients()
-        for gone in self._browsers.keys() - handles.keys():
-            del self._browsers[gone]
-        for number, handle in handles.items():
-            stamp = handle.camera.update_timestamp
-            if number not in self._browsers:
-                self._browsers[number] = _Browser(handle, stamp)
-            elif stamp != self._browsers[number].stamp:
-                self._browsers[number].stamp, self._browsers[number].moved_at = stamp, now
-        if handles:
-            self._seen_at = now
-
-    def _draw(self, now: float) -> None:
-        """Send one image, to the browser that has waited longest for one."""
-        if self._trainer is None:
+        self.server.view.noticed()
+        length = _number(self.headers.get("Content-Length", ""))
+        if not 0 <= length <= LONGEST_BODY:
+            self.rfile.read(min(max(length, 0), 8 * LONGEST_BODY))  # an answer before it would be lost
+            self._refuse(http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
             return
-        due = [browser for browser in self._browsers.values() if self._is_due(browser, now)]
-        if not due:
-            return
-        browser = min(due, key=lambda candidate: candidate.drawn_at)
-        browser.drawn, browser.drawn_at = self._wanted(browser, now), now
-        seen, width = browser.handle.camera, browser.drawn[1]
-        canvas = (seen.image_width, seen.image_height)
         try:
-            camera = browser_camera(seen.wxyz, seen.position, seen.fov, canvas, width)
-        except ArgumentError:
-            return  # the browser has sent no camera yet, or an invalid one: the next may be valid
+            body = parse_json(self.rfile.read(length))
+        except ValueError:
+            body = None
+        if self.path == "/control" and isinstance(body, dict) and self.server.view.control(body.get("do")):
+            self._offer(None, "")
+        elif self.path == "/picture":
+            self._draw(body)
+        else:
+            self._refuse(http.HTTPStatus.BAD_REQUEST)
+
+    def _draw(self, body: object) -> None:
         try:
-            with torch.no_grad():
-                image = self._render(self._trainer.gaussians, camera).image
-        except (SplatError, MemoryError, torch.cuda.OutOfMemoryError) as error:
-            self._note_failure(f"not drawn: {str(error) or 'out of memory'}")
+            camera = picture_camera(body)
+        except ArgumentError as error:
+            self._refuse(http.HTTPStatus.BAD_REQUEST, str(error))
             return
-        self._note_failure("")
-        levels = torch.nan_to_num(image).clamp(0.0, 1.0) * 255.0 + 0.5
-        with warnings.catch_warnings():  # viser warns if the browser has just disconnected
-            warnings.simplefilter("ignore")
-            browser.handle.scene.set_background_image(
-                levels.to(torch.uint8).numpy(force=True), format="jpeg", jpeg_quality=JPEG_QUALITY
-            )
-        browser.handle.flush()
+        picture = self.server.view.picture(camera)
+        if isinstance(picture, str):
+            self._refuse(http.HTTPStatus.SERVICE_UNAVAILABLE, picture)
+        else:
+            self._offer(picture, "image/jpeg")
 
-    def _wanted(self, browser: _Browser, now: float) -> tuple[float, int, int]:
-        """Return the image that a browser should have: time stamp of its camera, width, iteration."""
-        asked = int(
-            min(WIDTHS[1], max(WIDTHS[0], self._width.value))
-        )  # in this order, NaN becomes the smallest width
-        width = min(asked, browser.handle.camera.image_width)
-        if now - browser.moved_at < SETTLED:
-            width = round(MOVING * width)
-        return browser.stamp, width, 0 if self._trainer is None else self._trainer.iteration
-
-    def _is_due(self, browser: _Browser, now: float) -> bool:
-        wanted = self._wanted(browser, now)
-        if browser.drawn is None or wanted[:2] != browser.drawn[:2]:
-            return True
-        return wanted != browser.drawn and now - browser.drawn_at >= STILL_EVERY
-
-    def _note_failure(self, failure: str) -> None:
-        """Show in the panel why the last image was not drawn, or that it was: training continues either way."""
-        if failure != self._failure:
-            self._failure = failure
-            self._say(self._state)
-
-    def _say(self, state: str) -> None:
-        """Show the metrics of the last step."""
-        self._state = state
-        lines = [f"**{state}**"]
-        if self._event is not None and self._trainer is not None:
-            total = self._trainer.config.iterations
-            lines += [
-                f"iteration {self._trainer.iteration:,} of {total:,}",
-                _gaussians(self._trainer),
-                f"loss {self._event.loss:.4f}",
-            ]
-            if self._trainer.last is not None:
-                lines.append(f"PSNR {_psnr(self._trainer):.2f} dB (last photo)")
-                height, width, _ = self._trainer.last[0].shape
-                lines.append(f"photos at {width} x {height} px" + _share(self._event.photo_factor))
-        if self._failure:
-            lines.append(f"`{self._failure.replace('`', '')}`")
-        said = "  \n".join(lines)  # two spaces force a line break in Markdown
-        if said != self._said:
-            self._said = self._figures.content = said
-
-    def _set_scene(self) -> None:
-        cameras = [view.camera for view in self._capture.dataset.train]
-        self._up = common_up(cameras)
-        first, start = cameras[0], self._server.initial_camera
-        pivot = pivot_of(cameras, 0, self._capture.dataset.points)
-        self._distance = float((pivot - first.eye) @ first.R[2])
-        self._server.scene.set_up_direction(self._up)
-        start.position = first.eye
-        start.look_at = first.eye + self._distance * first.R[2]
-        start.fov = _vertical_fov(first)
-
-    def _add_panel(self) -> None:
-        gui = self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
-        gui.set_panel_label("gsplat-edu train")
-        self._figures = gui.add_markdown("loading photos")
-        self._pause, self._step = gui.add_button("Pause"), gui.add_button("Step")
-        low, high = WIDTHS
-        self._width = gui.add_slider("Width (px)", low, high, step=20, initial_value=START_WIDTH)
-        self._pause.on_click(lambda event: self._commands.put(self._toggle))
-        self._step.on_click(lambda event: self._commands.put(self._step_once))
-        dataset = self._capture.dataset
-        start = dataset.train[0].camera
-        reset = gui.add_button("Reset view")
-        reset.on_click(lambda event: self._send(event.client, start, self._up))
-        views = _cameras(dataset.train, dataset.test)
-        cameras = gui.add_dropdown("Camera", list(views), initial_value=dataset.train[0].name)
-        cameras.on_update(lambda event: self._send(event.client, views.get(event.target.value)))
-
-    def _send(
-        self,
-        browser: viser.ClientHandle | None,
-        camera: Camera | None,
-        up: Float64[np.ndarray, "3"] | None = None,
-    ) -> None:
-        """Ask the training thread to move a browser to a camera; see `_move`."""
-        if browser is not None and camera is not None:  # a browser may send a name that is not in the list
-            self._commands.put(functools.partial(self._move, browser, camera, up))
-
-    def _move(self, browser: viser.ClientHandle, camera: Camera, up: Float64[np.ndarray, "3"] | None) -> None:
-        """Move a browser to a camera, with `up` upwards; None takes the camera's own up."""
-        seen = browser.camera
-        if not seen.update_timestamp:  # it has not sent its camera yet
-            return
-        with warnings.catch_warnings(), browser.atomic():  # viser warns if the browser has just disconnected
-            warnings.simplefilter("ignore")
-            seen.fov = _vertical_fov(camera)
-            seen.position = camera.eye
-            seen.look_at = camera.eye + self._distance * camera.R[2]
-            if up is None:
-                seen.wxyz = viser.transforms.SO3.from_matrix(camera.R.T).wxyz
-            else:
-                seen.up_direction = up
-        browser.flush()
-
-    def _toggle(self) -> None:
-        self._left = 0 if self._left == math.inf else math.inf
-
-    def _step_once(self) -> None:
-        self._left = 1
-
-
-class _Server(viser.ViserServer):
-    """viser without its tunnel. Any browser could request the tunnel, which exposes the view to the internet."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse."""
-        return None
-
-
-def _server(host: str, port: int, closing: ExitStack) -> tuple[viser.ViserServer, str]:
-    """Start viser's server and return it with its token; `closing` receives the clean-up.
-
-    If the port is in use, viser would take the next free one; if the address cannot be bound, it would wait forever.
-    """
-    wanted = free_port(host, port, NAMES)
-    closing.enter_context(_silence())
-    guard = Guard(host, wanted)
-    with guard.installed():
-        server = _Server(host=host, port=wanted, label="gsplat-edu", verbose=False)
-        closing.callback(server.stop)
-    if server.get_port() != wanted:
-        raise ArgumentError(
-            f"{NAMES[1]}: {wanted} has just been taken; choose another port, or 0 for any free one"
+    def _let_in(self) -> bool:
+        fault = self.server.guard.fault(
+            self.command, self.path, lambda name: self.headers.get_all(name) or []
         )
-    return server, guard.token
+        if fault is not None:
+            self._refuse(http.HTTPStatus.FORBIDDEN, fault)
+        return fault is None
+
+    def _offer(self, body: bytes | None, kind: str) -> None:
+        """Send what there is; without a body, say that there is none."""
+        if body is None:
+            self._reply(http.HTTPStatus.NO_CONTENT, b"", "text/plain")
+        else:
+            self._reply(http.HTTPStatus.OK, body, kind)
+
+    def _refuse(self, status: http.HTTPStatus, reason: str = "") -> None:
+        """Send an error, with one line for the user."""
+        text = f"{status.value} {status.phrase}{reason and ': '}{reason}\n".encode()
+        more = {"Allow": "GET, POST"} if status is http.HTTPStatus.METHOD_NOT_ALLOWED else None
+        self._reply(status, text, "text/plain; charset=utf-8", more)
+
+    def _reply(
+        self, status: http.HTTPStatus, body: bytes, kind: str, more: Mapping[str, str] | None = None
+    ) -> None:
+        self.send_response(status)
+        self.send_header("Referrer-Policy", "no-referrer")  # the URL is a secret
+        for name, value in (more or {}).items():
+            self.send_header(name, value)
+        self._headers(kind, len(body))
+        whole = memoryview(body if self.command != "HEAD" else b"")
+        for begin in range(0, len(whole), CHUNK):
+            self.wfile.write(whole[begin : begin + CHUNK])
 
 
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep viser's console output and its WebSocket log off the terminal."""
-    console, logger = rich.get_console(), logging.getLogger("websockets")
-    before = console.quiet, logger.level
-    console.quiet = True
-    logger.setLevel(logging.CRITICAL + 1)
+class _LiveServer(PageServer):
+    """Serves the page of a training and answers its requests."""
+
+    def __init__(self, view: LiveView, html: bytes, policy: str, host: str, port: int) -> None:
+        super().__init__(html, host, port, NAMES, policy)
+        self.RequestHandlerClass = _LiveHandler
+        self.view = view
+        self.guard = Guard(host, self.server_port)
+
+
+def picture_camera(value: object) -> Camera:
+    """Make a camera of what a browser sent.
+
+    Args:
+        value: An object with R, eye, fx, fy, cx, cy, W and H, as in the page's facts.
+
+    Raises:
+        ArgumentError: it does not describe a camera, or one whose image is too large.
+    """
+    if not isinstance(value, dict):
+        raise ArgumentError("camera: is not an object")
     try:
-        yield
-    finally:
-        console.quiet = before[0]
-        logger.setLevel(before[1])
+        given = {name: value[name] for name in ("R", "eye", "fx", "fy", "cx", "cy", "W", "H")}
+        W, H = (whole_number(name, given.pop(name), 1, WIDEST) for name in ("W", "H"))
+        focal = {name: in_range(name, given.pop(name), 0.0, 1e9, open_low=True) for name in ("fx", "fy")}
+        return Camera(**given, **focal, H=H, W=W)
+    except KeyError as error:
+        raise ArgumentError(f"camera: lacks {error}") from None
+    except (SplatError, ValueError, TypeError, OverflowError) as error:
+        raise ArgumentError(f"camera: {str(error)[:200]}") from None
 
 
-def _cameras(train: Sequence[View], test: Sequence[View]) -> dict[str, Camera]:
-    """Return the cameras by their names in the list, in the capture's order."""
-    names = {view.name: view.name for view in train} | {view.name: f"{view.name} (held out)" for view in test}
-    return {names[view.name]: view.camera for view in sorted([*train, *test], key=lambda view: view.name)}
+def _jpeg(output: RenderOutput) -> bytes:
+    levels = torch.nan_to_num(output.image).clamp(0.0, 1.0) * 255.0 + 0.5
+    made = io.BytesIO()
+    Image.fromarray(np.asarray(levels.to(torch.uint8).numpy(force=True))).save(
+        made, "JPEG", quality=JPEG_QUALITY
+    )
+    return made.getvalue()
 
 
-def _vertical_fov(camera: Camera) -> float:
-    return 2.0 * math.atan(camera.H / 2 / camera.fy)
-
-
-def _psnr(trainer: Trainer) -> float:
-    try:
-        return math.nan if trainer.last is None else psnr(*trainer.last)
-    except SplatError:  # an image with NaN or infinity has no PSNR
-        return math.nan
-
-
-def _gaussians(trainer: Trainer) -> str:
-    cap = trainer.config.max_gaussians
-    return f"{len(trainer.gaussians):,}" + (f" of at most {cap:,}" if cap is not None else "") + " Gaussians"
-
-
-def _share(factor: float) -> str:
-    return "" if factor == 1.0 else f", 1/{factor:.3g} of their width"
+def _number(text: str) -> int:
+    """Return a whole number in ASCII digits; -1 for anything else."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 16 else -1

@@ -9,23 +9,23 @@ from __future__ import annotations
 
 import base64
 import gzip
-import html as html_text
-import json
 import math
-import re
 import zlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from jaxtyping import Float
+
 from gsplat_edu import constants
 from gsplat_edu.camera import Camera
-from gsplat_edu.content_policy import content_policy, policy_element
 from gsplat_edu.errors import SceneFormatError
 from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.files import written_aside
+from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.reading import parse_json, read_bytes
@@ -33,63 +33,11 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.viewer import page_data
-from gsplat_edu.viewer.page_start import Start, first_camera, start_of
+from gsplat_edu.viewer.page_parts import filled, web
+from gsplat_edu.viewer.page_start import Start, first_camera, start_among, start_of, subjects_of
 
 FORMAT = "gsplat-edu page"
 VERSION = 1
-
-SCRIPTS = (
-    "scene.js",
-    "region.js",
-    "camera.js",
-    "path.js",
-    "draw.js",
-    "sorter.js",
-    "controls.js",
-    "panel.js",
-    "keyframes.js",
-    "main.js",
-)
-"""The page's scripts in loading order; they share one scope."""
-
-LEVEL_SCRIPTS = (*SCRIPTS[:-1], "levels.js", "main.js")
-"""The same for a page that loads levels of detail."""
-
-EDIT_SCRIPTS = (
-    *SCRIPTS[:-1],
-    "edit_member.js",
-    "edit_state.js",
-    "edit_shapes.js",
-    "edit_draw.js",
-    "edit_tools.js",
-    "edit_panel.js",
-    "edit.js",
-    "edit_start.js",
-    "main.js",
-)
-"""The same for a page with the editor."""
-
-STYLE, EDIT_STYLE = "style.css", "edit.css"
-
-SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
-
-SHADER_CONSTANTS = (
-    "DILATION",
-    "ALPHA_MIN",
-    "ALPHA_MAX",
-    "Z_NEAR",
-    "COLOR_LIMIT",
-    "DET_FLOOR",
-    "SH_OFFSET",
-    "C0",
-    "C1",
-    "C2",
-    "C3",
-)
-"""Names in `gsplat_edu.constants` that the shaders use."""
-
-FINITE = 3e38
-"""Larger values count as infinite in a shader; float32 ends at 3.4e38."""
 
 PIECE = 12 << 20
 """Compressed bytes per element, a multiple of 3 so that the base64 of one element continues in the next."""
@@ -186,16 +134,44 @@ def html(
     return b"".join(_pieces(title, scene, views, settings, held_out, tour or Tour(), editing))
 
 
-def policy(levels: bool = False, editing: bool = False) -> str:
-    """Return the Content-Security-Policy of every page: its scripts, its style, and its workers.
+def live_facts(
+    title: str,
+    views: Sequence[NamedCamera],
+    held_out: Collection[str],
+    points: Float[np.ndarray, "N 3"],
+    settings: RenderSettings,
+    origin: Sequence[float] = ORIGIN,
+) -> dict[str, Any]:
+    """Return the facts of a page whose splats come later and change.
 
     Args:
-        levels: Whether the page loads levels of detail, from its own server.
-        editing: Whether it has the editor, which saves to its own server.
+        title: Heading of the page.
+        views: As for `write`; at least one.
+        held_out: As for `write`.
+        points: (N, 3) points of the scene; may be empty.
+        settings: Render settings of the finished scene.
+        origin: As for `Tour`.
     """
-    scripts = EDIT_SCRIPTS if editing else LEVEL_SCRIPTS if levels else SCRIPTS
-    own_server = levels or editing
-    return content_policy(map(_web, scripts), [_style(editing)], workers=True, own_server=own_server)
+    nothing = Scene(Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (1, 3), (0, 3), ()))))
+    facts = _facts(title, nothing, views, settings, held_out, Tour(origin=origin))
+    index = facts["start"]["index"]
+    start = start_among([camera for _, camera in views], index, points)
+    facts["start"] |= {"pivot": start.pivot.tolist(), "up": start.up.tolist()}
+    _add_subjects(facts, [camera for _, camera in views], start.camera, points)
+    return facts | {"up": start.up.tolist(), "sh_degree": int(settings.sh_degree)}
+
+
+def live_html(facts: dict[str, Any], step: bool = True) -> bytes:
+    """Return a page that shows a training: without splats, which it asks its server for.
+
+    Args:
+        facts: From `live_facts`.
+        step: Whether the server can take a single step.
+    """
+    head, tail = web("index.html").split("{{splats}}\n")
+    nothing = SPLATS_OPEN + base64.b64encode(gzip.compress(b"", mtime=0)) + CLOSE + b"\n"
+    begin = filled(head, str(facts["title"]), facts | {"live": {"step": step}})
+    return begin.encode("utf-8", errors="replace") + nothing + tail.encode("utf-8")
 
 
 def levels_html(scene: Scene, levels: dict[str, Any], title: str) -> bytes:
@@ -207,8 +183,8 @@ def levels_html(scene: Scene, levels: dict[str, Any], title: str) -> bytes:
         title: Heading of the page.
     """
     facts = _facts(title, scene, (), file_settings(scene), (), Tour()) | {"count": 0, "lod": levels}
-    head, tail = _web("index.html").split("{{splats}}\n")
-    return (_filled(head, title, facts) + tail).encode("utf-8", errors="replace")
+    head, tail = web("index.html").split("{{splats}}\n")
+    return (filled(head, title, facts) + tail).encode("utf-8", errors="replace")
 
 
 def read(path: Path) -> Scene:
@@ -252,8 +228,8 @@ def _pieces(
     facts["cameras"] = [*facts.pop("views"), *facts["cameras"]]
     if editing is not None:
         facts["edit"] = editing.facts
-    head, tail = _web("index.html").split("{{splats}}\n")
-    yield _filled(head, title, facts).encode("utf-8", errors="replace")  # a file name may not be valid text
+    head, tail = web("index.html").split("{{splats}}\n")
+    yield filled(head, title, facts).encode("utf-8", errors="replace")  # a file name may not be valid text
     yield from _elements(SPLATS_OPEN, page_data.packed(scene.gaussians))
     if editing is not None:
         yield from _elements(VALUES_OPEN, editing.values)
@@ -289,7 +265,7 @@ def _facts(
     trained = [i for i, (name, _) in enumerate(views) if name not in held_out]
     first = first_camera(cameras, trained or range(len(views))) if views else 0
     start = start_of(scene, cameras, first)
-    return {
+    facts = {
         "format": FORMAT,
         "version": VERSION,
         "title": title,
@@ -311,6 +287,19 @@ def _facts(
             {"name": name, "held_out": name in held_out, **_camera(camera)} for name, camera in views
         ],
     }
+    opaque = scene.gaussians.logit_opacities > 0
+    _add_subjects(facts, cameras, start.camera, scene.gaussians.means[opaque].double().numpy(force=True))
+    return facts
+
+
+def _add_subjects(
+    facts: dict[str, Any], cameras: Sequence[Camera], first: Camera, points: Float[np.ndarray, "N 3"]
+) -> None:
+    """Tell the page where the subject is in the images of the capture and of the start."""
+    *others, start = subjects_of(cameras, [*cameras, first], points)
+    facts["start"]["camera"]["subject"] = start
+    for entry, subject in zip(facts["cameras"], others, strict=True):
+        entry["subject"] = subject
 
 
 def _start(start: Start) -> dict[str, Any]:
@@ -325,55 +314,6 @@ def _start(start: Start) -> dict[str, Any]:
 def _camera(camera: Camera) -> dict[str, Any]:
     numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "H", "W")}
     return {"R": camera.R.tolist(), "eye": camera.eye.tolist(), **numbers}
-
-
-def _filled(template: str, title: str, facts: dict[str, Any]) -> str:
-    """Fill in the part before the splats."""
-    levels, editing = "lod" in facts, "edit" in facts
-    scripts = [_web(name) for name in (EDIT_SCRIPTS if editing else LEVEL_SCRIPTS if levels else SCRIPTS)]
-    workers = [_text_element("sort-worker", _web("sort_worker.js"))]
-    if levels:
-        workers.append(_text_element("lod-worker", _web("lod_worker.js")))
-    texts = {
-        "title": html_text.escape(title),
-        "policy": policy_element(policy(levels, editing)),
-        "style": _style(editing),
-        # "<" is escaped so that no text in the JSON can close its element
-        "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
-        "shaders": "\n".join(_text_element(name, _shader(name, editing)) for name in SHADERS),
-        "worker": "\n".join(workers),
-        "scripts": "\n".join(f"<script>{script}</script>" for script in scripts),
-    }
-    # One pass over the template only: placeholders inside inserted text stay unchanged.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], template)
-
-
-def _text_element(name: str, text: str) -> str:
-    return f'<script type="text/plain" id="{name}">{text}</script>'
-
-
-def _web(name: str) -> str:
-    return (files("gsplat_edu.viewer") / "web" / name).read_text("utf-8")
-
-
-def _style(editing: bool) -> str:
-    return _web(STYLE) + (_web(EDIT_STYLE) if editing else "")
-
-
-def _shader(name: str, editing: bool) -> str:
-    """Return one of our shaders, preceded by the renderer's constants; without the editor's part for other pages."""
-    lines = ["#version 300 es", "precision highp float;", f"const float FINITE = {FINITE!r};"]
-    for constant in SHADER_CONSTANTS:
-        value = getattr(constants, constant)
-        if isinstance(value, tuple):
-            kind = f"float[{len(value)}]"
-            lines.append(f"const {kind} {constant} = {kind}({', '.join(map(repr, value))});")
-        else:
-            lines.append(f"const float {constant} = {value!r};")
-    text = _web(f"{name}.glsl")
-    if not editing:
-        text = re.sub(r"#ifdef EDITING\n.*?#endif\n", "", text, flags=re.DOTALL)
-    return "\n".join([*lines, *(["#define EDITING"] if editing else []), text])
 
 
 def _read_facts(path: Path, data: bytes) -> dict[str, Any]:

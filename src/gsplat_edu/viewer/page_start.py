@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 
 from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry
@@ -30,6 +30,23 @@ MIDDLE_OF = 5
 FAR_FROM_MIDDLE = 1.25
 """A camera is at the edge if its distance from the middle is more than this many times the median distance. In a closed
 ring, all distances are about equal."""
+
+
+SUBJECT_PART = 0.9
+"""Central fraction of an image, along each side, that has to hold a point of the subject."""
+
+SEEN_BY = 0.7
+"""Fraction of the cameras that have to see a point of the subject, of what sees the best one; the best one is seen by
+this fraction at least, or there is no subject."""
+
+OUTERMOST = 3.0
+"""Percentage of the subject's points on each side of an image that do not count."""
+
+LEAST_PART, LEAST_POINTS = 0.1, 16
+"""Smallest side of the subject in an image, as a fraction of the image's, and fewest points of it."""
+
+MOST_POINTS, MOST_CAMERAS = 4000, 40
+"""Points and cameras that are looked at, evenly chosen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +91,56 @@ def first_camera(cameras: Sequence[Camera], allowed: Sequence[int]) -> int:
     return min(allowed, key=lambda index: float(aside[index]))
 
 
+def subjects_of(
+    cameras: Sequence[Camera], shown: Sequence[Camera], points: Float[np.ndarray, "N 3"]
+) -> list[list[float] | None]:
+    """Find the subject in images: what most cameras of a capture see. A narrow window shows at least that.
+
+    Args:
+        cameras: Those of the capture; without any, every point belongs to the subject.
+        shown: The cameras of the images.
+        points: (N, 3) points of the scene; may be empty.
+
+    Returns:
+        For each image the left, top, right and bottom edge of the subject, px; None if there is none, as on a walk
+        through rooms, or if it is behind the camera.
+    """
+    near = points[~far_shell(points)]
+    near = near[:: max(1, len(near) // MOST_POINTS)]
+    some = cameras[:: max(1, len(cameras) // MOST_CAMERAS)]
+    if some and len(near):
+        share = np.mean([_is_inside(camera, near, SUBJECT_PART) for camera in some], axis=0)
+        near = near[share >= SEEN_BY * share.max()] if share.max() >= SEEN_BY else near[:0]
+    return [_edges(camera, near) for camera in shown]
+
+
+def _is_inside(camera: Camera, points: Float64[np.ndarray, "N 3"], part: float) -> Bool[np.ndarray, " N"]:
+    """Return which points lie in the middle part of a camera's image."""
+    x, y, z = camera.world_to_cam(points).T
+    across, down = 0.5 * part * camera.W / camera.fx, 0.5 * part * camera.H / camera.fy
+    inside: Bool[np.ndarray, " N"] = (z > 0) & (abs(x) < across * z) & (abs(y) < down * z)
+    return inside
+
+
+def _edges(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> list[float] | None:
+    """Return the edges of points in an image without the outermost ones, inside the image."""
+    x, y, z = camera.world_to_cam(points).T
+    front = z > 0
+    if front.sum() < LEAST_POINTS:
+        return None
+    edges = []
+    for ratio, focal, centre, side in (
+        (x, camera.fx, camera.cx, camera.W),
+        (y, camera.fy, camera.cy, camera.H),
+    ):
+        ends = np.percentile(focal * ratio[front] / z[front] + centre + 0.5, (OUTERMOST, 100 - OUTERMOST))
+        edges.append(np.clip(ends, 0, side))
+    (left, right), (top, bottom) = edges
+    if right - left < LEAST_PART * camera.W or bottom - top < LEAST_PART * camera.H:
+        return None
+    return [round(float(edge), 1) for edge in (left, top, right, bottom)]
+
+
 def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
     """Choose the initial view: a camera of the capture, or else the first one of an orbit around the scene.
 
@@ -82,19 +149,37 @@ def start_of(scene: Scene, cameras: Sequence[Camera], index: int = 0) -> Start:
         cameras: The capture's cameras, if any.
         index: The camera to start at.
     """
-    up = np.array(scene.up or WORLD_UP, dtype=np.float64)
-    up = common_up(cameras) if scene.up is None and cameras else up / np.linalg.norm(up)
+    up = None if scene.up is None else np.array(scene.up, dtype=np.float64)
     if cameras:
         opaque = scene.gaussians.logit_opacities > 0
         means = scene.gaussians.means[opaque].double().numpy(force=True)
-        near = means[~far_shell(means)]  # a sky is no subject
-        return Start(cameras[index], pivot_of(cameras, index, near), up, index)
+        return start_among(cameras, index, means, up)
+    up = np.array(WORLD_UP, dtype=np.float64) if up is None else up / np.linalg.norm(up)
     if len(scene.gaussians):
         orbit = orbit_of_scene(scene.gaussians, ORBIT, SIDE, up)
     else:
         orbit = [Camera.looking_at((0.0, 0.0, -1.0), np.zeros(3), SIDE, SIDE, SIDE, SIDE)]
     centre = Geometry(orbit, np.zeros((0, 3))).centre
     return Start(orbit[0], np.zeros(3) if centre is None else centre, up, -1)
+
+
+def start_among(
+    cameras: Sequence[Camera],
+    index: int,
+    points: Float[np.ndarray, "N 3"],
+    up: Float64[np.ndarray, "3"] | None = None,
+) -> Start:
+    """Start at a camera of the capture.
+
+    Args:
+        cameras: The capture's cameras, at least one.
+        index: The camera to start at.
+        points: (N, 3) points of the scene; may be empty.
+        up: (3,) up direction; None takes that of the cameras.
+    """
+    up = common_up(cameras) if up is None else up / np.linalg.norm(up)
+    near = points[~far_shell(points)]  # a sky is no subject
+    return Start(cameras[index], pivot_of(cameras, index, near), up, index)
 
 
 def pivot_of(

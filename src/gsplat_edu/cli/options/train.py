@@ -222,9 +222,9 @@ def _add_view(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--view",
         action="store_true",
-        help="show the training in the browser, with pause and single step. It takes at most a fifth of the time and"
-        " does not change the result. The printed URL contains a token that is required for access. After the training"
-        " the view stays open until the last browser is closed, or Ctrl-C",
+        help="show the training in the browser, with curves, pause and single step. Snapshots take at most 2 %% of the"
+        " time and do not change the result. The printed URL contains a token that is required for access. After the"
+        " training the view stays open until the last browser is closed, or Ctrl-C",
     )
     group.add_argument(
         "--view-host",

@@ -3,6 +3,8 @@
 "use strict";
 
 const ORBIT_STEP = Math.PI / 180;
+const NEAREST = 0.01; // distance to the pivot, in initial distances
+const FARTHEST = 3; // the same, and of the pivot from the initial one, in distances of the farthest camera
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -19,22 +21,40 @@ function turned(vector, axis, angle) {
 // Most that a wide window enlarges the image beyond fitting it: at most a fifth of its height is cropped.
 const MOST_CROPPED = 1.25;
 
-// Fits a camera to a window of another shape around the centre of its image. A narrow window is filled and the sides
-// are cropped, since no camera saw anything above and below the image. A wide window keeps most of the height, since a
-// square photo of an object would lose its top and bottom, and shows some more at the sides.
+// Width of a narrow window, in widths of the subject that has to be in view.
+const ROOM = 1.1;
+
+// Fits a camera to a window of another shape. A narrow window is filled and the sides are cropped, since no camera saw
+// anything above and below the image, but as much as `subject` (left, top, right, bottom in px of the image) stays in
+// view. A wide window keeps most of the height, since a square photo of an object would lose its top and bottom, and
+// shows some more at the sides. The centre of the image, or of the subject, is in the middle.
 function fitted(camera, width, height) {
+  const { subject, ...rest } = camera;
   const [across, down] = [width / camera.W, height / camera.H];
-  const scale = across > down ? Math.min(across, MOST_CROPPED * down) : down;
-  const moved = (middle, from, to) => (middle + 0.5) * scale - 0.5 + 0.5 * (to - from * scale);
+  let scale = across > down ? Math.min(across, MOST_CROPPED * down) : down;
+  let [x, y] = [0.5 * camera.W, 0.5 * camera.H];
+  if (subject && across < down) {
+    const [left, top, right, bottom] = subject;
+    scale = Math.min(down, Math.max(across, width / (ROOM * (right - left))));
+    [x, y] = [within(0.5 * (left + right), camera.W, width / scale), within(0.5 * (top + bottom), camera.H, height / scale)];
+  }
+  const moved = (middle, from, to) => (middle + 0.5 - from) * scale - 0.5 + 0.5 * to;
   return {
-    ...camera,
+    ...rest,
     fx: camera.fx * scale,
     fy: camera.fy * scale,
-    cx: moved(camera.cx, camera.W, width),
-    cy: moved(camera.cy, camera.H, height),
+    cx: moved(camera.cx, x, width),
+    cy: moved(camera.cy, y, height),
     W: width,
     H: height,
   };
+}
+
+// The middle of a window on one axis of an image, moved so that neither of the two extends beyond the other on one side
+// only.
+function within(middle, image, shown) {
+  const [a, b] = [0.5 * shown, image - 0.5 * shown];
+  return Math.min(Math.max(middle, Math.min(a, b)), Math.max(a, b));
 }
 
 // The point at a given depth that a camera sees at column u and row v.
@@ -63,6 +83,7 @@ class View {
     this.region = new Region(eyes);
     this.goTo(camera);
     this.pace = this.distance; // flying covers this distance in two seconds
+    this.reach = Math.max(this.pace, ...eyes.map((eye) => Math.hypot(...plus(eye, pivot, -1))));
     this.region.around(this.focus);
     this.turn = this.region.turn();
   }
@@ -138,11 +159,15 @@ class View {
     return [R, [0, 1, 2].map((i) => R[0][i] * seen[0] + R[1][i] * seen[1] + R[2][i] * seen[2])];
   }
 
-  // Moves by world units along the camera's axes (right, down, forward).
+  // Moves by world units along the camera's axes (right, down, forward), but not so far away that the scene is lost.
   move(steps) {
-    const shifted = (point) => steps.reduce((at, step, i) => plus(at, this.camera.R[i], step), point);
-    this.camera = { ...this.camera, eye: shifted(this.camera.eye) };
-    this.orbitAround(shifted(this.focus));
+    const before = this.focus;
+    let after = steps.reduce((at, step, i) => plus(at, this.camera.R[i], step), before);
+    const away = (point) => Math.hypot(...plus(point, this.pivot, -1));
+    const most = Math.max(FARTHEST * this.reach, away(before));
+    if (away(after) > most) after = plus(this.pivot, plus(after, this.pivot, -1), most / away(after));
+    this.camera = { ...this.camera, eye: plus(this.camera.eye, plus(after, before, -1)) };
+    this.orbitAround(after);
   }
 
   // Pans with the picture: dx, dy in pixels of a window whose camera is `shown`.
@@ -153,7 +178,8 @@ class View {
 
   // Moves closer to the pivot (factor below 1) or farther away.
   zoom(factor) {
-    const distance = Math.min(Math.max(this.distance * factor, 1e-3 * this.pace), 1e3 * this.pace);
+    const most = Math.max(FARTHEST * this.reach, this.distance);
+    const distance = Math.min(Math.max(this.distance * factor, NEAREST * this.pace), most);
     const offset = plus(this.camera.eye, this.focus, -1);
     this.camera = { ...this.camera, eye: plus(this.focus, offset, distance / this.distance) };
   }

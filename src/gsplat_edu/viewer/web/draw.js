@@ -21,6 +21,7 @@ class Renderer {
     this.screen = linked(gl, "screen");
     this.textureWidth = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.textures = layout(facts).map((part) => this.uploaded(part, splats[part.name]));
+    this.next = null; // splats that wait for their order
     this.image = null;
     this.framebuffer = gl.createFramebuffer();
     this.setUpOrder();
@@ -60,12 +61,28 @@ class Renderer {
     });
   }
 
+  // Uploads other splats, in place of all; they are drawn from the next order on, which has to be theirs.
+  replace(facts, splats) {
+    const textures = layout(facts).map((part) => this.uploaded(part, splats[part.name], facts.count));
+    this.next = { facts, textures };
+  }
+
+  // Draws the splats that `replace` uploaded.
+  adopt() {
+    const gl = this.gl;
+    this.textures.forEach((texture) => gl.deleteTexture(texture));
+    ({ facts: this.facts, textures: this.textures } = this.next);
+    this.next = null;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.facts.count, gl.DYNAMIC_DRAW);
+  }
+
   // Copies an array into a texture, row by row.
-  uploaded({ channels, texels, type }, values) {
+  uploaded({ channels, texels, type }, values, count = this.facts.count) {
     const gl = this.gl;
     const [stored, format, kind] = this.kind(type, channels);
     const width = this.textureWidth;
-    const used = this.facts.count * texels;
+    const used = count * texels;
     const height = Math.max(1, Math.ceil(used / width));
     if (height > width) throw new Error("This scene has more splats than this graphics processor's textures can hold.");
     const texture = nearestTexture(gl);
@@ -96,6 +113,7 @@ class Renderer {
 
   setOrder(order) {
     const gl = this.gl;
+    if (this.next) this.adopt();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
     this.count = order.length;
@@ -188,6 +206,13 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.image);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Waits until everything is drawn.
+  finish() {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.FLOAT, new Float32Array(4));
   }
 
   // Returns the image as float32 RGB, first row on top.

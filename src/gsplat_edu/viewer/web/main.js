@@ -11,7 +11,7 @@ class Viewer {
     this.levels = levels; // of detail
     this.settings = { ...facts.settings };
     this.canvas = element("canvas");
-    this.renderer = new Renderer(this.canvas, splats, facts);
+    this.renderer = this.makeRenderer(splats);
     this.sorter = new Sorter(splats.means, facts.near, (order) => this.renderer.setOrder(order));
     const eyes = facts.cameras.filter(({ saved }) => !saved).map(({ eye }) => eye);
     this.view = new View(facts.start, eyes);
@@ -31,6 +31,10 @@ class Viewer {
     addEventListener("resize", () => this.askFrame());
     this.canvas.addEventListener("webglcontextlost", () => this.lose());
     this.askFrame();
+  }
+
+  makeRenderer(splats) {
+    return new Renderer(this.canvas, splats, this.facts);
   }
 
   actions() {
@@ -81,6 +85,14 @@ class Viewer {
     await this.levels?.load(camera);
     await this.sorter.sort(camera);
     this.draw(camera);
+  }
+
+  // Shows other splats in place of all: of this number and degree. Resolves once they are drawn.
+  async replace(facts, splats) {
+    const all = { ...this.facts, ...facts };
+    await this.sorter.replace(splats.means, () => this.renderer.replace(all, splats));
+    this.panel.counted(all.count);
+    await this.settled();
   }
 
   // Other splats are shown now.

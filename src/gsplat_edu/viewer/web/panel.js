@@ -3,6 +3,8 @@
 
 const POINT_SHOWN = 800; // milliseconds
 
+const SMALL = "(max-width: 600px) and (orientation: portrait)"; // as in style.css
+
 const element = (id) => document.getElementById(id);
 
 function say(text) {
@@ -14,14 +16,25 @@ class Panel {
   // actions: fly(), reset(), goTo(index), degree(value).
   constructor(facts, actions) {
     this.facts = facts;
-    const splats = facts.count === 1 ? "1 splat" : `${facts.count.toLocaleString("en")} splats`;
-    if (!facts.lod) element("count").textContent = splats;
+    if (!facts.lod) this.counted(facts.count);
     element("fly").addEventListener("click", () => actions.fly());
     element("reset").addEventListener("click", () => actions.reset());
     element("help-button").addEventListener("click", () => this.help());
+    element("fold").addEventListener("click", () => this.fold(!element("tools").hidden));
+    this.fold(matchMedia(SMALL).matches); // the scene has the room first
     this.fillDegrees(actions);
     this.fillCameras(actions);
     this.atRest();
+  }
+
+  // Hides the controls, or shows them.
+  fold(away) {
+    element("tools").hidden = away;
+    element("fold").setAttribute("aria-expanded", !away);
+  }
+
+  counted(count) {
+    element("count").textContent = count === 1 ? "1 splat" : `${count.toLocaleString("en")} splats`;
   }
 
   // How many splats of a scene with levels of detail are shown.

@@ -18,14 +18,21 @@ function layout(facts) {
 // Returns the splats as typed arrays by name. The text is removed from the page piece by piece, so that it and the
 // numbers are never in memory together.
 async function unpackSplats(facts) {
-  const parts = layout(facts).map((part) => ({ ...part, length: facts.count * part.channels * part.texels }));
-  const total = parts.reduce((sum, part) => sum + part.length * part.type.BYTES_PER_ELEMENT, 0);
+  const total = layout(facts).reduce((sum, part) => sum + lengthOf(part, facts) * part.type.BYTES_PER_ELEMENT, 0);
   const bytes = await inflated(document.querySelectorAll("script.splats"), total);
+  return arraysIn(bytes.buffer, 0, facts);
+}
+
+function lengthOf({ channels, texels }, facts) {
+  return facts.count * channels * texels;
+}
+
+// The arrays of packed splats that begin at a byte of a buffer.
+function arraysIn(buffer, begin, facts) {
   const arrays = {};
-  let begin = 0;
-  for (const { name, type, length } of parts) {
-    arrays[name] = new type(bytes.buffer, begin, length);
-    begin += arrays[name].byteLength;
+  for (const part of layout(facts)) {
+    arrays[part.name] = new part.type(buffer, begin, lengthOf(part, facts));
+    begin += arrays[part.name].byteLength;
   }
   return arrays;
 }

@@ -8,14 +8,27 @@ class Sorter {
     const source = document.getElementById("sort-worker").textContent;
     const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
     this.worker = new Worker(url);
-    this.order = new ArrayBuffer((means.length / 3) * Uint32Array.BYTES_PER_ELEMENT);
+    this.near = near;
     this.onOrder = onOrder;
     this.running = null;
     this.sorted = "";
     this.version = 0; // of the means
     this.camera = null; // of the last sort
+    this.give(means);
+  }
+
+  give(means) {
+    this.order = new ArrayBuffer((means.length / 3) * Uint32Array.BYTES_PER_ELEMENT);
     const copy = means.slice(); // transferred to the worker, which keeps it
-    this.worker.postMessage({ means: copy, near }, [copy.buffer]);
+    this.worker.postMessage({ means: copy, near: this.near }, [copy.buffer]);
+  }
+
+  // Takes other means, in place of all. prepare() is called before; the next order is of these means.
+  async replace(means, prepare) {
+    while (this.running) await this.running;
+    prepare();
+    ++this.version;
+    this.give(means);
   }
 
   // Whether the current order was made for this camera.

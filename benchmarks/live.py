@@ -1,0 +1,145 @@
+"""By how much does a watching page slow a training?
+
+    python benchmarks/live.py [CAPTURE] [--from SCENE] [--resolution R] [--turns N] [--seconds S] [--smoke]
+                              [--out FILE.json]
+
+Trains with a live view. In turns, a headless Chromium shows the page, or an empty one, for some seconds each; the first
+seconds of a turn do not count. Prints the iterations per second of each turn, and the median over pairs of neighbours
+of the share that is lost. Without a graphics processor, the page draws on the same cores as the training. What other
+programs take from these disturbs the rates, so the processor time of the browser, on Linux, is printed beside them.
+
+--smoke requests states and snapshots without a browser.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import statistics
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import hardware
+from captures import capture
+
+from gsplat_edu.budget.plan import Limits, plan
+from gsplat_edu.cli.main import build_parser
+from gsplat_edu.cli.options.train import options_from
+from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.viewer.live import GRACE, LiveView
+from gsplat_edu.viewer.snapshots import Broadcast
+
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+SETTLING = GRACE + 3.0
+"""Seconds at the start of a turn that do not count: the page loads, or is forgotten."""
+
+
+def browser_seconds() -> float:
+    """Return the processor time of all processes below this one, s; 0 where there is no /proc."""
+    parents, seconds = {}, {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        parents[int(stat.parent.name)] = int(fields[1])
+        seconds[int(stat.parent.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    below, found = {os.getpid()}, 0.0
+    while children := {pid for pid, parent in parents.items() if parent in below} - below:
+        below |= children
+        found += sum(seconds[child] for child in children)
+    return found
+
+
+@contextmanager
+def training(words: list[str], stop: threading.Event) -> Iterator[tuple[CaptureRun, LiveView]]:
+    """Train in a thread of its own, with a live view."""
+    run = CaptureRun(
+        plan(options_from(build_parser(["train"]).parse_args(["train", *words])), Limits()).options
+    )
+    with LiveView(run, port=0) as view:
+        broadcast = Broadcast(run, stop.is_set, [view])
+        thread = threading.Thread(target=run.train, args=(stop.is_set, [broadcast.show]))
+        thread.start()
+        try:
+            yield run, view
+        finally:
+            stop.set()
+            thread.join()
+
+
+@contextmanager
+def page(smoke: bool) -> Iterator[Callable[[str], object]]:
+    """Yield what opens an address in a headless Chromium; with `smoke`, what requests the page."""
+    if smoke:
+        yield lambda url: url.startswith("http") and urllib.request.urlopen(url, timeout=60).read()
+        return
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
+        tab = browser.new_page(viewport={"width": 1440, "height": 900})
+        yield lambda url: tab.goto(url, wait_until="commit")
+        browser.close()
+
+
+def main() -> None:
+    """Measure, print the turns and write the JSON."""
+    parser = hardware.parser("Live view: what watching costs the training.")
+    parser.add_argument("capture", type=Path, nargs="?")
+    parser.add_argument("--from", dest="scene", type=Path)
+    parser.add_argument("--resolution", default="1")
+    parser.add_argument("--turns", type=int, default=10)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    arguments = parser.parse_args()
+    settling, seconds, turns = SETTLING, arguments.seconds, arguments.turns
+    if arguments.smoke:
+        settling, seconds, turns = 0.0, 0.3, 2
+    with ExitStack() as stack:
+        folder = stack.enter_context(capture(arguments.capture, arguments.smoke))
+        out = Path(stack.enter_context(TemporaryDirectory())) / "run"
+        words = [
+            str(folder),
+            "--out",
+            str(out),
+            "--iterations",
+            "1000000",
+            "--eval-every",
+            "0",
+            "--save-every",
+            "0",
+        ]
+        words += ["--resolution", arguments.resolution]
+        words += [] if arguments.scene is None else ["--from", str(arguments.scene)]
+        run, view = stack.enter_context(training(words, threading.Event()))
+        show = stack.enter_context(page(arguments.smoke))
+        rates: list[float] = []
+        busy: list[float] = []
+        for turn in range(turns):
+            show(view.url if turn % 2 else "about:blank")
+            time.sleep(settling)
+            before, began, used = run.trainer.iteration, time.perf_counter(), browser_seconds()
+            time.sleep(seconds)
+            taken = time.perf_counter() - began
+            rates.append((run.trainer.iteration - before) / taken)
+            busy.append((browser_seconds() - used) / taken)
+        count = len(run.trainer.gaussians)
+        print(f"{count} Gaussians at the end; the last scene shown is of iteration {view.shown()}")
+    pairs = [1.0 - watched / alone for alone, watched in zip(rates[::2], rates[1::2], strict=False) if alone]
+    lost = statistics.median(pairs) if pairs else 0.0
+    hardware.report({"rates": rates, "browser": busy, "lost": lost, "count": count}, arguments.out)
+    for name, part in (("alone", rates[::2]), ("watched", rates[1::2])):
+        print(f"{name:>8}: {'  '.join(f'{rate:.2f}' for rate in part)} iterations/s")
+    print(
+        f"  browser: {'  '.join(f'{part:.3f}' for part in busy[1::2])} processor seconds per second, watching"
+    )
+    print(f"lost by watching: {100 * lost:.1f} % (median of {len(pairs)} pairs)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""Access control for servers that can do something: only their own page, with its token, under this computer's name.
+
+Browsers let any page send requests to any address. So each request must pass three checks:
+
+- Host names this computer (`gsplat_edu.viewer.serve.names_this_computer`); this prevents DNS rebinding.
+- Origin, required unless the method only reads, has the same host and port: the page was served here. Where the browser
+  says so (Sec-Fetch-Site), a request that reads comes from the own page, too; only the page itself may be opened from
+  elsewhere, with the token.
+- The token, random for each server, is in the URL or in the cookie set when the page was opened with it. The cookie is
+  HttpOnly and SameSite=Strict.
+
+The module imports nothing slow.
+"""
+
+from __future__ import annotations
+
+import http.cookies
+import secrets
+import urllib.parse
+from collections.abc import Callable, Sequence
+
+from gsplat_edu.viewer.serve import names_this_computer
+
+TOKEN_BYTES = 16
+"""Random bytes of a token: 2^128 possibilities cannot be guessed."""
+
+READING = ("GET", "HEAD")
+"""Methods that change nothing. Browsers send no Origin with them to the page's own server."""
+
+
+class Guard:
+    """Checks requests to one server.
+
+    Args:
+        host: Address that the server listens on.
+        port: Its port, which distinguishes its cookie from those of other servers on this computer.
+
+    Attributes:
+        token: The token.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self.token = secrets.token_urlsafe(TOKEN_BYTES)
+        self._host = host
+        self._name = f"gsplat_edu_{port}"
+
+    @property
+    def cookie(self) -> str:
+        """The value of Set-Cookie for whoever opens the page with the token."""
+        return f"{self._name}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def fault(self, method: str, target: str, headers: Callable[[str], Sequence[str]]) -> str | None:
+        """Return why a request is refused, in one line for the user; None if it is let in.
+
+        Args:
+            method: GET, POST or another.
+            target: Path and query as in the request.
+            headers: Returns all values of a header by its name.
+        """
+        hosts, origins = headers("Host"), headers("Origin")
+        if len(hosts) != 1 or not names_this_computer(hosts[0], self._host):
+            return "unknown host name for this server"
+        own = {f"{scheme}://{hosts[0]}".lower() for scheme in ("http", "https")}  # https if a proxy adds it
+        path = urllib.parse.urlsplit(target).path
+        foreign = set(headers("Sec-Fetch-Site")) - {"same-origin", "none"} and path != "/"
+        needs_origin = method not in READING
+        if (
+            foreign
+            or len(origins) > 1
+            or (needs_origin and not origins)
+            or not own.issuperset(map(str.lower, origins))
+        ):
+            return "requests from other pages are not allowed"
+        if not any(
+            secrets.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
+            for given in self._given(target, headers("Cookie"))
+        ):
+            return "open the URL that was printed, including its token"
+        return None
+
+    def _given(self, target: str, cookies: Sequence[str]) -> list[str]:
+        """Return the tokens of a request, from its URL and its cookies."""
+        query = urllib.parse.urlsplit(target).query
+        given = urllib.parse.parse_qs(query).get("token", [])
+        for header in cookies:
+            try:
+                found = http.cookies.SimpleCookie(header)
+            except http.cookies.CookieError:
+                continue
+            if self._name in found:
+                given.append(found[self._name].value)
+        return given

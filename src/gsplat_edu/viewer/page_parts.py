@@ -1,0 +1,152 @@
+"""The parts of a page before its splats: scripts, style, shaders and workers of each kind of page, and their policy."""
+
+from __future__ import annotations
+
+import html as html_text
+import json
+import re
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+from gsplat_edu import constants
+from gsplat_edu.content_policy import content_policy, policy_element
+
+SCRIPTS = (
+    "scene.js",
+    "region.js",
+    "camera.js",
+    "path.js",
+    "draw.js",
+    "sorter.js",
+    "controls.js",
+    "panel.js",
+    "keyframes.js",
+)
+"""Scripts of every page in loading order; they share one scope."""
+
+LAST_SCRIPT = "main.js"
+
+SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
+
+SHADER_CONSTANTS = (
+    "DILATION",
+    "ALPHA_MIN",
+    "ALPHA_MAX",
+    "Z_NEAR",
+    "COLOR_LIMIT",
+    "DET_FLOOR",
+    "SH_OFFSET",
+    "C0",
+    "C1",
+    "C2",
+    "C3",
+)
+"""Names in `gsplat_edu.constants` that the shaders use."""
+
+FINITE = 3e38
+"""Larger values count as infinite in a shader; float32 ends at 3.4e38."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a page has beyond the scene.
+
+    Args:
+        fact: Entry of the page's facts that only this kind has; empty for the plain page.
+        scripts: Its scripts, loaded before `LAST_SCRIPT`.
+        styles: Its style sheets, after the common one.
+        workers: Its workers, beside the one that sorts.
+        own_server: Whether it may load from its own server, and save there.
+        define: Macro that its shaders are compiled with; empty for none.
+    """
+
+    fact: str = ""
+    scripts: tuple[str, ...] = ()
+    styles: tuple[str, ...] = ()
+    workers: tuple[str, ...] = ()
+    own_server: bool = False
+    define: str = ""
+
+
+PLAIN = Kind()
+LEVELS = Kind("lod", ("levels.js",), workers=("lod_worker",), own_server=True)
+LIVE = Kind("live", ("live_curves.js", "live_pictures.js", "live.js"), ("live.css",), own_server=True)
+EDITOR = Kind(
+    "edit",
+    (
+        "edit_member.js",
+        "edit_state.js",
+        "edit_shapes.js",
+        "edit_draw.js",
+        "edit_tools.js",
+        "edit_panel.js",
+        "edit.js",
+        "edit_start.js",
+    ),
+    ("edit.css",),
+    own_server=True,
+    define="EDITING",
+)
+
+
+def policy(kind: Kind = PLAIN) -> str:
+    """Return the Content-Security-Policy of every page of a kind: its scripts, its style, and its workers."""
+    return content_policy(_scripts(kind), [_style(kind)], workers=True, own_server=kind.own_server)
+
+
+def filled(template: str, title: str, facts: dict[str, Any]) -> str:
+    """Fill in the part of a page before the splats.
+
+    Args:
+        template: Text with placeholders, {{name}}.
+        title: Heading of the page.
+        facts: The page's metadata, which also decides its kind.
+    """
+    kind = next((kind for kind in (LEVELS, LIVE, EDITOR) if kind.fact in facts), PLAIN)
+    workers = ("sort_worker", *kind.workers)
+    texts = {
+        "title": html_text.escape(title),
+        "policy": policy_element(policy(kind)),
+        "style": _style(kind),
+        # "<" is escaped so that no text in the JSON can close its element
+        "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        "shaders": "\n".join(_text_element(name, _shader(name, kind.define)) for name in SHADERS),
+        "worker": "\n".join(_text_element(name.replace("_", "-"), web(f"{name}.js")) for name in workers),
+        "scripts": "\n".join(f"<script>{script}</script>" for script in _scripts(kind)),
+    }
+    # One pass over the template only: placeholders inside inserted text stay unchanged.
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], template)
+
+
+def web(name: str) -> str:
+    """Return the text of a file in `viewer/web`."""
+    return (files("gsplat_edu.viewer") / "web" / name).read_text("utf-8")
+
+
+def _scripts(kind: Kind) -> list[str]:
+    return [web(name) for name in (*SCRIPTS, *kind.scripts, LAST_SCRIPT)]
+
+
+def _style(kind: Kind) -> str:
+    return "".join(web(name) for name in ("style.css", *kind.styles))
+
+
+def _text_element(name: str, text: str) -> str:
+    return f'<script type="text/plain" id="{name}">{text}</script>'
+
+
+def _shader(name: str, define: str) -> str:
+    """Return one of our shaders, preceded by the renderer's constants; the editor's part only if it is defined."""
+    lines = ["#version 300 es", "precision highp float;", f"const float FINITE = {FINITE!r};"]
+    for constant in SHADER_CONSTANTS:
+        value = getattr(constants, constant)
+        if isinstance(value, tuple):
+            array = f"float[{len(value)}]"
+            lines.append(f"const {array} {constant} = {array}({', '.join(map(repr, value))});")
+        else:
+            lines.append(f"const float {constant} = {value!r};")
+    text = web(f"{name}.glsl")
+    if not define:
+        text = re.sub(r"#ifdef EDITING\n.*?#endif\n", "", text, flags=re.DOTALL)
+    return "\n".join([*lines, *([f"#define {define}"] if define else []), text])

@@ -1,0 +1,161 @@
+// Shows a training: its state, as often as the server tells it, and its newest splats, whenever the last ones are drawn.
+"use strict";
+
+// Drawing other splats takes this computer's time, which the training needs as well. So the page waits this many times
+// as long as it worked before it asks for the next ones.
+const REST_FACTOR = 30;
+const SHORTEST_REST = 500; // milliseconds
+const LONGEST_REST = 90000;
+const PHOTOS_VARY = 0.25; // weight of the newest photo in the curves of its loss and PSNR
+const TRIES = 4; // to reach the server again before the page gives up
+const TRY_EVERY = 1000; // milliseconds
+
+const whole = (number) => number.toLocaleString("en");
+
+function duration(seconds) {
+  const [hours, minutes] = [Math.floor(seconds / 3600), Math.floor(seconds / 60) % 60];
+  if (hours) return `${hours} h ${minutes} min`;
+  return minutes ? `${minutes} min ${Math.floor(seconds) % 60} s` : `${Math.ceil(seconds)} s`;
+}
+
+// The header and the splats of scene.bin; live_folder.py describes it.
+function unframed(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  return { header, splats: arraysIn(buffer, 4 + length, header) };
+}
+
+class Live {
+  constructor(viewer, { step }) {
+    Object.assign(this, { viewer, state: null, over: false, wake: () => {} });
+    this.draws = viewer.renderer instanceof Renderer;
+    this.build();
+    this.step.hidden = !step;
+    history.replaceState(null, "", location.pathname); // without the token
+    this.watch();
+    if (this.draws) this.follow().catch(fail);
+  }
+
+  build() {
+    this.title = created("p", { class: "state", role: "status" }, "waiting for the first iteration");
+    this.bar = created("progress", { max: 1, value: 0, "aria-label": "iterations" });
+    this.left = created("p", { class: "left" }, "\u00a0");
+    this.photos = created("p", { title: "Size that is trained on, and its share of the full width" }, "\u00a0");
+    this.curves = {
+      loss: new Curve("loss", (value) => value.toPrecision(3), PHOTOS_VARY),
+      psnr: new Curve("PSNR", (value) => `${value.toFixed(2)} dB`, PHOTOS_VARY),
+      count: new Curve("splats", whole, 1),
+    };
+    this.pause = created("button", { title: "Wait after this iteration, or continue" }, "pause");
+    this.step = created("button", { title: "One more iteration, then wait" }, "step");
+    this.pause.addEventListener("click", () => this.control(this.state?.state === "paused" ? "resume" : "pause"));
+    this.step.addEventListener("click", () => this.control("step"));
+    this.note = created("p", { class: "note", role: "alert", hidden: "" });
+    const buttons = created("p", { class: "row" }, this.pause, this.step);
+    const curves = Object.values(this.curves).map((curve) => curve.element);
+    const section = created("section", { id: "live", "aria-label": "training" });
+    section.append(this.title, this.bar, this.left, buttons, this.note);
+    element("tools").before(section);
+    element("tools").prepend(created("section", { id: "curves", "aria-label": "curves" }, ...curves, this.photos));
+    this.noted(this.draws ? "" : "This browser has no WebGL2, so the training's computer draws the pictures.");
+  }
+
+  noted(text) {
+    this.note.textContent = text;
+    this.note.hidden = !text;
+  }
+
+  async control(what) {
+    await fetch("control", { method: "POST", body: JSON.stringify({ do: what }) }).catch(() => {});
+  }
+
+  // Shows states until the server is gone.
+  async watch() {
+    let [version, failures] = [-1, 0];
+    while (failures < TRIES) {
+      try {
+        const answer = await fetch(`state?after=${version}`);
+        if (!answer.ok) throw new Error(answer.statusText);
+        failures = 0;
+        if (answer.status === 204) continue;
+        const state = await answer.json();
+        version = state.version;
+        this.show(state);
+      } catch {
+        ++failures;
+        await new Promise((resolve) => setTimeout(resolve, TRY_EVERY));
+      }
+    }
+    this.over = true;
+    this.wake();
+    this.title.textContent = "ended";
+    this.pause.disabled = this.step.disabled = true;
+    this.noted("The training's program has ended or cannot be reached. This is the last scene that the page received.");
+  }
+
+  show(state) {
+    this.state = state;
+    const { iteration, iterations, history, seconds_left: left } = state;
+    this.title.textContent = `${state.state}, iteration ${whole(iteration)} of ${whole(iterations)}`;
+    [this.bar.max, this.bar.value] = [iterations, iteration];
+    this.left.textContent = left === null ? "\u00a0" : `${duration(left)} left`;
+    const share = state.photo_factor === 1 ? "" : ` (1/${Number(state.photo_factor.toFixed(2))})`;
+    this.photos.textContent = state.width ? `photos of ${state.width} × ${state.height} px${share}` : "\u00a0";
+    for (const [name, curve] of Object.entries(this.curves)) curve.show(state[name], history.iteration, history[name]);
+    this.pause.textContent = state.state === "paused" ? "resume" : "pause";
+    this.pause.disabled = this.step.disabled = !["training", "paused"].includes(state.state);
+    const still = ["paused", "finished"].includes(state.state);
+    if (state.failure || this.draws) this.noted(state.failure);
+    if (still) this.wake();
+    if (this.draws) return;
+    this.viewer.renderer.still = still;
+    this.viewer.panel.counted(state.count);
+    if (this.viewer.renderer.failure) this.noted(this.viewer.renderer.failure);
+    if (iteration !== this.pictured) this.viewer.askFrame();
+    this.pictured = iteration;
+  }
+
+  // Draws the newest splats until the server is gone.
+  async follow() {
+    let iteration = -1;
+    say("Waiting for the first splats ...");
+    while (!this.over) {
+      await this.visible();
+      const answer = await fetch(`scene?after=${iteration}`).catch(() => null);
+      if (!answer?.ok || answer.status === 204) {
+        if (!answer?.ok) await this.rest(TRY_EVERY);
+        continue;
+      }
+      const began = performance.now();
+      const buffer = await answer.arrayBuffer().catch(() => null);
+      if (!buffer) continue; // the server ended
+      const { header, splats } = unframed(buffer);
+      await this.viewer.replace({ count: header.count, sh_degree: header.sh_degree }, splats);
+      this.viewer.renderer.finish();
+      const isFirst = iteration < 0; // the server may have had it ready for a while
+      iteration = header.iteration;
+      if (isFirst) say("");
+      element("count").textContent += ` after ${whole(iteration)} iterations`;
+      const spent = performance.now() - began;
+      if (!isFirst) await this.rest(Math.min(LONGEST_REST, Math.max(SHORTEST_REST, REST_FACTOR * spent)));
+    }
+  }
+
+  // Resolves once somebody can see the page.
+  async visible() {
+    while (document.hidden) {
+      await new Promise((resolve) => document.addEventListener("visibilitychange", resolve, { once: true }));
+    }
+  }
+
+  // Waits; not for long if the training waits as well.
+  rest(milliseconds) {
+    const still = ["paused", "finished"].includes(this.state?.state);
+    return new Promise((resolve) => {
+      this.wake = resolve;
+      setTimeout(resolve, still ? SHORTEST_REST : milliseconds);
+    });
+  }
+}
+
+addEventListener("viewer", ({ detail }) => (window.live = new Live(detail.viewer, FACTS.live)));

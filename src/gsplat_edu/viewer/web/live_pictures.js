@@ -1,0 +1,74 @@
+// For browsers without WebGL2: the training's computer renders, and the page shows its pictures.
+"use strict";
+
+const PICTURE_SIDE = 800; // longest side of a picture while the training runs, px
+const STILL_SIDE = 1600; // while it waits or is finished
+
+// Takes the place of Renderer.
+class Pictures {
+  constructor(canvas) {
+    Object.assign(this, { canvas, asking: false, wanted: null, still: false, failure: "" });
+    this.context = canvas.getContext("2d");
+  }
+
+  setOrder() {}
+
+  replace() {}
+
+  show() {}
+
+  surface() {
+    return null;
+  }
+
+  // Asks for a picture from this camera; of several, the last one counts.
+  draw(camera) {
+    this.wanted = camera;
+    if (!this.asking) this.ask();
+  }
+
+  async ask() {
+    this.asking = true;
+    while (this.wanted) {
+      const camera = this.wanted;
+      this.wanted = null;
+      const share = Math.min(1, (this.still ? STILL_SIDE : PICTURE_SIDE) / Math.max(camera.W, camera.H));
+      const side = (length) => Math.max(1, Math.round(share * length));
+      const { R, eye, fx, fy, cx, cy, W, H } = fitted(camera, side(camera.W), side(camera.H));
+      try {
+        const answer = await fetch("picture", {
+          method: "POST",
+          body: JSON.stringify({ R, eye, fx, fy, cx, cy, W, H }),
+        });
+        if (!answer.ok) throw new Error((await answer.text()).trim());
+        const picture = await createImageBitmap(await answer.blob());
+        this.context.drawImage(picture, 0, 0, this.canvas.width, this.canvas.height);
+        this.failure = "";
+      } catch (error) {
+        this.failure = error.message;
+      }
+    }
+    this.asking = false;
+  }
+}
+
+const hasWebGL2 = () => {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return gl !== null;
+};
+
+// This listener comes before that of main.js.
+addEventListener("DOMContentLoaded", (event) => {
+  if (hasWebGL2()) return;
+  event.stopImmediatePropagation();
+  class PictureViewer extends Viewer {
+    makeRenderer() {
+      return new Pictures(this.canvas);
+    }
+  }
+  const viewer = new PictureViewer({ ...FACTS, sh_degree: 0 }, { means: new Float32Array(0) });
+  window.viewer = viewer;
+  say("");
+  dispatchEvent(new CustomEvent("viewer", { detail: { viewer, splats: null } }));
+});
