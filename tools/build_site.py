@@ -31,6 +31,7 @@ USE = {
     "README.md": "Install and first run",
     "docs/INSTALL.md": "Wheels and platforms",
     "docs/GUIDE.md": "Guide",
+    "docs/EDITS.md": "Edited scenes",
     "docs/SCALE.md": "Larger than one machine",
     "docs/CLI.md": "Command line",
     "docs/FORMATS.md": "Scene formats",

@@ -16,8 +16,12 @@ from gsplat_edu.cli.arguments import numbers_text
 from gsplat_edu.cli.exporting import check_and_say
 from gsplat_edu.cli.options.convert import MOVES
 from gsplat_edu.cli.terminal import Field, Terminal
+from gsplat_edu.edits.apply import Views, edited, placed, views_after
+from gsplat_edu.edits.document import Edits, read_edits
+from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.edits.operations import Measure
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.keyframes import read_path
+from gsplat_edu.evaluate.keyframes import KeyframePath, read_path
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.io.formats import LOD_META, TILESET
 from gsplat_edu.io.lod.levels import LodOptions
@@ -27,7 +31,8 @@ from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.sfm.scale_text import points_of
-from gsplat_edu.viewer import export
+from gsplat_edu.viewer import export, page
+from gsplat_edu.viewer.edit_page import tour_of
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -42,6 +47,8 @@ def run(arguments: argparse.Namespace) -> None:
     backend = resolve_backend(arguments.backend) if arguments.verify or arguments.lod_refine else ""
     _check(arguments)
     along = None if arguments.path is None else read_path(arguments.path)
+    edits = None if arguments.edits is None else read_edits(arguments.edits)
+    views = views_after(() if edits is None else edits.operations)
     options = _levels(arguments)
     console = Terminal()
     columns = (
@@ -56,7 +63,10 @@ def run(arguments: argparse.Namespace) -> None:
         sources = []
         for path in arguments.sources:
             bar.update(steps, description=f"reading {path}")
-            sources.append(_edited(open_source(path), keep, move))
+            source = open_source(path)
+            if edits is not None:
+                source = _after_edits(source, edits, views, arguments)
+            sources.append(_filtered(source, keep, move))
             bar.advance(steps)
         source = _joined(sources)
         if arguments.scale is not None:
@@ -64,13 +74,13 @@ def run(arguments: argparse.Namespace) -> None:
         say = functools.partial(console.print, soft_wrap=True)
         for note in (*_origins(sources), *export.losses(arguments.out, source.scene)):
             say(note)
-        if along is not None:
-            along = along.shifted(-np.array(source.origin)).placed(move.R, move.s, move.t)
-        if move is not IDENTITY:  # the page's views then have the coordinates of the moved scene
-            source = replace(source, origin=ORIGIN)
+        total = move if views.move is IDENTITY else move.after(views.move)
+        for measure in views.measures:
+            say(_measured(measure, total.s, source.scene.unit))
+        source, tour = _toured(source, views, total, along)
         bar.update(steps, description=f"writing {arguments.out}")
         if arguments.lod_refine is None:
-            export.write(arguments.out, source, along, options)
+            export.write(arguments.out, source, tour, options)
         else:
             export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
         bar.advance(steps)
@@ -84,6 +94,39 @@ def run(arguments: argparse.Namespace) -> None:
             )
         if arguments.verify:
             check_and_say(arguments.out, source, backend, bar, say)
+
+
+def _after_edits(source: Source, edits: Edits, views: Views, arguments: argparse.Namespace) -> Source:
+    """Apply the operations of an edits file."""
+    scene, name = source.scene, str(arguments.edits)
+    edits.check_scene(identity_of(scene.gaussians, source.origin), name, arguments.edits_anyway)
+    left = edited(scene, edits.operations)
+    if not len(left.gaussians):
+        raise ArgumentError(
+            f"{name}: leaves none of {len(scene.gaussians):,} splats; remove a deletion from it"
+        )
+    cameras = source.cameras
+    if views.move is not IDENTITY:
+        cameras = tuple((name, views.move.camera(camera)) for name, camera in cameras)
+    return replace(source, scene=placed(left, views), cameras=cameras)
+
+
+def _toured(
+    source: Source, views: Views, move: Similarity, along: KeyframePath | None
+) -> tuple[Source, page.Tour]:
+    """Return the scene with the origin of its coordinates after all moves, and the tour of its page."""
+    path = views.path if along is None else along.shifted(-np.array(source.origin))
+    if path is not None:
+        path = path.placed(move.R, move.s, move.t)
+    if move is not IDENTITY:  # the page's views then have the coordinates of the moved scene
+        source = replace(source, origin=ORIGIN)
+    return source, tour_of(source, views, move, path)
+
+
+def _measured(measure: Measure, scale: float, unit: str | None) -> str:
+    """Describe a measured distance, in the units of the written scene."""
+    length = scale * float(np.linalg.norm(np.subtract(*measure.points)))
+    return f"measured {length:.4g} {unit or 'units'}{f': {measure.note}' if measure.note else ''}"
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -128,6 +171,7 @@ def _check_refining(arguments: argparse.Namespace) -> None:
         "--transform": arguments.transform,
         "--scale": arguments.scale is not None,
         "--crop": arguments.crop is not None,
+        "--edits": arguments.edits is not None,
     }
     for name, given in changes.items():
         if given:
@@ -136,7 +180,7 @@ def _check_refining(arguments: argparse.Namespace) -> None:
             )
 
 
-def _edited(source: Source, keep: Filter, move: Similarity) -> Source:
+def _filtered(source: Source, keep: Filter, move: Similarity) -> Source:
     kept = replace(source.scene, gaussians=keep.apply(source.scene.gaussians))
     if not len(kept.gaussians):
         raise ArgumentError(

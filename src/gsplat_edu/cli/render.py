@@ -18,6 +18,9 @@ from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.edits.apply import Views, edited, placed, views_after
+from gsplat_edu.edits.document import Edits, read_edits
+from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.following import path_along
 from gsplat_edu.evaluate.images import VIDEO_SUFFIX, check_output, write_frames
@@ -27,8 +30,10 @@ from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
 from gsplat_edu.files import check_writable
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.edit import IDENTITY
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
+from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import MAPS, RenderSettings
@@ -71,13 +76,17 @@ def run(arguments: argparse.Namespace) -> None:
     _check_numbers(arguments)
     maps = _chosen_maps(arguments)
     folder = RunFolder(arguments.source)
+    edits = None if arguments.edits is None else read_edits(arguments.edits)
     orbit = arguments.orbit or arguments.dataset is None
-    name = _output_name(arguments, orbit, bool(maps))
+    has_path = arguments.path is not None or (
+        edits is not None and views_after(edits.operations).path is not None
+    )
+    name = _output_name(has_path, orbit, bool(maps))
     if folder.exists():
-        shot = _run_shot(arguments, folder, orbit)
+        shot = _run_shot(arguments, folder, orbit, edits)
         out = arguments.out or folder.renders / name
     elif file_in(arguments.source).is_file():
-        shot = _file_shot(arguments, orbit)
+        shot = _file_shot(arguments, orbit, edits)
         out = arguments.out or Path("out") / f"{arguments.source.stem}_{name}"
     elif arguments.source.exists():
         raise ArgumentError(
@@ -120,11 +129,11 @@ def _check_numbers(arguments: argparse.Namespace) -> None:
         check_writable("--save-path", arguments.save_path)
 
 
-def _output_name(arguments: argparse.Namespace, orbit: bool, maps: bool) -> str:
+def _output_name(has_path: bool, orbit: bool, maps: bool) -> str:
     """Return the default name of the output: a video, or a folder for maps and for the dataset's cameras."""
     if not orbit:
         return "views"
-    kind = "orbit" if arguments.path is None else "path"
+    kind = "path" if has_path else "orbit"
     return kind if maps else f"{kind}{VIDEO_SUFFIX}"
 
 
@@ -147,50 +156,73 @@ def _save_path(arguments: argparse.Namespace, shot: Shot, orbit: bool) -> str:
     return f"wrote {arguments.save_path}: {len(cameras)} keyframes, a {kind} of {path.seconds:g} s"
 
 
-def _path_cameras(
-    arguments: argparse.Namespace, origin: Sequence[float], width: int, height: int
-) -> list[Camera]:
-    """Return the cameras along the path of --path, in a scene whose origin was subtracted."""
-    path = read_path(arguments.path, origin)
+def _path_of(arguments: argparse.Namespace, origin: Sequence[float], views: Views) -> KeyframePath | None:
+    """Return the path of --path, or that of the edits, in the edited scene; its origin was subtracted."""
+    path = views.path if arguments.path is None else read_path(arguments.path, origin)
+    if path is None or views.move is IDENTITY:
+        return path
+    return path.placed(views.move.R, views.move.s, views.move.t)
+
+
+def _after_edits(
+    arguments: argparse.Namespace, scene: Scene, origin: Sequence[float], edits: Edits | None
+) -> tuple[Scene, Views]:
+    """Apply the edits of --edits to a scene whose origin was subtracted."""
+    if edits is None:
+        return scene, views_after(())
+    edits.check_scene(identity_of(scene.gaussians, origin), str(arguments.edits))
+    views = views_after(edits.operations)
+    left = edited(scene, edits.operations)
+    if not len(left.gaussians):
+        raise ArgumentError(f"{arguments.edits}: leaves no splat of the scene; remove a deletion from it")
+    return placed(left, views), views
+
+
+def _path_cameras(arguments: argparse.Namespace, path: KeyframePath, width: int, height: int) -> list[Camera]:
+    """Return the cameras along a path."""
     frames = arguments.frames
     if frames is None:
         frames = max(1, round(path.seconds * arguments.fps) + (0 if path.loop else 1))
         if frames > MOST_FRAMES:
             raise ArgumentError(
-                f"{arguments.path}: lasts {path.seconds:g} s, which is {frames:,} frames; give --frames"
+                f"{arguments.path or arguments.edits}: the path lasts {path.seconds:g} s, which is {frames:,} frames;"
+                " give --frames"
             )
     return PathCurve(path).cameras(frames, width, height)
 
 
-def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool) -> Shot:
+def _run_shot(arguments: argparse.Namespace, folder: RunFolder, orbit: bool, edits: Edits | None) -> Shot:
     config = folder.read_config()
     settings = _settings(render_settings(config), arguments)
     scene, _ = folder.latest_scene()
     if arguments.dataset not in (None, RUNS_CAMERAS):
         return _dataset_shot(arguments, load_ply(scene), settings, data_settings(config), orbit)
     origin = config.get("origin") or ORIGIN
-    gaussians = load_ply(scene, origin)
+    left, views = _after_edits(arguments, Scene(load_ply(scene, origin)), origin, edits)
+    gaussians = left.gaussians
     cameras = folder.read_cameras(origin)
     named = [(name, camera) for name, _, camera in cameras]
+    if views.move is not IDENTITY:
+        named = [(name, views.move.camera(camera)) for name, camera in named]
     if not named:
         raise ArgumentError(f"{folder.cameras}: lists no cameras; give a dataset folder with --dataset PATH")
-    if arguments.path is not None:
+    if (path := _path_of(arguments, origin, views)) is not None:
         first = named[0][1] if arguments.size is None else resized(named[0][1], arguments.size)
-        along = _path_cameras(arguments, origin, first.W, first.H)
+        along = _path_cameras(arguments, path, first.W, first.H)
         return Shot(gaussians, along, None, settings)
     return replace(_shot(arguments, gaussians, named, settings, orbit), origin=origin)
 
 
-def _file_shot(arguments: argparse.Namespace, orbit: bool) -> Shot:
+def _file_shot(arguments: argparse.Namespace, orbit: bool, edits: Edits | None) -> Shot:
     if arguments.dataset == RUNS_CAMERAS:
         raise ArgumentError("--dataset: a scene file has no cameras; give the dataset folder: --dataset PATH")
-    scene = read_scene(arguments.source)
+    scene, views = _after_edits(arguments, read_scene(arguments.source), ORIGIN, edits)
     settings = _settings(file_settings(scene), arguments)
     if arguments.dataset is not None:
         return _dataset_shot(arguments, scene.gaussians, settings, DataSettings(), orbit)
     side = arguments.size or SCENE_SIZE
-    if arguments.path is not None:
-        return Shot(scene.gaussians, _path_cameras(arguments, ORIGIN, side, side), None, settings)
+    if (path := _path_of(arguments, ORIGIN, views)) is not None:
+        return Shot(scene.gaussians, _path_cameras(arguments, path, side, side), None, settings)
     cameras = orbit_of_scene(scene.gaussians, _orbit_frames(arguments), side, scene.up or WORLD_UP)
     description = (
         "a scene file has no cameras: using a full circle; --dataset PATH follows a capture's cameras"

@@ -11,13 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
+from gsplat_edu.cli.options.view import BESIDE
 from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.keyframes import read_path
+from gsplat_edu.files import check_writable
 from gsplat_edu.io.formats import LOD_META, file_in
 from gsplat_edu.io.lod.codec import read_index
+from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.viewer import export, page
+from gsplat_edu.viewer.edit_page import editing_of
+from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 from gsplat_edu.viewer.serve import PageServer, exposure
 from gsplat_edu.viewer.stream import folder_page
 
@@ -30,10 +36,16 @@ def run(arguments: argparse.Namespace) -> None:
     levels = file.name.lower() == LOD_META
     if arguments.budget is not None and not levels:
         raise ArgumentError(f"--budget: {arguments.source} has no levels of detail; convert it to {LOD_META}")
+    editing = arguments.edit is not None
+    if editing and levels:
+        raise ArgumentError(
+            "--edit: levels of detail cannot be edited; edit the scene, then convert it again"
+        )
+    does = "sees the scene and changes its edits" if editing else "sees the scene"
     # first: report a port in use before loading the scene
-    with PageServer(b"", arguments.host, arguments.port, policy=page.policy(levels)) as server:
+    with _server(arguments, levels) as server:
         (_prepare_levels if levels else _prepare)(server, console, arguments)
-        if warning := exposure(arguments.host, "sees the scene"):
+        if warning := exposure(arguments.host, does, token=editing):
             console.print(warning, soft_wrap=True)
         console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
         if not arguments.no_open and _has_screen():
@@ -45,6 +57,26 @@ def run(arguments: argparse.Namespace) -> None:
             console.print("ended")
 
 
+def _server(arguments: argparse.Namespace, levels: bool) -> PageServer:
+    if arguments.edit is None:
+        return PageServer(b"", arguments.host, arguments.port, policy=page.policy(levels))
+    file = _edits_file(arguments)
+    check_writable("--edit", file)
+    return EditServer(arguments.host, arguments.port, page.policy(editing=True), file)
+
+
+def _edits_file(arguments: argparse.Namespace) -> Path:
+    """Return the file that --edit names, or the usual one."""
+    if arguments.edit != BESIDE:
+        return Path(arguments.edit)
+    source: Path = arguments.source
+    return (
+        source / "edits.json"
+        if RunFolder(source).exists()
+        else source.parent / f"{_title(source)}.edits.json"
+    )
+
+
 def _prepare(server: PageServer, console: Terminal, arguments: argparse.Namespace) -> None:
     """Put a page with the whole scene on the server."""
     along = None if arguments.path is None else read_path(arguments.path)
@@ -52,7 +84,14 @@ def _prepare(server: PageServer, console: Terminal, arguments: argparse.Namespac
     if along is not None:
         along = along.shifted(-np.array(source.origin))
     title, tour = _title(arguments.source), page.Tour(along, source.origin)
-    server.page = page.html(source.scene, source.cameras, source.settings, title, source.held_out, tour)
+    editing = None
+    if isinstance(server, EditServer):
+        editing = editing_of(source, arguments.source, server.file, ADDRESS)
+        server.prepare(identity_of(source.scene.gaussians, source.origin))
+        console.print(f"edits: {server.file}", soft_wrap=True)
+    server.page = page.html(
+        source.scene, source.cameras, source.settings, title, source.held_out, tour, editing
+    )
     cameras = f", {len(source.cameras)} cameras" if source.cameras else ""
     console.print(
         f"{source.path}: {len(source.scene.gaussians):,} Gaussians{cameras}, {len(server.page):,} bytes",

@@ -24,6 +24,7 @@ from jaxtyping import Float64
 from gsplat_edu.camera import ROTATION_TOLERANCE, Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.files import written_aside
+from gsplat_edu.json_fields import check_keys, number, numbers, shown
 from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.validation import ArrayLike, float64_array
 
@@ -99,7 +100,7 @@ class KeyframePath:
             )
         for index, keyframe in enumerate(self.keyframes):
             try:
-                _check(keyframe)
+                check_keyframe(keyframe)
             except ArgumentError as error:
                 raise type(error)(f"keyframes[{index}].{error}") from None
         self._check_times()
@@ -184,7 +185,7 @@ def read_path(file: Path, origin: ArrayLike = NO_SHIFT) -> KeyframePath:
     except ValueError as error:  # a UnicodeDecodeError is one, too
         raise ArgumentError(f"{file}: is not JSON ({str(error)[:80]}); give a path file") from None
     try:
-        return _parsed(found).shifted(-shift)
+        return parsed_path(found).shifted(-shift)
     except ArgumentError as error:
         raise ArgumentError(f"{file}: {error}") from None
 
@@ -218,7 +219,12 @@ def evenly_chosen(cameras: Sequence[Camera], most: int) -> list[Camera]:
     return [cameras[i] for i in np.linspace(0, len(cameras) - 1, most).round().astype(int)]
 
 
-def _check(keyframe: Keyframe) -> None:
+def check_keyframe(keyframe: Keyframe) -> None:
+    """Check the values of a keyframe.
+
+    Raises:
+        ArgumentError: one is out of range.
+    """
     eye = float64_array("position", keyframe.eye, (3,))
     if np.abs(eye).max() > FARTHEST:
         raise ArgumentError(f"position: is beyond {FARTHEST:g}; move the scene closer to zero")
@@ -245,67 +251,51 @@ def _entry(keyframe: Keyframe) -> dict[str, Any]:
     }
 
 
-def _parsed(found: object) -> KeyframePath:
+def parsed_path(found: object) -> KeyframePath:
+    """Return the path that a document describes; positions are as they stand there.
+
+    Args:
+        found: The parsed JSON.
+
+    Raises:
+        ArgumentError: it is not a path of this version; the message names the key.
+    """
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise ArgumentError(f'is not a camera path: its "format" has to be "{FORMAT}"')
     version = found.get("version")
     if type(version) is not int or version != VERSION:
         raise ArgumentError(f"version: is {version!r}, but {VERSION} is supported")
-    _check_keys("", found, ("format", "version", "loop", "keyframes"), ("duration",))
+    check_keys("", found, ("format", "version", "loop", "keyframes"), ("duration",))
     loop, entries = found["loop"], found["keyframes"]
     if not isinstance(loop, bool):
-        raise ArgumentError(f"loop: is {_shown(loop)}, but has to be true or false")
+        raise ArgumentError(f"loop: is {shown(loop)}, but has to be true or false")
     if not isinstance(entries, list):
-        raise ArgumentError(f"keyframes: is {_shown(entries)}, but has to be a list")
-    keyframes = tuple(_keyframe(f"keyframes[{index}]", entry) for index, entry in enumerate(entries))
-    duration = _number("duration", found["duration"]) if "duration" in found else None
+        raise ArgumentError(f"keyframes: is {shown(entries)}, but has to be a list")
+    keyframes = tuple(parsed_keyframe(f"keyframes[{index}]", entry) for index, entry in enumerate(entries))
+    duration = number("duration", found["duration"]) if "duration" in found else None
     return KeyframePath(keyframes, loop, duration)
 
 
-def _keyframe(where: str, entry: object) -> Keyframe:
+def parsed_keyframe(where: str, entry: object) -> Keyframe:
+    """Return the keyframe that an object of the document describes; its values are checked by `check_keyframe`.
+
+    Args:
+        where: The object's place in its document, for messages.
+        entry: The parsed JSON.
+
+    Raises:
+        ArgumentError: a key is missing or unknown, or a value is of the wrong kind.
+    """
     if not isinstance(entry, dict):
-        raise ArgumentError(f"{where}: is {_shown(entry)}, but has to be an object")
-    _check_keys(f"{where}: ", entry, ("position", "rotation", "fov"), ("time",))
-    eye = _numbers(f"{where}.position", entry["position"], 3)
+        raise ArgumentError(f"{where}: is {shown(entry)}, but has to be an object")
+    check_keys(f"{where}: ", entry, ("position", "rotation", "fov"), ("time",))
+    eye = numbers(f"{where}.position", entry["position"], 3)
     rows = entry["rotation"]
     if not isinstance(rows, list) or len(rows) != 3:
-        raise ArgumentError(f"{where}.rotation: is {_shown(rows)}, but has to be three rows of three numbers")
-    rotation = [_numbers(f"{where}.rotation[{i}]", row, 3) for i, row in enumerate(rows)]
-    time = _number(f"{where}.time", entry["time"]) if "time" in entry else None
-    return Keyframe(np.array(eye), np.array(rotation).T, _number(f"{where}.fov", entry["fov"]), time)
-
-
-def _check_keys(where: str, found: dict[str, Any], needed: Sequence[str], optional: Sequence[str]) -> None:
-    """Reject a missing key, and one that would be ignored, such as a misspelt one."""
-    if missing := [key for key in needed if key not in found]:
-        raise ArgumentError(f"{where}lacks {missing[0]!r}")
-    if unknown := [key for key in found if key not in (*needed, *optional)]:
-        raise ArgumentError(
-            f"{where}has an unknown key {_shown(unknown[0])}; known are {', '.join((*needed, *optional))}"
-        )
-
-
-def _numbers(where: str, value: object, count: int) -> list[float]:
-    if not isinstance(value, list) or len(value) != count:
-        raise ArgumentError(f"{where}: is {_shown(value)}, but has to be {count} numbers")
-    return [_number(f"{where}[{index}]", number) for index, number in enumerate(value)]
-
-
-def _number(where: str, value: object) -> float:
-    if type(value) not in (int, float):
-        raise ArgumentError(f"{where}: is {_shown(value)}, but has to be a number")
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ArgumentError(f"{where}: is {_shown(value)}, but has to be finite")
-    return number
-
-
-def _shown(value: object) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else text[:37] + "..."
+        raise ArgumentError(f"{where}.rotation: is {shown(rows)}, but has to be three rows of three numbers")
+    rotation = [numbers(f"{where}.rotation[{i}]", row, 3) for i, row in enumerate(rows)]
+    time = number(f"{where}.time", entry["time"]) if "time" in entry else None
+    return Keyframe(np.array(eye), np.array(rotation).T, number(f"{where}.fov", entry["fov"]), time)
 
 
 def _refuse(name: str) -> NoReturn:

@@ -10,7 +10,6 @@ from typing import Any
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.fidelity import compare_scenes
-from gsplat_edu.evaluate.keyframes import KeyframePath
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.files import check_folder
 from gsplat_edu.io import formats
@@ -105,14 +104,14 @@ def has_levels(path: Path) -> bool:
 
 
 def write(
-    path: Path, source: Source, keyframes: KeyframePath | None = None, options: LodOptions | None = None
+    path: Path, source: Source, tour: page.Tour | None = None, options: LodOptions | None = None
 ) -> None:
     """Write a scene in the format given by the file's name; a page also gets the cameras and settings.
 
     Args:
         path: Output file.
         source: The scene.
-        keyframes: A camera path for the page to play, in the coordinates of the scene.
+        tour: Views and a camera path for the page, in the coordinates of the scene; None for none.
         options: How levels of detail are made, for formats that have them; None for the usual way.
 
     Raises:
@@ -120,7 +119,7 @@ def write(
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     if path.suffix.lower() == PAGE:
-        tour = page.Tour(keyframes, source.origin)
+        tour = tour or page.Tour(origin=source.origin)
         page.write(path, source.scene, source.cameras, source.settings, source.held_out, tour)
     elif path.name.lower() == LOD_META:
         lod_codec.write(path, source.scene, options)

@@ -38,7 +38,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
 from gsplat_edu.viewer import page_data
-from gsplat_edu.viewer.page_start import first_camera, start_among, start_of, subjects_of
+from gsplat_edu.viewer.page_start import Start, first_camera, start_among, start_of, subjects_of
 
 FORMAT = "gsplat-edu page"
 VERSION = 1
@@ -63,7 +63,21 @@ LEVEL_SCRIPTS = (*SCRIPTS[:-1], "levels.js", "main.js")
 LIVE_SCRIPTS = (*SCRIPTS[:-1], "live_curves.js", "live_pictures.js", "live.js", "main.js")
 """The same for a page that shows a training."""
 
-STYLE, LIVE_STYLE = "style.css", "live.css"
+EDIT_SCRIPTS = (
+    *SCRIPTS[:-1],
+    "edit_member.js",
+    "edit_state.js",
+    "edit_shapes.js",
+    "edit_draw.js",
+    "edit_tools.js",
+    "edit_panel.js",
+    "edit.js",
+    "edit_start.js",
+    "main.js",
+)
+"""The same for a page with the editor."""
+
+STYLE, LIVE_STYLE, EDIT_STYLE = "style.css", "live.css", "edit.css"
 
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag")
 
@@ -88,9 +102,10 @@ FINITE = 3e38
 PIECE = 12 << 20
 """Compressed bytes per element, a multiple of 3 so that the base64 of one element continues in the next."""
 
-FACTS_OPEN, SPLATS_OPEN, CLOSE = (
+FACTS_OPEN, SPLATS_OPEN, VALUES_OPEN, CLOSE = (
     b'<script type="application/json" id="facts">',
     b'<script type="application/octet-stream;base64" class="splats">',
+    b'<script type="application/octet-stream;base64" class="values">',
     b"</script>",
 )
 
@@ -102,10 +117,27 @@ class Tour:
     Args:
         path: Keyframes that the page plays, in the coordinates of the page's scene; None for none.
         origin: Origin subtracted from the coordinates of the scene's file; the page adds it to the views that it saves.
+        start: The view in which the page opens; None lets the page choose one.
+        views: Named views, listed before those of the capture.
     """
 
     path: KeyframePath | None = None
     origin: Sequence[float] = ORIGIN
+    start: Start | None = None
+    views: Sequence[NamedCamera] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Editing:
+    """What a page needs to edit its scene; see `gsplat_edu.viewer.edit_page`.
+
+    Args:
+        facts: The scene's identity, the operations so far, and the commands that apply them.
+        values: The exact parameters that the page's splats lack, little-endian float32: sh0, then logit_opacities.
+    """
+
+    facts: dict[str, Any]
+    values: bytes
 
 
 def write(
@@ -143,6 +175,7 @@ def html(
     title: str = "scene",
     held_out: Collection[str] = (),
     tour: Tour | None = None,
+    editing: Editing | None = None,
 ) -> bytes:
     """Return the page's bytes.
 
@@ -153,22 +186,25 @@ def html(
         title: Heading of the page.
         held_out: As for `write`.
         tour: As for `write`.
+        editing: Makes it a page with the editor.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
     """
-    return b"".join(_pieces(title, scene, views, settings, held_out, tour or Tour()))
+    return b"".join(_pieces(title, scene, views, settings, held_out, tour or Tour(), editing))
 
 
-def policy(levels: bool = False, live: bool = False) -> str:
+def policy(levels: bool = False, live: bool = False, editing: bool = False) -> str:
     """Return the Content-Security-Policy of every page: its scripts, its style, and its workers.
 
     Args:
         levels: Whether the page loads levels of detail, from its own server.
         live: Whether it shows a training, which it loads from its own server.
+        editing: Whether it has the editor, which saves to its own server.
     """
-    scripts = LIVE_SCRIPTS if live else LEVEL_SCRIPTS if levels else SCRIPTS
-    return content_policy(map(_web, scripts), [_style(live)], workers=True, own_server=levels or live)
+    scripts = _scripts(levels, live, editing)
+    own_server = levels or live or editing
+    return content_policy(map(_web, scripts), [_style(live, editing)], workers=True, own_server=own_server)
 
 
 def live_facts(
@@ -257,16 +293,37 @@ def _pieces(
     settings: RenderSettings | None,
     held_out: Collection[str],
     tour: Tour,
+    editing: Editing | None = None,
 ) -> Iterator[bytes]:
     """Yield the file in parts, so that they need not be in memory together."""
     scene.gaussians.check_finite()
-    facts = _facts(title, scene, views, settings or file_settings(scene), held_out, tour)
+    facts = _facts(title, scene, views, settings or file_settings(scene), held_out, tour) | _toured(tour)
+    facts["cameras"] = [*facts.pop("views"), *facts["cameras"]]
+    if editing is not None:
+        facts["edit"] = editing.facts
     head, tail = _web("index.html").split("{{splats}}\n")
     yield _filled(head, title, facts).encode("utf-8", errors="replace")  # a file name may not be valid text
-    compressed = memoryview(gzip.compress(page_data.packed(scene.gaussians), 6, mtime=0))
-    for begin in range(0, len(compressed), PIECE):
-        yield SPLATS_OPEN + base64.b64encode(compressed[begin : begin + PIECE]) + CLOSE + b"\n"
+    yield from _elements(SPLATS_OPEN, page_data.packed(scene.gaussians))
+    if editing is not None:
+        yield from _elements(VALUES_OPEN, editing.values)
     yield tail.encode("utf-8")
+
+
+def _elements(opening: bytes, data: bytes) -> Iterator[bytes]:
+    """Yield compressed bytes as elements."""
+    compressed = memoryview(gzip.compress(data, 6, mtime=0))
+    for begin in range(0, len(compressed), PIECE):
+        yield opening + base64.b64encode(compressed[begin : begin + PIECE]) + CLOSE + b"\n"
+
+
+def _toured(tour: Tour) -> dict[str, Any]:
+    """Return the facts of a tour that replace those of the scene, and its views."""
+    views = [
+        {"name": name, "held_out": False, "saved": True, **_camera(camera)} for name, camera in tour.views
+    ]
+    if tour.start is None:
+        return {"views": views}
+    return {"views": views, "start": _start(tour.start)}
 
 
 def _facts(
@@ -296,12 +353,7 @@ def _facts(
             "jacobian_limit": None if settings.jacobian_limit is None else float(settings.jacobian_limit),
         },
         "near": constants.Z_NEAR,
-        "start": {
-            "camera": _camera(start.camera),
-            "pivot": start.pivot.tolist(),
-            "up": start.up.tolist(),
-            "index": start.index,
-        },
+        "start": _start(start) | {"index": start.index + (len(tour.views) if start.index >= 0 else 0)},
         "origin": [float(x) for x in tour.origin],
         "path": None if tour.path is None else tour.path.document(),
         "cameras": [
@@ -323,6 +375,15 @@ def _add_subjects(
         entry["subject"] = subject
 
 
+def _start(start: Start) -> dict[str, Any]:
+    return {
+        "camera": _camera(start.camera),
+        "pivot": start.pivot.tolist(),
+        "up": start.up.tolist(),
+        "index": start.index,
+    }
+
+
 def _camera(camera: Camera) -> dict[str, Any]:
     numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "H", "W")}
     return {"R": camera.R.tolist(), "eye": camera.eye.tolist(), **numbers}
@@ -330,18 +391,18 @@ def _camera(camera: Camera) -> dict[str, Any]:
 
 def _filled(template: str, title: str, facts: dict[str, Any]) -> str:
     """Fill in the part before the splats."""
-    levels, live = "lod" in facts, "live" in facts
-    scripts = [_web(name) for name in (LIVE_SCRIPTS if live else LEVEL_SCRIPTS if levels else SCRIPTS)]
+    levels, live, editing = "lod" in facts, "live" in facts, "edit" in facts
+    scripts = [_web(name) for name in _scripts(levels, live, editing)]
     workers = [_text_element("sort-worker", _web("sort_worker.js"))]
     if levels:
         workers.append(_text_element("lod-worker", _web("lod_worker.js")))
     texts = {
         "title": html_text.escape(title),
-        "policy": policy_element(policy(levels, live)),
-        "style": _style(live),
+        "policy": policy_element(policy(levels, live, editing)),
+        "style": _style(live, editing),
         # "<" is escaped so that no text in the JSON can close its element
         "facts": json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
-        "shaders": "\n".join(_text_element(name, _shader(name)) for name in SHADERS),
+        "shaders": "\n".join(_text_element(name, _shader(name, editing)) for name in SHADERS),
         "worker": "\n".join(workers),
         "scripts": "\n".join(f"<script>{script}</script>" for script in scripts),
     }
@@ -357,12 +418,16 @@ def _web(name: str) -> str:
     return (files("gsplat_edu.viewer") / "web" / name).read_text("utf-8")
 
 
-def _style(live: bool) -> str:
-    return _web(STYLE) + (_web(LIVE_STYLE) if live else "")
+def _scripts(levels: bool, live: bool, editing: bool) -> Sequence[str]:
+    return EDIT_SCRIPTS if editing else LIVE_SCRIPTS if live else LEVEL_SCRIPTS if levels else SCRIPTS
 
 
-def _shader(name: str) -> str:
-    """Return one of our shaders, preceded by the renderer's constants."""
+def _style(live: bool, editing: bool) -> str:
+    return _web(STYLE) + (_web(LIVE_STYLE) if live else "") + (_web(EDIT_STYLE) if editing else "")
+
+
+def _shader(name: str, editing: bool) -> str:
+    """Return one of our shaders, preceded by the renderer's constants; without the editor's part for other pages."""
     lines = ["#version 300 es", "precision highp float;", f"const float FINITE = {FINITE!r};"]
     for constant in SHADER_CONSTANTS:
         value = getattr(constants, constant)
@@ -371,7 +436,10 @@ def _shader(name: str) -> str:
             lines.append(f"const {kind} {constant} = {kind}({', '.join(map(repr, value))});")
         else:
             lines.append(f"const float {constant} = {value!r};")
-    return "\n".join([*lines, _web(f"{name}.glsl")])
+    text = _web(f"{name}.glsl")
+    if not editing:
+        text = re.sub(r"#ifdef EDITING\n.*?#endif\n", "", text, flags=re.DOTALL)
+    return "\n".join([*lines, *(["#define EDITING"] if editing else []), text])
 
 
 def _read_facts(path: Path, data: bytes) -> dict[str, Any]:

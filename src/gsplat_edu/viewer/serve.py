@@ -133,6 +133,10 @@ class _Request(io.RawIOBase):
         self._until = time.monotonic() + REQUEST_SECONDS
         self._room = REQUEST_BYTES
 
+    def allow(self, seconds: float, count: int) -> None:
+        """Give the rest of the request this time and number of bytes."""
+        self._until, self._room = time.monotonic() + seconds, count
+
     def readable(self) -> bool:
         return True
 
@@ -176,8 +180,7 @@ class PageHandler(BaseHTTPRequestHandler):
 
     def _answer(self) -> bytes:
         """Send the headers of the page or a file and return its bytes, or send an error and return nothing."""
-        hosts = self.headers.get_all("Host") or []
-        if len(hosts) != 1 or not names_this_computer(hosts[0], self.server.bound_host):
+        if not self._is_for_us():
             self._say(http.HTTPStatus.FORBIDDEN)
             return b""
         if self.path == "/":
@@ -194,6 +197,11 @@ class PageHandler(BaseHTTPRequestHandler):
             self.send_header("Content-Security-Policy", f"{self.server.policy}; frame-ancestors 'none'")
         self._headers(kind, len(body))
         return body
+
+    def _is_for_us(self) -> bool:
+        """Return whether the request names this computer."""
+        hosts = self.headers.get_all("Host") or []
+        return len(hosts) == 1 and names_this_computer(hosts[0], self.server.bound_host)
 
     def _say(self, status: http.HTTPStatus) -> None:
         text = f"{status.value} {status.phrase}\n".encode("ascii")

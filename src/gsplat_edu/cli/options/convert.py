@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gsplat_edu.cli.arguments import add_backend, numbers_text, whole_number_text
 from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.errors import ArgumentError
 from gsplat_edu.sfm.scale_text import POINTS
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"
@@ -70,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="keyframes, as for render --path, that the page (OUT.html) plays; in the coordinates of IN",
     )
+    _add_edits(parser)
     parser.add_argument(
         "--verify",
         action="store_true",
@@ -77,6 +79,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _add_levels(parser.add_argument_group("levels of detail, for OUT/lod-meta.json and OUT/tileset.json"))
     add_backend(parser)
+
+
+def _add_edits(parser: argparse.ArgumentParser) -> None:
+    """Add the options of edits files."""
+    parser.add_argument(
+        "--edits",
+        type=Path,
+        metavar="FILE",
+        help="apply the operations of an edits file, from `gsplat-edu view IN --edit`, before all other options",
+    )
+    parser.add_argument(
+        "--edits-anyway",
+        action="store_true",
+        help="apply --edits to another scene than it was made for, if it selects by positions only",
+    )
 
 
 def _add_levels(group: argparse._ArgumentGroup) -> None:
@@ -110,3 +127,17 @@ def _add_levels(group: argparse._ArgumentGroup) -> None:
         help="train each coarser level against the run's photos, reduced to the size at which it is shown (renders of"
         f" the scene for a scene file), and print PSNR per level (default: {LOD_STEPS} steps); for lod-meta.json",
     )
+
+
+def check(arguments: argparse.Namespace) -> None:
+    """Check the options that depend on each other.
+
+    Raises:
+        ArgumentError: one needs another, or excludes it.
+    """
+    if arguments.edits_anyway and arguments.edits is None:
+        raise ArgumentError("--edits-anyway: has an effect only with --edits; add --edits FILE")
+    if arguments.edits is not None and len(arguments.sources) > 1:
+        raise ArgumentError(
+            "--edits: is for one scene; convert each scene with its edits, then merge the results"
+        )

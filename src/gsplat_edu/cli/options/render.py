@@ -83,6 +83,12 @@ def _add_path(parser: argparse.ArgumentParser) -> None:
         help="render along the keyframes of a JSON file, from --save-path or from the page of view and convert",
     )
     parser.add_argument(
+        "--edits",
+        type=Path,
+        metavar="FILE",
+        help="apply an edits file, from `gsplat-edu view SCENE --edit`, and render along its camera path if it has one",
+    )
+    parser.add_argument(
         "--save-path",
         type=Path,
         metavar="FILE",
@@ -110,6 +116,13 @@ def check(arguments: argparse.Namespace) -> None:
     }
     if arguments.path is not None and (given := [flag for flag, is_given in others.items() if is_given]):
         raise ArgumentError(f"--path: cannot be combined with {given[0]}; give one of them")
+    edits_exclude = {"--dataset": others["--dataset"], "--save-path": others["--save-path"]}
+    if arguments.edits is not None and (
+        given := [flag for flag, is_given in edits_exclude.items() if is_given]
+    ):
+        raise ArgumentError(
+            f"--edits: cannot be combined with {given[0]}; convert the scene with its edits first"
+        )
     if arguments.save_path is not None and (given := _given(arguments, "out", "maps")):
         raise ArgumentError(f"--save-path: renders nothing; remove {given[0]}")
     if arguments.save_path is None and arguments.keyframes is not None:

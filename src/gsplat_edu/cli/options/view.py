@@ -12,6 +12,9 @@ EXAMPLE = "example: gsplat-edu view runs/plush"
 
 PORT = 8080
 
+BESIDE = Path()
+"""Value of --edit without a file."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
@@ -46,5 +49,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="splats drawn at once of a scene with levels of detail (default: by the machine that shows the page:"
         " 1,000,000 on a phone, 2,000,000 with up to 4 GB of memory, else 4,000,000)",
+    )
+    parser.add_argument(
+        "--edit",
+        type=Path,
+        nargs="?",
+        const=BESIDE,
+        metavar="FILE",
+        help="open the editor, which reads and saves its operations in FILE (default: NAME.edits.json beside the scene,"
+        " edits.json in a run), for convert --edits; the URL has a token",
     )
     parser.add_argument("--no-open", action="store_true", help="print the URL without opening a browser")

@@ -13,7 +13,7 @@ class Viewer {
     this.canvas = element("canvas");
     this.renderer = this.makeRenderer(splats);
     this.sorter = new Sorter(splats.means, facts.near, (order) => this.renderer.setOrder(order));
-    const eyes = facts.cameras.map(({ eye }) => eye);
+    const eyes = facts.cameras.filter(({ saved }) => !saved).map(({ eye }) => eye);
     this.view = new View(facts.start, eyes);
     this.cameraIndex = facts.start.index;
     this.exact = null; // the camera given to setCamera, until the user moves

@@ -10,6 +10,10 @@ uniform highp sampler2D log_scales;
 uniform highp isampler2D quats;
 uniform highp sampler2D logit_opacities;
 uniform highp sampler2D sh;
+#ifdef EDITING
+uniform highp usampler2D flags;  // 0, 1: selected; above: hidden or deleted
+uniform vec3 highlight;          // colour of selected splats
+#endif
 uniform int texture_width;
 uniform int coefficients;  // stored per splat
 uniform int degree;        // drawn
@@ -75,6 +79,10 @@ float reach(vec2 direction, float a, float b, float c, float level) {
 void main() {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside the clip volume unless the splat is visible
     ivec2 place = texel(int(splat));
+#ifdef EDITING
+    uint flag = texelFetch(flags, place, 0).r;
+    if (flag > 1u) return;
+#endif
     vec3 offset = texelFetch(means, place, 0).xyz - eye;
     vec3 p = R * offset;
     if (!(p.z > Z_NEAR && p.z <= farthest)) return;
@@ -108,6 +116,9 @@ void main() {
     vec3 seen = color(offset / sqrt(dot(offset, offset)));
     if (!(all(lessThanEqual(abs(seen), vec3(COLOR_LIMIT))))) return;
     paint = vec4(max(seen, 0.0), opacity);
+#ifdef EDITING
+    if (flag == 1u) paint.rgb = mix(paint.rgb, highlight, 0.6);
+#endif
     conic = vec3(c, -b, a) / det;
 
     // The quad is tightest along the ellipse's long axis. A quad in any direction contains the ellipse, so the axis

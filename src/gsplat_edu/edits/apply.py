@@ -1,0 +1,175 @@
+"""Apply operations to a scene: what is selected, hidden and deleted after each, and what is left at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, UInt8
+
+from gsplat_edu.camera import WORLD_UP
+from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.membership import Members, Values, members
+from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.edit import IDENTITY, Similarity
+from gsplat_edu.io.scene import Scene
+
+SELECTED, HIDDEN, DELETED = 1, 2, 4
+"""States of a splat; at most one at a time. 0 is a splat that is merely there."""
+
+OPPOSITE = -1.0 + 1e-9
+"""Cosine below which the floor is upside down, so that its shortest turn has no definite axis."""
+
+Flags = UInt8[np.ndarray, " N"]
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """The operations that change no splat, as they stand at the end of a file.
+
+    Args:
+        move: Turns the floor level and scales the scene.
+        unit: What a unit is then; None if no operation says.
+        upright: Whether the floor was levelled.
+        start: The view in which a page opens.
+        named: The named views, in the order in which they were first named.
+        path: The camera path.
+        measures: The measured distances.
+    """
+
+    move: Similarity
+    unit: str | None
+    upright: bool
+    start: ops.StartView | None
+    named: tuple[ops.NamedView, ...]
+    path: KeyframePath | None
+    measures: tuple[ops.Measure, ...]
+
+
+def flags_after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Flags:
+    """Return the state of each of N splats after some operations: 0, `SELECTED`, `HIDDEN` or `DELETED`.
+
+    Args:
+        operations: In order.
+        gaussians: The scene.
+    """
+    flags = np.zeros(len(gaussians), dtype=np.uint8)
+    values = Values.of(gaussians)
+    for operation in operations:
+        _step(operation, values, flags)
+    return flags
+
+
+def kept(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
+    """Return which of N splats are neither hidden nor deleted after some operations."""
+    left: Bool[np.ndarray, " N"] = flags_after(operations, gaussians) <= SELECTED
+    return left
+
+
+def edited(scene: Scene, operations: Sequence[ops.Operation]) -> Scene:
+    """Return what is left of a scene, in its coordinates; the same object if nothing is removed."""
+    stays = kept(operations, scene.gaussians)
+    if stays.all():
+        return scene
+    rows = torch.from_numpy(stays).to(scene.gaussians.means.device)
+    return replace(scene, gaussians=scene.gaussians.map(lambda tensor: tensor[rows]))
+
+
+def views_after(operations: Sequence[ops.Operation]) -> Views:
+    """Collect the operations that change no splat; the last one of a kind counts."""
+    upright: ops.Upright | None = None
+    scale: ops.Scale | None = None
+    start: ops.StartView | None = None
+    path: KeyframePath | None = None
+    named: dict[str, ops.NamedView] = {}
+    for operation in operations:
+        match operation:
+            case ops.Upright():
+                upright = operation
+            case ops.Scale():
+                scale = operation
+            case ops.StartView():
+                start = operation
+            case ops.NamedView(name):
+                named[name] = operation
+            case ops.RemoveView(name):
+                named.pop(name, None)
+            case ops.Path(path):
+                pass
+    move = IDENTITY
+    if upright is not None:
+        move = Similarity(upright_rotation(upright), 1.0, np.zeros(3))
+    if scale is not None:
+        apart = float(np.linalg.norm(np.subtract(*scale.points)))
+        move = Similarity(np.eye(3), scale.length / apart, np.zeros(3)).after(move)
+    measures = tuple(operation for operation in operations if isinstance(operation, ops.Measure))
+    unit = None if scale is None else scale.unit
+    return Views(move, unit, upright is not None, start, tuple(named.values()), path, measures)
+
+
+def placed(scene: Scene, views: Views) -> Scene:
+    """Return a scene turned and scaled; its up direction and unit are then known as far as the operations say."""
+    if views.move is IDENTITY:
+        return scene
+    moved = views.move.scene(scene)
+    up = WORLD_UP if views.upright else moved.up
+    return replace(moved, up=up, unit=views.unit or moved.unit)
+
+
+def placed_view(view: Keyframe, move: Similarity) -> Keyframe:
+    """Return the view that sees the moved scene as this one sees the scene."""
+    return replace(view, eye=move.s * move.R @ view.eye + move.t, R=view.R @ move.R.T)
+
+
+def upright_rotation(upright: ops.Upright) -> Float64[np.ndarray, "3 3"]:
+    """Return the shortest rotation that takes the floor's normal to the world's up direction.
+
+    R = I + [v]x + [v]x² / (1 + c),  v = n x up,  c = n . up
+
+    n is the normal (b - a) x (c - a) of length 1. A floor that is exactly upside down turns about the x axis.
+    """
+    a, b, c = np.array(upright.points, dtype=np.float64)
+    first, second = (side / np.abs(side).max() for side in (b - a, c - a))
+    normal = np.cross(first, second)
+    normal /= np.linalg.norm(normal)
+    up = np.array(WORLD_UP)
+    cosine = float(normal @ up)
+    if cosine < OPPOSITE:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = np.cross(normal, up)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turn: Float64[np.ndarray, "3 3"] = np.eye(3) + across + across @ across / (1.0 + cosine)
+    return turn
+
+
+def _step(operation: ops.Operation, values: Values, flags: Flags) -> None:
+    """Apply one operation to the states, in place."""
+    match operation:
+        case ops.Select(how, region):
+            _select(how, members(region, values), flags)
+        case ops.Deselect():
+            flags[flags == SELECTED] = 0
+        case ops.Invert():
+            flags[flags <= SELECTED] ^= SELECTED
+        case ops.Delete():
+            flags[flags == SELECTED] = DELETED
+        case ops.Hide():
+            flags[flags == SELECTED] = HIDDEN
+        case ops.Show():
+            flags[flags == HIDDEN] = 0
+        case ops.Crop(box):
+            flags[~members(box, values)] = DELETED
+
+
+def _select(how: str, inside: Members, flags: Flags) -> None:
+    there, chosen = flags <= SELECTED, flags == SELECTED
+    now = {
+        ops.REPLACE: inside,
+        ops.ADD: chosen | inside,
+        ops.SUBTRACT: chosen & ~inside,
+        ops.INTERSECT: chosen & inside,
+    }[how]
+    flags[there] = now[there]

@@ -1,0 +1,167 @@
+"""Which splats a region holds: exactly the same ones as in the page (`viewer/web/edit_member.js`).
+
+Both sides compute with the float32 parameters converted to float64, by +, -, *, / and comparisons only, in the order
+written here. IEEE 754 defines the result of each to the bit, so both find the same splats. Nothing may be summed by a
+library (its order is its own) and no product fused with a sum. NaN belongs to no region.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.document import NEAR
+from gsplat_edu.gaussians import Gaussians
+
+Members = Bool[np.ndarray, " N"]
+Column = Float64[np.ndarray, " N"]
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """The values of N splats that regions are compared with, float32 numbers as float64.
+
+    Args:
+        means: (N, 3) world units.
+        log_scales: (N, 3).
+        logits: (N,) of the opacities.
+        sh0: (N, 3) coefficients of degree 0.
+    """
+
+    means: Float64[np.ndarray, "N 3"]
+    log_scales: Float64[np.ndarray, "N 3"]
+    logits: Float64[np.ndarray, " N"]
+    sh0: Float64[np.ndarray, "N 3"]
+
+    @classmethod
+    def of(cls, gaussians: Gaussians) -> Values:
+        """Return the values of Gaussians."""
+        means, log_scales, logits, sh0 = (
+            getattr(gaussians, name).detach().to(torch.float32).double().cpu().numpy()
+            for name in ("means", "log_scales", "logit_opacities", "sh0")
+        )
+        return cls(means, log_scales, logits, sh0[:, 0])
+
+
+def members(region: ops.Region, values: Values) -> Members:
+    """Return which splats a region holds.
+
+    Args:
+        region: The region.
+        values: N splats; NaN and infinity are allowed.
+    """
+    with np.errstate(all="ignore"):  # infinite splats
+        found: Members = _members(region, values)
+    return found
+
+
+def _members(region: ops.Region, values: Values) -> Any:  # noqa: ANN401
+    match region:
+        case ops.Rectangle(picture, (u0, v0, u1, v1)):
+            u, v, seen = _seen(picture, values.means)
+            return seen & (u >= u0) & (u <= u1) & (v >= v0) & (v <= v1)
+        case ops.Lasso(picture, points):
+            u, v, seen = _seen(picture, values.means)
+            return _chosen(u, v, seen, lambda u, v: _in_polygon(u, v, points))
+        case ops.Brush(picture, radius, points):
+            u, v, seen = _seen(picture, values.means)
+            return _chosen(u, v, seen, lambda u, v: _on_stroke(u, v, radius, points))
+        case ops.Sphere(center, radius):
+            x, y, z = (values.means[:, i] - center[i] for i in range(3))
+            return (x * x + y * y) + z * z <= radius * radius
+        case ops.Box():
+            return _in_box(region, values.means)
+        case ops.Color(low, high):
+            within = [_between(values.sh0[:, i], low[i], high[i]) for i in range(3)]
+            return within[0] & within[1] & within[2]
+        case ops.Opacity(lowest, highest):
+            return _between(values.logits, lowest, highest)
+        case ops.Size(lowest, highest):
+            x, y, z = values.log_scales.T
+            return _between(_larger(_larger(x, y), z), lowest, highest)
+    return np.ones(len(values.means), dtype=bool)
+
+
+def _seen(picture: ops.Picture, means: Float64[np.ndarray, "N 3"]) -> tuple[Column, Column, Members]:
+    """Project centres: u = (fx x) / z + cx, v = (fy y) / z + cy, for those in front of the camera."""
+    a, b, c = (means[:, i] - picture.position[i] for i in range(3))
+    x, y, z = ((row[0] * a + row[1] * b) + row[2] * c for row in picture.rotation)
+    u = (picture.fx * x) / z + picture.cx
+    v = (picture.fy * y) / z + picture.cy
+    return u, v, z > NEAR
+
+
+def _chosen(u: Column, v: Column, seen: Members, test: Callable[[Column, Column], Members]) -> Members:
+    """Apply a test to the splats that are seen."""
+    at = np.flatnonzero(seen)
+    result = np.zeros(len(u), dtype=bool)
+    result[at] = test(u[at], v[at])
+    return result
+
+
+def _in_polygon(u: Column, v: Column, points: tuple[ops.Numbers, ...]) -> Members:
+    """Even-odd rule within the polygon's bounds: count the edges that cross the ray towards larger u."""
+    columns, rows = [p[0] for p in points], [p[1] for p in points]
+    near = (u >= min(columns)) & (u <= max(columns)) & (v >= min(rows)) & (v <= max(rows))
+    at = np.flatnonzero(near)
+    u, v, odd = u[at], v[at], np.zeros(len(at), dtype=bool)
+    ax, ay = points[-1]
+    for bx, by in points:
+        here = np.flatnonzero((ay > v) != (by > v))
+        odd[here] ^= u[here] < ((bx - ax) * (v[here] - ay)) / (by - ay) + ax
+        ax, ay = bx, by
+    result = np.zeros(len(near), dtype=bool)
+    result[at] = odd
+    return result
+
+
+def _on_stroke(u: Column, v: Column, radius: float, points: tuple[ops.Numbers, ...]) -> Members:
+    """Within the radius of a segment, and of the segment's bounds widened by the radius."""
+    result = np.zeros(len(u), dtype=bool)
+    ax, ay = points[0]
+    for bx, by in points[1:] or points:
+        low_u, high_u = min(ax, bx) - radius, max(ax, bx) + radius
+        low_v, high_v = min(ay, by) - radius, max(ay, by) + radius
+        at = np.flatnonzero((u >= low_u) & (u <= high_u) & (v >= low_v) & (v <= high_v))
+        dx, dy = bx - ax, by - ay
+        wx, wy = u[at] - ax, v[at] - ay
+        along, length2 = wx * dx + wy * dy, dx * dx + dy * dy
+        ex, ey = u[at] - bx, v[at] - by
+        aside = wx * dy - wy * dx
+        square = radius * radius
+        from_start, from_end = wx * wx + wy * wy <= square, ex * ex + ey * ey <= square
+        between = aside * aside <= square * length2
+        result[at] |= np.where(along <= 0.0, from_start, np.where(along >= length2, from_end, between))
+        ax, ay = bx, by
+    return result
+
+
+def _in_box(box: ops.Box, means: Float64[np.ndarray, "N 3"]) -> Members:
+    """|axis . (mean - centre)| <= half extent along each axis."""
+    a, b, c = (means[:, i] - box.center[i] for i in range(3))
+    inside = np.ones(len(means), dtype=bool)
+    for axis, half in zip(box.axes, box.half, strict=True):
+        along = (axis[0] * a + axis[1] * b) + axis[2] * c
+        inside &= (along >= -half) & (along <= half)
+    return inside
+
+
+def _between(values: Column, low: float | None, high: float | None) -> Members:
+    inside: Members = values == values
+    if low is not None:
+        inside &= values >= low
+    if high is not None:
+        inside &= values <= high
+    return inside
+
+
+def _larger(a: Column, b: Column) -> Column:
+    """Return the larger value, or NaN if one is NaN, as Math.max does."""
+    larger: Column = np.maximum(a, b)
+    return larger

@@ -1,0 +1,94 @@
+"""What a page gets from edits: the editor's data, or the views of an edited scene."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gsplat_edu.camera import WORLD_UP, Camera
+from gsplat_edu.edits.apply import Views, placed_view
+from gsplat_edu.edits.document import MOST_BYTES
+from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
+from gsplat_edu.io.edit import Similarity
+from gsplat_edu.reading import open_file
+from gsplat_edu.runs.source import Source
+from gsplat_edu.viewer.page import Editing, Tour
+from gsplat_edu.viewer.page_start import SIDE, Start
+
+EXAMPLE_FORMAT = ".spz"
+"""Format in the command that the page shows."""
+
+
+def editing_of(source: Source, named: Path, file: Path, url: str | None = None) -> Editing:
+    """Return what the editor needs for a scene.
+
+    Args:
+        source: The scene.
+        named: The scene as the user named it, for the commands that the page shows.
+        file: The edits file, as the user named it.
+        url: Where the page reads and writes that file; None for a page without a server, which starts with no edits.
+    """
+    identity = identity_of(source.scene.gaussians, source.origin)
+    stem = named.resolve().name.split(".")[0] or "scene"
+    scene, edits = shlex.quote(str(named)), shlex.quote(str(file))
+    convert = f"gsplat-edu convert {scene} --edits {edits} {shlex.quote(stem + EXAMPLE_FORMAT)}"
+    render = f"gsplat-edu render {scene} --edits {edits} --out {shlex.quote(stem + '.mp4')}"
+    facts = {
+        "scene": identity.document(),
+        "file": file.name,
+        "commands": {"convert": convert, "render": render},
+        "url": url,
+    }
+    return Editing(facts, _values(source))
+
+
+def read_content(file: Path) -> bytes | None:
+    """Read the edits file of an editor; None if there is none.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if not file.exists():
+        return None
+    with open_file(file) as opened:
+        return opened.read(MOST_BYTES + 1)
+
+
+def tour_of(source: Source, views: Views, move: Similarity, path: KeyframePath | None) -> Tour:
+    """Return the tour of the page of an edited scene.
+
+    Args:
+        source: What is left of the scene, moved.
+        views: Start view and named views of the edits.
+        move: What moved the scene since it was opened.
+        path: The camera path, moved already.
+    """
+    W, H = (source.cameras[0][1].W, source.cameras[0][1].H) if source.cameras else (SIDE, SIDE)
+    named = [(view.name, _camera(placed_view(view.view, move), W, H)) for view in views.named]
+    start = None
+    if views.start is not None:
+        up = np.array(source.scene.up or WORLD_UP, dtype=np.float64)
+        pivot = move.s * move.R @ np.array(views.start.pivot) + move.t
+        camera = _camera(placed_view(views.start.view, move), W, H)
+        start = Start(camera, pivot, up / np.linalg.norm(up), -1)
+    return Tour(path, source.origin, start, named)
+
+
+def _camera(view: Keyframe, W: int, H: int) -> Camera:
+    focal = 0.5 * H / math.tan(math.radians(view.fov) / 2)
+    return Camera(view.R, view.eye, focal, focal, (W - 1) / 2, (H - 1) / 2, H, W)
+
+
+def _values(source: Source) -> bytes:
+    """Return sh0 and logit_opacities as little-endian float32."""
+    gaussians = source.scene.gaussians
+    parts = (gaussians.sh0, gaussians.logit_opacities)
+    return b"".join(
+        part.detach().to(torch.float32).cpu().contiguous().numpy().astype("<f4", copy=False).tobytes()
+        for part in parts
+    )

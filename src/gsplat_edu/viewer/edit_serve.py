@@ -1,0 +1,210 @@
+"""Serve a page with the editor, and write the edits file that it sends.
+
+A page that can write a file needs more than one that is only read. A request has to name this computer (`PageServer`
+checks Host) and bring the token, random for each server: in the URL that the command prints, later in a cookie that
+only this page's requests carry. A write also has to come from this page (Origin), and from its newest version: another
+tab or program may have written the file in between.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import http
+import http.cookies
+import secrets
+import threading
+import urllib.parse
+from pathlib import Path
+
+from gsplat_edu.edits.document import MOST_BYTES, parse_edits
+from gsplat_edu.edits.identity import Identity
+from gsplat_edu.errors import ArgumentError, SplatError
+from gsplat_edu.files import described, written_aside
+from gsplat_edu.viewer.edit_page import read_content
+from gsplat_edu.viewer.serve import PATIENCE, PageHandler, PageServer, _Request
+
+TOKEN_BYTES = 16
+"""Random bytes of a token: 2^128 possibilities cannot be guessed."""
+
+ADDRESS = "/edits.json"
+"""Where the page reads and writes its edits."""
+
+NO_FILE = "none"
+"""Version of a file that does not exist."""
+
+
+def version_of(data: bytes | None) -> str:
+    """Return the version of an edits file's content."""
+    return NO_FILE if data is None else hashlib.sha256(data).hexdigest()
+
+
+class EditServer(PageServer):
+    """Serves one page with the editor, to browsers that have its token.
+
+    Args:
+        host: Address to listen on.
+        port: Port; 0 picks a free one.
+        policy: Content-Security-Policy of the page.
+        file: The edits file to write.
+
+    Raises:
+        ArgumentError: the address does not belong to this computer, or the port is in use or out of range.
+    """
+
+    def __init__(self, host: str, port: int, policy: str, file: Path) -> None:
+        super().__init__(b"", host, port, policy=policy)
+        self.RequestHandlerClass = _Handler
+        self.file = file
+        self.scene: Identity | None = None
+        self.token = secrets.token_urlsafe(TOKEN_BYTES)
+        self.cookie = f"gsplat_edu_{self.server_port}"
+        self.writing = threading.Lock()
+
+    @property
+    def url(self) -> str:
+        """The page's address, with the token."""
+        return f"{super().url}?token={self.token}"
+
+    def prepare(self, scene: Identity) -> None:
+        """Say which scene is edited, and check the file if it exists.
+
+        Raises:
+            ArgumentError: the file is damaged, or was made for another scene.
+            OSError: it cannot be read.
+        """
+        self.scene = scene
+        self.content()
+
+    def content(self) -> bytes | None:
+        """Return the checked content of the file; None if there is none.
+
+        Raises:
+            ArgumentError: it is damaged, or was made for another scene.
+            OSError: it cannot be read.
+        """
+        data = read_content(self.file)
+        if data is not None:
+            self._check(data)
+        return data
+
+    def _check(self, data: bytes) -> None:
+        edits = parse_edits(data, self.file.name)
+        if self.scene is not None:
+            edits.check_scene(self.scene, self.file.name)
+
+    def store(self, data: bytes, expected: str) -> str | None:
+        """Write the file if its version is the expected one, and return the new version; None if it is another.
+
+        Raises:
+            ArgumentError: the data is no valid edits file of this scene.
+            OSError: the file cannot be written. An existing file stays unchanged.
+        """
+        self._check(data)
+        with self.writing:
+            if version_of(read_content(self.file)) != expected:
+                return None
+            with written_aside(self.file) as aside:
+                aside.write_bytes(data)
+        return version_of(data)
+
+
+class _Handler(PageHandler):
+    server: EditServer
+    _known = False  # whether the request brought the token
+
+    def _answer(self) -> bytes:
+        if (fault := self._fault()) is not None:
+            self._refuse(http.HTTPStatus.FORBIDDEN, fault)
+            return b""
+        self.path = urllib.parse.urlsplit(self.path).path
+        return self._edits() if self.path == ADDRESS else super()._answer()
+
+    def _edits(self) -> bytes:
+        """Send the headers of the edits file and return its content, or refuse one that the page could not apply."""
+        try:
+            data = self.server.content()
+        except (SplatError, OSError) as error:
+            reason = described(error) if isinstance(error, OSError) else str(error)
+            self._refuse(http.HTTPStatus.CONFLICT, reason)
+            return b""
+        body = b"null\n" if data is None else data
+        self.send_response(http.HTTPStatus.OK)
+        self.send_header("ETag", f'"{version_of(data)}"')
+        self._headers("application/json", len(body))
+        return body
+
+    def end_headers(self) -> None:
+        if self._known:
+            cookie = f"{self.server.cookie}={self.server.token}; Path=/; HttpOnly; SameSite=Strict"
+            self.send_header("Set-Cookie", cookie)
+        self.send_header("Referrer-Policy", "no-referrer")  # the URL is a secret
+        super().end_headers()
+
+    def do_PUT(self) -> None:
+        """Write the edits file."""
+        if (fault := self._fault() or self._foreign()) is not None:
+            return self._refuse(http.HTTPStatus.FORBIDDEN, fault)
+        if self.path != ADDRESS:
+            return self._refuse(http.HTTPStatus.NOT_FOUND, "there is nothing to write")
+        length, expected = self.headers.get("Content-Length", ""), self.headers.get("If-Match", "").strip('"')
+        if not length.isascii() or not length.isdigit():
+            return self._refuse(http.HTTPStatus.LENGTH_REQUIRED, "the length is missing")
+        if int(length) > MOST_BYTES:
+            return self._refuse(http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES:,} bytes")
+        raw = self.rfile.raw  # type: ignore[attr-defined]
+        if isinstance(raw, _Request):
+            raw.allow(PATIENCE, int(length) + 1)
+        data = self.rfile.read(int(length))
+        if len(data) != int(length):
+            return self._refuse(http.HTTPStatus.BAD_REQUEST, "the request is incomplete")
+        try:
+            version = self.server.store(data, expected)
+        except ArgumentError as error:
+            return self._refuse(http.HTTPStatus.BAD_REQUEST, str(error))
+        except OSError as error:
+            return self._refuse(http.HTTPStatus.INTERNAL_SERVER_ERROR, described(error))
+        except SplatError as error:
+            return self._refuse(http.HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        if version is None:
+            changed = (
+                f"{self.server.file.name} was changed elsewhere; download these edits, then reload the page"
+            )
+            return self._refuse(http.HTTPStatus.PRECONDITION_FAILED, changed)
+        self.send_response(http.HTTPStatus.OK)
+        self.send_header("ETag", f'"{version}"')
+        return self._text("saved")
+
+    def _fault(self) -> str | None:
+        """Return why a request is refused; None if it is not."""
+        if not self._is_for_us():
+            return "unknown host name for this server"
+        given = [*urllib.parse.parse_qs(urllib.parse.urlsplit(self.path).query).get("token", [])]
+        for header in self.headers.get_all("Cookie") or []:
+            try:
+                cookies = http.cookies.SimpleCookie(header)
+            except http.cookies.CookieError:
+                continue
+            if self.server.cookie in cookies:
+                given.append(cookies[self.server.cookie].value)
+        if not any(secrets.compare_digest(one.encode(), self.server.token.encode()) for one in given):
+            return "open the URL that the command printed, including its token"
+        self._known = True
+        return None
+
+    def _foreign(self) -> str | None:
+        """Return why a write is refused that another page may have sent."""
+        host, origins = self.headers.get("Host", ""), self.headers.get_all("Origin") or []
+        own = {f"{scheme}://{host}".lower() for scheme in ("http", "https")}  # https if a proxy adds it
+        if len(origins) != 1 or origins[0].lower() not in own:
+            return "requests from other pages are not allowed"
+        return None
+
+    def _refuse(self, status: http.HTTPStatus, reason: str) -> None:
+        self.send_response(status)
+        self._text(reason)
+
+    def _text(self, text: str) -> None:
+        body = f"{text}\n".encode("utf-8", "replace")
+        self._headers("text/plain; charset=utf-8", len(body))
+        if self.command != "HEAD":
+            self.wfile.write(body)

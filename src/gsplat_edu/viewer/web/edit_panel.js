@@ -1,0 +1,350 @@
+// The editor's panel: tools, their options, the list of operations.
+"use strict";
+
+const EDIT_PANEL = `
+<section id="edit" aria-label="editor">
+<p class="row" role="toolbar" aria-label="tools">
+<button data-tool="navigate" title="V: drags turn the view">navigate</button>
+<button data-tool="rectangle" title="T: select by a rectangle">rectangle</button>
+<button data-tool="lasso" title="L: select by a freehand outline">lasso</button>
+<button data-tool="brush" title="B: select by painting; [ and ] change the size">brush</button>
+<button data-tool="sphere" title="O: select by a sphere">sphere</button>
+<button data-tool="box" title="X: select by a box, or crop to it">box</button>
+<button data-tool="color" title="G: select by colour">colour</button>
+<button data-tool="floor" title="Z: turn the scene upright by three points of the floor">floor</button>
+<button data-tool="scale" title="C: set the scale by two points">scale</button>
+<button data-tool="measure" title="M: measure between two points">measure</button>
+</p>
+<p id="edit-hint"></p>
+<p class="row" data-for="rectangle lasso brush sphere box color" role="group" aria-label="how selections combine">
+<button data-how="replace" title="1: select only these">new</button>
+<button data-how="add" title="2, or Shift: add to the selection">add</button>
+<button data-how="subtract" title="3, or Ctrl: remove from the selection">subtract</button>
+<button data-how="intersect" title="4, or Shift Ctrl: keep what both select">intersect</button>
+</p>
+<p class="row" data-for="brush"><label>size <input id="edit-radius" type="range" min="2" max="200" value="24"></label></p>
+<div data-for="sphere box">
+<p class="row" id="edit-center" role="group" aria-label="centre"><span>centre</span></p>
+<p class="row" data-for="sphere"><label>radius <input id="edit-sphere" type="number" step="any" min="0"></label></p>
+<p class="row" data-for="box" id="edit-half" role="group" aria-label="half sizes"><span>half size</span></p>
+<p class="row"><button data-do="select-shape" title="Enter">select</button>
+<button data-do="crop" data-for="box" title="Delete everything outside the box">crop to box</button></p>
+</div>
+<p class="row" data-for="color"><label>colour <input id="edit-color" type="color" value="#808080"></label>
+<label>tolerance <input id="edit-tolerance" type="range" min="1" max="128" value="24"></label>
+<button data-do="select-color" title="Enter">select</button></p>
+<p class="row" data-for="scale"><label>distance <input id="edit-length" type="number" step="any" min="0" value="1"></label>
+<label>unit <select id="edit-unit"><option>m</option><option>cm</option><option>mm</option></select></label>
+<button data-do="scale" title="Enter">set scale</button></p>
+<p class="row" data-for="measure"><label>note <input id="edit-note" maxlength="200"></label>
+<button data-do="measure" title="Enter">keep</button></p>
+<p class="row" role="group" aria-label="selection">
+<button data-do="all" title="0: select all">all</button>
+<button data-do="none" title="N: select nothing">none</button>
+<button data-do="invert" title="I: invert the selection">invert</button>
+<button data-do="delete" title="Delete: delete the selected splats">delete</button>
+<button data-do="hide" title="J: hide the selected splats">hide</button>
+<button data-do="show" title="Shift J: show hidden splats again">show</button>
+</p>
+<details><summary>by opacity and size</summary>
+<p class="row"><label>opacity from <input id="edit-opacity-low" type="number" min="0" max="1" step="0.01" value="0"></label>
+<label>to <input id="edit-opacity-high" type="number" min="0" max="1" step="0.01" value="0.1"></label>
+<button data-do="select-opacity">select</button></p>
+<p class="row"><label>size from <input id="edit-size-low" type="number" min="0" step="any"></label>
+<label>to <input id="edit-size-high" type="number" min="0" step="any"></label>
+<button data-do="select-size">select</button></p>
+</details>
+<p id="edit-count" role="status"></p>
+<p class="row">
+<button data-do="undo" title="U or Ctrl Z: undo">undo</button>
+<button data-do="redo" title="Y or Ctrl Shift Z: redo">redo</button>
+<button data-do="save" title="Ctrl S: save the edits">save</button>
+<button data-do="download" title="Download the edits as a file">download</button>
+<span id="edit-saved" role="status"></span>
+</p>
+<p id="edit-message" role="alert"></p>
+<details id="edit-views"><summary></summary>
+<p class="row"><button data-do="start" title="The exported page opens in this view">start here</button>
+<label>name <input id="edit-name" maxlength="100"></label><button data-do="view">keep view</button></p>
+<ol></ol></details>
+<details id="edit-list"><summary></summary><ol></ol></details>
+<details id="edit-commands"><summary>commands</summary><p>The saved edits, applied:</p><pre tabindex="0"></pre>
+<p>Video of the camera path (preview: P):</p><pre tabindex="0"></pre></details>
+</section>`;
+
+const EDIT_HINTS = {
+  navigate: "Drag turns the view. Choose a tool to select splats.",
+  rectangle: "Drag a rectangle. Right drag and wheel still move the view; hold Space to turn it.",
+  lasso: "Draw around what to select. Hold Space to turn the view.",
+  brush: "Paint over what to select. Hold Space to turn the view.",
+  sphere: "Drag from the centre on a surface, then select.",
+  box: "Drag the dots on the sides, or a new box from its centre.",
+  color: "Click a colour in the picture, then select.",
+  floor: "Click three points of the floor, far apart.",
+  scale: "Click two points whose distance you know.",
+  measure: "Click two points.",
+};
+
+// Keys by what they press in the panel.
+const EDIT_KEYS = {
+  v: "[data-tool=navigate]",
+  t: "[data-tool=rectangle]",
+  l: "[data-tool=lasso]",
+  b: "[data-tool=brush]",
+  o: "[data-tool=sphere]",
+  x: "[data-tool=box]",
+  g: "[data-tool=color]",
+  z: "[data-tool=floor]",
+  c: "[data-tool=scale]",
+  m: "[data-tool=measure]",
+  1: "[data-how=replace]",
+  2: "[data-how=add]",
+  3: "[data-how=subtract]",
+  4: "[data-how=intersect]",
+  0: "[data-do=all]",
+  n: "[data-do=none]",
+  i: "[data-do=invert]",
+  delete: "[data-do=delete]",
+  backspace: "[data-do=delete]",
+  j: "[data-do=hide]",
+  "Shift+j": "[data-do=show]",
+  u: "[data-do=undo]",
+  y: "[data-do=redo]",
+};
+
+// What Enter applies, by tool.
+const EDIT_APPLIES = {
+  sphere: "select-shape",
+  box: "select-shape",
+  color: "select-color",
+  scale: "scale",
+  measure: "measure",
+};
+
+class EditPanel {
+  constructor(editor) {
+    this.editor = editor;
+    document.body.insertAdjacentHTML("beforeend", EDIT_PANEL);
+    this.root = element("edit");
+    this.numbers = { center: this.addNumbers("edit-center"), half: this.addNumbers("edit-half") };
+    this.root.addEventListener("click", (event) => this.click(event.target.closest("button")));
+    this.root.addEventListener("input", (event) => this.input(event.target));
+    // what is typed into a field is no command of the page
+    this.root.addEventListener("keydown", (event) => this.typed(event));
+    const [convert, render] = this.root.querySelectorAll("pre");
+    const { commands } = editor.scene;
+    [convert.textContent, render.textContent] = [commands?.convert ?? "", commands?.render ?? ""];
+    element("edit-commands").hidden = !commands;
+    this.button("save").hidden = !editor.save;
+  }
+
+  button(name) {
+    return this.root.querySelector(`[data-do=${name}]`);
+  }
+
+  addNumbers(id) {
+    return ["x", "y", "z"].map((axis) => {
+      const label = document.createElement("label");
+      const input = document.createElement("input");
+      Object.assign(input, { type: "number", step: "any" });
+      label.append(`${axis} `, input);
+      element(id).append(label);
+      return input;
+    });
+  }
+
+  click(button) {
+    const { editor } = this;
+    if (!button) return;
+    const { tool, how } = button.dataset;
+    if (tool) editor.tools.choose(tool);
+    else if (how) editor.chooseHow(how);
+    else if (button.dataset.do) this.act(button.dataset.do);
+  }
+
+  act(name) {
+    const { editor } = this;
+    const values = (id) => Number(element(id).value);
+    const actions = {
+      all: () => editor.perform({ op: "select", how: "replace", by: "all" }),
+      none: () => editor.perform({ op: "deselect" }),
+      invert: () => editor.perform({ op: "invert" }),
+      delete: () => editor.perform({ op: "delete" }),
+      hide: () => editor.perform({ op: "hide" }),
+      show: () => editor.perform({ op: "show" }),
+      undo: () => editor.undo(),
+      redo: () => editor.redo(),
+      save: () => editor.store(),
+      download: () => editor.download(),
+      crop: () => editor.crop(),
+      start: () => editor.startHere(),
+      view: () => editor.keepView(element("edit-name").value.trim()),
+      scale: () => editor.setScale(values("edit-length"), element("edit-unit").value),
+      measure: () => editor.keepMeasure(element("edit-note").value.trim()),
+      "select-shape": () => editor.selectShape(),
+      "select-color": () => editor.selectColor(element("edit-color").value, values("edit-tolerance")),
+      "select-opacity": () => editor.selectOpacity(values("edit-opacity-low"), values("edit-opacity-high")),
+      "select-size": () => editor.selectSize(element("edit-size-low").value, element("edit-size-high").value),
+    };
+    actions[name]();
+  }
+
+  // Whether Enter applies something chosen before.
+  get ready() {
+    const { tool, shape, apart } = this.editor.tools;
+    return Boolean({ sphere: shape, box: shape, color: true, scale: apart, measure: apart }[tool]);
+  }
+
+  apply() {
+    const name = EDIT_APPLIES[this.editor.tools.tool];
+    if (name && this.ready) this.act(name);
+  }
+
+  // Presses the button of a key; returns whether it has one.
+  pressKey(key) {
+    if (key === "[" || key === "]") {
+      element("edit-radius").value = this.editor.radius * (key === "]" ? 1.2 : 1 / 1.2);
+      this.input(element("edit-radius"));
+      return true;
+    }
+    const button = EDIT_KEYS[key] && this.root.querySelector(EDIT_KEYS[key]);
+    button?.click();
+    return Boolean(button);
+  }
+
+  typed(event) {
+    if (!event.target.matches("input, select")) return;
+    event.stopPropagation();
+    if (event.key === "Escape") event.target.blur();
+    if (event.key === "Enter" && event.target.type !== "color") this.apply();
+  }
+
+  // Takes numbers of the shape that were typed.
+  input(field) {
+    const { editor } = this;
+    const { shape } = editor.tools;
+    if (field.id === "edit-radius") editor.radius = Number(field.value);
+    const value = Number(field.value);
+    if (!shape || field.value === "" || !Number.isFinite(value)) return editor.redraw();
+    for (const name of ["center", "half"]) {
+      const index = this.numbers[name].indexOf(field);
+      const allowed = name === "center" ? Math.abs(value) < 1e30 : value > 0;
+      if (index >= 0 && allowed) shape[name] = shape[name].map((old, i) => (i === index ? value : old));
+    }
+    if (field.id === "edit-sphere" && value > 0) shape.radius = value;
+    return editor.redraw();
+  }
+
+  // Shows the tool, the counts and the operations.
+  update() {
+    const { tools, how, history } = this.editor;
+    for (const button of this.root.querySelectorAll("[data-tool]")) {
+      button.setAttribute("aria-pressed", button.dataset.tool === tools.tool);
+    }
+    for (const button of this.root.querySelectorAll("[data-how]")) {
+      button.setAttribute("aria-pressed", button.dataset.how === how);
+    }
+    for (const part of this.root.querySelectorAll("[data-for]")) {
+      part.hidden = !part.dataset.for.split(" ").includes(tools.tool);
+    }
+    element("edit-hint").textContent = this.hint();
+    this.showCounts(history.counts());
+    this.button("undo").disabled = !history.done.length;
+    this.button("redo").disabled = !history.undone.length;
+    this.button("select-shape").disabled = this.button("crop").disabled = !tools.shape;
+    this.button("scale").disabled = this.button("measure").disabled = tools.apart === null;
+    this.showShape();
+  }
+
+  hint() {
+    const { tools, lengthText } = this.editor;
+    if (tools.apart !== null) return `Distance: ${lengthText(tools.apart)}`;
+    const left = (POINTS_OF[tools.tool] ?? 0) - tools.points.length;
+    return tools.points.length && left > 0 ? `${left} more point${left > 1 ? "s" : ""}.` : EDIT_HINTS[tools.tool];
+  }
+
+  showCounts({ all, selected, hidden, deleted }) {
+    const number = (value) => value.toLocaleString("en");
+    const parts = [`${number(selected)} selected`, hidden && `${number(hidden)} hidden`, `${number(all - hidden - deleted)} of ${number(all)} left`];
+    element("edit-count").textContent = parts.filter(Boolean).join(" · ");
+    for (const name of ["delete", "hide"]) this.button(name).disabled = !selected;
+    this.button("show").disabled = !hidden;
+  }
+
+  showShape() {
+    const { shape } = this.editor.tools;
+    const fill = (input, value) => {
+      if (input !== document.activeElement) input.value = value === undefined ? "" : Number(value.toPrecision(6));
+    };
+    this.numbers.center.forEach((input, i) => fill(input, shape?.center[i]));
+    this.numbers.half.forEach((input, i) => fill(input, shape?.half?.[i]));
+    fill(element("edit-sphere"), shape?.radius);
+  }
+
+  // Lists of views and operations; only after a change of them.
+  list() {
+    const { history, editor } = { history: this.editor.history, editor: this.editor };
+    const views = history.views();
+    const button = (text, label, action, current) => {
+      const made = document.createElement("button");
+      made.textContent = text;
+      if (label) made.setAttribute("aria-label", label);
+      if (current !== undefined) made.setAttribute("aria-current", current);
+      made.addEventListener("click", action);
+      return made;
+    };
+    const row = (...parts) => {
+      const item = document.createElement("li");
+      item.append(...parts);
+      return item;
+    };
+    const rows = [...views.named.values()].map((view) =>
+      row(
+        button(view.name, `go to ${view.name}`, () => editor.goTo(view)),
+        button("×", `remove ${view.name}`, () => editor.perform({ op: "remove_view", name: view.name })),
+      ),
+    );
+    if (views.start) rows.unshift(row(button("start", "go to the start view", () => editor.goTo(views.start))));
+    element("edit-views").querySelector("ol").replaceChildren(...rows);
+    element("edit-views").querySelector("summary").textContent = `views (${rows.length})`;
+    const operations = [...history.done, ...[...history.undone].reverse()];
+    const items = operations.map((operation, i) =>
+      row(button(describeOperation(operation), "", () => editor.goToStep(i + 1), i + 1 === history.done.length)),
+    );
+    if (operations.length) items.unshift(row(button("as opened", "", () => editor.goToStep(0), !history.done.length)));
+    items.forEach((item, i) => item.classList.toggle("undone", i > history.done.length));
+    element("edit-list").querySelector("ol").replaceChildren(...items);
+    element("edit-list").querySelector("summary").textContent = `operations (${history.done.length})`;
+  }
+
+  showColor(color) {
+    element("edit-color").value = color;
+  }
+
+  saved(text) {
+    element("edit-saved").textContent = text;
+  }
+}
+
+function describeOperation(operation) {
+  const { op, how, by, name, note } = operation;
+  const verbs = { replace: "select", add: "add", subtract: "subtract", intersect: "intersect" };
+  if (op === "select") return by === "all" ? "select all" : `${verbs[how]} by ${by === "color" ? "colour" : by}`;
+  if (op === "scale") {
+    const apart = length3(plus(...operation.points, -1));
+    return `scale: ${shortNumber(apart)} units = ${operation.length} ${operation.unit}`;
+  }
+  const texts = {
+    deselect: "select none",
+    invert: "invert",
+    crop: "crop to box",
+    show: "show hidden",
+    upright: "turn upright",
+    start: "start view",
+    view: `view ${name}`,
+    remove_view: `remove view ${name}`,
+    path: operation.path ? `camera path of ${operation.path.keyframes.length} views` : "no camera path",
+    measure: `distance${note ? `: ${note}` : ""}`,
+  };
+  return texts[op] ?? op;
+}

@@ -1,0 +1,154 @@
+// Geometry of the editor: cameras, boxes and lines as an edits file describes them.
+"use strict";
+
+const EDIT_UP = [0, -1, 0]; // the world's up direction
+const [BOX_LOW, BOX_HIGH] = [0.02, 0.98]; // quantiles of the splats that a new box encloses
+const MOST_SAMPLED = 20000; // splats that these are taken from
+const DEVIATIONS = 3.4; // beyond these, a splat of any opacity is below 1/255
+const CIRCLE = 48; // corners of a drawn circle
+
+const rotated = (rows, vector) => rows.map((row) => dot(row, vector)); // rows of a matrix times a vector
+const length3 = (a) => Math.hypot(...a);
+
+// The camera of a picture as a "select" stores it.
+function pictureOf({ R, eye, fx, fy, cx, cy, W, H }) {
+  return { position: [...eye], rotation: transposed(R), fx, fy, cx, cy, width: W, height: H };
+}
+
+// A view as "start" and "view" store it.
+function storedView({ R, eye, H, fy }) {
+  return { position: [...eye], rotation: transposed(R), fov: (2 * Math.atan((0.5 * H) / fy) * 180) / Math.PI };
+}
+
+// Column and row at which a camera sees a point, and its depth.
+function seenAt(camera, point) {
+  const [x, y, z] = rotated(camera.R, plus(point, camera.eye, -1));
+  return { u: (camera.fx * x) / z + camera.cx, v: (camera.fy * y) / z + camera.cy, depth: z };
+}
+
+// The splats that may cover a pixel, far to near: those whose extent, which is overestimated, reaches it.
+function splatsAt({ count, means, log_scales }, flags, camera, column, row, near) {
+  const found = [];
+  const { R, eye, fx, fy, cx, cy } = camera;
+  const focal = Math.max(fx, fy);
+  for (let i = 0, k = 0; i < count; ++i, k += 3) {
+    if (flags[i] > SELECTED) continue;
+    const [a, b, c] = [means[k] - eye[0], means[k + 1] - eye[1], means[k + 2] - eye[2]];
+    const depth = R[2][0] * a + R[2][1] * b + R[2][2] * c;
+    if (!(depth > near)) continue;
+    const x = (R[0][0] * a + R[0][1] * b + R[0][2] * c) / depth;
+    const y = (R[1][0] * a + R[1][1] * b + R[1][2] * c) / depth;
+    const size = Math.exp(Math.max(log_scales[k], log_scales[k + 1], log_scales[k + 2]));
+    const reach = DEVIATIONS * (1 + (focal / depth) * size * (1 + Math.abs(x) + Math.abs(y)));
+    if (Math.abs(fx * x + cx - column) <= reach && Math.abs(fy * y + cy - row) <= reach) found.push({ i, depth });
+  }
+  return Uint32Array.from(found.sort((a, b) => b.depth - a.depth || b.i - a.i), ({ i }) => i);
+}
+
+// The part of a line in front of the camera, as two pixels; null if there is none.
+function seenLine(camera, a, b, near) {
+  const [za, zb] = [a, b].map((point) => dot(camera.R[2], plus(point, camera.eye, -1)));
+  if (!(za > near || zb > near)) return null;
+  const cut = (from, to, zFrom, zTo) =>
+    zFrom > near ? from : from.map((x, i) => x + ((near * 1.001 - zFrom) / (zTo - zFrom)) * (to[i] - x));
+  return [seenAt(camera, cut(a, b, za, zb)), seenAt(camera, cut(b, a, zb, za))];
+}
+
+// Normal of the plane through three points, of length 1, counterclockwise as seen from its side.
+function normalOf([a, b, c]) {
+  return unit(cross(plus(b, a, -1), plus(c, a, -1)));
+}
+
+// Shortest rotation from one direction to another; both of length 1. Opposite ones turn about the x axis.
+function shortestTurn(from, to) {
+  const cosine = dot(from, to);
+  if (cosine < -1 + 1e-9) return [[1, 0, 0], [0, -1, 0], [0, 0, -1]];
+  const v = cross(from, to);
+  const across = [[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]];
+  return across.map((row, i) =>
+    row.map((value, j) => {
+      const square = row.reduce((sum, x, k) => sum + x * across[k][j], 0);
+      return (i === j ? 1 : 0) + value + square / (1 + cosine);
+    }),
+  );
+}
+
+// Axes of a box that stands upright, as columns.
+function uprightAxes(up) {
+  return transposed(shortestTurn(up, EDIT_UP));
+}
+
+const axesOf = ({ rotation }) => transposed(rotation);
+
+// A box around most of the splats that are there.
+function boxAround({ count, means }, flags, up) {
+  const rotation = uprightAxes(up);
+  const axes = transposed(rotation);
+  const places = [[], [], []];
+  const every = Math.max(1, Math.floor(count / MOST_SAMPLED));
+  for (let i = 0; i < count; i += every) {
+    const point = [means[3 * i], means[3 * i + 1], means[3 * i + 2]];
+    if (flags[i] <= SELECTED && point.every(Number.isFinite)) axes.forEach((axis, j) => places[j].push(dot(axis, point)));
+  }
+  if (!places[0].length) return { center: [0, 0, 0], rotation, half: [1, 1, 1] };
+  const ends = places.map((list) => {
+    list.sort((a, b) => a - b);
+    return [BOX_LOW, BOX_HIGH].map((share) => list[Math.round(share * (list.length - 1))]);
+  });
+  const middle = ends.map(([low, high]) => (low + high) / 2);
+  const half = ends.map(([low, high]) => Math.max(0.55 * (high - low), 1e-3));
+  return { center: rotated(rotation, middle), rotation, half };
+}
+
+// Corners and edges of a box.
+function boxLines({ center, rotation, half }) {
+  const axes = transposed(rotation);
+  const corner = (k) => axes.reduce((at, axis, j) => plus(at, axis, k & (1 << j) ? half[j] : -half[j]), center);
+  const lines = [];
+  for (let k = 0; k < 8; ++k) for (const j of [1, 2, 4]) if (!(k & j)) lines.push([corner(k), corner(k | j)]);
+  return lines;
+}
+
+// The middle of each side of a box, with its axis and direction.
+function boxHandles({ center, rotation, half }) {
+  return transposed(rotation).flatMap((axis, j) =>
+    [-1, 1].map((side) => ({ axis: j, side, direction: axis, point: plus(center, axis, side * half[j]) })),
+  );
+}
+
+// Moves one side of a box by a length along its axis; the opposite side stays.
+function withSideMoved(box, { axis, side, direction }, by) {
+  const least = 1e-3 * Math.max(...box.half);
+  const step = Math.max(side * by, 2 * (least - box.half[axis]));
+  const half = box.half.map((value, j) => (j === axis ? value + step / 2 : value));
+  return { ...box, half, center: plus(box.center, direction, (side * step) / 2) };
+}
+
+// Three circles around a sphere, along the axes of the view.
+function sphereLines({ center, radius }, R) {
+  const lines = [];
+  for (const [a, b] of [[0, 1], [1, 2], [0, 2]]) {
+    const at = (i) => {
+      const angle = (2 * Math.PI * i) / CIRCLE;
+      return plus(plus(center, R[a], radius * Math.cos(angle)), R[b], radius * Math.sin(angle));
+    };
+    for (let i = 0; i < CIRCLE; ++i) lines.push([at(i), at(i + 1)]);
+  }
+  return lines;
+}
+
+// Turns a camera about its line of sight until its picture is level.
+function levelled(camera, up) {
+  const forward = camera.R[2];
+  const right = cross(forward, up);
+  if (length3(right) < 1e-3) return camera;
+  const level = unit(right);
+  return { ...camera, R: [level, cross(forward, level), forward] };
+}
+
+// A number as text, short.
+function shortNumber(value) {
+  if (value === 0) return "0";
+  const size = Math.abs(value);
+  return size >= 1e5 || size < 1e-3 ? value.toExponential(2) : String(Number(value.toPrecision(4)));
+}

@@ -1,0 +1,133 @@
+// The state of every splat after a list of operations, as gsplat_edu/edits/apply.py computes it, with undo and redo.
+"use strict";
+
+const [SELECTED, HIDDEN, DELETED] = [1, 2, 4]; // at most one at a time; 0 is a splat that is merely there
+const UNDO_BYTES = 128 << 20; // changes remembered for undo; older operations are undone by repeating those before
+
+// Applies one operation to the states, in place.
+function applyOperation(operation, values, flags) {
+  const change = (next) => {
+    for (let i = 0; i < flags.length; ++i) flags[i] = next(flags[i], i);
+  };
+  switch (operation.op) {
+    case "select":
+      return applySelect(operation.how, members(operation, values), flags);
+    case "deselect":
+      return change((flag) => (flag === SELECTED ? 0 : flag));
+    case "invert":
+      return change((flag) => (flag <= SELECTED ? flag ^ SELECTED : flag));
+    case "delete":
+      return change((flag) => (flag === SELECTED ? DELETED : flag));
+    case "hide":
+      return change((flag) => (flag === SELECTED ? HIDDEN : flag));
+    case "show":
+      return change((flag) => (flag === HIDDEN ? 0 : flag));
+    case "crop": {
+      const inside = boxMembers(operation, values);
+      return change((flag, i) => (inside[i] ? flag : DELETED));
+    }
+  }
+}
+
+function applySelect(how, inside, flags) {
+  for (let i = 0; i < flags.length; ++i) {
+    const flag = flags[i];
+    if (flag > SELECTED) continue;
+    if (how === "replace") flags[i] = inside[i];
+    else if (how === "add") flags[i] = flag | inside[i];
+    else if (how === "subtract") flags[i] = flag & ~inside[i];
+    else flags[i] = flag & inside[i];
+  }
+}
+
+class EditHistory {
+  // values: as for members(). operations: those of the opened file.
+  constructor(values, operations) {
+    this.values = values;
+    this.flags = new Uint8Array(values.count);
+    this.done = [];
+    this.undone = [];
+    this.changes = []; // of each operation done: which splats had another state before, and which; null if forgotten
+    this.bytes = 0;
+    for (const operation of operations) this.step(operation);
+  }
+
+  // Applies a new operation; what was undone before is forgotten.
+  perform(operation) {
+    this.undone = [];
+    this.step(operation);
+  }
+
+  step(operation) {
+    const before = this.flags.slice();
+    applyOperation(operation, this.values, this.flags);
+    this.done.push(operation);
+    this.remember(before);
+  }
+
+  remember(before) {
+    let count = 0;
+    for (let i = 0; i < before.length; ++i) if (before[i] !== this.flags[i]) ++count;
+    const change = { at: new Uint32Array(count), was: new Uint8Array(count) };
+    for (let i = 0, j = 0; j < count; ++i) {
+      if (before[i] === this.flags[i]) continue;
+      change.at[j] = i;
+      change.was[j++] = before[i];
+    }
+    this.changes.push(change);
+    this.bytes += 5 * count;
+    for (let i = 0; this.bytes > UNDO_BYTES && i < this.changes.length; ++i) this.forget(i);
+  }
+
+  forget(index) {
+    if (this.changes[index]) this.bytes -= 5 * this.changes[index].at.length;
+    this.changes[index] = null;
+  }
+
+  // Undoes the last operation; returns it, or undefined if there is none.
+  undo() {
+    const operation = this.done.pop();
+    if (!operation) return undefined;
+    this.undone.push(operation);
+    const change = this.changes.pop();
+    if (change) {
+      this.bytes -= 5 * change.at.length;
+      for (let j = 0; j < change.at.length; ++j) this.flags[change.at[j]] = change.was[j];
+    } else {
+      this.flags.fill(0);
+      for (const earlier of this.done) applyOperation(earlier, this.values, this.flags);
+    }
+    return operation;
+  }
+
+  redo() {
+    const operation = this.undone.pop();
+    if (operation) this.step(operation);
+    return operation;
+  }
+
+  // Number of splats in each state.
+  counts() {
+    const counts = { all: this.flags.length, selected: 0, hidden: 0, deleted: 0 };
+    for (const flag of this.flags) {
+      if (flag === SELECTED) ++counts.selected;
+      else if (flag === HIDDEN) ++counts.hidden;
+      else if (flag === DELETED) ++counts.deleted;
+    }
+    return counts;
+  }
+
+  // The operations that change no splat, as they stand now: the last one of a kind counts.
+  views() {
+    const found = { upright: null, scale: null, start: null, path: undefined, named: new Map(), measures: [] };
+    for (const operation of this.done) {
+      const { op, name } = operation;
+      if (op === "upright" || op === "scale" || op === "start") found[op] = operation;
+      else if (op === "path") found.path = operation.path;
+      else if (op === "view") found.named.set(name, operation);
+      else if (op === "remove_view") found.named.delete(name);
+      else if (op === "measure") found.measures.push(operation);
+    }
+    return found;
+  }
+}

@@ -1,0 +1,212 @@
+"""Edits files: everything in them is read, and whatever is damaged is one line that names its place."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.document import MOST_BYTES, MOST_POINTS, empty_document, parse_edits, read_edits
+from gsplat_edu.edits.identity import Identity
+from gsplat_edu.errors import ArgumentError
+
+SCENE = Identity(7, "ab" * 32, (1.0, 2.5, -3.0))
+EYE = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+CAMERA = {
+    "position": [0, 0, -2], "rotation": EYE, "fx": 100, "fy": 110.5, "cx": 49.5, "cy": 39.5, "width": 100, "height": 80,
+}  # fmt: skip
+BOX = {"center": [0, 0, 0], "rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "half": [1, 2, 3]}
+VIEW = {"position": [0, 0, -2], "rotation": EYE, "fov": 50.0}
+PATH = {"format": "gsplat_edu path", "version": 1, "loop": False, "keyframes": [VIEW, VIEW]}
+
+
+def select(by, **fields):
+    return {"op": "select", "how": "replace", "by": by, **fields}
+
+
+EVERY = [
+    select("rectangle", camera=CAMERA, corners=[1, 2, 3.5, 4]),
+    select("lasso", camera=CAMERA, points=[[0, 0], [1, 0], [0, 1]]),
+    select("brush", camera=CAMERA, radius=2, points=[[5, 5]]),
+    select("sphere", center=[1, 2, 3], radius=0.5),
+    select("box", **BOX),
+    select("color", low=[-1, -1, -1], high=[1, 1, 1]),
+    select("opacity", low=-2),
+    select("size", low=-5, high=-1),
+    select("all"),
+    *({"op": op} for op in ("deselect", "invert", "delete", "hide", "show")),
+    {"op": "crop", **BOX},
+    {"op": "upright", "points": [[0, 0, 0], [1, 0, 0], [0, 0, 1]]},
+    {"op": "scale", "points": [[0, 0, 0], [2, 0, 0]], "length": 1, "unit": "m"},
+    {"op": "start", **VIEW, "pivot": [0, 0, 0]},
+    {"op": "view", "name": "Tür <b>", **VIEW},
+    {"op": "remove_view", "name": "Tür <b>"},
+    {"op": "path", "path": PATH},
+    {"op": "path", "path": None},
+    {"op": "measure", "points": [[0, 0, 0], [2, 0, 0]], "note": ""},
+]
+
+
+def document(*operations):
+    scene = SCENE.document()
+    return {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": list(operations)}
+
+
+def parsed(content):
+    text = content if isinstance(content, bytes) else json.dumps(content).encode()
+    return parse_edits(text, "e.json")
+
+
+def refused(content):
+    with pytest.raises(ArgumentError) as caught:
+        parsed(content)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("e.json: ")
+    return str(caught.value).removeprefix("e.json: ")
+
+
+def test_every_operation_is_read():
+    edits = parsed(document(*EVERY))
+    assert edits.scene == SCENE
+    assert len(edits.operations) == len(EVERY)
+    regions = [operation.region for operation in edits.operations[:9]]
+    assert regions[3] == ops.Sphere((1.0, 2.0, 3.0), 0.5)
+    assert regions[4] == ops.Box(
+        (0.0,) * 3, ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), (1.0, 2.0, 3.0)
+    )
+    assert regions[6:] == [ops.Opacity(-2.0, None), ops.Size(-5.0, -1.0), ops.Everything()]
+    assert edits.operations[16] == ops.Scale(((0.0,) * 3, (2.0, 0.0, 0.0)), 1.0, "m")
+    assert edits.operations[18].name == "Tür <b>"
+
+
+def test_an_empty_document_is_read_back():
+    edits = parsed(empty_document(SCENE).encode())
+    assert edits.scene == SCENE and edits.operations == ()
+
+
+def test_every_missing_and_every_unknown_field_is_named():
+    for index, operation in enumerate(EVERY):
+        for key in operation:
+            less = {name: value for name, value in operation.items() if name != key}
+            if operation.get("by") == "size":
+                continue  # one of its ends may be missing
+            assert f"operations[{index}]: lacks '{key}'" in refused(document(*EVERY[:index], less))
+        more = {**operation, "extra": 1}
+        assert f'operations[{index}]: has an unknown key "extra"' in refused(document(*EVERY[:index], more))
+
+
+def numbers_in(value, place=()):
+    """Return the places of all numbers in a document."""
+    if isinstance(value, bool):
+        return []
+    if isinstance(value, int | float):
+        return [place]
+    entries = (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    )
+    return [found for key, entry in entries for found in numbers_in(entry, (*place, key))]
+
+
+def replaced(value, place, other):
+    value = json.loads(json.dumps(value))  # no parts in common
+    inside = value
+    for key in place[:-1]:
+        inside = inside[key]
+    inside[place[-1]] = other
+    return value
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e200, "1", None, True, [], 10**400])
+def test_no_number_may_be_anything_else(wrong):
+    whole = document(*EVERY)
+    places = numbers_in(whole)
+    assert len(places) > 150
+    for place in places:
+        message = refused(replaced(whole, place, wrong))
+        names = [str(key) for key in place if not isinstance(key, int)]
+        assert names[-1] in message or "is not JSON" in message, (place, message)
+        if place[0] == "operations" and "thousands" not in message:
+            assert f"operations[{place[1]}]" in message, (place, message)
+
+
+@pytest.mark.parametrize(
+    ("operation", "says"),
+    [
+        ({"op": "paint"}, 'operations[0].op: is "paint", but has to be one of select, '),
+        ({}, "operations[0]: lacks 'op'"),
+        (5, "operations[0]: is 5, but has to be an object"),
+        (select("magic"), 'operations[0].by: is "magic"'),
+        ({**select("all"), "how": "xor"}, 'operations[0].how: is "xor"'),
+        (select("opacity"), "operations[0]: lacks 'low' and 'high'"),
+        (select("sphere", center=[0, 0, 0], radius=0), "operations[0].radius: is 0, but has to be from"),
+        (select("sphere", center=[0, 0], radius=1), "operations[0].center: is [0, 0], but has to be 3 numbers"),
+        (select("lasso", camera=CAMERA, points=[[0, 0], [1, 1]]), "points: has 2 points, but needs at least 3"),
+        (select("brush", camera=CAMERA, radius=1, points=[]), "points: has 0 points"),
+        (select("rectangle", camera=CAMERA, corners=[3, 0, 1, 1]), "corners: u0, v0 must not exceed u1, v1"),
+        (
+            select("lasso", camera=CAMERA, points=[[0, 0]] * (MOST_POINTS + 1)),
+            "operations[0].points: has 20,001 entries, but at most 20,000",
+        ),
+        (select("box", **{**BOX, "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}), "rotation: is not a rotation"),
+        (select("rectangle", camera={**CAMERA, "fx": 0}, corners=[0, 0, 1, 1]), "operations[0].camera.fx: is 0"),
+        (select("rectangle", camera={**CAMERA, "width": 0.5}, corners=[0, 0, 1, 1]), "camera.width: is 0.5"),
+        ({"op": "upright", "points": [[0, 0, 0], [1, 1, 1], [2, 2, 2]]}, "points: lie on one line"),
+        ({"op": "upright", "points": [[0, 0, 0], [0, 0, 0], [2, 2, 2]]}, "points: lie on one line"),
+        ({"op": "scale", "points": [[1, 1, 1]] * 2, "length": 1, "unit": "m"}, "points: are 0 apart"),
+        ({"op": "scale", "points": [[0] * 3, [1] * 3], "length": 1, "unit": "ft"}, 'unit: is "ft"'),
+        ({"op": "view", "name": "", **VIEW}, "operations[0].name: is"),
+        ({"op": "view", "name": "a\nb", **VIEW}, "must not hold control characters"),
+        ({"op": "view", "name": "a", **VIEW, "fov": 0}, "operations[0].fov: is 0"),
+        ({"op": "path", "path": {**PATH, "keyframes": [VIEW]}}, "operations[0].path: keyframes: has 1"),
+    ],
+)  # fmt: skip
+def test_a_wrong_operation_is_named(operation, says):
+    assert says in refused(document(operation))
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "is not JSON"),
+        (b"{", "is not JSON"),
+        (b"\xff\xfe", "is not JSON"),
+        (b"[" * 100_000, "is not JSON"),
+        (b"[]", "is no edits file"),
+        (b'{"format": "gsplat_edu path"}', "is no edits file"),
+        (b" " * (MOST_BYTES + 1), "has more than 67,108,864 bytes"),
+        ({**document(), "version": 2}, "version: is 2, but 1 is supported"),
+        ({**document(), "version": True}, "version: is true"),
+        ({**document(), "more": 1}, 'has an unknown key "more"'),
+        ({**document(), "operations": {}}, "operations: is {}, but has to be a list"),
+        ({**document(), "scene": {**SCENE.document(), "sha256": "AB" * 32}}, "scene.sha256: is"),
+        ({**document(), "scene": {**SCENE.document(), "count": -1}}, "scene.count: is -1"),
+    ],
+)
+def test_a_wrong_file_is_named(content, says):
+    assert says in refused(content)
+
+
+def test_cutting_a_file_anywhere_is_one_line(tmp_path):
+    whole = json.dumps(document(*EVERY)).encode()
+    for length in np.random.default_rng(0).integers(0, len(whole), 60):
+        (tmp_path / "cut.json").write_bytes(whole[:length])
+        with pytest.raises(ArgumentError, match=r"cut\.json: is no"):
+            read_edits(tmp_path / "cut.json")
+
+
+def test_another_scene_is_one_line_and_positions_carry_over_on_demand():
+    places = parsed(document(select("sphere", center=[0, 0, 0], radius=1), {"op": "delete"}))
+    values = parsed(document({"op": "invert"}, select("opacity", low=0)))
+    other = Identity(8, "cd" * 32, SCENE.origin)
+    places.check_scene(SCENE, "e.json")
+    for scene, says in (
+        (other, "of 7 splats, this one has 8"),
+        (Identity(7, "cd" * 32, SCENE.origin), "SHA-256 abababab, not cdcdcdcd"),
+        (Identity(7, SCENE.sha256, (0.0, 2.5, -3.0)), r"with the origin \[1.0, 2.5, -3.0\]"),
+    ):
+        with pytest.raises(ArgumentError, match=f"^e.json: was made for another scene .*{says}"):
+            places.check_scene(scene, "e.json")
+    places.check_scene(other, "e.json", anyway=True)
+    with pytest.raises(ArgumentError, match=r"operations\[1\] selects by opacity, which does not carry over"):
+        values.check_scene(other, "e.json", anyway=True)

@@ -1,0 +1,138 @@
+"""Which splats a region holds, on scenes where the answer is plain."""
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.document import NEAR
+from gsplat_edu.edits.membership import Values, members
+from gsplat_edu.gaussians import Gaussians
+
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+FRONT = ops.Picture((0.0, 0.0, -1.0), AXES, 10.0, 20.0, 5.0, 6.0)
+"""At depth 1, the point (x, y, 0) is seen at (10 x + 5, 20 y + 6)."""
+
+
+def values_at(*points, log_scales=None, logits=None, sh0=None):
+    n = len(points)
+    means = np.array(points, dtype=np.float64).reshape(n, 3)
+    return Values(
+        means,
+        np.zeros((n, 3)) if log_scales is None else np.array(log_scales, float),
+        np.zeros(n) if logits is None else np.array(logits, float),
+        np.zeros((n, 3)) if sh0 is None else np.array(sh0, float),
+    )
+
+
+def held(region, values):
+    return members(region, values).tolist()
+
+
+def test_a_rectangle_holds_its_border_and_nothing_behind_the_camera():
+    values = values_at(
+        (0, 0, 0), (0.5, 0.2, 0), (0.6, 0, 0), (0, 0.25, 0), (0, 0, -3), (0, 0, -1 + 0.99 * NEAR), (0, 0, 9)
+    )
+    # seen at (5, 6), (10, 10), (11, 6), (5, 11); behind; before the near plane; (5, 6) from far away
+    region = ops.Rectangle(FRONT, (5.0, 6.0, 10.0, 10.0))
+    assert held(region, values) == [True, True, False, False, False, False, True]
+
+
+def test_a_turned_picture_sees_along_its_axes():
+    """A camera that looks along +x, with its right along -z: rows (right, down, forward)."""
+    picture = ops.Picture(
+        (0.0, 0.0, 0.0), ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), 1.0, 1.0, 0.0, 0.0
+    )
+    values = values_at((2, 0, -2), (2, 0, 2), (2, 2, 0), (-2, 0, 0))
+    assert held(ops.Rectangle(picture, (0.5, -0.5, 1.5, 0.5)), values) == [True, False, False, False]
+    assert held(ops.Rectangle(picture, (-0.5, 0.5, 0.5, 1.5)), values) == [False, False, True, False]
+
+
+def seen(u, v):
+    return ((u - 5) / 10, (v - 6) / 20, 0.0)
+
+
+def test_a_lasso_follows_the_even_odd_rule():
+    """A bow tie: two triangles that share the point (10, 10). Between them above and below is outside."""
+    bow = ops.Lasso(FRONT, ((0.0, 0.0), (20.0, 20.0), (20.0, 0.0), (0.0, 20.0)))
+    values = values_at(seen(3, 10), seen(17, 10), seen(10, 3), seen(10, 17), seen(-1, 10))
+    assert held(bow, values) == [True, True, False, False, False]
+
+
+def test_a_lasso_around_a_square_with_a_hole_leaves_the_hole():
+    """The outline of a square, then that of an inner square: inside of both is crossed twice."""
+    outer, inner = ((0, 0), (9, 0), (9, 9), (0, 9), (0, 0)), ((3, 3), (6, 3), (6, 6), (3, 6), (3, 3))
+    region = ops.Lasso(FRONT, tuple((float(u), float(v)) for u, v in (*outer, *inner)))
+    values = values_at(seen(1.5, 4.5), seen(4.5, 4.5), seen(7.5, 4.5), seen(4.5, 10))
+    assert held(region, values) == [True, False, True, False]
+
+
+def test_a_brush_is_a_rounded_band():
+    """From (0, 0) to (8, 0), radius 2: a capsule. The corner of its bounds (-1.9, 1.9) is 2.7 from the end."""
+    stroke = ops.Brush(FRONT, 2.0, ((0.0, 0.0), (8.0, 0.0)))
+    values = values_at(
+        seen(4, 1.9), seen(4, 2.1), seen(-1.9, 0), seen(-1.9, 1.9), seen(9.4, 1.4), seen(9.5, 1.5)
+    )
+    assert held(stroke, values) == [True, False, True, False, True, False]
+    dab = ops.Brush(FRONT, 2.0, ((4.0, 0.0),))
+    assert held(dab, values_at(seen(5.9, 0), seen(5.5, 1.5), seen(4, -1.9))) == [True, False, True]
+
+
+def test_a_sphere_and_a_turned_box_hold_their_borders():
+    values = values_at((1, 0, 0), (0, 1.0001, 0), (0.6, 0.6, 0.6))
+    assert held(ops.Sphere((0.0, 0.0, 0.0), 1.0), values) == [True, False, False]  # 3 * 0.36 = 1.08
+    h = float(np.sqrt(0.5))
+    box = ops.Box((0.0, 0.0, 0.0), ((h, h, 0.0), (-h, h, 0.0), (0.0, 0.0, 1.0)), (1.0, 0.1, 0.5))
+    corners = values_at(
+        (0.7, 0.7, 0.5), (0.72, 0.72, 0), (0.7, -0.7, 0), (0.1, 0.1, 0.51), (-0.7, -0.7, -0.5)
+    )
+    assert held(box, corners) == [True, False, False, False, True]
+
+
+def test_values_are_compared_raw_with_both_ends_included():
+    values = values_at(
+        *[(0, 0, 0)] * 3,
+        log_scales=[(-9, -2, -9), (-1, -9, -9), (-9, -9, -3)],
+        logits=[-1, 0, 2],
+        sh0=[(0, 0, 0), (1, 1, 1), (0, 0, 1.5)],
+    )
+    assert held(ops.Opacity(0.0, None), values) == [False, True, True]
+    assert held(ops.Opacity(None, 0.0), values) == [True, True, False]
+    assert held(ops.Size(-2.0, -1.0), values) == [True, True, False]
+    assert held(ops.Color((0.0,) * 3, (1.0,) * 3), values) == [True, True, False]
+    assert held(ops.Everything(), values) == [True] * 3
+
+
+NAN, INF = np.nan, np.inf
+
+
+def test_nan_belongs_to_no_region_and_infinity_is_compared():
+    values = values_at(
+        (NAN, 0, 0), (INF, 0, 0), (0, 0, INF), (0, 0, 0),
+        log_scales=[(NAN, 5, 5), (INF, 0, 0), (-INF, -INF, -INF), (5, NAN, 5)],
+        logits=[NAN, INF, -INF, 0],
+        sh0=[(NAN, 0, 0), (0, INF, 0), (0, 0, -INF), (0, 0, 0)],
+    )  # fmt: skip
+    box = ops.Box((0.0,) * 3, AXES, (1e30,) * 3)
+    assert held(ops.Sphere((0.0,) * 3, 1e30), values) == [False, False, False, True]
+    assert held(box, values) == [False, False, False, True]
+    for region in (ops.Rectangle(FRONT, (-1e6, -1e6, 1e6, 1e6)), ops.Brush(FRONT, 1e6, ((0.0, 0.0),))):
+        assert held(region, values)[:2] == [False, False] and held(region, values)[3]
+    assert held(ops.Opacity(-1e6, None), values) == [False, True, False, True]
+    assert held(ops.Opacity(None, 1e6), values) == [False, False, True, True]
+    assert held(ops.Size(None, 1e6), values) == [False, False, True, False]
+    assert held(ops.Color((-1e6,) * 3, (1e6,) * 3), values) == [False, False, False, True]
+
+
+@pytest.mark.parametrize("n", [0, 3])
+def test_values_are_those_of_float32(n):
+    """A float64 scene is compared as the float32 numbers that a page has."""
+    third = torch.full((n, 3), 1.0 / 3.0, dtype=torch.float64)
+    gaussians = Gaussians(
+        third, torch.ones(n, 4).double(), third, third[:, None], torch.zeros(n, 0, 3).double(), third[:, 0]
+    )
+    values = Values.of(gaussians)
+    assert values.means.shape == (n, 3) and values.means.dtype == np.float64
+    for array in (values.means, values.log_scales, values.sh0, values.logits):
+        assert np.all(array == float(np.float32(1.0 / 3.0)))
+    assert len(members(ops.Everything(), values)) == n
