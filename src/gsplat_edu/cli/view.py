@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import threading
 import webbrowser
 from pathlib import Path
 
 import numpy as np
 
+from gsplat_edu.cli.screen import has_screen
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.keyframes import read_path
@@ -36,7 +35,7 @@ def run(arguments: argparse.Namespace) -> None:
         if warning := exposure(arguments.host, "sees the scene"):
             console.print(warning, soft_wrap=True)
         console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
-        if not arguments.no_open and _has_screen():
+        if not arguments.no_open and has_screen():
             # in a thread: some browsers have to exit before webbrowser returns
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         try:
@@ -79,11 +78,3 @@ def _check_is_no_page(path: Path) -> None:
 
 def _title(path: Path) -> str:
     return path.resolve().name
-
-
-def _has_screen() -> bool:
-    """Return whether a user at this computer could see a browser window."""
-    windows = sys.platform in ("win32", "darwin") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
-    return windows and sys.stdin.isatty() and sys.stdout.isatty()
