@@ -32,6 +32,7 @@ USE = {
     "docs/INSTALL.md": "Wheels and platforms",
     "docs/GUIDE.md": "Guide",
     "docs/SCALE.md": "Larger than one machine",
+    "docs/STUDIO.md": "The studio and its HTTP API",
     "docs/CLI.md": "Command line",
     "docs/FORMATS.md": "Scene formats",
     "docs/RECIPE.md": "Training parameters",

@@ -51,7 +51,9 @@ class Bar(Progress):
     def _report(self, task_id: TaskID) -> None:
         task = self._tasks[task_id]
         if task.visible:
-            emitter.progress(printable(task.description), task.completed, task.total, lambda: task.time_remaining)
+            emitter.progress(
+                printable(task.description), task.completed, task.total, lambda: task.time_remaining
+            )
 
 
 class Field(TextColumn):

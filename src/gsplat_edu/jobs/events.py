@@ -1,7 +1,7 @@
 """What a command reports while it runs, as values; a file of events has one JSON object per line.
 
-A command writes them if the variable `EVENTS` of its environment names a file (`gsplat_edu.jobs.emitter`). Every line has
-`event`, the name of the kind, and `time`, seconds since 1970; the other fields are those of the class.
+A command writes them if the variable `EVENTS` of its environment names a file (`gsplat_edu.jobs.emitter`). Every line
+has `event`, the name of the kind, and `time`, seconds since 1970; the other fields are those of the class.
 """
 
 from __future__ import annotations

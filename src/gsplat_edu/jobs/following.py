@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsplat_edu.jobs.events import Event, Failed, Finished, Interrupted, Started, parse_line
+from gsplat_edu.jobs.events import Event, Failed, Finished, Interrupted, Progress, Stage, Started, parse_line
 from gsplat_edu.reading import open_file
 
 PIECE = 1 << 20
@@ -97,6 +97,24 @@ def last_word(path: Path) -> Failed | Interrupted | Finished | None:
         if isinstance(event, Started):
             return None
     return None
+
+
+def last_stage(path: Path) -> str:
+    """Return the stage of which a file of events tells last; empty if none."""
+    try:
+        with open_file(path) as file:
+            file.seek(max(os.fstat(file.fileno()).st_size - LAST, 0))
+            data = file.read()
+    except OSError:
+        return ""
+    for line in reversed(data.splitlines()):
+        try:
+            event = parse_line(line)[1]
+        except ValueError:
+            continue
+        if isinstance(event, Progress | Stage):
+            return event.stage if isinstance(event, Progress) else event.name
+    return ""
 
 
 def last_start(path: Path) -> Started | None:

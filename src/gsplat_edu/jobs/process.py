@@ -6,8 +6,10 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 from pathlib import Path
+
+PROC = Path("/proc")
+"""Where Linux lists processes; other systems have `ps`."""
 
 
 def identity(pid: int) -> str | None:
@@ -19,10 +21,10 @@ def identity(pid: int) -> str | None:
     Returns:
         None if no such process runs; one that has ended but was not waited for does not run.
     """
-    if sys.platform.startswith("linux"):
+    if PROC.is_dir():
         try:
-            fields = Path(f"/proc/{pid}/stat").read_text("utf-8", errors="replace").rpartition(")")[2].split()
-            boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+            fields = (PROC / f"{pid}/stat").read_text("utf-8", errors="replace").rpartition(")")[2].split()
+            boot = (PROC / "sys/kernel/random/boot_id").read_text("ascii").strip()
         except (OSError, ValueError):
             return None
         return None if fields[0] in "ZX" else f"{boot} {fields[19]}"

@@ -54,6 +54,9 @@ class JobQueue:
         changed: Called with every new state of a job, from any thread and while the queue is locked; with None for a
             job that was removed.
         patience: See `PATIENCE`.
+        hold: Called to let a job wait (true) or continue; returns whether it does so by itself. Otherwise its
+            processes are stopped.
+        program: What runs a command line.
     """
 
     def __init__(
@@ -62,13 +65,16 @@ class JobQueue:
         at_once: int = 1,
         changed: Callable[[str, Job | None], None] = lambda name, job: None,
         patience: dict[str, float] | None = None,
+        hold: Callable[[Job, bool], bool] = lambda job, wait: False,
+        program: Sequence[str] = PROGRAM,
     ) -> None:
         self.folder, self.at_once = folder, at_once
-        self.changed = changed
+        self.changed, self.hold = changed, hold
         self.damaged: list[str] = []
         """A line for each record that could not be read."""
         self.trouble = ""
         """Why records cannot be written; empty if they can."""
+        self._program = tuple(program)
         self._patience = PATIENCE if patience is None else patience
         self._lock = threading.RLock()
         self._jobs: dict[str, Job] = {}
@@ -141,8 +147,12 @@ class JobQueue:
             if job.state is State.QUEUED:
                 return self._put(job, state=State.CANCELLED, ended=time.time(), cancelled=True)
             if job.state not in ACTIVE:
-                raise ArgumentError(f"job {name}: is {job.state}; only jobs that wait or run can be cancelled")
-            job = self._put(job, cancelled=True)
+                raise ArgumentError(
+                    f"job {name}: is {job.state}; only jobs that wait or run can be cancelled"
+                )
+            if job.state is State.PAUSED:
+                self.hold(job, False)
+            job = self._put(job, cancelled=True, state=State.RUNNING)
             self._end(job)
             return self._jobs[name]
 
@@ -156,8 +166,10 @@ class JobQueue:
             job = self.get(name)
             if job.state is not State.RUNNING or name in self._endings:
                 raise ArgumentError(f"job {name}: is {job.state}; only a running job can be paused")
-            if job.pid is None or not send(job.pid, job.identity, signal.SIGSTOP, group=True):
+            if job.pid is None or not runs(job.pid, job.identity):
                 raise ArgumentError(f"job {name}: has just ended")
+            if not self.hold(job, True):
+                send(job.pid, job.identity, signal.SIGSTOP, group=True)
             return self._put(job, state=State.PAUSED)
 
     def resume(self, name: str) -> Job:
@@ -169,6 +181,7 @@ class JobQueue:
         with self._lock:
             job = self.get(name)
             if job.state is State.PAUSED:
+                self.hold(job, False)
                 if job.pid is not None:
                     send(job.pid, job.identity, signal.SIGCONT, group=True)
                 return self._put(job, state=State.RUNNING)
@@ -249,7 +262,7 @@ class JobQueue:
         try:
             with folder.output.open("ab") as output:
                 child = subprocess.Popen(
-                    [*PROGRAM, *job.argv],
+                    [*self._program, *job.argv],
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=subprocess.STDOUT,
@@ -260,8 +273,10 @@ class JobQueue:
             self._put(job, state=State.FAILED, ended=time.time(), line=described(error))
             return
         self._children[job.id] = child
-        self._note(replace(job, pid=child.pid, identity=identity(child.pid) or ""))  # even if the disk is full
-        self._put(self._jobs[job.id])
+        self._note(
+            replace(job, pid=child.pid, identity=identity(child.pid) or "")
+        )  # even if the disk is full
+        folder.write(self._jobs[job.id])
 
     def _end(self, job: Job) -> None:
         """Send the first signal of a cancellation, unless it was sent."""
@@ -287,6 +302,8 @@ class JobQueue:
         """Note how a process ended: by its last event, else by its exit code."""
         self._children.pop(job.id, None)
         stopped = self._endings.pop(job.id, None)
+        if job.state is State.PAUSED:
+            self.hold(job, False)
         said = last_word(JobFolder(self.folder / job.id).events)
         changes: dict[str, Any] = {"state": State.INTERRUPTED, "line": "", "pid": None, "identity": ""}
         if isinstance(said, Finished):

@@ -1,8 +1,8 @@
 """A job on disk: a command line, its state, and the files of its output.
 
-    job.json        the record below
-    events.jsonl    its events (`gsplat_edu.jobs.events`), of all its attempts
-    output.txt      what it printed, of all its attempts
+job.json        the record below
+events.jsonl    its events (`gsplat_edu.jobs.events`), of all its attempts
+output.txt      what it printed, of all its attempts
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Job:
         return self.state in RESUMABLE
 
     def again(self) -> tuple[str, ...]:
-        """Return the words that continue it: a training resumes if its run folder has begun, others do so by themselves."""
+        """Return the words that continue it; other commands than `train` resume by themselves or begin again."""
         return resumed(self.argv)
 
     def document(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
-from gsplat_edu.studio import job_routes, library_routes
+from gsplat_edu.studio import job_routes, library_routes, live_routes, run_routes, scene_routes
 from gsplat_edu.studio.guard import Guard
 from gsplat_edu.studio.refusal import missing
 from gsplat_edu.studio.replies import act, file_answer
@@ -32,7 +32,9 @@ TYPES = {
 """Types of the page's files."""
 
 
-def application(studio: Studio, token: str, host: str = LOOPBACK, cookie: str = "gsplat_edu_studio") -> Starlette:
+def application(
+    studio: Studio, token: str, host: str = LOOPBACK, cookie: str = "gsplat_edu_studio"
+) -> Starlette:
     """Return the application.
 
     Args:
@@ -57,6 +59,9 @@ def application(studio: Studio, token: str, host: str = LOOPBACK, cookie: str = 
         act("/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.studio")),
         act("/viewer/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.viewer")),
         *job_routes.routes(),
+        *live_routes.routes(),
+        *run_routes.routes(),
+        *scene_routes.routes(),
         *library_routes.routes(),
     ]
     guard = Middleware(Guard, token=token, host=host, cookie=cookie)

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
+from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.library import Library, scene_file, walked
 from gsplat_edu.studio.names import checked_name
-from gsplat_edu.studio.refusal import Refused, conflict
+from gsplat_edu.studio.refusal import RefusedError, conflict
 from gsplat_edu.train.config import APPEARANCES, QUALITIES, REFINEMENTS, SKIES, STRATEGIES
 from gsplat_edu.train.setting import TRANSIENTS
-from gsplat_edu.sfm.video import VIDEO_ENDINGS
 
 EXPORTS = "exports"
 """Folder of an entry with the files that were exported from it."""
@@ -51,7 +51,7 @@ class Work:
 def _choice(*values: str) -> Option:
     def words(name: str, value: Any) -> Words:  # noqa: ANN401
         if value not in values:
-            raise Refused(f"{name}: is {str(value)[:40]!r}, but has to be one of {', '.join(values)}")
+            raise RefusedError(f"{name}: is {str(value)[:40]!r}, but has to be one of {', '.join(values)}")
         return [_flag(name), str(value)]
 
     return words
@@ -60,7 +60,9 @@ def _choice(*values: str) -> Option:
 def _whole(least: int, most: int) -> Option:
     def words(name: str, value: Any) -> Words:  # noqa: ANN401
         if type(value) is not int or not least <= value <= most:
-            raise Refused(f"{name}: is {str(value)[:40]}, but has to be a whole number from {least} to {most}")
+            raise RefusedError(
+                f"{name}: is {str(value)[:40]}, but has to be a whole number from {least} to {most}"
+            )
         return [_flag(name), str(value)]
 
     return words
@@ -69,7 +71,9 @@ def _whole(least: int, most: int) -> Option:
 def _number(least: float, most: float) -> Option:
     def words(name: str, value: Any) -> Words:  # noqa: ANN401
         if type(value) not in (int, float) or not math.isfinite(value) or not least <= value <= most:
-            raise Refused(f"{name}: is {str(value)[:40]}, but has to be a number from {least:g} to {most:g}")
+            raise RefusedError(
+                f"{name}: is {str(value)[:40]}, but has to be a number from {least:g} to {most:g}"
+            )
         return [_flag(name), f"{value:g}" if value == float(f"{value:g}") else repr(value)]
 
     return words
@@ -77,14 +81,20 @@ def _number(least: float, most: float) -> Option:
 
 def _switch(name: str, value: Any) -> Words:  # noqa: ANN401
     if not isinstance(value, bool):
-        raise Refused(f"{name}: is {str(value)[:40]}, but has to be true or false")
+        raise RefusedError(f"{name}: is {str(value)[:40]}, but has to be true or false")
     return [_flag(name)] if value else []
 
 
 def _text(name: str, value: Any) -> Words:  # noqa: ANN401
     """Pass a short text on; the command checks it."""
-    if not isinstance(value, str) or not value or len(value) > LONGEST_TEXT or not value.isprintable() or value[0] == "-":
-        raise Refused(f"{name}: has to be a short text that does not begin with a dash")
+    if (
+        not isinstance(value, str)
+        or not value
+        or len(value) > LONGEST_TEXT
+        or not value.isprintable()
+        or value[0] == "-"
+    ):
+        raise RefusedError(f"{name}: has to be a short text that does not begin with a dash")
     return [_flag(name), value]
 
 
@@ -156,16 +166,23 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
             what docs/STUDIO.md lists.
 
     Raises:
-        Refused: the command is unknown, an option is not allowed, or an entry does not exist or exists already.
+        RefusedError: the command is unknown, an option is not allowed, or an entry does not exist or exists already.
     """
     command = request.get("command")
-    makers = {"sfm": _sfm, "train": _train, "doctor": _doctor, "clean": _clean, "convert": _convert, "render": _render}
+    makers = {
+        "sfm": _sfm,
+        "train": _train,
+        "doctor": _doctor,
+        "clean": _clean,
+        "convert": _convert,
+        "render": _render,
+    }
     maker = makers.get(command) if isinstance(command, str) else None
     if maker is None:
-        raise Refused(f"command: is {str(command)[:40]!r}, but has to be one of {', '.join(makers)}")
-    known = {"command", "subject", "to", "options", "format", "edits", "resume", "path"}
+        raise RefusedError(f"command: is {str(command)[:40]!r}, but has to be one of {', '.join(makers)}")
+    known = {"command", "subject", "to", "options", "format", "edits", "resume"}
     if unknown := sorted(set(request) - known):
-        raise Refused(f"{unknown[0]}: is not known; see docs/STUDIO.md")
+        raise RefusedError(f"{unknown[0]}: is not known; see docs/STUDIO.md")
     return maker(library, request)
 
 
@@ -181,13 +198,13 @@ def scene_of(entry: Path, kind: str) -> Path:
     """Return what convert reads of an entry: the run's folder, or the scene's file.
 
     Raises:
-        Refused: the entry holds no scene.
+        RefusedError: the entry holds no scene.
     """
     if kind == "runs":
         return entry
     if kind == "scenes" and (found := scene_file(entry)) is not None:
         return found
-    raise Refused(f"{kind}/{entry.name}: holds no scene; choose a run or a scene")
+    raise RefusedError(f"{kind}/{entry.name}: holds no scene; choose a run or a scene")
 
 
 def _sfm(library: Library, request: Mapping[str, Any]) -> Work:
@@ -227,15 +244,11 @@ def _convert(library: Library, request: Mapping[str, Any]) -> Work:
     kind, entry = _subject(library, request, "runs", "scenes")
     form = request.get("format")
     if form not in FORMATS:
-        raise Refused(f"format: is {str(form)[:40]!r}, but has to be one of {', '.join(FORMATS)}")
+        raise RefusedError(f"format: is {str(form)[:40]!r}, but has to be one of {', '.join(FORMATS)}")
     name = checked_name("to", request.get("to") or entry.name)
     out = entry / EXPORTS / f"{name}.{form}"
     argv = ["convert", str(scene_of(entry, kind)), str(out), *_options(request, CONVERT)]
-    if request.get("edits") is True:
-        if not (entry / EDITS).is_file():
-            raise Refused(f"edits: {kind}/{entry.name} has none; edit the scene first, or export it as it is")
-        argv += ["--edits", str(entry / EDITS)]
-    argv += ["--verify"] if request.get("edits") is not True else []
+    argv += [*_edits(request, kind, entry), "--verify"]
     return Work(tuple(argv), f"export of {out.name}", f"{kind}/{entry.name}")
 
 
@@ -243,32 +256,35 @@ def _render(library: Library, request: Mapping[str, Any]) -> Work:
     kind, entry = _subject(library, request, "runs", "scenes")
     name = checked_name("to", request.get("to") or entry.name)
     argv = ["render", str(scene_of(entry, kind)), "--out", str(entry / EXPORTS / f"{name}.mp4")]
-    if request.get("path") is True:
-        keyframes = entry / EXPORTS / "path.json"
-        if not keyframes.is_file():
-            raise Refused(f"path: {kind}/{entry.name} has none; PUT its keyframes first")
-        argv += ["--path", str(keyframes)]
-    argv += _options(request, RENDER)
+    argv += [*_edits(request, kind, entry), *_options(request, RENDER)]
     return Work(tuple(argv), f"video of {entry.name}", f"{kind}/{entry.name}")
+
+
+def _edits(request: Mapping[str, Any], kind: str, entry: Path) -> Words:
+    if request.get("edits") is not True:
+        return []
+    if not (entry / EDITS).is_file():
+        raise RefusedError(f"edits: {kind}/{entry.name} has none; edit the scene first, or leave them out")
+    return ["--edits", str(entry / EDITS)]
 
 
 def _subject(library: Library, request: Mapping[str, Any], *kinds: str) -> tuple[str, Path]:
     kind, entry = library.named(request.get("subject"))
     if kind not in kinds:
-        raise Refused(f"subject: is of {kind}, but has to be of {' or '.join(kinds)}")
+        raise RefusedError(f"subject: is of {kind}, but has to be of {' or '.join(kinds)}")
     if kind == "photos" and not any(True for _ in walked(entry)):
         raise conflict(f"photos/{entry.name}: is empty; add photos first")
     return kind, entry
 
 
 def _options(request: Mapping[str, Any], known: Mapping[str, Option]) -> Words:
-    given = request.get("options") or {}
+    given = request.get("options", {})
     if not isinstance(given, dict):
-        raise Refused("options: has to be an object")
+        raise RefusedError("options: has to be an object")
     words: Words = []
     for name, value in given.items():
         if name not in known:
-            raise Refused(f"options.{str(name)[:40]}: is not one of {', '.join(known) or 'none'}")
+            raise RefusedError(f"options.{str(name)[:40]}: is not one of {', '.join(known) or 'none'}")
         if value is not None:
             words += known[name](name, value)
     return words

@@ -12,7 +12,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
 from gsplat_edu.reading import open_file
-from gsplat_edu.studio.refusal import Refused, conflict, missing
+from gsplat_edu.studio.refusal import RefusedError, conflict, missing
 from gsplat_edu.studio.replies import act
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.stream import event_document, job_document
@@ -44,7 +44,7 @@ def _jobs(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noq
 
 def _start(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     if not isinstance(body, dict):
-        raise Refused("body: has to be an object")
+        raise RefusedError("body: has to be an object")
     return job_document(studio.start(body))
 
 
@@ -79,7 +79,7 @@ def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
 def _events(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     text = request.query_params.get("after", "0")
     if not text.isdecimal():
-        raise Refused("after: has to be the number of an event")
+        raise RefusedError("after: has to be the number of an event")
     found = events_after(studio.queue.files(_job(studio, request).id).events, int(text))
     return {
         "events": [event_document(*entry) for entry in found[-MOST_EVENTS:]],

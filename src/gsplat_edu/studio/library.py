@@ -6,8 +6,8 @@
     scenes/NAME      a folder with one scene file
     .studio/         jobs/, trash/, uploads/ (parts of files), cache/ (thumbnails, pages)
 
-An adopted entry is a link to a folder elsewhere (for a scene and a video: a folder with a link to the file). Removing it
-removes the link.
+An adopted entry is a link to a folder elsewhere (for a scene and a video: a folder with a link to the file).
+Removing it removes the link.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.files import written_aside
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.names import checked_name
-from gsplat_edu.studio.refusal import Refused, conflict, missing
+from gsplat_edu.studio.refusal import RefusedError, conflict, missing
 
 KINDS = ("photos", "captures", "runs", "scenes")
 """Kinds of entries, and their folders."""
@@ -90,7 +90,7 @@ class Library:
         """Return an existing entry.
 
         Raises:
-            Refused: there is none of this kind and name.
+            RefusedError: there is none of this kind and name.
         """
         path = self.place(kind, name)
         if not path.is_dir():
@@ -101,7 +101,7 @@ class Library:
         """Return kind and path of an entry named like "runs/toy".
 
         Raises:
-            Refused: there is none.
+            RefusedError: there is none.
         """
         kind, _, name = subject.partition("/") if isinstance(subject, str) else ("", "", "")
         return kind, self.entry(kind, name)
@@ -110,17 +110,17 @@ class Library:
         """Return where an entry is or would be.
 
         Raises:
-            Refused: kind or name is not allowed.
+            RefusedError: kind or name is not allowed.
         """
         if kind not in KINDS:
-            raise Refused(f"{kind!r}: is not a kind of entry; the kinds are {', '.join(KINDS)}")
+            raise RefusedError(f"{kind!r}: is not a kind of entry; the kinds are {', '.join(KINDS)}")
         return self.root / kind / checked_name(kind, name)
 
     def fresh(self, kind: str, name: object) -> Path:
         """Return the place of a new entry.
 
         Raises:
-            Refused: the name is not allowed or taken.
+            RefusedError: the name is not allowed or taken.
         """
         path = self.place(kind, name)
         if os.path.lexists(path):
@@ -142,7 +142,7 @@ class Library:
         """Rename a complete folder to a new entry.
 
         Raises:
-            Refused: the name is taken by now.
+            RefusedError: the name is taken by now.
         """
         with self.lock:
             path = self.fresh(kind, name)
@@ -153,19 +153,19 @@ class Library:
         """Make an entry of a folder or file elsewhere on this computer, without copying it.
 
         Raises:
-            Refused: the source does not exist, is not of that kind, or lies in the library; or the name is taken.
+            RefusedError: the source does not exist, is not of that kind, or lies in the library; or the name is taken.
         """
         if not source.is_absolute():
-            raise Refused(f"path: {source} is relative; give the whole path, from the root")
+            raise RefusedError(f"path: {source} is relative; give the whole path, from the root")
         source = source.resolve()
         if not source.exists():
-            raise Refused(f"path: {source} does not exist; correct it")
+            raise RefusedError(f"path: {source} does not exist; correct it")
         if source.is_relative_to(self.root) or self.root.is_relative_to(source):
-            raise Refused(f"path: {source} overlaps the library; give a place outside of it")
+            raise RefusedError(f"path: {source} overlaps the library; give a place outside of it")
         endings = {"scenes": SCENE_ENDINGS, "photos": VIDEO_ENDINGS}.get(kind, ())
         if source.is_file() and source.suffix.lower() not in endings:
             wanted = f"a folder, or a file ending in {', '.join(endings)}" if endings else "a folder"
-            raise Refused(f"path: {source} is a file; give {wanted}")
+            raise RefusedError(f"path: {source} is a file; give {wanted}")
         with self.lock:
             path = self.fresh(kind, name)
             if source.is_file():
@@ -179,7 +179,7 @@ class Library:
         """Give an entry another name.
 
         Raises:
-            Refused: there is none, a job uses it, or the name is taken.
+            RefusedError: there is none, a job uses it, or the name is taken.
         """
         with self.lock:
             path = self.entry(kind, name)
@@ -192,7 +192,7 @@ class Library:
         """Move an entry to the trash; return its id there.
 
         Raises:
-            Refused: there is none, or a job uses it.
+            RefusedError: there is none, or a job uses it.
         """
         with self.lock:
             path = self.entry(kind, name)
@@ -220,7 +220,7 @@ class Library:
         """Move an entry back from the trash.
 
         Raises:
-            Refused: there is none, or its name is taken.
+            RefusedError: there is none, or its name is taken.
         """
         with self.lock:
             for entry in self.trash():

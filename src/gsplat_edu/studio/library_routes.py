@@ -14,7 +14,7 @@ from gsplat_edu.jobs.record import State
 from gsplat_edu.studio.library import KINDS
 from gsplat_edu.studio.listing import summary
 from gsplat_edu.studio.pictures import photo_list, thumbnail
-from gsplat_edu.studio.refusal import Refused
+from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, answered, content_length, entry_of, fields, file_answer
 from gsplat_edu.studio.state import Studio
 
@@ -87,7 +87,7 @@ def _empty_trash(studio: Studio, request: Request, body: Any) -> dict[str, Any]:
 def _photos(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     kind, entry = entry_of(studio, request)
     if kind not in ("photos", "captures"):
-        raise Refused(f"{kind}: have no photos of their own; ask for those of a capture")
+        raise RefusedError(f"{kind}: have no photos of their own; ask for those of a capture")
     return {"photos": photo_list(entry)}
 
 
@@ -115,5 +115,5 @@ async def _upload_zip(request: Request) -> Response:
 def _length(request: Request) -> int | None:
     length = content_length(request)
     if length == 0:
-        raise Refused("file: is empty; send its bytes as the body")
+        raise RefusedError("file: is empty; send its bytes as the body")
     return length

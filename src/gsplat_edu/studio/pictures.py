@@ -12,7 +12,7 @@ from gsplat_edu.errors import DatasetError, NotEnoughMemoryError
 from gsplat_edu.files import written_aside
 from gsplat_edu.studio.library import Library, photo_names
 from gsplat_edu.studio.names import below, checked_path
-from gsplat_edu.studio.refusal import Refused, missing
+from gsplat_edu.studio.refusal import RefusedError, missing
 from gsplat_edu.text import legible
 
 SIDES = (128, 256, 512, 1024)
@@ -53,10 +53,10 @@ def thumbnail(library: Library, entry: Path, name: str, side: str) -> Path:
         side: Its longest side, px, as text.
 
     Raises:
-        Refused: there is no such photo, it cannot be decoded, or the side is not one of `SIDES`.
+        RefusedError: there is no such photo, it cannot be decoded, or the side is not one of `SIDES`.
     """
     if side not in map(str, SIDES):
-        raise Refused(f"side: is {side[:20]!r}, but has to be one of {', '.join(map(str, SIDES))}")
+        raise RefusedError(f"side: is {side[:20]!r}, but has to be one of {', '.join(map(str, SIDES))}")
     photo = below(entry, checked_path("photo", name), "photo")
     try:
         facts = photo.stat()
@@ -82,12 +82,12 @@ def _make(photo: Path, side: int, target: Path) -> None:
     try:
         W, H = image_size(photo)
         if W * H > MOST_PIXELS:
-            raise Refused(f"{photo.name}: has {W}x{H} px, too many for a preview")
+            raise RefusedError(f"{photo.name}: has {W}x{H} px, too many for a preview")
         pixels, alpha = decode(photo, image_orientation(photo), smaller=side)
     except (DatasetError, NotEnoughMemoryError) as error:
-        raise Refused(str(error), HTTPStatus.UNPROCESSABLE_ENTITY) from None
+        raise RefusedError(str(error), HTTPStatus.UNPROCESSABLE_ENTITY) from None
     if alpha is not None:
-        pixels = Photo(pixels, alpha).over((0.5, 0.5, 0.5))  # type: ignore[assignment]
+        pixels = Photo(pixels, alpha).over((0.5, 0.5, 0.5))
     factor = side / max(pixels.shape[:2])
     if factor < 1.0:
         size = (max(1, round(factor * pixels.shape[1])), max(1, round(factor * pixels.shape[0])))

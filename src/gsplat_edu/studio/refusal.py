@@ -7,7 +7,7 @@ from http import HTTPStatus
 from gsplat_edu.errors import ArgumentError
 
 
-class Refused(ArgumentError):
+class RefusedError(ArgumentError):
     """A request cannot be carried out.
 
     Args:
@@ -20,16 +20,16 @@ class Refused(ArgumentError):
         self.status = status
 
 
-def missing(what: str) -> Refused:
+def missing(what: str) -> RefusedError:
     """Return the refusal of something that does not exist."""
-    return Refused(f"{what}: does not exist; it may have been renamed or removed", HTTPStatus.NOT_FOUND)
+    return RefusedError(f"{what}: does not exist; it may have been renamed or removed", HTTPStatus.NOT_FOUND)
 
 
-def conflict(message: str) -> Refused:
+def conflict(message: str) -> RefusedError:
     """Return the refusal of something that the state of the library does not allow."""
-    return Refused(message, HTTPStatus.CONFLICT)
+    return RefusedError(message, HTTPStatus.CONFLICT)
 
 
-def too_large(message: str) -> Refused:
+def too_large(message: str) -> RefusedError:
     """Return the refusal of something beyond a limit."""
-    return Refused(message, HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+    return RefusedError(message, HTTPStatus.REQUEST_ENTITY_TOO_LARGE)

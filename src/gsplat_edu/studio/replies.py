@@ -16,7 +16,7 @@ from starlette.routing import Route
 from gsplat_edu.errors import SplatError
 from gsplat_edu.files import described
 from gsplat_edu.reading import parse_json
-from gsplat_edu.studio.refusal import Refused, missing, too_large
+from gsplat_edu.studio.refusal import RefusedError, missing, too_large
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
 
@@ -47,7 +47,7 @@ def answered(endpoint: Callable[[Request], Awaitable[Response]]) -> Callable[[Re
     async def safe(request: Request) -> Response:
         try:
             return await endpoint(request)
-        except Refused as error:
+        except RefusedError as error:
             return refusal(str(error), error.status)
         except SplatError as error:
             return refusal(str(error), HTTPStatus.BAD_REQUEST)
@@ -68,7 +68,7 @@ async def json_body(request: Request) -> Any:  # noqa: ANN401
     """Read a JSON body.
 
     Raises:
-        Refused: it is too long, of another type, or not JSON.
+        RefusedError: it is too long, of another type, or not JSON.
     """
     length = content_length(request)
     if length == 0:
@@ -76,7 +76,7 @@ async def json_body(request: Request) -> Any:  # noqa: ANN401
     if (length or 0) > MOST_JSON:
         raise too_large(f"body: has {length:,} bytes, but {MOST_JSON:,} are allowed")
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise Refused("body: has to be application/json", HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
+        raise RefusedError("body: has to be application/json", HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
     pieces, size = [], 0
     async for piece in request.stream():
         size += len(piece)
@@ -88,7 +88,7 @@ async def json_body(request: Request) -> Any:  # noqa: ANN401
     try:
         return parse_json(b"".join(pieces), _no_constant)
     except ValueError as error:
-        raise Refused(f"body: is not JSON ({str(error)[:80]})") from None
+        raise RefusedError(f"body: is not JSON ({str(error)[:80]})") from None
 
 
 def content_length(request: Request) -> int | None:
@@ -97,7 +97,7 @@ def content_length(request: Request) -> int | None:
     if text is None:
         return None if "transfer-encoding" in request.headers else 0
     if not text.isdecimal():
-        raise Refused("Content-Length: is not a number")
+        raise RefusedError("Content-Length: is not a number")
     return int(text)
 
 
@@ -105,7 +105,7 @@ def entry_of(studio: Studio, request: Request) -> tuple[str, Path]:
     """Return kind and path of the entry that a route names.
 
     Raises:
-        Refused: there is none.
+        RefusedError: there is none.
     """
     kind = request.path_params["kind"]
     return kind, studio.library.entry(kind, request.path_params["name"])
@@ -141,15 +141,15 @@ def fields(body: Any, **wanted: type) -> Mapping[str, Any]:  # noqa: ANN401
     """Check that a body is an object with exactly these fields.
 
     Raises:
-        Refused: a field is missing, of another type or not known.
+        RefusedError: a field is missing, of another type or not known.
     """
     if not isinstance(body, dict):
-        raise Refused("body: has to be an object")
+        raise RefusedError("body: has to be an object")
     for name, kind in wanted.items():
         if not isinstance(body.get(name), kind):
-            raise Refused(f"{name}: is missing, or not of type {kind.__name__}")
+            raise RefusedError(f"{name}: is missing, or not of type {kind.__name__}")
     if unknown := sorted(set(body) - set(wanted)):
-        raise Refused(f"{unknown[0]}: is not known; see docs/STUDIO.md")
+        raise RefusedError(f"{unknown[0]}: is not known; see docs/STUDIO.md")
     return body
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import socket
 from collections.abc import Callable
@@ -20,6 +21,8 @@ from gsplat_edu.studio.library import HIDDEN
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.uploads import Limits
 from gsplat_edu.viewer.serve import REQUEST_BYTES, REQUEST_SECONDS, bound_socket, url_of
+
+logging.getLogger("uvicorn.error").setLevel(logging.ERROR)  # not a line for each request that is no HTTP
 
 MOST_CONNECTIONS = 256
 """Connections that are served at once; further ones are closed without an answer."""
@@ -99,7 +102,8 @@ def serve(
         studio = Studio(folder, at_once, limits)
         try:
             app = application(studio, token, host, f"gsplat_edu_studio_{number}")
-            server = _Server(_config(app), lambda: opened(f"{url_of(host, number)}?token={token}"))
+            url = f"{url_of(host, number)}?token={token}"
+            server = _Server(_config(app), lambda: opened(url), studio.stream.close)
             server.run(sockets=[sock])
         finally:
             if any(job.pid for job in studio.queue.jobs()):
@@ -125,13 +129,18 @@ def _config(app: Any) -> uvicorn.Config:  # noqa: ANN401
 
 
 class _Server(uvicorn.Server):
-    """A server that tells once it listens."""
+    """A server that tells once it listens, and before it waits for its connections to end."""
 
-    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None], ending: Callable[[], None]) -> None:
         super().__init__(config)
-        self._ready = ready
+        self._ready, self._ending = ready, ending
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to listen."""
         await super().startup(sockets)
         self._ready()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the connections."""
+        self._ending()
+        await super().shutdown(sockets)

@@ -51,7 +51,12 @@ def job_document(job: Job) -> dict[str, Any]:
 
 def event_document(number: int, time: float, event: Event) -> dict[str, Any]:
     """Return an event of a job as the API shows it."""
-    return {"event": type(event).__name__.lower(), "number": number, "time": time, **dataclasses.asdict(event)}
+    return {
+        "event": type(event).__name__.lower(),
+        "number": number,
+        "time": time,
+        **dataclasses.asdict(event),
+    }
 
 
 class Stream:
@@ -69,6 +74,12 @@ class Stream:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._woken: set[asyncio.Event] = set()
         self._followers: dict[str, Follower] = {}
+        self._over = threading.Event()
+
+    def close(self) -> None:
+        """End all streams, for the end of the server; called in its event loop."""
+        self._over.set()
+        self._wake()
 
     def changed(self, name: str, job: Job | None) -> None:
         """Note a new state of a job, or that it was removed. May be called from any thread."""
@@ -128,7 +139,7 @@ class Stream:
                 with self._lock:
                     after = self._number
                 yield f"id: {self.boot}-{after}\nevent: reset\ndata: {json.dumps({'boot': self.boot})}\n\n"
-            while True:
+            while not self._over.is_set():
                 woken.clear()
                 with self._lock:
                     oldest = self._kept[0][0] if self._kept else self._number + 1
@@ -138,6 +149,8 @@ class Stream:
                 for number, text in new:
                     after = number
                     yield text
+                if self._over.is_set():
+                    break
                 try:
                     await asyncio.wait_for(woken.wait(), HEARTBEAT)
                 except TimeoutError:

@@ -1,12 +1,13 @@
 """Unpack zip files that somebody else made.
 
-A few kilobytes can claim petabytes, name files outside of the folder, be links, or list so many entries that reading the
-list takes all memory. So the directory of the file is measured before it is read, every name is checked before anything
-is written, and bytes are counted while they are written.
+A few kilobytes can claim petabytes, name files outside of the folder, be links, or list so many entries that reading
+the list takes all memory. So the directory of the file is measured before it is read, every name is checked before
+anything is written, and bytes are counted while they are written.
 """
 
 from __future__ import annotations
 
+import errno
 import stat
 import struct
 import zipfile
@@ -18,7 +19,7 @@ from pathlib import Path
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.reading import open_file
 from gsplat_edu.studio.names import checked_path
-from gsplat_edu.studio.refusal import Refused, too_large
+from gsplat_edu.studio.refusal import RefusedError, too_large
 
 CHUNK = 1 << 20
 
@@ -64,7 +65,7 @@ def unpack(
         Number of files written, and the names of those that were not wanted.
 
     Raises:
-        Refused: it is not a zip file, exceeds a limit, or holds an entry that is not allowed; names the entry.
+        RefusedError: it is not a zip file, exceeds a limit, or holds an entry that is not allowed; names the entry.
         OSError: it cannot be written.
     """
     _check_directory(path, limits)
@@ -76,12 +77,23 @@ def unpack(
             room = limits.total
             for name, entry in chosen.items():
                 room -= _write(archive, entry, into / name, room)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, struct.error, ValueError) as error:
+    except (
+        zipfile.BadZipFile,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+        struct.error,
+        ValueError,
+    ) as error:
         if isinstance(error, ArgumentError):
             raise
-        raise Refused(f"zip: is damaged ({str(error)[:80]}); pack it again") from None
+        raise RefusedError(f"zip: is damaged ({str(error)[:80]}); pack it again") from None
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # which a seek to a place that no file has ends in
+            raise
+        raise RefusedError("zip: its directory is damaged; pack it again") from None
     except zlib.error:
-        raise Refused("zip: its data are damaged; pack it again") from None
+        raise RefusedError("zip: its data are damaged; pack it again") from None
     return len(chosen), [name.as_posix() for name in entries if name not in chosen]
 
 
@@ -89,7 +101,7 @@ def _check_directory(path: Path, limits: ZipLimits) -> None:
     """Measure the directory of a zip file without reading it.
 
     Raises:
-        Refused: there is none, or it lists too much.
+        RefusedError: there is none, or it lists too much.
     """
     size = path.stat().st_size
     with open_file(path) as file:
@@ -97,17 +109,19 @@ def _check_directory(path: Path, limits: ZipLimits) -> None:
         tail = file.read()
         at = tail.rfind(b"PK\x05\x06")
         if at < 0 or len(tail) < at + 22:
-            raise Refused("zip: is not a zip file; pack the photos as zip")
+            raise RefusedError("zip: is not a zip file; pack the photos as zip")
         count, length = struct.unpack_from("<HI", tail, at + 10)
         locator = tail[at - 20 : at] if at >= 20 else b""
         if locator[:4] == b"PK\x06\x07":  # zip64: zipfile believes its record, whatever the other says
             file.seek(min(struct.unpack_from("<Q", locator, 8)[0], size))
             record = file.read(56)
             if len(record) < 56 or record[:4] != b"PK\x06\x06":
-                raise Refused("zip: its end is damaged; pack it again")
+                raise RefusedError("zip: its end is damaged; pack it again")
             count, length = struct.unpack_from("<QQ", record, 32)
     if count > limits.entries or length > limits.entries * BYTES_PER_ENTRY:
-        raise too_large(f"zip: lists {count:,} entries in {length:,} bytes; {limits.entries:,} entries may be in it")
+        raise too_large(
+            f"zip: lists {count:,} entries in {length:,} bytes; {limits.entries:,} entries may be in it"
+        )
 
 
 def _checked(archive: zipfile.ZipFile, packed: int, limits: ZipLimits) -> dict[Path, zipfile.ZipInfo]:
@@ -124,11 +138,11 @@ def _checked(archive: zipfile.ZipFile, packed: int, limits: ZipLimits) -> dict[P
     for info in infos:
         kind = stat.S_IFMT(info.external_attr >> 16)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise Refused(f"zip: {info.filename[:60]!r} is a link or a device; pack the file itself")
+            raise RefusedError(f"zip: {info.filename[:60]!r} is a link or a device; pack the file itself")
         if info.flag_bits & 1:
-            raise Refused(f"zip: {info.filename[:60]!r} is encrypted; pack it without a password")
+            raise RefusedError(f"zip: {info.filename[:60]!r} is encrypted; pack it without a password")
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise Refused(f"zip: {info.filename[:60]!r} is packed in an unusual way; use deflate")
+            raise RefusedError(f"zip: {info.filename[:60]!r} is packed in an unusual way; use deflate")
         if info.is_dir():
             continue
         parts = info.filename.split("/")
@@ -136,10 +150,10 @@ def _checked(archive: zipfile.ZipFile, packed: int, limits: ZipLimits) -> dict[P
             continue
         name = checked_path("zip", info.filename)
         if name in found:
-            raise Refused(f"zip: {info.filename[:60]!r} is in it twice; pack it again")
+            raise RefusedError(f"zip: {info.filename[:60]!r} is in it twice; pack it again")
         found[name] = info
     if any(parent in found for name in found for parent in name.parents):
-        raise Refused("zip: a name in it is a file and a folder; pack it again")
+        raise RefusedError("zip: a name in it is a file and a folder; pack it again")
     return _without_common_folder(found)
 
 

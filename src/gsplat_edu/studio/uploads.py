@@ -6,8 +6,7 @@ import asyncio
 import os
 import shutil
 import threading
-from collections.abc import AsyncIterator, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
@@ -18,9 +17,10 @@ from starlette.concurrency import run_in_threadpool
 
 from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.image_files import is_image
-from gsplat_edu.studio.library import SCENE_ENDINGS, VIDEO_ENDINGS, Library, extent
-from gsplat_edu.studio.names import LONGEST_FILE, below, checked_name, checked_path
-from gsplat_edu.studio.refusal import Refused, conflict, too_large
+from gsplat_edu.sfm.video import VIDEO_ENDINGS
+from gsplat_edu.studio.library import SCENE_ENDINGS, Library, extent
+from gsplat_edu.studio.names import below, checked_path
+from gsplat_edu.studio.refusal import RefusedError, conflict, too_large
 from gsplat_edu.studio.unpack import ZipLimits, unpack
 
 STALL = 30.0
@@ -89,28 +89,34 @@ class Uploads:
         """Return where a file goes.
 
         Raises:
-            Refused: a name is not allowed, its ending is not that of what the entry holds, or it is there already.
+            RefusedError: a name is not allowed, its ending is not that of what the entry holds, or it is there already.
         """
         wanted = checked_path("file", path)
         self._check_ending(kind, wanted)
         entry = self.library.place(kind, name)
         if entry.is_symlink():
-            raise conflict(f"{kind}/{entry.name}: is adopted from elsewhere; add files there, or make a new entry")
+            raise conflict(
+                f"{kind}/{entry.name}: is adopted from elsewhere; add files there, or make a new entry"
+            )
         if kind == "scenes" and entry.is_dir() and any(entry.iterdir()):
             raise conflict(f"scenes/{entry.name}: exists already; choose another name")
         target = below(entry, wanted, "file")
         if os.path.lexists(target):
-            raise conflict(f"{kind}/{entry.name}/{wanted}: exists already; rename the new one or remove the old one")
+            raise conflict(
+                f"{kind}/{entry.name}/{wanted}: exists already; rename the new one or remove the old one"
+            )
         return target
 
     def _check_ending(self, kind: str, path: Path) -> None:
         ending = path.suffix.lower()
         if kind == "runs":
-            raise Refused("runs: cannot be uploaded; adopt the folder, or upload its scene")
+            raise RefusedError("runs: cannot be uploaded; adopt the folder, or upload its scene")
         if kind == "scenes" and (ending not in SCENE_ENDINGS or len(path.parts) > 1):
-            raise Refused(f"file: {path.name!r} is not a scene; scenes end in {', '.join(SCENE_ENDINGS)}")
+            raise RefusedError(
+                f"file: {path.name!r} is not a scene; scenes end in {', '.join(SCENE_ENDINGS)}"
+            )
         if kind == "photos" and ending not in (*PHOTO_ENDINGS, *VIDEO_ENDINGS):
-            raise Refused(
+            raise RefusedError(
                 f"file: {path.name!r} is neither a photo nor a video by its ending; photos end in"
                 f" {', '.join(PHOTO_ENDINGS)}"
             )
@@ -127,7 +133,7 @@ class Uploads:
             Its size.
 
         Raises:
-            Refused: it is too large, stalls, is shorter than announced, or is no photo although its name says so.
+            RefusedError: it is too large, stalls, is shorter than announced, or is no photo although its name says so.
         """
         part = self.library.part(target.suffix.lower())
         try:
@@ -146,10 +152,10 @@ class Uploads:
             Number of files, and the names of files that were left out.
 
         Raises:
-            Refused: as for `receive` and `gsplat_edu.studio.unpack.unpack`, or the entry exists.
+            RefusedError: as for `receive` and `gsplat_edu.studio.unpack.unpack`, or the entry exists.
         """
         if kind not in ("photos", "captures"):
-            raise Refused(f"{kind}: takes no zip files; upload photos or a capture")
+            raise RefusedError(f"{kind}: takes no zip files; upload photos or a capture")
         entry = await run_in_threadpool(self.library.fresh, kind, name)
         part, folder = self.library.part(".zip"), self.library.part()
         try:
@@ -168,66 +174,74 @@ class Uploads:
         wanted = (lambda path: path.suffix.lower() in endings) if kind == "photos" else (lambda path: True)
         count, left_out = unpack(part, folder, limits, wanted)
         if not count:
-            raise Refused("zip: holds nothing that can be used; pack photos, or a capture")
+            raise RefusedError("zip: holds nothing that can be used; pack photos, or a capture")
         self.library.publish(folder, kind, name)
         self.recount()
-        return {"entry": f"{kind}/{name}", "files": count, "left_out": left_out[:50], "num_left_out": len(left_out)}
+        return {
+            "entry": f"{kind}/{name}",
+            "files": count,
+            "left_out": left_out[:50],
+            "num_left_out": len(left_out),
+        }
 
     async def _stream(self, chunks: AsyncIterator[bytes], length: int | None, part: Path) -> int:
-        await run_in_threadpool(self._check_room, length)
-        size = 0
-        with self._counted(length or 0):
-            with part.open("xb") as file:
-                try:
-                    while (chunk := await asyncio.wait_for(anext(chunks, None), STALL)) is not None:
-                        size += len(chunk)
-                        if size > self.limits.file or (length is not None and size > length):
-                            raise too_large(f"file: has more than {min(self.limits.file, length or size):,} bytes")
-                        if length is None:
-                            await run_in_threadpool(self._check_room, len(chunk))
-                        await run_in_threadpool(file.write, chunk)
-                except TimeoutError:
-                    raise Refused(
-                        f"file: no byte came for {STALL:.0f} s; send it again", HTTPStatus.REQUEST_TIMEOUT
-                    ) from None
-        if length is not None and size != length:
-            raise Refused(f"file: has {size:,} of the announced {length:,} bytes; send it again")
-        return size
-
-    @contextmanager
-    def _counted(self, expected: int) -> Iterator[None]:
-        with self._lock:
-            if self._running >= AT_ONCE:
-                raise Refused("file: too many uploads at once; send it again", HTTPStatus.SERVICE_UNAVAILABLE)
-            self._running += 1
-            self._expected += expected
+        """Write a body to a file; room for it is reserved first, or as it comes if its length is unknown."""
+        size, reserved = 0, length or 0
+        await run_in_threadpool(self._reserve, reserved, begins=True)
         try:
-            yield
+            with part.open("xb") as file:
+                while (chunk := await asyncio.wait_for(anext(chunks, None), STALL)) is not None:
+                    size += len(chunk)
+                    if size > min(self.limits.file, length or size):
+                        raise too_large(
+                            f"file: has more than {min(self.limits.file, length or size):,} bytes"
+                        )
+                    if length is None:
+                        await run_in_threadpool(self._reserve, len(chunk))
+                        reserved += len(chunk)
+                    await run_in_threadpool(file.write, chunk)
+        except TimeoutError:
+            raise RefusedError(
+                f"file: no byte came for {STALL:.0f} s; send it again", HTTPStatus.REQUEST_TIMEOUT
+            ) from None
         finally:
             with self._lock:
                 self._running -= 1
-                self._expected -= expected
+                self._expected -= reserved
+        if length is not None and size != length:
+            raise RefusedError(f"file: has {size:,} of the announced {length:,} bytes; send it again")
+        return size
 
     def _room(self) -> int:
         """Return how many bytes more may be taken in."""
         disk = shutil.disk_usage(self.library.root).free - self.limits.spare
         return min(disk, self.limits.library - self.used()) - self._expected
 
-    def _check_room(self, length: int | None) -> None:
-        """Refuse what is too large before a byte of it is read."""
-        size = length or 0
+    def _reserve(self, size: int, *, begins: bool = False) -> None:
+        """Reserve room for bytes of an upload.
+
+        Raises:
+            RefusedError: there is none, the file is too large, or too many uploads are running.
+        """
         if size > self.limits.file:
             raise too_large(f"file: has {size:,} bytes, but one file may have {self.limits.file:,}")
-        if size > (room := self._room()):
-            raise Refused(
-                f"file: has {size:,} bytes, but there is room for {max(room, 0):,}; remove something, or set"
-                " --max-library",
-                HTTPStatus.INSUFFICIENT_STORAGE,
-            )
+        with self._lock:
+            if begins and self._running >= AT_ONCE:
+                raise RefusedError(
+                    "file: too many uploads at once; send it again", HTTPStatus.SERVICE_UNAVAILABLE
+                )
+            if size > (room := self._room()):
+                raise RefusedError(
+                    f"file: has {size:,} bytes, but there is room for {max(room, 0):,}; remove something, or set"
+                    " --max-library",
+                    HTTPStatus.INSUFFICIENT_STORAGE,
+                )
+            self._expected += size
+            self._running += begins
 
     def _place(self, part: Path, target: Path) -> None:
         if target.suffix.lower() in PHOTO_ENDINGS and not is_image(part):
-            raise Refused(f"file: {target.name!r} is not an image that can be read; export it as JPEG")
+            raise RefusedError(f"file: {target.name!r} is not an image that can be read; export it as JPEG")
         size = part.stat().st_size
         with self.library.lock:
             folder = target.parent
@@ -235,13 +249,10 @@ class Uploads:
                 raise too_large(f"file: {folder.name} holds {self.limits.entry_files:,} files already")
             folder.mkdir(parents=True, exist_ok=True)
             if os.path.lexists(target):
-                raise conflict(f"file: {target.name!r} exists already; rename the new one or remove the old one")
+                raise conflict(
+                    f"file: {target.name!r} exists already; rename the new one or remove the old one"
+                )
             part.rename(target)
         with self._lock:
             if self._used is not None:
                 self._used += size
-
-
-def upload_name(name: str) -> str:
-    """Return the name of an entry made from the name of a file: without its ending."""
-    return checked_name("name", Path(checked_name("name", name, LONGEST_FILE)).stem)
