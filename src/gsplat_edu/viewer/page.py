@@ -65,14 +65,8 @@ LIVE_SCRIPTS = (*SCRIPTS[:-1], "live_curves.js", "live_pictures.js", "live.js", 
 
 EDIT_SCRIPTS = (
     *SCRIPTS[:-1],
-    "edit_member.js",
-    "edit_state.js",
-    "edit_shapes.js",
-    "edit_draw.js",
-    "edit_tools.js",
-    "edit_panel.js",
-    "edit.js",
-    "edit_start.js",
+    *("edit_member.js", "edit_state.js", "edit_shapes.js", "edit_draw.js", "edit_tools.js"),
+    *("edit_panel.js", "edit.js", "edit_start.js"),
     "main.js",
 )
 """The same for a page with the editor."""
