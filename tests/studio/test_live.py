@@ -38,7 +38,7 @@ def test_files_are_asked_for_while_somebody_asks(page, training):
     assert not training.is_wanted()
     training.path.mkdir()
     training.write(training.state, STATE)
-    training.write_scene(framed(30, 0, 0, b""))
+    training.scene.write_bytes(framed(30, 0, 0, b""))
     found = page.get("/api/runs/r/live/state").json()
     assert found["iteration"] == 30 and training.is_wanted()
     scene = page.get("/api/runs/r/live/scene?after=-1")

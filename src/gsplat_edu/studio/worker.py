@@ -9,7 +9,6 @@ the memory of a scene is not held forever. Nothing that it does takes longer tha
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import select
@@ -38,13 +37,14 @@ def make_page(source: str, title: str, out: str, edits: str = "", url: str = "")
         url: Where that page reads and stores edits, relative to itself.
     """
     from gsplat_edu.runs.source import open_source
+    from gsplat_edu.viewer import page
+    from gsplat_edu.viewer.edit_page import editing_of
 
-    page = _viewer("page")
     found = open_source(source)
     tour = page.Tour(origin=found.origin)
     shown = (found.scene, found.cameras, found.settings, title, found.held_out, tour)
     if edits:
-        editing = _viewer("edit_page").editing_of(found, Path(source), Path(edits), url)
+        editing = editing_of(found, Path(source), Path(edits), url)
         html, policy = page.html(*shown, editing), page.policy(editing=True)
     else:
         html, policy = page.html(*shown), page.policy()
@@ -59,7 +59,8 @@ def make_live_page(facts: str, out: str) -> dict[str, Any]:
         facts: Its page.json.
         out: File to write.
     """
-    page = _viewer("page")
+    from gsplat_edu.viewer import page
+
     _write(out, page.live_html(parse_json(read_bytes(Path(facts))), step=False))
     return {"policy": page.policy(live=True)}
 
@@ -165,10 +166,6 @@ def main() -> None:
             return
         answers.write(json.dumps(answer(line)) + "\n")
         answers.flush()
-
-
-def _viewer(name: str) -> Any:  # noqa: ANN401
-    return importlib.import_module(f"gsplat_edu.viewer.{name}")
 
 
 def _write(out: str, data: bytes) -> None:
