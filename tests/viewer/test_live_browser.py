@@ -3,10 +3,6 @@
 import io
 import re
 import signal
-import subprocess
-import sys
-import threading
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -17,9 +13,11 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.viewer import live
+from gsplat_edu.viewer.live_folder import LiveFolder, header_of
 from live_clients import GROWING, PATIENCE, Client, training, until
+from processes import Program
 
-COMMAND = [sys.executable, "-c", "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"]
+COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main())"
 NO_WEBGL2 = """
 const before = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
@@ -121,42 +119,38 @@ def test_without_webgl2_the_page_shows_our_own_renders(capture, tmp_path, browse
         assert tab.complaints == [] and made.view._shown == -1, "no snapshot was packed"
 
 
-@contextmanager
-def commanded(capture, out, *words):
-    """Run the command with a view in a separate process; yield the process and the URL it printed."""
-    command = [*COMMAND, "train", str(capture), "--out", str(out), "--view", "--view-port", "0", *words]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        watchdog = threading.Timer(PATIENCE, process.kill)  # no pipe may block forever
-        watchdog.start()
-        while not (
-            found := re.fullmatch(
-                r"live view: (http://127\.0\.0\.1:\d+/\?token=[\w-]{22})\n", process.stdout.readline()
-            )
-        ):
-            assert process.poll() is None, process.stderr.read()
-        yield process, found[1]
-    finally:
-        watchdog.cancel()
-        process.kill()
-        process.communicate()
+def output(folder):
+    """Return what the program in this folder has printed so far."""
+    path = folder / "stdout.txt"
+    return path.read_text() if path.exists() else ""
 
 
-@pytest.mark.own_process
 def test_after_the_training_the_view_stays_until_ctrl_c_and_exits_with_0(capture, tmp_path):
-    words = ["--iterations", "150", "--view-host", "0.0.0.0", *GROWING]
-    with commanded(capture, tmp_path / "run", *words) as (process, url):
-        # Read here: `communicate` does not return what the pipe's reader has buffered behind the URL.
-        warning = process.stdout.readline()
-        assert warning.startswith(
-            "warning: listening on 0.0.0.0: anyone who can reach this computer and has the URL sees the training"
+    """The whole command, watched by a page's requests and by files."""
+    out = tmp_path / "run"
+    words = ["train", capture, "--out", out, "--view", "--view-port", 0, "--view-host", "0.0.0.0", *GROWING]
+    program = Program(COMMAND, [*words, "--iterations", 60], tmp_path)
+    try:
+        url = until(
+            lambda: re.search(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}\n", output(tmp_path)), "the URL"
+        )[0]
+        client, files = Client(url.strip()), LiveFolder(out)
+        seen = until(
+            lambda: (files.ask(), client.ask("GET", "/state"), files.read_state())[2], "a state in a file"
         )
-        client = Client(url)
-        client.states(state="finished", iteration=150)
-        assert (tmp_path / "run" / "metrics.json").exists() and process.poll() is None
-        assert client.scene()[0]["iteration"] == 150
-        process.send_signal(signal.SIGINT)
-        printed, complaints = process.communicate(timeout=PATIENCE)
-        assert (process.returncode, complaints) == (0, "")
-        assert printed.endswith("the live view stays open until its last browser is closed, or Ctrl-C\n")
-    assert not (tmp_path / "run" / "live").exists()
+        assert seen["iterations"] == 60 and header_of(files.scene)["sh_degree"] == 0
+        client.states(state="finished", iteration=60)
+        assert (out / "metrics.json").exists() and program.runs
+        assert client.scene()[0]["iteration"] == 60
+        program.send(signal.SIGINT)
+        code, printed, complaints = program.ended(PATIENCE)
+    finally:
+        if program.runs:
+            program.send(signal.SIGKILL)
+    assert (code, complaints) == (0, "")
+    assert (
+        "warning: listening on 0.0.0.0: anyone who can reach this computer and has the URL sees the training"
+        in printed
+    )
+    assert printed.endswith("the live view stays open until its last browser is closed, or Ctrl-C\n")
+    assert sorted(path.name for path in files.path.iterdir()) == ["wanted"], "it tidies up"

@@ -4,14 +4,13 @@ import json
 import os
 import threading
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.cli.main import build_parser, main
+from gsplat_edu.cli.main import build_parser
 from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
@@ -116,10 +115,10 @@ def test_a_watcher_who_leaves_gets_no_more(capture, tmp_path):
         until(made.live.scene.exists, "a scene")
         os.utime(made.live.wanted, (0, 0))
         held = made.run.trainer.iteration
-        until(lambda: made.run.trainer.iteration > held + 100, "many more iterations")
+        until(lambda: made.run.trainer.iteration > held + 20, "many more iterations")
         before = made.live.state.stat().st_mtime_ns
         held = made.run.trainer.iteration
-        until(lambda: made.run.trainer.iteration > held + 300, "many more iterations")
+        until(lambda: made.run.trainer.iteration > held + 60, "many more iterations")
         assert made.live.state.stat().st_mtime_ns == before
 
 
@@ -130,11 +129,11 @@ def bits(run):
 
 def test_watching_and_pausing_by_files_does_not_change_the_bits(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(snapshots, "SHARE", 1.0)
-    alone = made_run(capture, tmp_path / "alone", "--iterations", "80", "--random-background")
+    alone = made_run(capture, tmp_path / "alone", "--iterations", "50", "--random-background")
     alone.train()
     run = tmp_path / "watched"
     LiveFolder(run).set_paused(True)
-    with Watched(capture, run, "--iterations", "80", "--random-background") as made:
+    with Watched(capture, run, "--iterations", "50", "--random-background") as made:
         until(lambda: made.said, "the pause")
         scenes = set()
         made.live.set_paused(False)
@@ -223,16 +222,3 @@ def test_the_curves_keep_few_points(capture, tmp_path, monkeypatch):
     iterations = [point[0] for point in figures.points]
     assert len(iterations) <= 8 and iterations[0] == 1 and iterations[-1] > 40
     assert len({b - a for a, b in pairwise(iterations)}) == 1, "evenly spaced"
-
-
-def test_the_command_serves_a_watcher_and_tidies_up(capture, tmp_path, capsys):
-    """`gsplat-edu train` in this process; the watcher asks beforehand."""
-    run = tmp_path / "run"
-    LiveFolder(run).ask()
-    seen = []
-    watching = threading.Thread(target=lambda: seen.append(until(LiveFolder(run).read_state, "a state")))
-    watching.start()
-    assert main(["train", str(capture), "--out", str(run), "--iterations", "40", *GROWING]) in (0, None)
-    watching.join(60)
-    assert seen[0]["iterations"] == 40
-    assert sorted(path.name for path in Path(run / "live").iterdir()) == ["wanted"]

@@ -132,11 +132,12 @@ class Live {
       const { header, splats } = unframed(buffer);
       await this.viewer.replace({ count: header.count, sh_degree: header.sh_degree }, splats);
       this.viewer.renderer.finish();
-      if (iteration < 0) say("");
+      const isFirst = iteration < 0; // the server may have had it ready for a while
       iteration = header.iteration;
+      if (isFirst) say("");
       element("count").textContent += ` after ${whole(iteration)} iterations`;
       const spent = performance.now() - began;
-      await this.rest(Math.min(LONGEST_REST, Math.max(SHORTEST_REST, REST_FACTOR * spent)));
+      if (!isFirst) await this.rest(Math.min(LONGEST_REST, Math.max(SHORTEST_REST, REST_FACTOR * spent)));
     }
   }
 
