@@ -48,6 +48,8 @@ FIRST = (
     "tests/blocks/test_runs.py",
     "tests/sfm/test_training.py",
     "tests/viewer/test_page_controls.py",
+    "tests/viewer/test_edit_page.py",
+    "tests/viewer/test_edit_by_hand.py",
     "tests/repo/test_scripts.py",
     "tests/gpu/test_compile.py",
     "tests/sfm/test_reconstruct.py",

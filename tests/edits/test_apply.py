@@ -165,7 +165,7 @@ def test_the_last_operation_of_a_kind_counts():
             ops.Measure(points, "door"),
             ops.NamedView("a", view(3)),
             ops.RemoveView("none of this name"),
-            ops.Path(path),
+            ops.CameraPath(path),
             ops.StartView(view(4), (0.0, 1.0, 0.0)),
             ops.Measure(points, ""),
         ]
@@ -175,7 +175,9 @@ def test_the_last_operation_of_a_kind_counts():
     assert views.path is path and views.move is IDENTITY and not views.upright
     assert [measure.note for measure in views.measures] == ["door", ""]
     assert (
-        views_after([ops.Path(path), ops.Path(None), ops.NamedView("a", view(1)), ops.RemoveView("a")]).named
+        views_after(
+            [ops.CameraPath(path), ops.CameraPath(None), ops.NamedView("a", view(1)), ops.RemoveView("a")]
+        ).named
         == ()
     )
-    assert views_after([ops.Path(path), ops.Path(None)]).path is None
+    assert views_after([ops.CameraPath(path), ops.CameraPath(None)]).path is None

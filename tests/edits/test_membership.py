@@ -34,7 +34,7 @@ def test_a_rectangle_holds_its_border_and_nothing_behind_the_camera():
         (0, 0, 0), (0.5, 0.2, 0), (0.6, 0, 0), (0, 0.25, 0), (0, 0, -3), (0, 0, -1 + 0.99 * NEAR), (0, 0, 9)
     )
     # seen at (5, 6), (10, 10), (11, 6), (5, 11); behind; before the near plane; (5, 6) from far away
-    region = ops.Rectangle(FRONT, (5.0, 6.0, 10.0, 10.0))
+    region = ops.PictureRectangle(FRONT, (5.0, 6.0, 10.0, 10.0))
     assert held(region, values) == [True, True, False, False, False, False, True]
 
 
@@ -44,8 +44,8 @@ def test_a_turned_picture_sees_along_its_axes():
         (0.0, 0.0, 0.0), ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), 1.0, 1.0, 0.0, 0.0
     )
     values = values_at((2, 0, -2), (2, 0, 2), (2, 2, 0), (-2, 0, 0))
-    assert held(ops.Rectangle(picture, (0.5, -0.5, 1.5, 0.5)), values) == [True, False, False, False]
-    assert held(ops.Rectangle(picture, (-0.5, 0.5, 0.5, 1.5)), values) == [False, False, True, False]
+    assert held(ops.PictureRectangle(picture, (0.5, -0.5, 1.5, 0.5)), values) == [True, False, False, False]
+    assert held(ops.PictureRectangle(picture, (-0.5, 0.5, 0.5, 1.5)), values) == [False, False, True, False]
 
 
 def seen(u, v):
@@ -116,7 +116,7 @@ def test_nan_belongs_to_no_region_and_infinity_is_compared():
     box = ops.Box((0.0,) * 3, AXES, (1e30,) * 3)
     assert held(ops.Sphere((0.0,) * 3, 1e30), values) == [False, False, False, True]
     assert held(box, values) == [False, False, False, True]
-    for region in (ops.Rectangle(FRONT, (-1e6, -1e6, 1e6, 1e6)), ops.Brush(FRONT, 1e6, ((0.0, 0.0),))):
+    for region in (ops.PictureRectangle(FRONT, (-1e6, -1e6, 1e6, 1e6)), ops.Brush(FRONT, 1e6, ((0.0, 0.0),))):
         assert held(region, values)[:2] == [False, False] and held(region, values)[3]
     assert held(ops.Opacity(-1e6, None), values) == [False, True, False, True]
     assert held(ops.Opacity(None, 1e6), values) == [False, False, True, True]

@@ -188,7 +188,7 @@ def _path_cameras(arguments: argparse.Namespace, path: KeyframePath, width: int,
         frames = max(1, round(path.seconds * arguments.fps) + (0 if path.loop else 1))
         if frames > MOST_FRAMES:
             raise ArgumentError(
-                f"{arguments.path or arguments.edits}: the path lasts {path.seconds:g} s, which is {frames:,} frames;"
+                f"{arguments.path or arguments.edits}: lasts {path.seconds:g} s, which is {frames:,} frames;"
                 " give --frames"
             )
     return PathCurve(path).cameras(frames, width, height)

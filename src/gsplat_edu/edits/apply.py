@@ -63,7 +63,7 @@ def flags_after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Fl
     return flags
 
 
-def kept(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
+def kept_after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
     """Return which of N splats are neither hidden nor deleted after some operations."""
     left: Bool[np.ndarray, " N"] = flags_after(operations, gaussians) <= SELECTED
     return left
@@ -71,7 +71,7 @@ def kept(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Bool[np.n
 
 def edited(scene: Scene, operations: Sequence[ops.Operation]) -> Scene:
     """Return what is left of a scene, in its coordinates; the same object if nothing is removed."""
-    stays = kept(operations, scene.gaussians)
+    stays = kept_after(operations, scene.gaussians)
     if stays.all():
         return scene
     rows = torch.from_numpy(stays).to(scene.gaussians.means.device)
@@ -97,7 +97,7 @@ def views_after(operations: Sequence[ops.Operation]) -> Views:
                 named[name] = operation
             case ops.RemoveView(name):
                 named.pop(name, None)
-            case ops.Path(path):
+            case ops.CameraPath(path):
                 pass
     move = IDENTITY
     if upright is not None:

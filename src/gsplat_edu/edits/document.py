@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,16 +18,16 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.keyframes import Keyframe, check_keyframe, parsed_keyframe, parsed_path
 from gsplat_edu.io.ply_comments import UNITS
 from gsplat_edu.json_fields import (
+    as_json,
     check_keys,
-    choice,
-    mapping,
+    checked_choice,
+    checked_list,
+    checked_numbers,
+    checked_object,
+    checked_text,
+    checked_whole,
     number_within,
-    numbers,
     numbers_within,
-    objects,
-    shown,
-    text,
-    whole,
 )
 from gsplat_edu.reading import open_file, parse_json
 
@@ -99,7 +99,7 @@ class Edits:
                 )
 
 
-def read_edits(path: FilePath) -> Edits:
+def read_edits(path: Path) -> Edits:
     """Read an edits file.
 
     Args:
@@ -147,10 +147,10 @@ def _parsed(found: object) -> Edits:
         raise ArgumentError(f'is no edits file: its "format" has to be "{FORMAT}"')
     version = found.get("version")
     if type(version) is not int or version != VERSION:
-        raise ArgumentError(f"version: is {shown(version)}, but {VERSION} is supported; update gsplat-edu")
+        raise ArgumentError(f"version: is {as_json(version)}, but {VERSION} is supported; update gsplat-edu")
     check_keys("", found, ("format", "version", "scene", "operations"))
     scene = Identity.of_document("scene", found["scene"])
-    entries = objects("operations", found["operations"], MOST_OPERATIONS)
+    entries = checked_list("operations", found["operations"], MOST_OPERATIONS)
     return Edits(scene, tuple(_operation(f"operations[{i}]", entry) for i, entry in enumerate(entries)))
 
 
@@ -158,10 +158,10 @@ Fields = dict[str, Any]
 
 
 def _operation(where: str, value: object) -> ops.Operation:
-    entry = mapping(where, value)
+    entry = checked_object(where, value)
     if "op" not in entry:
         raise ArgumentError(f"{where}: lacks 'op'")
-    kind = choice(f"{where}.op", entry["op"], tuple(_OPERATIONS))
+    kind = checked_choice(f"{where}.op", entry["op"], tuple(_OPERATIONS))
     keys, parse = _OPERATIONS[kind]
     if kind != "select":
         check_keys(f"{where}: ", entry, ("op", *keys))
@@ -172,18 +172,18 @@ def _select(where: str, entry: Fields) -> ops.Select:
     for key in ("how", "by"):
         if key not in entry:
             raise ArgumentError(f"{where}: lacks {key!r}")
-    how = choice(f"{where}.how", entry["how"], ops.HOW)
-    by = choice(f"{where}.by", entry["by"], tuple(_REGIONS))
+    how = checked_choice(f"{where}.how", entry["how"], ops.HOW)
+    by = checked_choice(f"{where}.by", entry["by"], tuple(_REGIONS))
     keys, optional, parse = _REGIONS[by]
     check_keys(f"{where}: ", entry, ("op", "how", "by", *keys), optional)
     return ops.Select(how, parse(where, entry))
 
 
 def _picture(where: str, value: object) -> ops.Picture:
-    entry = mapping(where, value)
+    entry = checked_object(where, value)
     check_keys(f"{where}: ", entry, ("position", "rotation", "fx", "fy", "cx", "cy", "width", "height"))
     for side in ("width", "height"):
-        whole(f"{where}.{side}", entry[side], 1, 65_536)
+        checked_whole(f"{where}.{side}", entry[side], 1, 65_536)
     fx, fy = (number_within(f"{where}.{key}", entry[key], SMALLEST, LONGEST_FOCAL) for key in ("fx", "fy"))
     cx, cy = (
         number_within(f"{where}.{key}", entry[key], -FARTHEST_PIXEL, FARTHEST_PIXEL) for key in ("cx", "cy")
@@ -205,7 +205,7 @@ def _point(where: str, value: object) -> ops.Numbers:
 def _axes(where: str, value: object) -> tuple[ops.Numbers, ops.Numbers, ops.Numbers]:
     """Return the columns of a rotation that is given by its rows."""
     if not isinstance(value, list) or len(value) != 3:
-        raise ArgumentError(f"{where}: is {shown(value)}, but has to be three rows of three numbers")
+        raise ArgumentError(f"{where}: is {as_json(value)}, but has to be three rows of three numbers")
     rows = np.array([numbers_within(f"{where}[{i}]", row, 3, 2.0) for i, row in enumerate(value)])
     if np.abs(rows @ rows.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rows) < 0:
         raise ArgumentError(
@@ -220,17 +220,17 @@ def _length(where: str, value: object, most: float = FARTHEST) -> float:
 
 
 def _pixels(where: str, value: object, least: int) -> tuple[ops.Numbers, ...]:
-    entries = objects(where, value, MOST_POINTS)
+    entries = checked_list(where, value, MOST_POINTS)
     if len(entries) < least:
         raise ArgumentError(f"{where}: has {len(entries)} points, but needs at least {least}")
     return tuple(numbers_within(f"{where}[{i}]", entry, 2, FARTHEST_PIXEL) for i, entry in enumerate(entries))
 
 
-def _rectangle(where: str, entry: Fields) -> ops.Rectangle:
+def _rectangle(where: str, entry: Fields) -> ops.PictureRectangle:
     u0, v0, u1, v1 = numbers_within(f"{where}.corners", entry["corners"], 4, FARTHEST_PIXEL)
     if u0 > u1 or v0 > v1:
         raise ArgumentError(f"{where}.corners: u0, v0 must not exceed u1, v1")
-    return ops.Rectangle(_picture(f"{where}.camera", entry["camera"]), (u0, v0, u1, v1))
+    return ops.PictureRectangle(_picture(f"{where}.camera", entry["camera"]), (u0, v0, u1, v1))
 
 
 def _lasso(where: str, entry: Fields) -> ops.Lasso:
@@ -250,7 +250,8 @@ def _sphere(where: str, entry: Fields) -> ops.Sphere:
 
 def _box(where: str, entry: Fields) -> ops.Box:
     half = tuple(
-        _length(f"{where}.half[{i}]", x) for i, x in enumerate(numbers(f"{where}.half", entry["half"], 3))
+        _length(f"{where}.half[{i}]", x)
+        for i, x in enumerate(checked_numbers(f"{where}.half", entry["half"], 3))
     )
     axes = _axes(f"{where}.rotation", entry["rotation"])
     return ops.Box(_point(f"{where}.center", entry["center"]), axes, half)
@@ -272,7 +273,7 @@ def _range(where: str, entry: Fields) -> tuple[float | None, float | None]:
 
 
 def _upright(where: str, entry: Fields) -> ops.Upright:
-    points = objects(f"{where}.points", entry["points"], 3)
+    points = checked_list(f"{where}.points", entry["points"], 3)
     if len(points) != 3:
         raise ArgumentError(f"{where}.points: has {len(points)} points, but has to have 3")
     a, b, c = (_point(f"{where}.points[{i}]", point) for i, point in enumerate(points))
@@ -288,7 +289,7 @@ def _upright(where: str, entry: Fields) -> ops.Upright:
 
 
 def _pair(where: str, value: object) -> tuple[ops.Numbers, ops.Numbers]:
-    points = objects(where, value, 2)
+    points = checked_list(where, value, 2)
     if len(points) != 2:
         raise ArgumentError(f"{where}: has {len(points)} points, but has to have 2")
     first, second = (_point(f"{where}[{i}]", point) for i, point in enumerate(points))
@@ -301,7 +302,7 @@ def _scale(where: str, entry: Fields) -> ops.Scale:
     length = _length(f"{where}.length", entry["length"])
     if apart < SMALLEST or not SMALLEST <= length / apart <= FARTHEST:
         raise ArgumentError(f"{where}.points: are {apart:g} apart, which no scale makes {length:g}")
-    return ops.Scale(points, length, choice(f"{where}.unit", entry["unit"], tuple(UNITS)))
+    return ops.Scale(points, length, checked_choice(f"{where}.unit", entry["unit"], tuple(UNITS)))
 
 
 VIEW = ("position", "rotation", "fov")
@@ -321,21 +322,21 @@ def _start(where: str, entry: Fields) -> ops.StartView:
 
 
 def _name(where: str, entry: Fields) -> str:
-    return text(f"{where}.name", entry["name"], LONGEST_NAME, 1)
+    return checked_text(f"{where}.name", entry["name"], LONGEST_NAME, 1)
 
 
-def _path(where: str, entry: Fields) -> ops.Path:
+def _path(where: str, entry: Fields) -> ops.CameraPath:
     if entry["path"] is None:
-        return ops.Path(None)
+        return ops.CameraPath(None)
     try:
-        return ops.Path(parsed_path(entry["path"]))
+        return ops.CameraPath(parsed_path(entry["path"]))
     except ArgumentError as error:
         raise ArgumentError(f"{where}.path: {error}") from None
 
 
 def _measure(where: str, entry: Fields) -> ops.Measure:
     return ops.Measure(
-        _pair(f"{where}.points", entry["points"]), text(f"{where}.note", entry["note"], LONGEST_NOTE)
+        _pair(f"{where}.points", entry["points"]), checked_text(f"{where}.note", entry["note"], LONGEST_NOTE)
     )
 
 

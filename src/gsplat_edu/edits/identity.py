@@ -11,7 +11,7 @@ import torch
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.json_fields import check_keys, mapping, numbers_within, shown, whole
+from gsplat_edu.json_fields import as_json, check_keys, checked_object, checked_whole, numbers_within
 
 ORDER = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 """Parameters in the order in which they are hashed."""
@@ -47,13 +47,13 @@ class Identity:
         Raises:
             ArgumentError: a key is missing or unknown, or a value is invalid.
         """
-        entry = mapping(where, value)
+        entry = checked_object(where, value)
         check_keys(f"{where}: ", entry, ("count", "sha256", "origin"))
         digest = entry["sha256"]
         if not isinstance(digest, str) or len(digest) != 64 or set(digest) - set("0123456789abcdef"):
-            raise ArgumentError(f"{where}.sha256: is {shown(digest)}, but has to be 64 hexadecimal digits")
+            raise ArgumentError(f"{where}.sha256: is {as_json(digest)}, but has to be 64 hexadecimal digits")
         x, y, z = numbers_within(f"{where}.origin", entry["origin"], 3, FARTHEST_ORIGIN)
-        return cls(whole(f"{where}.count", entry["count"], 0, MOST_SPLATS), digest, (x, y, z))
+        return cls(checked_whole(f"{where}.count", entry["count"], 0, MOST_SPLATS), digest, (x, y, z))
 
     def difference(self, other: Identity) -> str | None:
         """Return in a few words how another scene differs from this one; None if it does not."""

@@ -63,7 +63,7 @@ def members(region: ops.Region, values: Values) -> Members:
 
 def _members(region: ops.Region, values: Values) -> Any:  # noqa: ANN401
     match region:
-        case ops.Rectangle(picture, (u0, v0, u1, v1)):
+        case ops.PictureRectangle(picture, (u0, v0, u1, v1)):
             u, v, seen = _seen(picture, values.means)
             return seen & (u >= u0) & (u <= u1) & (v >= v0) & (v <= v1)
         case ops.Lasso(picture, points):

@@ -40,7 +40,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Rectangle:
+class PictureRectangle:
     """Splats whose centres are seen within a rectangle of a picture, u0 <= u <= u1 and v0 <= v <= v1, px."""
 
     picture: Picture
@@ -116,7 +116,7 @@ class Everything:
     """All splats."""
 
 
-Region: TypeAlias = Rectangle | Lasso | Brush | Sphere | Box | Color | Opacity | Size | Everything
+Region: TypeAlias = PictureRectangle | Lasso | Brush | Sphere | Box | Color | Opacity | Size | Everything
 
 BY_VALUE = (Color, Opacity, Size)
 """Regions that depend on more than where splats are."""
@@ -202,7 +202,7 @@ class RemoveView:
 
 
 @dataclass(frozen=True)
-class Path:
+class CameraPath:
     """The camera path; None removes it."""
 
     path: KeyframePath | None
@@ -229,6 +229,6 @@ Operation: TypeAlias = (
     | StartView
     | NamedView
     | RemoveView
-    | Path
+    | CameraPath
     | Measure
 )

@@ -24,7 +24,7 @@ from jaxtyping import Float64
 from gsplat_edu.camera import ROTATION_TOLERANCE, Camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.files import written_aside
-from gsplat_edu.json_fields import check_keys, number, numbers, shown
+from gsplat_edu.json_fields import as_json, check_keys, checked_number, checked_numbers
 from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.validation import ArrayLike, float64_array
 
@@ -268,11 +268,11 @@ def parsed_path(found: object) -> KeyframePath:
     check_keys("", found, ("format", "version", "loop", "keyframes"), ("duration",))
     loop, entries = found["loop"], found["keyframes"]
     if not isinstance(loop, bool):
-        raise ArgumentError(f"loop: is {shown(loop)}, but has to be true or false")
+        raise ArgumentError(f"loop: is {as_json(loop)}, but has to be true or false")
     if not isinstance(entries, list):
-        raise ArgumentError(f"keyframes: is {shown(entries)}, but has to be a list")
+        raise ArgumentError(f"keyframes: is {as_json(entries)}, but has to be a list")
     keyframes = tuple(parsed_keyframe(f"keyframes[{index}]", entry) for index, entry in enumerate(entries))
-    duration = number("duration", found["duration"]) if "duration" in found else None
+    duration = checked_number("duration", found["duration"]) if "duration" in found else None
     return KeyframePath(keyframes, loop, duration)
 
 
@@ -287,15 +287,17 @@ def parsed_keyframe(where: str, entry: object) -> Keyframe:
         ArgumentError: a key is missing or unknown, or a value is of the wrong kind.
     """
     if not isinstance(entry, dict):
-        raise ArgumentError(f"{where}: is {shown(entry)}, but has to be an object")
+        raise ArgumentError(f"{where}: is {as_json(entry)}, but has to be an object")
     check_keys(f"{where}: ", entry, ("position", "rotation", "fov"), ("time",))
-    eye = numbers(f"{where}.position", entry["position"], 3)
+    eye = checked_numbers(f"{where}.position", entry["position"], 3)
     rows = entry["rotation"]
     if not isinstance(rows, list) or len(rows) != 3:
-        raise ArgumentError(f"{where}.rotation: is {shown(rows)}, but has to be three rows of three numbers")
-    rotation = [numbers(f"{where}.rotation[{i}]", row, 3) for i, row in enumerate(rows)]
-    time = number(f"{where}.time", entry["time"]) if "time" in entry else None
-    return Keyframe(np.array(eye), np.array(rotation).T, number(f"{where}.fov", entry["fov"]), time)
+        raise ArgumentError(
+            f"{where}.rotation: is {as_json(rows)}, but has to be three rows of three numbers"
+        )
+    rotation = [checked_numbers(f"{where}.rotation[{i}]", row, 3) for i, row in enumerate(rows)]
+    time = checked_number(f"{where}.time", entry["time"]) if "time" in entry else None
+    return Keyframe(np.array(eye), np.array(rotation).T, checked_number(f"{where}.fov", entry["fov"]), time)
 
 
 def _refuse(name: str) -> NoReturn:

@@ -55,7 +55,7 @@ class Overlay {
     this.canvas = document.createElement("canvas");
     this.canvas.id = "edit-overlay";
     this.canvas.setAttribute("aria-hidden", "true");
-    document.body.append(this.canvas);
+    viewer.canvas.after(this.canvas); // below the panels
     this.context = this.canvas.getContext("2d");
   }
 

@@ -26,7 +26,7 @@ function seenMembers({ camera }, { count, means }, test) {
 
 // Even-odd rule within the polygon's bounds: counts the edges that cross the ray towards larger u.
 function inPolygon(points) {
-  const [us, vs] = [points.map(([u]) => u), points.map(([, v]) => v)];
+  const [us, vs] = [0, 1].map((axis) => Float64Array.from(points, (point) => point[axis]));
   const [lowU, highU] = extent(us);
   const [lowV, highV] = extent(vs);
   const count = points.length;
@@ -34,7 +34,8 @@ function inPolygon(points) {
     if (!(u >= lowU && u <= highU && v >= lowV && v <= highV)) return false;
     let odd = false;
     for (let j = 0, i = count - 1; j < count; i = j++) {
-      const [ay, by] = [vs[i], vs[j]];
+      const ay = vs[i];
+      const by = vs[j];
       if (ay > v !== by > v && u < ((us[j] - us[i]) * (v - ay)) / (by - ay) + us[i]) odd = !odd;
     }
     return odd;

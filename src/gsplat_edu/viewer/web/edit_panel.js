@@ -274,7 +274,7 @@ class EditPanel {
   showShape() {
     const { shape } = this.editor.tools;
     const fill = (input, value) => {
-      if (input !== document.activeElement) input.value = value === undefined ? "" : Number(value.toPrecision(6));
+      if (input !== document.activeElement) input.value = value === undefined ? "" : Number(value.toPrecision(4));
     };
     this.numbers.center.forEach((input, i) => fill(input, shape?.center[i]));
     this.numbers.half.forEach((input, i) => fill(input, shape?.half?.[i]));
