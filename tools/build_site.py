@@ -33,6 +33,7 @@ USE = {
     "docs/GUIDE.md": "Guide",
     "docs/EDITS.md": "Edited scenes",
     "docs/SCALE.md": "Larger than one machine",
+    "docs/STUDIO.md": "The studio and its HTTP API",
     "docs/CLI.md": "Command line",
     "docs/FORMATS.md": "Scene formats",
     "docs/RECIPE.md": "Training parameters",

@@ -33,6 +33,7 @@ NEEDED = {
     "convert": "a b.ply",
     "clean": "a",
     "view": "a",
+    "studio": "",
     "doctor": "a",
     "info": "a",
     "demo": "",
@@ -58,6 +59,7 @@ OUT_OF_RANGE = [
     "sfm a b --frames 0",
     "clean a --max-loss -1",
     "clean a --dry-run --out b.ply",
+    "studio --jobs 0",
 ]
 
 

@@ -21,7 +21,13 @@ from gsplat_edu.cli.ranks import is_first, speaks_for_all
 from gsplat_edu.errors import BackendWarning, SplatError
 from gsplat_edu.files import described
 from gsplat_edu.headroom import shortage
+from gsplat_edu.jobs import emitter
+from gsplat_edu.jobs.events import Failed, Interrupted
 from gsplat_edu.render.settings import BACKENDS
+from gsplat_edu.text import printable
+
+EXIT_BUG = 1
+"""Exit code of Python for a traceback."""
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -96,7 +102,9 @@ class OneLineParser(argparse.ArgumentParser):
         """Print the line and exit with 2."""
         end = "" if message.endswith("?") else ";"
         if speaks_for_all():
-            complain(f"{self.prog}: {message}{end} see {self.prog} --help")
+            line = f"{self.prog}: {message}{end} see {self.prog} --help"
+            complain(line)
+            emitter.emit(Failed(line, EXIT_BAD_INPUT))
         self.exit(EXIT_BAD_INPUT)
 
 
@@ -182,16 +190,21 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
             command()
     except KeyboardInterrupt as interruption:
         if is_first() and speaks_for_all():
-            complain(f"{program}: {str(interruption) or 'interrupted'}")
+            said = f"{program}: {str(interruption) or 'interrupted'}"
+            complain(said)
+            emitter.emit(Interrupted(said))
         return EXIT_INTERRUPTED
     except Exception as error:
         if (line := _line(program, error)) is None:
+            emitter.emit(Failed(f"{program}: {type(error).__name__}: {printable(str(error))}", EXIT_BUG))
             raise
         if debug:
             traceback.print_exc()
         if speaks_for_all():
             complain(f"{program}: {line}")
+            emitter.emit(Failed(f"{program}: {printable(line)}", EXIT_BAD_INPUT))
         return EXIT_BAD_INPUT
+    emitter.finish()
     return 0
 
 

@@ -6,13 +6,14 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.clean.guard import clean
-from gsplat_edu.cli.terminal import Field, Terminal
+from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.formats import format_of
 from gsplat_edu.io.ply import ORIGIN, save_ply
+from gsplat_edu.jobs import emitter
 from gsplat_edu.runs.cleaning import SIGNALS, default_target, open_subject, preview, report_lines
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.viewer import export
@@ -39,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("judging", total=None)
         cleaning = clean(
             source.scene.gaussians,
@@ -75,4 +76,5 @@ def _write(out: Path, source: Source, console: Terminal) -> None:
             where = ", ".join(f"{x:.6g}" for x in source.origin)
             console.print(f"coordinates are relative to the capture's origin ({where})", soft_wrap=True)
         export.write(out, source)
+    emitter.output(out)
     console.print(f"wrote {out}: {len(source.scene.gaussians):,} splats", soft_wrap=True)

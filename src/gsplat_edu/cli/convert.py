@@ -9,13 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.arguments import numbers_text
 from gsplat_edu.cli.exporting import check_and_say
 from gsplat_edu.cli.options.convert import MOVES
-from gsplat_edu.cli.terminal import Field, Terminal
+from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.edits.apply import Views, edited, placed, views_after
 from gsplat_edu.edits.document import Edits, read_edits
 from gsplat_edu.edits.identity import identity_of
@@ -27,6 +27,7 @@ from gsplat_edu.io.formats import LOD_META, TILESET
 from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.lod.tiles import tile_options
 from gsplat_edu.io.ply import ORIGIN
+from gsplat_edu.jobs import emitter
 from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
@@ -58,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
         TimeElapsedColumn(),
     )
     quiet = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+    with Bar(*columns, console=console, transient=True, disable=quiet) as bar:
         steps = bar.add_task("reading", total=len(arguments.sources) + 1)
         sources = []
         for path in arguments.sources:
@@ -84,6 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
         else:
             export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
         bar.advance(steps)
+        emitter.output(arguments.out)
         count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
         say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}")
         if export.has_levels(arguments.out):

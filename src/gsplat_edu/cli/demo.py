@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from gsplat_edu.cli.sphere import options_from, run_sphere
-from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
 
@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> None:
         "[progress.description]{task.description}",
         "L1 {task.fields[loss]:.4f}  K {task.fields[count]}",
     )
-    bar = Progress(
+    bar = Bar(
         TextColumn(columns[0]),
         BarColumn(),
         MofNCompleteColumn(),

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.appearance import check_exposure
@@ -23,6 +23,8 @@ from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.doctor.survey import prepare
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.io.ply import load_ply
+from gsplat_edu.jobs import emitter
+from gsplat_edu.jobs.events import Diagnosed, Found
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import appearance_of, run_dataset
@@ -47,8 +49,21 @@ def run(arguments: argparse.Namespace) -> None:
         diagnosis, lines = _after(arguments, console)
     else:
         diagnosis, lines = _before(arguments, console)
+    for finding in diagnosis.ranked:
+        emitter.emit(
+            Found(
+                finding.name,
+                finding.severity.name.lower(),
+                finding.sentence,
+                finding.advice,
+                finding.images,
+                finding.values,
+            )
+        )
+    emitter.emit(Diagnosed(diagnosis.facts, diagnosis.fine, tuple(diagnosis.advice)))
     console.print(*diagnosis_lines(diagnosis), *lines, *advice_lines(diagnosis), sep="\n", soft_wrap=True)
     if diagnosis.hopeless:
+        emitter.finish()
         raise SystemExit(EXIT_HOPELESS)
 
 
@@ -192,4 +207,4 @@ def _exposure_beforehand(capture: Path, console: Console) -> tuple[list[Finding]
 
 def _bar(console: Console) -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    return Bar(*columns, console=console, transient=True, disable=not console.is_terminal)

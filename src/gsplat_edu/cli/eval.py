@@ -8,9 +8,9 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
-from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.io.ply import load_ply
@@ -73,7 +73,7 @@ def _evaluate(
         device_of(backend)
     )  # in the coordinate frame of the cameras
     judged = Judged(dataset.test, dataset.train, settings.background, dataset.notes)
-    with Progress(
+    with Bar(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),

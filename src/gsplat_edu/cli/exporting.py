@@ -10,6 +10,8 @@ from typing import Any
 from rich.progress import Progress, TaskID
 
 from gsplat_edu.evaluate.metrics import ImageScore
+from gsplat_edu.jobs import emitter
+from gsplat_edu.jobs.events import Metric
 from gsplat_edu.runs.source import Source
 from gsplat_edu.viewer import export
 
@@ -21,6 +23,8 @@ def check_and_say(
     task = bar.add_task(f"checking {path}", total=len(source.probes(export.VIEWS, export.SIDE)))
     found = export.check(path, source, backend, functools.partial(_advance, bar, task))
     bar.remove_task(task)
+    emitter.emit(Metric("psnr", found.psnr, "dB", str(path)))
+    emitter.emit(Metric("bytes", found.num_bytes, "", str(path)))
     say(found.line())
     return found
 
@@ -34,6 +38,7 @@ def export_all(
         for note in export.losses(path, source.scene):
             say(note)
         export.write(path, source)
+        emitter.output(path)
         written.append(check_and_say(path, source, backend, bar, say).document())
     return written
 

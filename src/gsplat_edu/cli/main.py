@@ -12,6 +12,8 @@ from importlib.metadata import version
 from gsplat_edu.cli.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, OneLineParser, run_command
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.cli.ranks import num_processes
+from gsplat_edu.jobs import emitter
+from gsplat_edu.jobs.events import Interrupted
 from gsplat_edu.render.settings import check_backend
 
 COMMANDS = {
@@ -26,6 +28,7 @@ COMMANDS = {
     "convert": "write a scene in another format, or as a web page; filter, transform, merge and verify it",
     "clean": "remove floaters, and splats that no camera supports, from a scene",
     "view": "show a scene or a run in the browser",
+    "studio": "take photos to a finished scene on one page in the browser",
     "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",
     "info": "summarise a capture, a run or a scene file on one screen",
 }
@@ -43,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
     escape_unencodable_characters()
+    emitter.start()
     try:
         parser = build_parser(words)
         parsed = parser.parse_args(words)
@@ -54,6 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_command(f"gsplat-edu {parsed.command}", lambda: parsed.run(parsed), parsed.debug)
     except KeyboardInterrupt:  # while the options were still being imported
         complain("gsplat-edu: interrupted")
+        emitter.emit(Interrupted("gsplat-edu: interrupted"))
         return EXIT_INTERRUPTED
 
 

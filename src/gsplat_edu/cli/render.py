@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from rich.progress import track
+from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE
-from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.edits.apply import Views, edited, placed, views_after
 from gsplat_edu.edits.document import Edits, read_edits
@@ -34,6 +34,7 @@ from gsplat_edu.io.edit import IDENTITY
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.jobs import emitter
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.render.maps import render_maps
 from gsplat_edu.render.settings import MAPS, RenderSettings
@@ -102,15 +103,17 @@ def run(arguments: argparse.Namespace) -> None:
         return
     started = time.perf_counter()
     shot = replace(shot, gaussians=shot.gaussians.to(device_of(backend)), maps=maps)
-    frames = track(
-        _frames(shot, backend, out),
-        "rendering",
-        total=len(shot.cameras),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    written = write_frames(out, frames, fps=arguments.fps, names=shot.names)
+    columns = (Field("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("rendering", total=len(shot.cameras))
+
+        def advanced() -> Iterator[Any]:
+            for frame in _frames(shot, backend, out):
+                yield frame
+                bar.advance(task)
+
+        written = write_frames(out, advanced(), fps=arguments.fps, names=shot.names)
+    emitter.output(out)
     each = 1e3 * (time.perf_counter() - started) / len(shot.cameras)
     first = shot.cameras[0]
     also = f" and their maps ({', '.join(maps)})" if maps else ""

@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from gsplat_edu.cli.options.sfm import options_from
-from gsplat_edu.cli.terminal import Terminal
+from gsplat_edu.cli.terminal import Bar, Terminal
+from gsplat_edu.jobs import emitter
 from gsplat_edu.locks import locked
 from gsplat_edu.sfm.reconstruct import reconstruct
 
@@ -31,6 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
             raise KeyboardInterrupt(
                 "interrupted; the same command resumes after the last completed stage"
             ) from None
+    emitter.output(options.out)
     say(f"wrote {options.out}; next: gsplat-edu train {shlex.quote(str(options.out))} --out RUN")
 
 
@@ -50,7 +52,7 @@ def stage_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         tasks: dict[str, TaskID] = {}
 
         def show(stage: str, done: int, total: int) -> None:

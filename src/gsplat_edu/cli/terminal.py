@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Task, TextColumn
+from rich.progress import Progress, Task, TaskID, TextColumn
 from rich.text import Text
 
+from gsplat_edu.jobs import emitter
+from gsplat_edu.jobs.events import Message
 from gsplat_edu.text import printable
 
 
@@ -18,7 +20,10 @@ class Terminal(Console):
         super().__init__(highlight=False, markup=False, emoji=False)
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: ANN401
-        """Print like rich, each text on one line."""
+        """Print like rich, each text on one line; a job also reports them (`gsplat_edu.jobs`)."""
+        for text in objects:
+            if isinstance(text, str):
+                emitter.emit(Message(printable(text)))
         super().print(*(printable(o) if isinstance(o, str) else o for o in objects), **options)
 
     def shows(self, characters: str) -> bool:
@@ -28,6 +33,27 @@ class Terminal(Console):
         except (UnicodeError, LookupError):
             return False
         return True
+
+
+class Bar(Progress):
+    """Progress bars that a job also reports as events."""
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:  # noqa: ANN401
+        """Update a task like rich."""
+        super().update(task_id, **changes)
+        self._report(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        """Advance a task like rich."""
+        super().advance(task_id, advance)
+        self._report(task_id)
+
+    def _report(self, task_id: TaskID) -> None:
+        task = self._tasks[task_id]
+        if task.visible:
+            emitter.progress(
+                printable(task.description), task.completed, task.total, lambda: task.time_remaining
+            )
 
 
 class Field(TextColumn):

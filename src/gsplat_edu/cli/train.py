@@ -23,7 +23,7 @@ from gsplat_edu.cli.options.train import left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.sfm import stage_bars
-from gsplat_edu.cli.terminal import Field, Terminal
+from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.points import read_points_ply
@@ -31,6 +31,8 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.remedies import Remedy, remedies_for, transients_for
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
+from gsplat_edu.jobs import emitter
+from gsplat_edu.jobs.events import Metric
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
@@ -283,6 +285,9 @@ def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None])
     )
     for line in score_lines(result.test, result.train):
         say(line)
+    for name, unit in (("psnr", "dB"), ("ssim", "")) if result.test else ():
+        emitter.emit(Metric(name, result.metrics["test"][name], unit, "test"))
+    emitter.output(capture.folder.path)
     say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
     if (planned := trainer.config.iterations) > trainer.iteration:
         folder = capture.folder.path
@@ -371,7 +376,7 @@ def progress_bar(console: Console, state: str) -> Progress:
         Field(state),
     )
     quiet = not console.is_terminal
-    return Progress(*columns, TimeRemainingColumn(), console=console, transient=not state, disable=quiet)
+    return Bar(*columns, TimeRemainingColumn(), console=console, transient=not state, disable=quiet)
 
 
 @contextmanager

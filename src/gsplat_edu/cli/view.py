@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import threading
 import webbrowser
 from pathlib import Path
@@ -12,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsplat_edu.cli.options.view import BESIDE
+from gsplat_edu.cli.screen import has_screen
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.errors import ArgumentError
@@ -48,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
         if warning := exposure(arguments.host, does, token=editing):
             console.print(warning, soft_wrap=True)
         console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
-        if not arguments.no_open and _has_screen():
+        if not arguments.no_open and has_screen():
             # in a thread: some browsers have to exit before webbrowser returns
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         try:
@@ -119,11 +118,3 @@ def _check_is_no_page(path: Path) -> None:
 
 def _title(path: Path) -> str:
     return path.resolve().name
-
-
-def _has_screen() -> bool:
-    """Return whether a user at this computer could see a browser window."""
-    windows = sys.platform in ("win32", "darwin") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
-    return windows and sys.stdin.isatty() and sys.stdout.isatty()

@@ -252,6 +252,30 @@ def checked_address(
     return family, address
 
 
+def bound_socket(host: str, port: int, names: tuple[str, str]) -> socket.socket:
+    """Return a socket that is bound to an address, for servers that take one.
+
+    Args:
+        host: Name or address.
+        port: Port; 0 picks a free one.
+        names: The user's names for host and port, for messages.
+
+    Raises:
+        ArgumentError: the address does not belong to this computer, or the port is in use or out of range.
+    """
+    family, address = checked_address(host, port, names)
+    bound = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        if os.name == "posix":  # a port whose last connections are closing counts as free
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+        bound.listen()
+    except OSError as error:
+        bound.close()
+        raise _refusal(host, port, names, error) from None
+    return bound
+
+
 def free_port(host: str, port: int, names: tuple[str, str]) -> int:
     """Check that a port is available, for servers that do not report it themselves.
 

@@ -1,0 +1,49 @@
+"""`gsplat-edu studio`: one page that takes photos to a finished scene."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import threading
+import webbrowser
+from dataclasses import replace
+
+from gsplat_edu.cli.printing import say
+from gsplat_edu.cli.screen import has_screen
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.viewer.serve import exposure
+
+NEEDED = ("starlette", "uvicorn", "h11")
+"""Modules of the extra `studio`."""
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Serve the page until Ctrl-C."""
+    for name in NEEDED:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError:
+            how = "pip install -c constraints.txt 'gsplat-edu[studio]'"
+            raise ArgumentError(f"studio: {name} is not installed; {how}") from None
+    from gsplat_edu.studio.server import serve
+    from gsplat_edu.studio.uploads import Limits
+
+    limits = Limits()
+    if arguments.max_upload is not None:
+        limits = replace(limits, file=arguments.max_upload)
+    if arguments.max_library is not None:
+        limits = replace(limits, library=arguments.max_library)
+    if warning := exposure(arguments.host, "can run trainings and read and write your files", token=True):
+        say(warning)
+
+    def opened(url: str) -> None:
+        say(f"{url}   (press Ctrl-C to stop)")
+        if not arguments.no_open and has_screen():
+            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+
+    try:
+        serve(arguments.folder, arguments.host, arguments.port, arguments.jobs, limits, say, opened)
+    except KeyboardInterrupt:
+        say("ended")
+    else:
+        say("ended")

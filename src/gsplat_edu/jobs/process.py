@@ -1,0 +1,72 @@
+"""Processes that outlive the one that started them: which one a number means, and signals to it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+PROC = Path("/proc")
+"""Where Linux lists processes; other systems have `ps`."""
+
+
+def identity(pid: int) -> str | None:
+    """Return what tells a process from a later one of the same number: its start, and the boot on Linux.
+
+    Args:
+        pid: Process id.
+
+    Returns:
+        None if no such process runs; one that has ended but was not waited for does not run.
+    """
+    if PROC.is_dir():
+        try:
+            fields = (PROC / f"{pid}/stat").read_text("utf-8", errors="replace").rpartition(")")[2].split()
+            boot = (PROC / "sys/kernel/random/boot_id").read_text("ascii").strip()
+        except (OSError, ValueError):
+            return None
+        return None if fields[0] in "ZX" else f"{boot} {fields[19]}"
+    done = subprocess.run(
+        ["ps", "-o", "stat=,lstart=", "-p", str(pid)], capture_output=True, text=True, check=False
+    )
+    state, _, start = done.stdout.strip().partition(" ")
+    return start.strip() if start and not state.startswith("Z") else None
+
+
+def runs(pid: int, known: str) -> bool:
+    """Return whether a process still runs.
+
+    Args:
+        pid: Process id.
+        known: Its `identity` when it was started.
+    """
+    return bool(known) and identity(pid) == known
+
+
+def send(pid: int, known: str, number: int, *, group: bool = False) -> bool:
+    """Send a signal, unless the process has ended and another one has its number.
+
+    Args:
+        pid: Process id.
+        known: Its `identity` when it was started.
+        number: The signal.
+        group: Whether its whole process group gets the signal; the process has to lead it.
+
+    Returns:
+        Whether the signal was sent.
+    """
+    if not runs(pid, known):
+        return False
+    with contextlib.suppress(ProcessLookupError):
+        if group and os.getpgid(pid) == pid:
+            os.killpg(pid, number)
+        else:
+            os.kill(pid, number)
+        return True
+    return False
+
+
+SIGNALS = {"interrupt": signal.SIGINT, "terminate": signal.SIGTERM, "kill": signal.SIGKILL}
+"""The signals of a cancellation, in their order."""

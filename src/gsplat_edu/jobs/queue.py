@@ -1,0 +1,356 @@
+"""A queue of jobs on disk: it starts them in their order, follows their processes and survives its own end.
+
+A thread looks at the processes several times a second. Nothing here waits for one: a cancelled job gets its signals in
+turn, and the end of every process is read from what it wrote, or else from its exit code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.files import described, remove_leftovers
+from gsplat_edu.jobs.events import EVENTS, Failed, Finished, Interrupted
+from gsplat_edu.jobs.following import last_start, last_word
+from gsplat_edu.jobs.process import SIGNALS, identity, runs, send
+from gsplat_edu.jobs.record import ACTIVE, Job, JobFolder, State
+
+POLL = 0.1
+"""Seconds between two looks at the processes."""
+
+PATIENCE = {"interrupt": 60.0, "terminate": 10.0}
+"""Seconds after a signal of a cancellation until the next one: a checkpoint of millions of Gaussians takes a while."""
+
+MOST_QUEUED = 200
+"""Jobs that may wait; more are a program gone wrong."""
+
+ID = re.compile(r"\d{6}")
+"""Ids of jobs: numbers in the order of their creation."""
+
+PROGRAM = (sys.executable, "-m", "gsplat_edu")
+"""What runs a command line."""
+
+
+class JobQueue:
+    """The jobs of a folder.
+
+    It may be used from any thread. Only one process may have a queue for a folder (see `gsplat_edu.locks`).
+
+    Args:
+        folder: One folder per job; created if missing.
+        at_once: Jobs that run at the same time.
+        changed: Called with every new state of a job, from any thread and while the queue is locked; with None for a
+            job that was removed.
+        patience: See `PATIENCE`.
+        hold: Called to let a job wait (true) or continue; returns whether it does so by itself. Otherwise its
+            processes are stopped.
+        program: What runs a command line.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        at_once: int = 1,
+        changed: Callable[[str, Job | None], None] = lambda name, job: None,
+        patience: dict[str, float] | None = None,
+        hold: Callable[[Job, bool], bool] = lambda job, wait: False,
+        program: Sequence[str] = PROGRAM,
+    ) -> None:
+        self.folder, self.at_once = folder, at_once
+        self.changed, self.hold = changed, hold
+        self.damaged: list[str] = []
+        """A line for each record that could not be read."""
+        self.trouble = ""
+        """Why records cannot be written; empty if they can."""
+        self._program = tuple(program)
+        self._patience = PATIENCE if patience is None else patience
+        self._lock = threading.RLock()
+        self._jobs: dict[str, Job] = {}
+        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._endings: dict[str, tuple[str, float]] = {}  # the last signal of each cancellation, and when
+        self._closed = threading.Event()
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(folder)
+        self._recover()
+        self._thread = threading.Thread(target=self._watch, name="jobs", daemon=True)
+        self._thread.start()
+
+    def jobs(self) -> list[Job]:
+        """Return all jobs, oldest first."""
+        with self._lock:
+            return [self._jobs[name] for name in sorted(self._jobs)]
+
+    def get(self, name: str) -> Job:
+        """Return a job.
+
+        Raises:
+            ArgumentError: there is none of this id.
+        """
+        with self._lock:
+            if name not in self._jobs:
+                raise ArgumentError(f"job {name!r}: does not exist; it may have been removed")
+            return self._jobs[name]
+
+    def files(self, name: str) -> JobFolder:
+        """Return the folder of a job; errors as for `get`."""
+        return JobFolder(self.folder / self.get(name).id)
+
+    def submit(self, argv: Sequence[str], title: str = "", subject: str = "") -> Job:
+        """Add a job to the end of the queue.
+
+        Args:
+            argv: Words after `gsplat-edu`.
+            title: See `Job`.
+            subject: See `Job`.
+
+        Raises:
+            ArgumentError: too many jobs are waiting.
+            OSError: its record cannot be written; there is then no job.
+        """
+        with self._lock:
+            waiting = sum(job.state is State.QUEUED for job in self._jobs.values())
+            if waiting >= MOST_QUEUED:
+                raise ArgumentError(f"jobs: {waiting} are waiting; cancel some, or wait until they are done")
+            known = [int(name) for name in os.listdir(self.folder) if ID.fullmatch(name)]  # noqa: PTH208
+            name = f"{max(known, default=0) + 1:06d}"
+            job = Job(name, tuple(argv), State.QUEUED, time.time(), title, subject)
+            folder = JobFolder(self.folder / name)
+            folder.path.mkdir()
+            try:
+                folder.write(job)
+            except BaseException:
+                shutil.rmtree(folder.path, ignore_errors=True)
+                raise
+            self._note(job)
+            return job
+
+    def cancel(self, name: str) -> Job:
+        """End a job: at once if it waits, else by an interruption, upon which a training writes a checkpoint.
+
+        Raises:
+            ArgumentError: there is none of this id, or it has ended.
+        """
+        with self._lock:
+            job = self.get(name)
+            if job.state is State.QUEUED:
+                return self._put(job, state=State.CANCELLED, ended=time.time(), cancelled=True)
+            if job.state not in ACTIVE:
+                raise ArgumentError(
+                    f"job {name}: is {job.state}; only jobs that wait or run can be cancelled"
+                )
+            if job.state is State.PAUSED:
+                self.hold(job, False)
+            job = self._put(job, cancelled=True, state=State.RUNNING)
+            self._end(job)
+            return self._jobs[name]
+
+    def pause(self, name: str) -> Job:
+        """Stop the processes of a job until `resume`; they keep their memory.
+
+        Raises:
+            ArgumentError: there is none of this id, it does not run, or it is being cancelled.
+        """
+        with self._lock:
+            job = self.get(name)
+            if job.state is not State.RUNNING or name in self._endings:
+                raise ArgumentError(f"job {name}: is {job.state}; only a running job can be paused")
+            if job.pid is None or not runs(job.pid, job.identity):
+                raise ArgumentError(f"job {name}: has just ended")
+            if not self.hold(job, True):
+                send(job.pid, job.identity, signal.SIGSTOP, group=True)
+            return self._put(job, state=State.PAUSED)
+
+    def resume(self, name: str) -> Job:
+        """Continue a paused job, or queue one again that failed, was cancelled or was interrupted.
+
+        Raises:
+            ArgumentError: there is none of this id, or it is waiting, running or done.
+        """
+        with self._lock:
+            job = self.get(name)
+            if job.state is State.PAUSED:
+                self.hold(job, False)
+                if job.pid is not None:
+                    send(job.pid, job.identity, signal.SIGCONT, group=True)
+                return self._put(job, state=State.RUNNING)
+            if not job.resumable:
+                raise ArgumentError(f"job {name}: is {job.state}; it cannot be resumed")
+            return self._put(
+                job, state=State.QUEUED, ended=None, line="", cancelled=False, pid=None, identity=""
+            )
+
+    def remove(self, name: str) -> None:
+        """Forget a job that waits or has ended, and delete its record; what it wrote elsewhere stays.
+
+        Raises:
+            ArgumentError: there is none of this id, or it is running.
+            OSError: its folder cannot be removed.
+        """
+        with self._lock:
+            job = self.get(name)
+            if job.state in ACTIVE:
+                raise ArgumentError(f"job {name}: is {job.state}; cancel it first")
+            shutil.rmtree(self.folder / name)
+            del self._jobs[name]
+            self.changed(name, None)
+
+    def close(self, interrupt: bool = True) -> None:
+        """End the queue; waiting jobs wait for the next one.
+
+        Args:
+            interrupt: Whether running jobs are interrupted, which makes a training write a checkpoint; else they
+                run on, and the next queue finds them.
+        """
+        self._closed.set()
+        self._thread.join()
+        with self._lock:
+            active = [job for job in self._jobs.values() if job.state in ACTIVE]
+            for job in active if interrupt else ():
+                self._end(job)
+        while interrupt and any(job.state in ACTIVE for job in self.jobs()):
+            self._look()
+            time.sleep(POLL)
+
+    def _watch(self) -> None:
+        while not self._closed.wait(POLL):
+            try:
+                self._look()
+                self._start_waiting()
+                self.trouble = ""
+            except OSError as error:  # a record cannot be written: the next look tries again
+                self.trouble = described(error)
+
+    def _start_waiting(self) -> None:
+        """Start waiting jobs while there is room."""
+        with self._lock:
+            busy = sum(job.state in ACTIVE for job in self._jobs.values())
+            waiting = [job for job in self.jobs() if job.state is State.QUEUED]
+            for job in waiting[: max(self.at_once - busy, 0)]:
+                self._start(job)
+
+    def _look(self) -> None:
+        """Note which processes have ended, and send the next signal of cancellations."""
+        with self._lock:
+            for job in self.jobs():
+                if job.state not in ACTIVE:
+                    continue
+                child = self._children.get(job.id)
+                code = None if child is None else child.poll()
+                if code is None and (child is not None or (job.pid and runs(job.pid, job.identity))):
+                    self._press(job)
+                else:
+                    self._ended(job, code)
+
+    def _start(self, job: Job) -> None:
+        folder = JobFolder(self.folder / job.id)
+        argv = job.again() if job.attempts else job.argv
+        job = self._put(
+            job, state=State.RUNNING, argv=argv, started=time.time(), attempts=job.attempts + 1, pid=None
+        )
+        try:
+            with folder.output.open("ab") as output:
+                child = subprocess.Popen(
+                    [*self._program, *job.argv],
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    env={**os.environ, EVENTS: str(folder.events.resolve()), "PYTHONUNBUFFERED": "1"},
+                    start_new_session=True,  # Ctrl-C in the server's terminal does not reach it
+                )
+        except OSError as error:
+            self._put(job, state=State.FAILED, ended=time.time(), line=described(error))
+            return
+        self._children[job.id] = child
+        self._note(
+            replace(job, pid=child.pid, identity=identity(child.pid) or "")
+        )  # even if the disk is full
+        folder.write(self._jobs[job.id])
+
+    def _end(self, job: Job) -> None:
+        """Send the first signal of a cancellation, unless it was sent."""
+        if job.id not in self._endings:
+            self._signal(job, "interrupt")
+
+    def _press(self, job: Job) -> None:
+        """Send the next signal of a cancellation if its time has come."""
+        if job.id not in self._endings:
+            return
+        name, since = self._endings[job.id]
+        order = list(SIGNALS)
+        if name in self._patience and time.monotonic() - since > self._patience[name]:
+            self._signal(job, order[order.index(name) + 1])
+
+    def _signal(self, job: Job, name: str) -> None:
+        self._endings[job.id] = name, time.monotonic()
+        if job.pid is not None:
+            send(job.pid, job.identity, SIGNALS[name], group=name == "kill")
+            send(job.pid, job.identity, signal.SIGCONT, group=True)  # a stopped process would not see it
+
+    def _ended(self, job: Job, code: int | None) -> None:
+        """Note how a process ended: by its last event, else by its exit code."""
+        self._children.pop(job.id, None)
+        stopped = self._endings.pop(job.id, None)
+        if job.state is State.PAUSED:
+            self.hold(job, False)
+        said = last_word(JobFolder(self.folder / job.id).events)
+        changes: dict[str, Any] = {"state": State.INTERRUPTED, "line": "", "pid": None, "identity": ""}
+        if isinstance(said, Finished):
+            changes |= {"state": State.DONE, "outputs": said.outputs}
+        elif isinstance(said, Failed):
+            changes |= {"state": State.FAILED, "line": said.line}
+        elif isinstance(said, Interrupted):
+            changes["line"] = said.line
+        elif code is not None and code > 0:
+            changes |= {"state": State.FAILED, "line": self._last_line(job, code)}
+        else:
+            changes["line"] = "its process ended without a word" if stopped is None else "it was ended"
+        if job.cancelled and changes["state"] is not State.DONE:
+            changes["state"] = State.CANCELLED
+        self._put(job, ended=time.time(), **changes)
+
+    def _last_line(self, job: Job, code: int) -> str:
+        """Return the last line that a job printed, for one that failed before it could write events."""
+        with contextlib.suppress(OSError):
+            text = JobFolder(self.folder / job.id).output.read_text("utf-8", errors="replace").strip()
+            if text:
+                return text.splitlines()[-1]
+        return f"ended with exit code {code}"
+
+    def _recover(self) -> None:
+        """Read the records that an earlier queue left, and find its processes."""
+        for path in sorted(self.folder.iterdir()):
+            if not ID.fullmatch(path.name):
+                continue
+            try:
+                job = JobFolder(path).read()
+            except (ArgumentError, OSError) as error:
+                self.damaged.append(str(error))
+                continue
+            if job.state in ACTIVE and job.pid is None and (found := last_start(JobFolder(path).events)):
+                # the earlier queue was killed between the start of the process and its note
+                job = replace(job, pid=found.pid, identity=found.identity)
+            self._jobs[job.id] = job
+            if job.state in ACTIVE and not (job.pid and runs(job.pid, job.identity)):
+                self._ended(job, None)
+
+    def _put(self, job: Job, **changes: Any) -> Job:  # noqa: ANN401
+        job = replace(job, **changes)
+        JobFolder(self.folder / job.id).write(job)
+        self._note(job)
+        return job
+
+    def _note(self, job: Job) -> None:
+        self._jobs[job.id] = job
+        self.changed(job.id, job)

@@ -1,0 +1,1 @@
+"""The studio: a server for one browser page that takes photos to a finished scene; every long step is a job."""

@@ -1,0 +1,80 @@
+"""The studio as an ASGI application: the page's files, and the API that docs/STUDIO.md describes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import BaseRoute
+
+from gsplat_edu.studio import job_routes, library_routes, live_routes, run_routes, scene_routes
+from gsplat_edu.studio.guard import Guard
+from gsplat_edu.studio.refusal import missing
+from gsplat_edu.studio.replies import act, file_answer
+from gsplat_edu.studio.state import Studio
+from gsplat_edu.viewer.serve import LOOPBACK
+
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".glsl": "text/plain; charset=utf-8",
+}
+"""Types of the page's files."""
+
+
+def application(
+    studio: Studio, token: str, host: str = LOOPBACK, cookie: str = "gsplat_edu_studio"
+) -> Starlette:
+    """Return the application.
+
+    Args:
+        studio: The library and its jobs.
+        token: See `gsplat_edu.studio.guard.Guard`.
+        host: Address that the server listens on.
+        cookie: See `Guard`.
+    """
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        following = asyncio.create_task(studio.stream.follow(studio.queue))
+        try:
+            yield
+        finally:
+            following.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await following
+
+    routes: list[BaseRoute] = [
+        act("/", "GET", lambda studio, request, body: _web(request, "gsplat_edu.studio", "index.html")),
+        act("/web/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.studio")),
+        act("/viewer/{name}", "GET", lambda studio, request, body: _web(request, "gsplat_edu.viewer")),
+        *job_routes.routes(),
+        *live_routes.routes(),
+        *run_routes.routes(),
+        *scene_routes.routes(),
+        *library_routes.routes(),
+    ]
+    guard = Middleware(Guard, token=token, host=host, cookie=cookie)
+    app = Starlette(routes=routes, middleware=[guard], lifespan=lifespan)
+    app.state.studio = studio
+    return app
+
+
+def _web(request: Request, package: str, name: str | None = None) -> Response:
+    """Return a file of a page: one that its folder lists."""
+    name = request.path_params["name"] if name is None else name
+    folder: Any = files(package) / "web"
+    known = {entry.name for entry in folder.iterdir() if Path(entry.name).suffix in TYPES}
+    if name not in known:
+        raise missing(str(name))
+    return file_answer(request, Path(str(folder / name)), TYPES[Path(name).suffix])

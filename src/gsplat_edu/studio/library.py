@@ -1,0 +1,296 @@
+"""A folder of photos, captures, runs and scenes, each an entry with a name of its own.
+
+    photos/NAME      photos, in folders or not, or a video
+    captures/NAME    photos with poses, in any layout that `train` reads
+    runs/NAME        what `train` writes
+    scenes/NAME      a folder with one scene file
+    .studio/         jobs/, trash/, uploads/ (parts of files), cache/ (thumbnails, pages)
+
+An adopted entry is a link to a folder elsewhere (for a scene and a video: a folder with a link to the file).
+Removing it removes the link.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.data.capture import PHOTO_ENDINGS
+from gsplat_edu.files import written_aside
+from gsplat_edu.sfm.video import VIDEO_ENDINGS
+from gsplat_edu.studio.names import checked_name
+from gsplat_edu.studio.refusal import RefusedError, conflict, missing
+
+KINDS = ("photos", "captures", "runs", "scenes")
+"""Kinds of entries, and their folders."""
+
+HIDDEN = ".studio"
+"""Folder of what the studio keeps for itself."""
+
+SCENE_ENDINGS = (".ply", ".splat", ".spz", ".sog", ".glb")
+"""Endings of scene files that can be taken in."""
+
+NOT_PHOTOS = frozenset(("masks", "renders", "sfm", "exports", "checkpoints", "point_cloud", "transients"))
+"""Folders whose images are not photos of an entry."""
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What a folder holds.
+
+    Args:
+        files: Number of files.
+        num_bytes: Their size.
+        photos: Number of those that are photos by their endings.
+        videos: Number of those that are videos by their endings.
+    """
+
+    files: int
+    num_bytes: int
+    photos: int
+    videos: int
+
+
+class Library:
+    """A folder of entries. It may be used from any thread.
+
+    Args:
+        root: The folder; its parts are created if missing.
+        in_use: Returns why a path may not be moved, or None; called with absolute paths.
+    """
+
+    def __init__(self, root: Path, in_use: Callable[[Path], str | None] = lambda path: None) -> None:
+        self.root = root.resolve()
+        self.in_use = in_use
+        self.lock = threading.RLock()
+        for kind in KINDS:
+            (self.root / kind).mkdir(parents=True, exist_ok=True)
+        for part in ("jobs", "trash", "uploads", "cache"):
+            self.hidden(part).mkdir(parents=True, exist_ok=True)
+        for left in self.hidden("uploads").iterdir():
+            _delete(left)
+
+    def hidden(self, part: str) -> Path:
+        """Return a folder of what the studio keeps for itself."""
+        return self.root / HIDDEN / part
+
+    def entries(self, kind: str) -> list[Path]:
+        """Return the entries of a kind, by name."""
+        found = (self.root / kind).iterdir()
+        return sorted(path for path in found if path.name[0] != "." and path.is_dir())
+
+    def entry(self, kind: str, name: str) -> Path:
+        """Return an existing entry.
+
+        Raises:
+            RefusedError: there is none of this kind and name.
+        """
+        path = self.place(kind, name)
+        if not path.is_dir():
+            raise missing(f"{kind}/{name}")
+        return path
+
+    def named(self, subject: object) -> tuple[str, Path]:
+        """Return kind and path of an entry named like "runs/toy".
+
+        Raises:
+            RefusedError: there is none.
+        """
+        kind, _, name = subject.partition("/") if isinstance(subject, str) else ("", "", "")
+        return kind, self.entry(kind, name)
+
+    def place(self, kind: str, name: object) -> Path:
+        """Return where an entry is or would be.
+
+        Raises:
+            RefusedError: kind or name is not allowed.
+        """
+        if kind not in KINDS:
+            raise RefusedError(f"{kind!r}: is not a kind of entry; the kinds are {', '.join(KINDS)}")
+        return self.root / kind / checked_name(kind, name)
+
+    def fresh(self, kind: str, name: object) -> Path:
+        """Return the place of a new entry.
+
+        Raises:
+            RefusedError: the name is not allowed or taken.
+        """
+        path = self.place(kind, name)
+        if os.path.lexists(path):
+            raise conflict(f"{kind}/{path.name}: exists already; choose another name")
+        return path
+
+    def free_name(self, kind: str, name: str) -> str:
+        """Return a name, with a number behind it if it is taken."""
+        chosen, copy = name, 2
+        while os.path.lexists(self.place(kind, chosen)):
+            chosen, copy = f"{name}-{copy}", copy + 1
+        return chosen
+
+    def part(self, suffix: str = "") -> Path:
+        """Return a new path for a file or folder that is not complete yet."""
+        return self.hidden("uploads") / f"{secrets.token_hex(8)}{suffix}"
+
+    def publish(self, part: Path, kind: str, name: str) -> Path:
+        """Rename a complete folder to a new entry.
+
+        Raises:
+            RefusedError: the name is taken by now.
+        """
+        with self.lock:
+            path = self.fresh(kind, name)
+            part.rename(path)
+        return path
+
+    def adopt(self, kind: str, source: Path, name: str) -> Path:
+        """Make an entry of a folder or file elsewhere on this computer, without copying it.
+
+        Raises:
+            RefusedError: the source does not exist, is not of that kind, or lies in the library; or the name is taken.
+        """
+        if not source.is_absolute():
+            raise RefusedError(f"path: {source} is relative; give the whole path, from the root")
+        source = source.resolve()
+        if not source.exists():
+            raise RefusedError(f"path: {source} does not exist; correct it")
+        if source.is_relative_to(self.root) or self.root.is_relative_to(source):
+            raise RefusedError(f"path: {source} overlaps the library; give a place outside of it")
+        endings = {"scenes": SCENE_ENDINGS, "photos": VIDEO_ENDINGS}.get(kind, ())
+        if source.is_file() and source.suffix.lower() not in endings:
+            wanted = f"a folder, or a file ending in {', '.join(endings)}" if endings else "a folder"
+            raise RefusedError(f"path: {source} is a file; give {wanted}")
+        with self.lock:
+            path = self.fresh(kind, name)
+            if source.is_file():
+                path.mkdir()
+                (path / source.name).symlink_to(source)
+            else:
+                path.symlink_to(source, target_is_directory=True)
+        return path
+
+    def rename(self, kind: str, name: str, to: object) -> Path:
+        """Give an entry another name.
+
+        Raises:
+            RefusedError: there is none, a job uses it, or the name is taken.
+        """
+        with self.lock:
+            path = self.entry(kind, name)
+            self._check_free(path)
+            target = self.fresh(kind, to)
+            path.rename(target)
+        return target
+
+    def remove(self, kind: str, name: str) -> str:
+        """Move an entry to the trash; return its id there.
+
+        Raises:
+            RefusedError: there is none, or a job uses it.
+        """
+        with self.lock:
+            path = self.entry(kind, name)
+            self._check_free(path)
+            number = f"{time.time_ns():020d}"
+            folder = self.hidden("trash") / number
+            folder.mkdir()
+            with written_aside(folder / "from.txt") as aside:
+                aside.write_text(kind, encoding="utf-8")
+            path.rename(folder / path.name)
+        return number
+
+    def trash(self) -> list[dict[str, Any]]:
+        """Return what is in the trash, newest first."""
+        found = []
+        for folder in sorted(self.hidden("trash").iterdir(), reverse=True):
+            for path in folder.iterdir() if folder.name.isdigit() else ():
+                if path.name != "from.txt" and (folder / "from.txt").is_file():
+                    kind = (folder / "from.txt").read_text("utf-8")
+                    removed = int(folder.name) / 1e9
+                    found.append({"id": folder.name, "kind": kind, "name": path.name, "removed": removed})
+        return found
+
+    def restore(self, number: str) -> Path:
+        """Move an entry back from the trash.
+
+        Raises:
+            RefusedError: there is none, or its name is taken.
+        """
+        with self.lock:
+            for entry in self.trash():
+                if entry["id"] == number:
+                    target = self.fresh(entry["kind"], entry["name"])
+                    folder = self.hidden("trash") / number
+                    (folder / entry["name"]).rename(target)
+                    _delete(folder)
+                    return target
+        raise missing(f"trash/{number}")
+
+    def empty_trash(self) -> None:
+        """Delete what is in the trash; adopted entries lose only their link."""
+        for entry in self.trash():
+            _delete(self.hidden("trash") / entry["id"])
+
+    def _check_free(self, path: Path) -> None:
+        if (why := self.in_use(path)) is not None:
+            raise conflict(f"{path.parent.name}/{path.name}: {why}")
+
+
+def extent(folder: Path) -> Extent:
+    """Count what a folder holds, without following links inside."""
+    files = num_bytes = photos = videos = 0
+    for _, entry, is_photo in walked(folder):
+        files += 1
+        num_bytes += entry.stat().st_size
+        ending = os.path.splitext(entry.name)[1].lower()  # noqa: PTH122 - a name, thousands of times
+        photos += is_photo and ending in PHOTO_ENDINGS
+        videos += ending in VIDEO_ENDINGS
+    return Extent(files, num_bytes, photos, videos)
+
+
+def photo_names(folder: Path) -> list[str]:
+    """Return the photos below an entry by their endings, as paths with slashes, sorted."""
+    found = []
+    for name, entry, is_photo in walked(folder):
+        if is_photo and os.path.splitext(entry.name)[1].lower() in PHOTO_ENDINGS:  # noqa: PTH122
+            found.append(name)
+    return sorted(found)
+
+
+def walked(folder: Path) -> Iterator[tuple[str, os.DirEntry[str], bool]]:
+    """Yield the files below a folder: their path with slashes, their entry, and whether photos may lie there."""
+    waiting = [(str(folder), "", True)]
+    while waiting:
+        place, prefix, photos = waiting.pop()
+        try:
+            with os.scandir(place) as found:
+                entries = [entry for entry in found if not entry.name.startswith(".")]
+        except OSError:
+            continue
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                inside = photos and entry.name not in NOT_PHOTOS
+                waiting.append((entry.path, f"{prefix}{entry.name}/", inside))
+            elif entry.is_file():
+                yield f"{prefix}{entry.name}", entry, photos
+
+
+def scene_file(folder: Path) -> Path | None:
+    """Return the scene of an entry of scenes: its only file with a scene's ending, or meta.json of an unpacked SOG."""
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in SCENE_ENDINGS)
+    found += [folder / name for name in ("lod-meta.json", "meta.json") if (folder / name).is_file()]
+    return found[0] if found else None
+
+
+def _delete(path: Path) -> None:
+    """Delete a file, a link or a folder; links inside are not followed."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,119 @@
+"""Routes of the library: what is in it, taking in, renaming and removing."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route
+
+from gsplat_edu.jobs.record import State
+from gsplat_edu.studio.library import KINDS
+from gsplat_edu.studio.listing import summary
+from gsplat_edu.studio.pictures import photo_list, thumbnail
+from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.studio.replies import act, answered, content_length, entry_of, fields, file_answer
+from gsplat_edu.studio.state import Studio
+
+
+def routes() -> list[BaseRoute]:
+    """Return the routes."""
+    return [
+        act("/api/library", "GET", _library),
+        act("/api/adopt", "POST", _adopt),
+        act("/api/trash", "GET", lambda studio, request, body: {"trash": studio.library.trash()}),
+        act("/api/trash", "DELETE", _empty_trash),
+        act("/api/trash/{id}/restore", "POST", _restore),
+        act("/api/{kind}/{name}", "GET", _entry),
+        act("/api/{kind}/{name}", "DELETE", _remove),
+        act("/api/{kind}/{name}/rename", "POST", _rename),
+        act("/api/{kind}/{name}/photos", "GET", _photos),
+        act("/api/{kind}/{name}/thumbs/{path:path}", "GET", _thumb),
+        Route("/api/{kind}/{name}/files/{path:path}", answered(_upload), methods=["PUT"]),
+        Route("/api/{kind}/{name}/zip", answered(_upload_zip), methods=["PUT"]),
+    ]
+
+
+def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    library = studio.library
+    lists = {kind: [summary(kind, path) for path in library.entries(kind)] for kind in KINDS}
+    return {
+        "folder": str(library.root),
+        "free_bytes": shutil.disk_usage(library.root).free,
+        "used_bytes": studio.uploads.used(),
+        "limits": studio.uploads.limits.document(),
+        "jobs_at_once": studio.queue.at_once,
+        "waiting": sum(job.state is State.QUEUED for job in studio.queue.jobs()),
+        "trouble": [*studio.queue.damaged, *([studio.queue.trouble] if studio.queue.trouble else [])],
+        **lists,
+    }
+
+
+def _entry(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    return summary(*entry_of(studio, request))
+
+
+def _adopt(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    given = fields(body, kind=str, path=str, name=str)
+    path = studio.library.adopt(given["kind"], Path(given["path"]), given["name"])
+    return summary(given["kind"], path)
+
+
+def _rename(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    kind, name = request.path_params["kind"], request.path_params["name"]
+    return summary(kind, studio.library.rename(kind, name, fields(body, to=str)["to"]))
+
+
+def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    number = studio.library.remove(request.path_params["kind"], request.path_params["name"])
+    studio.uploads.recount()
+    return {"trash": number}
+
+
+def _restore(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    path = studio.library.restore(request.path_params["id"])
+    studio.uploads.recount()
+    return summary(path.parent.name, path)
+
+
+def _empty_trash(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    studio.library.empty_trash()
+    return {"trash": studio.library.trash()}
+
+
+def _photos(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    kind, entry = entry_of(studio, request)
+    if kind not in ("photos", "captures"):
+        raise RefusedError(f"{kind}: have no photos of their own; ask for those of a capture")
+    return {"photos": photo_list(entry)}
+
+
+def _thumb(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    _, entry = entry_of(studio, request)
+    side = request.query_params.get("side", "256")
+    path = thumbnail(studio.library, entry, request.path_params["path"], side)
+    return file_answer(request, path, "image/jpeg")
+
+
+async def _upload(request: Request) -> Response:
+    studio: Studio = request.app.state.studio
+    kind, name = request.path_params["kind"], request.path_params["name"]
+    target = studio.uploads.target(kind, name, request.path_params["path"])
+    size = await studio.uploads.receive(request.stream(), _length(request), target)
+    return JSONResponse({"entry": f"{kind}/{name}", "file": target.name, "bytes": size}, 201)
+
+
+async def _upload_zip(request: Request) -> Response:
+    studio: Studio = request.app.state.studio
+    kind, name = request.path_params["kind"], request.path_params["name"]
+    return JSONResponse(await studio.uploads.receive_zip(request.stream(), _length(request), kind, name), 201)
+
+
+def _length(request: Request) -> int | None:
+    length = content_length(request)
+    if length == 0:
+        raise RefusedError("file: is empty; send its bytes as the body")
+    return length

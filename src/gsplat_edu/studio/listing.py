@@ -1,0 +1,120 @@
+"""One entry of the library in a few numbers, as the list of the page shows it."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.errors import CheckpointError
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.studio.library import extent, scene_file
+from gsplat_edu.text import legible
+
+
+def summary(kind: str, path: Path) -> dict[str, Any]:
+    """Return an entry's facts.
+
+    Args:
+        kind: Its kind.
+        path: Its folder.
+    """
+    size = extent(path)
+    facts: dict[str, Any] = {
+        "kind": kind,
+        "name": legible(path.name),
+        "entry": f"{kind}/{legible(path.name)}",
+        "path": legible(str(path)),
+        "adopted": legible(str(path.readlink())) if path.is_symlink() else None,
+        "modified": path.stat().st_mtime,
+        "files": size.files,
+        "bytes": size.num_bytes,
+    }
+    if kind in ("photos", "captures"):
+        facts |= {"photos": size.photos, "videos": size.videos}
+    if kind == "captures":
+        facts["layout"] = layout(path)
+    if kind == "runs":
+        facts |= run_facts(path)
+    if kind == "scenes":
+        file = scene_file(path)
+        facts |= {"file": None if file is None else legible(file.name), "scene_bytes": scene_bytes(file)}
+    if kind in ("runs", "scenes"):
+        facts["edited"] = (path / "edits.json").is_file()
+    return facts
+
+
+def layout(path: Path) -> str | None:
+    """Return the layout of a capture by its files; None if it has no poses that can be found quickly."""
+    if (path / "transforms_train.json").is_file():
+        return "Blender"
+    if (path / "transforms.json").is_file():
+        return "transforms.json"
+    names = (("sparse", "0"), ("sparse",), ("colmap", "sparse", "0"), ())
+    for parts in names:
+        place = path.joinpath(*parts)
+        if any((place / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
+            return "COLMAP"
+    return None
+
+
+def scene_bytes(file: Path | None) -> int:
+    """Return the size of a scene: its file, or the folder of an unpacked SOG."""
+    if file is None:
+        return 0
+    return extent(file.parent).num_bytes if file.suffix == ".json" else file.stat().st_size
+
+
+def run_facts(path: Path) -> dict[str, Any]:
+    """Return how far a run is and its scores; where a file is damaged, `problem` has the line."""
+    folder = RunFolder(path)
+    facts: dict[str, Any] = {
+        "planned": None,
+        "iterations": None,
+        "finished": False,
+        "psnr": None,
+        "ssim": None,
+        "num_gaussians": None,
+        "seconds": None,
+        "capture": None,
+        "problem": None,
+    }
+    try:
+        config, metrics = folder.read_config(), folder.read_metrics()
+    except (CheckpointError, OSError) as error:
+        return {**facts, "problem": str(error)}
+    train, data = config.get("train"), config.get("data")
+    planned = train.get("iterations") if isinstance(train, dict) else None
+    test = metrics.get("test") or {}
+    done = metrics.get("iterations")
+    last = last_logged(folder.log_file) if done is None else {}
+    return facts | {
+        "planned": planned,
+        "iterations": last.get("iteration") if done is None else done,
+        "finished": done is not None and (planned is None or done >= planned),
+        "psnr": test.get("psnr"),
+        "ssim": test.get("ssim"),
+        "num_gaussians": metrics.get("num_gaussians") or last.get("num_gaussians"),
+        "seconds": metrics.get("seconds") or last.get("seconds"),
+        "capture": data.get("path") if isinstance(data, dict) else None,
+    }
+
+
+def last_logged(path: Path) -> dict[str, Any]:
+    """Return figures of the last complete line of a run's log that has them."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(os.fstat(file.fileno()).st_size - 2048, 0))
+            tail = file.read().decode("utf-8", errors="replace")
+    except OSError:
+        return {}
+    found: dict[str, Any] = {}
+    for line in tail.splitlines()[::-1]:
+        if '"ms"' not in line:
+            continue
+        for name in ("iteration", "num_gaussians", "seconds"):
+            if match := re.search(rf'"{name}": ([0-9.]+)', line):
+                found[name] = float(match[1]) if name == "seconds" else int(float(match[1]))
+        return found
+    return found

@@ -1,0 +1,84 @@
+"""Names that a browser may give to entries of the library and to files in them.
+
+Any script is kept, in Unicode's composed form, and so are characters like < that only matter to a careless page. What
+is refused could leave a folder, hide a file, look like an option of a command or break a line.
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from pathlib import Path
+
+from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.text import as_file_name, printable
+
+LONGEST = 120
+"""Bytes of the name of an entry in UTF-8; file systems have 255, and some names get an ending."""
+
+LONGEST_FILE = 200
+"""Bytes of the name of a file in UTF-8."""
+
+DEEPEST = 8
+"""Folders within folders of an entry."""
+
+RESERVED = frozenset('/\\:*?"|')
+"""Characters with a meaning to some file system."""
+
+
+def checked_name(what: str, name: object, longest: int = LONGEST) -> str:
+    """Check the name of an entry or a file, and return it in Unicode's composed form.
+
+    Args:
+        what: What is named, for messages.
+        name: The name.
+        longest: Most bytes in UTF-8.
+
+    Raises:
+        RefusedError: it is not a name; says why.
+    """
+    if not isinstance(name, str) or not name.strip():
+        raise RefusedError(f"{what}: has no name; give one")
+    name = unicodedata.normalize("NFC", name)
+    said = printable(name)[:60]
+    try:
+        size = len(name.encode("utf-8"))
+    except UnicodeEncodeError:
+        raise RefusedError(f"{what}: the name {said!r} is not Unicode; rename it") from None
+    if size > longest:
+        raise RefusedError(
+            f"{what}: the name {said!r}... has {size} bytes, but may have {longest}; shorten it"
+        )
+    if printable(name) != name:
+        raise RefusedError(f"{what}: the name {said!r} contains control characters; rename it")
+    if bad := sorted(RESERVED.intersection(name)):
+        raise RefusedError(f"{what}: the name {said!r} contains {' '.join(bad)}; rename it")
+    if name[0] in ".-" or name[-1] in ". " or name[0] == " ":
+        raise RefusedError(
+            f"{what}: the name {said!r} begins with a dot, a dash or a space, or ends with one; rename it"
+        )
+    return as_file_name(name)
+
+
+def checked_path(what: str, path: object) -> Path:
+    """Check the path of a file below an entry, with slashes.
+
+    Raises:
+        RefusedError: it leads elsewhere, or a part of it is not a name.
+    """
+    if not isinstance(path, str) or not path:
+        raise RefusedError(f"{what}: has no name; give one")
+    parts = path.split("/")
+    if len(parts) > DEEPEST:
+        raise RefusedError(f"{what}: lies in more than {DEEPEST - 1} folders; move it up")
+    return Path(*(checked_name(what, part, LONGEST_FILE) for part in parts))
+
+
+def below(root: Path, path: Path, what: str) -> Path:
+    """Return a path below a folder; links inside may not lead out of it.
+
+    Raises:
+        RefusedError: it leads out of the folder.
+    """
+    if not (root / path).resolve().is_relative_to(root.resolve()):
+        raise RefusedError(f"{what}: leads out of its folder")
+    return root / path

@@ -1,0 +1,35 @@
+"""What the server refuses, with the status that HTTP has for it."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+
+from gsplat_edu.errors import ArgumentError
+
+
+class RefusedError(ArgumentError):
+    """A request cannot be carried out.
+
+    Args:
+        message: One line: what is wrong, where, and what to do next.
+        status: Status of the answer.
+    """
+
+    def __init__(self, message: str, status: HTTPStatus = HTTPStatus.BAD_REQUEST) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+def missing(what: str) -> RefusedError:
+    """Return the refusal of something that does not exist."""
+    return RefusedError(f"{what}: does not exist; it may have been renamed or removed", HTTPStatus.NOT_FOUND)
+
+
+def conflict(message: str) -> RefusedError:
+    """Return the refusal of something that the state of the library does not allow."""
+    return RefusedError(message, HTTPStatus.CONFLICT)
+
+
+def too_large(message: str) -> RefusedError:
+    """Return the refusal of something beyond a limit."""
+    return RefusedError(message, HTTPStatus.REQUEST_ENTITY_TOO_LARGE)

@@ -1,0 +1,157 @@
+"""What the routes have in common: bodies that are checked, answers as JSON, and errors as one line."""
+
+from __future__ import annotations
+
+import email.utils
+from collections.abc import Awaitable, Callable, Mapping
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from gsplat_edu.errors import SplatError
+from gsplat_edu.files import described
+from gsplat_edu.reading import parse_json
+from gsplat_edu.studio.refusal import RefusedError, missing, too_large
+from gsplat_edu.studio.state import Studio
+from gsplat_edu.text import legible
+
+MOST_JSON = 16 << 20
+"""Bytes of a JSON body; a lasso of an edit has thousands of points."""
+
+Act = Callable[[Studio, Request, Any], Any]
+"""A route: the studio, the request and its JSON body (None without one); returns what is sent as JSON, or an answer."""
+
+CLOSE = {"Connection": "close"}
+"""Header of an answer to a request whose body was not read: the rest of the body is not worth receiving."""
+
+
+def act(path: str, method: str, function: Act) -> Route:
+    """Return a route whose function runs in a thread, after the JSON body was read."""
+
+    async def endpoint(request: Request) -> Response:
+        body = await json_body(request) if method in ("POST", "PUT", "PATCH") else None
+        found = await run_in_threadpool(function, request.app.state.studio, request, body)
+        return found if isinstance(found, Response) else JSONResponse(found)
+
+    return Route(path, answered(endpoint), methods=[method])
+
+
+def answered(endpoint: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+    """Turn errors of a route into answers with one line."""
+
+    async def safe(request: Request) -> Response:
+        try:
+            return await endpoint(request)
+        except RefusedError as error:
+            return refusal(str(error), error.status)
+        except SplatError as error:
+            return refusal(str(error), HTTPStatus.BAD_REQUEST)
+        except ClientDisconnect:
+            return refusal("the browser closed the connection", HTTPStatus.BAD_REQUEST)
+        except OSError as error:
+            return refusal(described(error), HTTPStatus.INTERNAL_SERVER_ERROR)
+
+    return safe
+
+
+def refusal(line: str, status: HTTPStatus) -> JSONResponse:
+    """Return an error as an answer: {"error": the line}."""
+    return JSONResponse({"error": legible(line)}, status, headers=CLOSE)
+
+
+async def json_body(request: Request) -> Any:  # noqa: ANN401
+    """Read a JSON body.
+
+    Raises:
+        RefusedError: it is too long, of another type, or not JSON.
+    """
+    length = content_length(request)
+    if length == 0:
+        return None
+    if (length or 0) > MOST_JSON:
+        raise too_large(f"body: has {length:,} bytes, but {MOST_JSON:,} are allowed")
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+        raise RefusedError("body: has to be application/json", HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
+    pieces, size = [], 0
+    async for piece in request.stream():
+        size += len(piece)
+        if size > MOST_JSON:
+            raise too_large(f"body: has more than {MOST_JSON:,} bytes")
+        pieces.append(piece)
+    if not size:
+        return None
+    try:
+        return parse_json(b"".join(pieces), _no_constant)
+    except ValueError as error:
+        raise RefusedError(f"body: is not JSON ({str(error)[:80]})") from None
+
+
+def content_length(request: Request) -> int | None:
+    """Return the announced length of a body; None if it has none."""
+    text = request.headers.get("content-length")
+    if text is None:
+        return None if "transfer-encoding" in request.headers else 0
+    if not text.isdecimal():
+        raise RefusedError("Content-Length: is not a number")
+    return int(text)
+
+
+def entry_of(studio: Studio, request: Request) -> tuple[str, Path]:
+    """Return kind and path of the entry that a route names.
+
+    Raises:
+        RefusedError: there is none.
+    """
+    kind = request.path_params["kind"]
+    return kind, studio.library.entry(kind, request.path_params["name"])
+
+
+def file_answer(
+    request: Request, path: Path, media_type: str, *, download: str | None = None, version: str = ""
+) -> Response:
+    """Return a file, or 304 if the browser has this version.
+
+    Args:
+        request: The request, whose If-None-Match counts.
+        path: The file.
+        media_type: Its type; nothing is guessed from its name or contents.
+        download: Name under which the browser saves it; None shows it.
+        version: What its ETag is made of; its size and time if empty.
+    """
+    try:
+        facts = path.stat()
+    except OSError:
+        raise missing(path.name) from None
+    etag = f'"{version or f"{facts.st_mtime_ns:x}-{facts.st_size:x}"}"'
+    headers = {"ETag": etag, "Cache-Control": "no-cache"}
+    if request.headers.get("if-none-match") == etag:
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    if download is not None:
+        quoted = email.utils.encode_rfc2231(legible(download), "utf-8")
+        headers["Content-Disposition"] = f"attachment; filename*={quoted}"
+    return FileResponse(path, headers=headers, media_type=media_type)
+
+
+def fields(body: Any, **wanted: type) -> Mapping[str, Any]:  # noqa: ANN401
+    """Check that a body is an object with exactly these fields.
+
+    Raises:
+        RefusedError: a field is missing, of another type or not known.
+    """
+    if not isinstance(body, dict):
+        raise RefusedError("body: has to be an object")
+    for name, kind in wanted.items():
+        if not isinstance(body.get(name), kind):
+            raise RefusedError(f"{name}: is missing, or not of type {kind.__name__}")
+    if unknown := sorted(set(body) - set(wanted)):
+        raise RefusedError(f"{unknown[0]}: is not known; see docs/STUDIO.md")
+    return body
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not JSON")

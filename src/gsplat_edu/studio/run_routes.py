@@ -1,0 +1,145 @@
+"""Routes of runs and captures: curves, held-out views, comparisons, findings and forecasts."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import BaseRoute
+
+from gsplat_edu.jobs.events import Diagnosed, Found, Started
+from gsplat_edu.jobs.following import events_after
+from gsplat_edu.jobs.record import Job
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.studio.library import photo_names
+from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.studio.replies import act, entry_of, file_answer
+from gsplat_edu.studio.runs import compared, curves, picture, views
+from gsplat_edu.studio.state import Studio
+from gsplat_edu.text import legible
+
+REPORT_POLICY = (
+    "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'"
+)
+"""Of a run's report, which has its style and pictures inside; scripts do not run, and it belongs to no origin."""
+
+
+def routes() -> list[BaseRoute]:
+    """Return the routes."""
+    return [
+        act("/api/runs/{name}/curves", "GET", _curves),
+        act(
+            "/api/runs/{name}/views",
+            "GET",
+            lambda studio, request, body: {"views": views(_run(studio, request))},
+        ),
+        act("/api/runs/{name}/views/{index}/{what}.png", "GET", _picture),
+        act("/api/runs/{name}/report", "GET", _report),
+        act("/api/compare", "GET", _compare),
+        act("/api/{kind}/{name}/findings", "GET", _findings),
+        act("/api/captures/{name}/forecast", "GET", _forecast),
+    ]
+
+
+def _run(studio: Studio, request: Request) -> RunFolder:
+    return RunFolder(studio.library.entry("runs", request.path_params["name"]))
+
+
+def _curves(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    return curves(_run(studio, request), request.query_params.get("after", ""))
+
+
+def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    params = request.path_params
+    data, version = picture(_run(studio, request), params["index"], params["what"])
+    headers = {"ETag": f'"{version}"', "Cache-Control": "no-cache"}
+    if request.headers.get("if-none-match") == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    return Response(data, media_type="image/png", headers=headers)
+
+
+def _report(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    answer = file_answer(request, _run(studio, request).report, "text/html; charset=utf-8")
+    answer.headers["Content-Security-Policy"] = REPORT_POLICY
+    return answer
+
+
+def _compare(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    a, b = (RunFolder(studio.library.entry("runs", request.query_params.get(name, ""))) for name in "ab")
+    return compared(a, b)
+
+
+def _forecast(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    entry = studio.library.entry("captures", request.path_params["name"])
+    text = request.query_params.get("resolution")
+    try:
+        resolution = None if text is None else float(text)
+    except ValueError:
+        raise RefusedError(f"resolution: is {text[:20]!r}, but has to be a number") from None  # type: ignore[index]
+    return {"qualities": studio.prober.ask("forecast", capture=str(entry), resolution=resolution)}
+
+
+def _findings(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    kind, entry = entry_of(studio, request)
+    if kind not in ("captures", "runs"):
+        raise RefusedError(f"{kind}: the doctor examines captures and runs")
+    subject = f"{kind}/{entry.name}"
+    jobs = [job for job in studio.queue.jobs() if job.argv[0] == "doctor" and job.subject == subject]
+    if not jobs:
+        return {
+            "job": None,
+            "state": None,
+            "findings": [],
+            "facts": [],
+            "fine": [],
+            "advice": [],
+            "stale": False,
+        }
+    return _diagnosis(studio, jobs[-1], kind, entry)
+
+
+def _diagnosis(studio: Studio, job: Job, kind: str, entry: Path) -> dict[str, Any]:
+    """Return what a job of the doctor found, with the photos that it means."""
+    path = studio.queue.files(job.id).events
+    events = [event for _, _, event in events_after(path)]
+    starts = [index for index, event in enumerate(events) if isinstance(event, Started)]
+    events = events[starts[-1] :] if starts else events
+    places = _photo_places(studio, kind, entry)
+    findings = []
+    for event in events:
+        if isinstance(event, Found):
+            photos = [places.get(name) for name in event.images]
+            findings.append({**dataclasses.asdict(event), "photos": photos})
+    rest = next((event for event in events if isinstance(event, Diagnosed)), Diagnosed((), (), ()))
+    changing = entry / "metrics.json" if kind == "runs" else entry
+    stale = job.ended is not None and changing.exists() and changing.stat().st_mtime > job.ended
+    return {
+        "job": job.id,
+        "state": job.state.value,
+        "line": job.line,
+        "findings": findings,
+        **dataclasses.asdict(rest),
+        "stale": stale,
+    }
+
+
+def _photo_places(studio: Studio, kind: str, entry: Path) -> dict[str, str]:
+    """Return the photos of a capture, or of a run's capture, as "captures/NAME/thumbs" names them, by their names."""
+    if kind == "runs":
+        try:
+            capture = Path(str(RunFolder(entry).read_config()["data"]["path"]))
+        except (KeyError, TypeError):
+            return {}
+        parent = studio.library.root / "captures"
+        if capture.parent != parent or not capture.is_dir():
+            return {}
+        entry = capture
+    found: dict[str, str] = {}
+    for name in photo_names(entry):
+        parts = name.split("/")
+        for start in range(len(parts)):
+            found.setdefault("/".join(parts[start:]), f"captures/{legible(entry.name)}/{legible(name)}")
+    return found

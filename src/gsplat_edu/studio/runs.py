@@ -1,0 +1,157 @@
+"""A run's curves and its held-out views, read from its folder."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsplat_edu.errors import CheckpointError
+from gsplat_edu.image_files import UNDECODABLE, opened_image
+from gsplat_edu.reading import open_file, parse_json
+from gsplat_edu.runs.folder import RunFolder, image_file_names
+from gsplat_edu.studio.refusal import RefusedError, missing
+
+MOST_READ = 8 << 20
+"""Bytes of a log in one answer."""
+
+SEPARATOR = 4
+"""Width of the line between render and photo in renders/test, px (`gsplat_edu.evaluate.images.side_by_side`)."""
+
+GAIN = 4
+"""Factor of a difference picture."""
+
+PICTURES = ("render", "photo", "difference")
+
+POINT = ("iteration", "loss", "num_gaussians", "ms", "seconds")
+SCORE = ("iteration", "psnr", "ssim")
+
+
+def curves(folder: RunFolder, after: str) -> dict[str, Any]:
+    """Read what a run's log has gained.
+
+    Args:
+        folder: The run.
+        after: `next` of the answer before; empty for the whole log.
+
+    Returns:
+        points and scores as columns; next; reset, whether the log was rewritten, so that earlier points do not count;
+        and more, whether there is more to read at once.
+    """
+    try:
+        with open_file(folder.log_file) as file:
+            facts = folder.log_file.stat()
+            known, _, offset = after.partition(".")
+            file_id = f"{facts.st_ino:x}"
+            begin = int(offset) if known == file_id and offset.isdecimal() else 0
+            begin = begin if begin <= facts.st_size else 0
+            file.seek(begin)
+            data = file.read(MOST_READ)
+    except OSError:
+        return {
+            "points": _columns(POINT, []),
+            "scores": _columns(SCORE, []),
+            "next": "",
+            "reset": True,
+            "more": False,
+        }
+    end = data.rfind(b"\n") + 1
+    points, scores = [], []
+    for line in data[:end].splitlines():
+        try:
+            entry = parse_json(line)
+        except ValueError:
+            continue
+        if isinstance(entry, dict) and "loss" in entry:
+            points.append(entry)
+        elif isinstance(entry, dict) and "psnr" in entry:
+            scores.append(entry)
+    return {
+        "points": _columns(POINT, points),
+        "scores": _columns(SCORE, scores),
+        "next": f"{file_id}.{begin + end}",
+        "reset": begin == 0,
+        "more": len(data) == MOST_READ,
+    }
+
+
+def _columns(names: tuple[str, ...], entries: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    return {name: [entry.get(name) for entry in entries] for name in names}
+
+
+def views(folder: RunFolder) -> list[dict[str, Any]]:
+    """Return the scores of a run's held-out views, worst first, each with its index for `picture`.
+
+    Raises:
+        RefusedError: the run is damaged.
+    """
+    scores = _scores(folder)
+    entries = [{"index": index, **score} for index, score in enumerate(scores)]
+    return sorted(entries, key=lambda entry: (entry.get("psnr") is None, entry.get("psnr")))
+
+
+def compared(a: RunFolder, b: RunFolder) -> dict[str, Any]:
+    """Compare the held-out views that two runs share, by name; the largest loss of `b` first."""
+    one, other = ({view["name"]: view for view in views(folder)} for folder in (a, b))
+    shared = []
+    for name in one:
+        if name in other:
+            left, right = one[name].get("psnr"), other[name].get("psnr")
+            gain = None if left is None or right is None else right - left
+            shared.append({"name": name, "a": one[name], "b": other[name], "gain": gain})
+    shared.sort(key=lambda entry: (entry["gain"] is None, entry["gain"]))
+    return {
+        "views": shared,
+        "only_a": sorted(set(one) - set(other)),
+        "only_b": sorted(set(other) - set(one)),
+    }
+
+
+def picture(folder: RunFolder, index: str, what: str) -> tuple[bytes, str]:
+    """Return a picture of a held-out view as PNG, and a version of it.
+
+    Args:
+        folder: The run.
+        index: The view, as `views` numbers it.
+        what: render, photo, or difference: their absolute difference times `GAIN`.
+
+    Raises:
+        RefusedError: there is no such view or picture.
+    """
+    scores = _scores(folder)
+    if what not in PICTURES or not index.isdecimal() or int(index) >= len(scores):
+        raise missing(f"{folder.path.name}: view {index[:20]}/{what[:20]}")
+    names = image_file_names([str(score["name"]) for score in scores])
+    path = folder.renders / "test" / names[int(index)]
+    version = f"{path.stat().st_mtime_ns:x}-{what}" if path.is_file() else ""
+    return _part(path, what), version
+
+
+def _part(path: Path, what: str) -> bytes:
+    try:
+        with opened_image(path, ("PNG",)) as file:
+            both = np.asarray(file.convert("RGB"))
+    except UNDECODABLE:
+        raise missing(f"picture {path.name}") from None
+    W = (both.shape[1] - SEPARATOR) // 2
+    if both.shape[1] != 2 * W + SEPARATOR:
+        raise RefusedError(f"{path.name}: is not a render beside a photo; evaluate the run again")
+    render, photo = both[:, :W], both[:, W + SEPARATOR :]
+    apart = np.abs(render.astype(np.int16) - photo)
+    chosen = {"render": render, "photo": photo, "difference": np.minimum(GAIN * apart, 255).astype(np.uint8)}
+    data = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(chosen[what])).save(data, format="PNG", compress_level=1)
+    return data.getvalue()
+
+
+def _scores(folder: RunFolder) -> list[dict[str, Any]]:
+    try:
+        found = folder.read_metrics().get("test_views")
+    except (CheckpointError, OSError) as error:
+        raise RefusedError(str(error)) from None
+    if not isinstance(found, list):
+        return []
+    return [score for score in found if isinstance(score, dict) and isinstance(score.get("name"), str)]

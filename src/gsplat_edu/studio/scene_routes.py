@@ -1,0 +1,238 @@
+"""Routes of scenes and the scenes of runs: their page, edits, exports and downloads."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import threading
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route
+
+from gsplat_edu.errors import CheckpointError, SplatError
+from gsplat_edu.files import described, written_aside
+from gsplat_edu.jobs.events import Metric
+from gsplat_edu.jobs.following import events_after
+from gsplat_edu.jobs.record import State
+from gsplat_edu.reading import read_bytes
+from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, scene_of
+from gsplat_edu.studio.names import LONGEST_FILE, checked_name
+from gsplat_edu.studio.refusal import RefusedError, conflict, missing
+from gsplat_edu.studio.replies import CLOSE, MOST_JSON, act, content_length, entry_of, file_answer
+from gsplat_edu.studio.state import Studio
+from gsplat_edu.text import legible
+
+KEPT_PAGES = 12
+"""Pages in the cache."""
+
+NO_EDITS = "none"
+"""Version of edits that do not exist."""
+
+BINARY = "application/octet-stream"
+
+_storing = threading.Lock()
+"""Edits are compared with the stored version and written by one request at a time."""
+
+
+def routes() -> list[BaseRoute]:
+    """Return the routes."""
+    return [
+        act("/api/{kind}/{name}/page", "GET", _page),
+        act("/api/{kind}/{name}/scene", "GET", _download),
+        act("/api/{kind}/{name}/exports", "GET", _exports),
+        act("/api/{kind}/{name}/exports/{file}", "GET", _export),
+        act("/api/{kind}/{name}/exports/{file}", "DELETE", _remove_export),
+        Route("/api/{kind}/{name}/edits.json", _plain(_edits), methods=["GET"]),
+        Route("/api/{kind}/{name}/edits.json", _plain(_store_edits), methods=["PUT"]),
+    ]
+
+
+def current_scene(entry: Path, kind: str) -> Path:
+    """Return the file of an entry's scene, the latest one of a run.
+
+    Raises:
+        RefusedError: it has none.
+    """
+    if kind != "runs":
+        return scene_of(entry, kind)
+    try:
+        return RunFolder(entry).latest_scene()[0]
+    except CheckpointError as error:
+        raise RefusedError(str(error), HTTPStatus.NOT_FOUND) from None
+
+
+def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    kind, entry = entry_of(studio, request)
+    scene = current_scene(entry, kind)
+    facts = scene.stat()
+    editing = request.query_params.get("edit") == "1"
+    key = f"{scene} {facts.st_mtime_ns} {facts.st_size} {entry.name} {editing}"
+    digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
+    target = studio.library.hidden("cache") / "pages" / f"{digest}.html"
+    policy = target.with_suffix(".policy")
+    if not (target.is_file() and policy.is_file()):
+        task = {"source": str(scene_of(entry, kind)), "title": legible(entry.name), "out": str(target)}
+        if editing:
+            task |= {"edits": str(entry / EDITS), "url": EDITS}
+        made = studio.worker.ask("page", **task)
+        with written_aside(policy) as aside:
+            aside.write_text(made["policy"], encoding="utf-8")
+        _prune(target.parent)
+    return page_answer(request, target, policy.read_text("utf-8"))
+
+
+def page_answer(request: Request, path: Path, policy: str) -> Response:
+    """Return one of our pages with the policy that allows its own scripts; the studio's page may show it in a frame."""
+    answer = file_answer(request, path, "text/html; charset=utf-8")
+    answer.headers["Content-Security-Policy"] = f"{policy}; frame-ancestors 'self'"
+    return answer
+
+
+def _prune(folder: Path) -> None:
+    """Remove the oldest pages of the cache."""
+    pages = sorted(folder.glob("*.html"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in pages[KEPT_PAGES:]:
+        path.unlink(missing_ok=True)
+        path.with_suffix(".policy").unlink(missing_ok=True)
+
+
+def _download(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    kind, entry = entry_of(studio, request)
+    scene = current_scene(entry, kind)
+    if scene.suffix == ".json":
+        raise RefusedError(f"{kind}/{entry.name}: is a folder of files; export it to download it")
+    return file_answer(request, scene, BINARY, download=f"{entry.name}{scene.suffix}")
+
+
+def _exports(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    kind, entry = entry_of(studio, request)
+    if kind not in ("runs", "scenes"):
+        raise RefusedError(f"{kind}: have no exports; choose a run or a scene")
+    folder = entry / EXPORTS
+    found = []
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if path.name[0] == "." or not path.is_file():
+            continue
+        form = next((form for form in sorted(FORMATS, key=len)[::-1] if path.name.endswith(f".{form}")), None)
+        facts = path.stat()
+        found.append(
+            {
+                "file": legible(path.name),
+                "format": form or path.suffix[1:],
+                "bytes": facts.st_size,
+                "modified": facts.st_mtime,
+                **_made_by(studio, path),
+            }
+        )
+    return {"exports": found}
+
+
+def _made_by(studio: Studio, path: Path) -> dict[str, Any]:
+    """Return the job that wrote a file last, its command, and the PSNR that it measured; None where unknown."""
+    for job in reversed(studio.queue.jobs()):
+        if job.state is State.DONE and str(path) in job.outputs:
+            metrics = [event for _, _, event in events_after(studio.queue.files(job.id).events)]
+            of = {m.name: m.value for m in metrics if isinstance(m, Metric) and m.of == str(path)}
+            return {"job": job.id, "command": job.command, "psnr": of.get("psnr")}
+    return {"job": None, "command": None, "psnr": None}
+
+
+def _export_file(studio: Studio, request: Request) -> Path:
+    _, entry = entry_of(studio, request)
+    name = checked_name("file", request.path_params["file"], LONGEST_FILE)
+    path = entry / EXPORTS / name
+    if not path.is_file():
+        raise missing(f"{entry.name}/{EXPORTS}/{name}")
+    return path
+
+
+def _export(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    path = _export_file(studio, request)
+    return file_answer(request, path, BINARY, download=path.name)
+
+
+def _remove_export(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    path = _export_file(studio, request)
+    if (why := studio.in_use(path)) is not None:
+        raise conflict(f"{path.name}: {why}")
+    path.unlink()
+    return {"removed": legible(path.name)}
+
+
+def _plain(endpoint: Any) -> Any:  # noqa: ANN401
+    """Turn errors into plain text, which the editor shows."""
+
+    async def safe(request: Request) -> Response:
+        try:
+            return await endpoint(request)  # type: ignore[no-any-return]
+        except RefusedError as error:
+            line, status = str(error), error.status
+        except SplatError as error:
+            line, status = str(error), HTTPStatus.BAD_REQUEST
+        except OSError as error:
+            line, status = described(error), HTTPStatus.INTERNAL_SERVER_ERROR
+        return PlainTextResponse(f"{legible(line)}\n", status, headers=CLOSE)
+
+    return safe
+
+
+def version_of(data: bytes | None) -> str:
+    """Return the version of an edits file's content."""
+    return NO_EDITS if data is None else hashlib.sha256(data).hexdigest()
+
+
+def _stored(entry: Path) -> bytes | None:
+    path = entry / EDITS
+    return read_bytes(path) if path.is_file() else None
+
+
+async def _edits(request: Request) -> Response:
+    studio: Studio = request.app.state.studio
+    kind, entry = entry_of(studio, request)
+    await run_in_threadpool(current_scene, entry, kind)
+    data = await run_in_threadpool(_stored, entry)
+    headers = {"ETag": f'"{version_of(data)}"'}
+    return Response(b"null\n" if data is None else data, media_type="application/json", headers=headers)
+
+
+async def _store_edits(request: Request) -> Response:
+    studio: Studio = request.app.state.studio
+    kind, entry = entry_of(studio, request)
+    if (content_length(request) or 0) > MOST_JSON:
+        raise RefusedError(f"edits.json: may have {MOST_JSON:,} bytes", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+    data = b""
+    async with asyncio.timeout(60):
+        async for piece in request.stream():
+            data += piece
+            if len(data) > MOST_JSON:
+                raise RefusedError(
+                    f"edits.json: may have {MOST_JSON:,} bytes", HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+                )
+    expected = request.headers.get("if-match", "").strip('"')
+    version = await run_in_threadpool(_store, studio, kind, entry, data, expected)
+    return PlainTextResponse("saved\n", headers={"ETag": f'"{version}"'})
+
+
+def _store(studio: Studio, kind: str, entry: Path, data: bytes, expected: str) -> str:
+    """Check edits and store them, unless another tab has stored some since this one read them."""
+    part = studio.library.part(".json")
+    try:
+        part.write_bytes(data)
+        studio.worker.ask("check_edits", path=str(part), name=EDITS, source=str(scene_of(entry, kind)))
+    finally:
+        part.unlink(missing_ok=True)
+    with _storing:
+        if version_of(_stored(entry)) != expected:
+            raise RefusedError(
+                f"{EDITS} was changed elsewhere; download these edits, then reload the page",
+                HTTPStatus.PRECONDITION_FAILED,
+            )
+        with written_aside(entry / EDITS) as aside:
+            aside.write_bytes(data)
+    return version_of(data)

@@ -1,0 +1,168 @@
+"""The events of all jobs as one stream (Server-Sent Events), which a browser resumes by itself after a break."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import json
+import secrets
+import threading
+from collections import deque
+from collections.abc import AsyncIterator
+from typing import Any
+
+from gsplat_edu.jobs.events import Event
+from gsplat_edu.jobs.following import Follower
+from gsplat_edu.jobs.queue import JobQueue
+from gsplat_edu.jobs.record import ACTIVE, Job
+
+KEPT = 4_000
+"""Events that a browser may have missed and still gets; after more it reads the list of jobs again."""
+
+POLL = 0.2
+"""Seconds between two looks at the files of running jobs."""
+
+HEARTBEAT = 15.0
+"""Seconds of silence after which a comment tells whether the browser is still there."""
+
+MOST_WATCHING = 64
+"""Streams at once."""
+
+
+def job_document(job: Job) -> dict[str, Any]:
+    """Return a job as the API shows it."""
+    return {
+        "id": job.id,
+        "title": job.title,
+        "subject": job.subject,
+        "state": job.state.value,
+        "command": job.command,
+        "argv": list(job.argv),
+        "created": job.created,
+        "started": job.started,
+        "ended": job.ended,
+        "attempts": job.attempts,
+        "line": job.line,
+        "outputs": list(job.outputs),
+        "resumable": job.resumable,
+        "cancelling": job.cancelled and job.state in ACTIVE,
+    }
+
+
+def event_document(number: int, time: float, event: Event) -> dict[str, Any]:
+    """Return an event of a job as the API shows it."""
+    return {
+        "event": type(event).__name__.lower(),
+        "number": number,
+        "time": time,
+        **dataclasses.asdict(event),
+    }
+
+
+class Stream:
+    """Collects what happens to jobs, and hands it to everyone who watches.
+
+    Ids are `BOOT-NUMBER`: with the id of another start of the server, or one that is too old, a watcher is told to
+    read the list of jobs again.
+    """
+
+    def __init__(self) -> None:
+        self.boot = secrets.token_hex(4)
+        self._lock = threading.Lock()
+        self._kept: deque[tuple[int, str]] = deque(maxlen=KEPT)
+        self._number = 0
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._woken: set[asyncio.Event] = set()
+        self._followers: dict[str, Follower] = {}
+        self._over = threading.Event()
+
+    def close(self) -> None:
+        """End all streams, for the end of the server; called in its event loop."""
+        self._over.set()
+        self._wake()
+
+    def changed(self, name: str, job: Job | None) -> None:
+        """Note a new state of a job, or that it was removed. May be called from any thread."""
+        if job is None:
+            self.publish("removed", {"id": name})
+        else:
+            self.publish("job", job_document(job))
+
+    def publish(self, kind: str, data: dict[str, Any]) -> None:
+        """Add an event to the stream. May be called from any thread."""
+        with self._lock:
+            self._number += 1
+            text = f"id: {self.boot}-{self._number}\nevent: {kind}\ndata: {json.dumps(data)}\n\n"
+            self._kept.append((self._number, text))
+            loop = self._loop
+        if loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(self._wake)
+
+    def _wake(self) -> None:
+        for woken in self._woken:
+            woken.set()
+
+    async def follow(self, queue: JobQueue) -> None:
+        """Read the events of running jobs until cancelled."""
+        self._loop = asyncio.get_running_loop()
+        while True:
+            await asyncio.to_thread(self.look, queue)
+            await asyncio.sleep(POLL)
+
+    def look(self, queue: JobQueue) -> None:
+        """Publish what running jobs have written since the last look."""
+        jobs = {job.id: job for job in queue.jobs()}
+        for name in list(self._followers):
+            if name not in jobs:
+                del self._followers[name]
+        for name, job in jobs.items():
+            if job.state not in ACTIVE and name not in self._followers:
+                continue
+            follower = self._followers.get(name)
+            if follower is None:
+                follower = self._followers[name] = Follower(queue.folder / name / "events.jsonl")
+            for number, time, event in follower.read():
+                self.publish("event", {"job": name, **event_document(number, time, event)})
+            if job.state not in ACTIVE:
+                self._followers.pop(name, None)
+
+    async def watch(self, last_id: str | None) -> AsyncIterator[str]:
+        """Yield the stream, from behind an id if it is still known."""
+        woken = asyncio.Event()
+        if len(self._woken) >= MOST_WATCHING:
+            yield "event: full\ndata: {}\n\n"
+            return
+        self._woken.add(woken)
+        try:
+            after = self._after(last_id)
+            if after is None:
+                with self._lock:
+                    after = self._number
+                yield f"id: {self.boot}-{after}\nevent: reset\ndata: {json.dumps({'boot': self.boot})}\n\n"
+            while not self._over.is_set():
+                woken.clear()
+                with self._lock:
+                    oldest = self._kept[0][0] if self._kept else self._number + 1
+                    new = [entry for entry in self._kept if entry[0] > after]
+                if oldest > after + 1 and new:  # the watcher was slower than the ring
+                    yield "event: reset\ndata: {}\n\n"
+                for number, text in new:
+                    after = number
+                    yield text
+                if self._over.is_set():
+                    break
+                try:
+                    await asyncio.wait_for(woken.wait(), HEARTBEAT)
+                except TimeoutError:
+                    yield ": still here\n\n"
+        finally:
+            self._woken.discard(woken)
+
+    def _after(self, last_id: str | None) -> int | None:
+        """Return the number behind which a watcher wants to go on; None if it has to start anew."""
+        boot, _, number = (last_id or "").partition("-")
+        if boot != self.boot or not number.isdigit():
+            return None
+        with self._lock:
+            oldest = self._kept[0][0] if self._kept else self._number + 1
+            return int(number) if oldest - 1 <= int(number) <= self._number else None

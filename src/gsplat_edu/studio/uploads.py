@@ -1,0 +1,258 @@
+"""Take in files: streamed beside their place, limited in size, and renamed once they are complete."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import threading
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from functools import partial
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+
+from gsplat_edu.data.capture import PHOTO_ENDINGS
+from gsplat_edu.image_files import is_image
+from gsplat_edu.sfm.video import VIDEO_ENDINGS
+from gsplat_edu.studio.library import SCENE_ENDINGS, Library, extent
+from gsplat_edu.studio.names import below, checked_path
+from gsplat_edu.studio.refusal import RefusedError, conflict, too_large
+from gsplat_edu.studio.unpack import ZipLimits, unpack
+
+STALL = 30.0
+"""Seconds without a byte after which an upload is given up."""
+
+AT_ONCE = 16
+"""Uploads that are received at the same time."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much may be taken in.
+
+    Args:
+        file: Bytes of one file.
+        library: Bytes of the whole library, without adopted entries.
+        spare: Bytes of the disk that stay free.
+        entry_files: Files of one entry.
+        zipped: What a zip file may hold.
+    """
+
+    file: int = 4 << 30
+    library: int = 200 << 30
+    spare: int = 1 << 30
+    entry_files: int = 20_000
+    zipped: ZipLimits = field(default_factory=ZipLimits)
+
+    def document(self) -> dict[str, int]:
+        """Return the limits for the page."""
+        return {
+            "file_bytes": self.file,
+            "library_bytes": self.library,
+            "spare_bytes": self.spare,
+            "entry_files": self.entry_files,
+            "zip_bytes": self.zipped.total,
+            "zip_entries": self.zipped.entries,
+        }
+
+
+class Uploads:
+    """Receives files for a library.
+
+    Args:
+        library: The library.
+        limits: How much may be taken in.
+    """
+
+    def __init__(self, library: Library, limits: Limits) -> None:
+        self.library, self.limits = library, limits
+        self._lock = threading.Lock()
+        self._expected = 0  # bytes of the uploads that are being received
+        self._running = 0
+        self._used: int | None = None
+
+    def used(self) -> int:
+        """Return the bytes of the library's own files, counted once and then kept up with uploads."""
+        if self._used is None:
+            self._used = extent(self.library.root).num_bytes
+        return self._used
+
+    def recount(self) -> None:
+        """Count the library's files again at the next upload, after something else has written or removed some."""
+        self._used = None
+
+    def target(self, kind: str, name: str, path: str) -> Path:
+        """Return where a file goes.
+
+        Raises:
+            RefusedError: a name is not allowed, its ending is not that of what the entry holds, or it is there already.
+        """
+        wanted = checked_path("file", path)
+        self._check_ending(kind, wanted)
+        entry = self.library.place(kind, name)
+        if entry.is_symlink():
+            raise conflict(
+                f"{kind}/{entry.name}: is adopted from elsewhere; add files there, or make a new entry"
+            )
+        if kind == "scenes" and entry.is_dir() and any(entry.iterdir()):
+            raise conflict(f"scenes/{entry.name}: exists already; choose another name")
+        target = below(entry, wanted, "file")
+        if os.path.lexists(target):
+            raise conflict(
+                f"{kind}/{entry.name}/{wanted}: exists already; rename the new one or remove the old one"
+            )
+        return target
+
+    def _check_ending(self, kind: str, path: Path) -> None:
+        ending = path.suffix.lower()
+        if kind == "runs":
+            raise RefusedError("runs: cannot be uploaded; adopt the folder, or upload its scene")
+        if kind == "scenes" and (ending not in SCENE_ENDINGS or len(path.parts) > 1):
+            raise RefusedError(
+                f"file: {path.name!r} is not a scene; scenes end in {', '.join(SCENE_ENDINGS)}"
+            )
+        if kind == "photos" and ending not in (*PHOTO_ENDINGS, *VIDEO_ENDINGS):
+            raise RefusedError(
+                f"file: {path.name!r} is neither a photo nor a video by its ending; photos end in"
+                f" {', '.join(PHOTO_ENDINGS)}"
+            )
+
+    async def receive(self, chunks: AsyncIterator[bytes], length: int | None, target: Path) -> int:
+        """Receive a file.
+
+        Args:
+            chunks: The body.
+            length: Its announced length; None if unknown.
+            target: Where it goes; nothing is there until it is complete.
+
+        Returns:
+            Its size.
+
+        Raises:
+            RefusedError: it is too large, stalls, is shorter than announced, or is no photo although its name says so.
+        """
+        part = self.library.part(target.suffix.lower())
+        try:
+            size = await self._stream(chunks, length, part)
+            await run_in_threadpool(self._place, part, target)
+        finally:
+            await run_in_threadpool(part.unlink, missing_ok=True)
+        return size
+
+    async def receive_zip(
+        self, chunks: AsyncIterator[bytes], length: int | None, kind: str, name: str
+    ) -> dict[str, Any]:
+        """Receive a zip file and unpack it to a new entry.
+
+        Returns:
+            Number of files, and the names of files that were left out.
+
+        Raises:
+            RefusedError: as for `receive` and `gsplat_edu.studio.unpack.unpack`, or the entry exists.
+        """
+        if kind not in ("photos", "captures"):
+            raise RefusedError(f"{kind}: takes no zip files; upload photos or a capture")
+        entry = await run_in_threadpool(self.library.fresh, kind, name)
+        part, folder = self.library.part(".zip"), self.library.part()
+        try:
+            await self._stream(chunks, length, part)
+            done = await run_in_threadpool(self._unpack, part, folder, kind, entry.name)
+        finally:
+            await run_in_threadpool(part.unlink, missing_ok=True)
+            await run_in_threadpool(partial(shutil.rmtree, folder, ignore_errors=True))
+        return done
+
+    def _unpack(self, part: Path, folder: Path, kind: str, name: str) -> dict[str, Any]:
+        free = max(self._room(), 0)
+        zipped = self.limits.zipped
+        limits = ZipLimits(zipped.entries, min(zipped.total, free), zipped.ratio, zipped.free)
+        endings = (*PHOTO_ENDINGS, *VIDEO_ENDINGS)
+        wanted = (lambda path: path.suffix.lower() in endings) if kind == "photos" else (lambda path: True)
+        count, left_out = unpack(part, folder, limits, wanted)
+        if not count:
+            raise RefusedError("zip: holds nothing that can be used; pack photos, or a capture")
+        self.library.publish(folder, kind, name)
+        self.recount()
+        return {
+            "entry": f"{kind}/{name}",
+            "files": count,
+            "left_out": left_out[:50],
+            "num_left_out": len(left_out),
+        }
+
+    async def _stream(self, chunks: AsyncIterator[bytes], length: int | None, part: Path) -> int:
+        """Write a body to a file; room for it is reserved first, or as it comes if its length is unknown."""
+        size, reserved = 0, length or 0
+        await run_in_threadpool(self._reserve, reserved, begins=True)
+        try:
+            with part.open("xb") as file:
+                while (chunk := await asyncio.wait_for(anext(chunks, None), STALL)) is not None:
+                    size += len(chunk)
+                    if size > min(self.limits.file, length or size):
+                        raise too_large(
+                            f"file: has more than {min(self.limits.file, length or size):,} bytes"
+                        )
+                    if length is None:
+                        await run_in_threadpool(self._reserve, len(chunk))
+                        reserved += len(chunk)
+                    await run_in_threadpool(file.write, chunk)
+        except TimeoutError:
+            raise RefusedError(
+                f"file: no byte came for {STALL:.0f} s; send it again", HTTPStatus.REQUEST_TIMEOUT
+            ) from None
+        finally:
+            with self._lock:
+                self._running -= 1
+                self._expected -= reserved
+        if length is not None and size != length:
+            raise RefusedError(f"file: has {size:,} of the announced {length:,} bytes; send it again")
+        return size
+
+    def _room(self) -> int:
+        """Return how many bytes more may be taken in."""
+        disk = shutil.disk_usage(self.library.root).free - self.limits.spare
+        return min(disk, self.limits.library - self.used()) - self._expected
+
+    def _reserve(self, size: int, *, begins: bool = False) -> None:
+        """Reserve room for bytes of an upload.
+
+        Raises:
+            RefusedError: there is none, the file is too large, or too many uploads are running.
+        """
+        if size > self.limits.file:
+            raise too_large(f"file: has {size:,} bytes, but one file may have {self.limits.file:,}")
+        with self._lock:
+            if begins and self._running >= AT_ONCE:
+                raise RefusedError(
+                    "file: too many uploads at once; send it again", HTTPStatus.SERVICE_UNAVAILABLE
+                )
+            if size > (room := self._room()):
+                raise RefusedError(
+                    f"file: has {size:,} bytes, but there is room for {max(room, 0):,}; remove something, or set"
+                    " --max-library",
+                    HTTPStatus.INSUFFICIENT_STORAGE,
+                )
+            self._expected += size
+            self._running += begins
+
+    def _place(self, part: Path, target: Path) -> None:
+        if target.suffix.lower() in PHOTO_ENDINGS and not is_image(part):
+            raise RefusedError(f"file: {target.name!r} is not an image that can be read; export it as JPEG")
+        size = part.stat().st_size
+        with self.library.lock:
+            folder = target.parent
+            if folder.is_dir() and sum(1 for _ in folder.iterdir()) >= self.limits.entry_files:
+                raise too_large(f"file: {folder.name} holds {self.limits.entry_files:,} files already")
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.path.lexists(target):
+                raise conflict(
+                    f"file: {target.name!r} exists already; rename the new one or remove the old one"
+                )
+            part.rename(target)
+        with self._lock:
+            if self._used is not None:
+                self._used += size

@@ -1,0 +1,177 @@
+"""Short work that needs torch, in a process of its own that answers one request after the other.
+
+    python -m gsplat_edu.studio.worker
+
+reads requests from standard input and writes answers to standard output, one JSON object per line: {"task": name, ...}
+and {"result": ...} or {"error": one line}. It ends with its input, or after `IDLE` seconds without a request, so that
+the memory of a scene is not held forever. Nothing that it does takes longer than a minute; the rest are jobs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gsplat_edu.errors import SplatError
+from gsplat_edu.files import described, written_aside
+from gsplat_edu.reading import parse_json, read_bytes
+from gsplat_edu.text import legible
+
+IDLE = 600.0
+"""Seconds without a request after which the process ends."""
+
+
+def make_page(source: str, title: str, out: str, edits: str = "", url: str = "") -> dict[str, Any]:
+    """Write the page that shows a scene (`gsplat_edu.viewer.page`).
+
+    Args:
+        source: Scene file or run folder.
+        title: Heading of the page.
+        out: File to write.
+        edits: File of the scene's edits, for a page with the editor; empty for one without.
+        url: Where that page reads and stores edits, relative to itself.
+    """
+    from gsplat_edu.runs.source import open_source
+    from gsplat_edu.viewer import page, page_parts
+    from gsplat_edu.viewer.edit_page import editing_of
+
+    found = open_source(source)
+    tour = page.Tour(origin=found.origin)
+    shown = (found.scene, found.cameras, found.settings, title, found.held_out, tour)
+    if edits:
+        editing = editing_of(found, Path(source), Path(edits), url)
+        html, policy = page.html(*shown, editing), page_parts.policy(page_parts.EDITOR)
+    else:
+        html, policy = page.html(*shown), page_parts.policy()
+    _write(out, html)
+    return {"policy": policy, "count": len(found.scene.gaussians)}
+
+
+def make_live_page(facts: str, out: str) -> dict[str, Any]:
+    """Write the page that shows a training (`gsplat_edu.viewer.live_folder`).
+
+    Args:
+        facts: Its page.json.
+        out: File to write.
+    """
+    from gsplat_edu.viewer import page, page_parts
+
+    _write(out, page.live_html(parse_json(read_bytes(Path(facts))), step=False))
+    return {"policy": page_parts.policy(page_parts.LIVE)}
+
+
+def check_edits(path: str, name: str, source: str) -> dict[str, Any]:
+    """Check an edits file: its operations, and that it was made for a scene.
+
+    Args:
+        path: The file.
+        name: Its name, for messages.
+        source: Scene file or run folder.
+    """
+    from gsplat_edu.edits.document import parse_edits
+    from gsplat_edu.edits.identity import identity_of
+    from gsplat_edu.runs.source import open_source
+
+    edits = parse_edits(read_bytes(Path(path)), name)
+    found = open_source(source)
+    facts = found.path.stat()
+    key = f"{found.path} {facts.st_mtime_ns} {facts.st_size}"
+    if key not in _identities:
+        _identities.clear()
+        _identities[key] = identity_of(found.scene.gaussians, found.origin)
+    edits.check_scene(_identities[key], name)
+    return {"operations": len(edits.operations)}
+
+
+_identities: dict[str, Any] = {}
+"""The identity of the scene that was checked last."""
+
+
+def forecast(capture: str, resolution: float | None) -> dict[str, Any]:
+    """Forecast time and memory of a training of each quality, measured now on this machine.
+
+    Args:
+        capture: Folder of the capture.
+        resolution: As for `train --resolution`.
+    """
+    from dataclasses import replace
+
+    from gsplat_edu.budget.costs import Facts, wanted_gaussians
+    from gsplat_edu.budget.forecast import predict
+    from gsplat_edu.budget.probe import probe
+    from gsplat_edu.data.dataset import load_dataset
+    from gsplat_edu.data.settings import DataSettings
+    from gsplat_edu.render.backends import resolve_backend
+    from gsplat_edu.train.config import DEFAULT_STRATEGY, QUALITIES, recipe
+
+    dataset = load_dataset(Path(capture), DataSettings(resolution=resolution))
+    facts = Facts.of(dataset, load_dataset(dataset.path))
+    measured, found = None, {}
+    for name, iterations in sorted(QUALITIES.items(), key=lambda entry: -entry[1]):
+        config = recipe(iterations, strategy=DEFAULT_STRATEGY)
+        cap = wanted_gaussians(config, facts.points, facts.pixels, facts.train)
+        config = replace(config, max_gaussians=cap)
+        measured = measured or probe(dataset, config, resolve_backend("auto"))
+        said = predict(facts, measured, config, dataset.images.budget)
+        found[name] = {
+            "iterations": said.iterations,
+            "seconds": said.total,
+            "bytes": said.peak,
+            "gaussians": said.gaussians[1],
+            "factor": said.factor,
+            "backend": said.backend,
+            "lines": said.lines(),
+        }
+    return {name: found[name] for name in QUALITIES}
+
+
+TASKS: dict[str, Callable[..., dict[str, Any]]] = {
+    "page": make_page,
+    "live_page": make_live_page,
+    "check_edits": check_edits,
+    "forecast": forecast,
+}
+
+
+def answer(line: bytes) -> dict[str, Any]:
+    """Carry out a request; a failure becomes one line."""
+    try:
+        request = parse_json(line)
+        return {"result": TASKS[request.pop("task")](**request)}
+    except SplatError as error:
+        return {"error": legible(str(error))}
+    except OSError as error:
+        return {"error": legible(described(error))}
+    except MemoryError:
+        return {"error": "ran out of memory; close other programs, or cancel a job"}
+    except Exception as error:
+        return {
+            "error": legible(f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
+        }
+
+
+def main() -> None:
+    """Answer requests until the input ends."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what libraries print is no answer
+    requests = sys.stdin.buffer
+    while select.select([requests], [], [], IDLE)[0]:
+        line = requests.readline()
+        if not line:
+            return
+        answers.write(json.dumps(answer(line)) + "\n")
+        answers.flush()
+
+
+def _write(out: str, data: bytes) -> None:
+    with written_aside(Path(out)) as aside:
+        aside.write_bytes(data)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Processes that do short work with torch for the server, which never imports it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import threading
+from http import HTTPStatus
+from typing import Any
+
+from gsplat_edu.reading import parse_json
+from gsplat_edu.studio.refusal import RefusedError
+
+PATIENCE = 180.0
+"""Seconds after which a worker that does not answer is ended."""
+
+MOST_WAITING = 6
+"""Requests that wait for a worker; each holds a thread of the server."""
+
+COMMAND = (sys.executable, "-m", "gsplat_edu.studio.worker")
+
+
+class Worker:
+    """A worker process, started when it is needed. It may be used from any thread; requests wait for one another."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._closed = False
+        self._room = threading.Semaphore(MOST_WAITING)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def ask(self, task: str, **arguments: Any) -> Any:  # noqa: ANN401
+        """Let the worker do something (`gsplat_edu.studio.worker.TASKS`) and return its result.
+
+        Raises:
+            RefusedError: it failed, has ended, or too many requests are waiting; has the line.
+        """
+        line = json.dumps({"task": task, **arguments}).encode() + b"\n"
+        if not self._room.acquire(blocking=False):
+            raise RefusedError(
+                f"{task}: too many requests are waiting; try again soon", HTTPStatus.SERVICE_UNAVAILABLE
+            )
+        try:
+            with self._lock:
+                said = self._asked(line) or self._asked(line)  # it may just have ended because nobody asked
+        finally:
+            self._room.release()
+        if not said:
+            raise RefusedError(
+                f"{task}: its process ended or took too long; close other programs, or cancel a job",
+                HTTPStatus.INTERNAL_SERVER_ERROR,
+            )
+        found = parse_json(said)
+        if "error" in found:
+            raise RefusedError(found["error"])
+        return found["result"]
+
+    def close(self) -> None:
+        """End the process, and whatever it does."""
+        self._closed = True
+        process = self._process
+        if process is not None:
+            process.kill()
+            with self._lock:  # whoever waits for it gets no answer
+                self._drop()
+
+    def _drop(self) -> None:
+        """Forget the process."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
+
+    def _asked(self, line: bytes) -> bytes:
+        """Send a request; return the answer, empty if there is none."""
+        if self._closed:
+            return b""
+        if self._process is None or self._process.poll() is not None:
+            self._drop()
+            self._process = subprocess.Popen(
+                COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+            )
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None
+        timer = threading.Timer(PATIENCE, process.kill)
+        timer.start()
+        try:
+            process.stdin.write(line)
+            process.stdin.flush()
+            said = process.stdout.readline()
+        except OSError:
+            said = b""
+        finally:
+            timer.cancel()
+        if said.endswith(b"\n"):
+            return said
+        self._drop()
+        return b""

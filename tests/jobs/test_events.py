@@ -1,0 +1,127 @@
+"""Events survive their file, whatever they hold, and readers survive damaged files."""
+
+import math
+import os
+
+import pytest
+
+from gsplat_edu.jobs import emitter, events
+from gsplat_edu.jobs.emitter import Emitter
+from gsplat_edu.jobs.following import Follower, events_after, last_stage, last_word
+from gsplat_edu.jobs.process import identity, runs
+
+ALL = [
+    events.Started(12, "boot 34"),
+    events.Stage("training"),
+    events.Progress("training", 3, 10, 1.5),
+    events.Progress("photos", 3),
+    events.Message('quotes " and \n line ends, <b>ü\udcff'),
+    events.Found(
+        "blur", "warning", "2 photos are blurred", "leave them out", ("a.jpg", "b.jpg"), ("0.1", "0.2")
+    ),
+    events.Diagnosed((("capture", "x"), ("holds", "y")), ("files",), ("train",)),
+    events.Metric("psnr", 30.5, "dB", "test"),
+    events.Failed("gsplat-edu train: no", 2),
+    events.Interrupted("gsplat-edu train: interrupted"),
+    events.Finished(("runs/a", "b.spz")),
+]
+
+
+@pytest.mark.parametrize("event", ALL, ids=lambda event: type(event).__name__)
+def test_an_event_survives_its_line(event):
+    line = events.line_of(event, 5.25)
+    assert line.count("\n") == 1 and line.isascii()
+    assert events.parse_line(line) == (5.25, event)
+
+
+def test_every_kind_is_tested():
+    assert {type(event) for event in ALL} == set(events.KINDS.values())
+
+
+def test_a_figure_that_json_lacks_is_null():
+    line = events.line_of(events.Metric("psnr", math.nan), 0.0)
+    assert events.parse_line(line)[1] == events.Metric("psnr", None)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("", "{", "[]", "3", '{"event":"begun","time":1}', '{"event":"stage","time":1}'),
+        '{"event":"stage","time":"x","name":"a"}',
+    ],
+)
+def test_other_lines_are_refused(line):
+    with pytest.raises(ValueError):
+        events.parse_line(line)
+
+
+def test_a_reader_sees_whole_lines_once(tmp_path):
+    path = tmp_path / "events.jsonl"
+    follower = Follower(path)
+    assert follower.read() == []
+    first, second = (events.line_of(event, 1.0).encode() for event in ALL[:2])
+    path.write_bytes(first + second[:7])
+    assert [(number, event) for number, _, event in follower.read()] == [(1, ALL[0])]
+    with path.open("ab") as file:
+        file.write(second[7:] + b"damaged\n" + first)
+    assert [(number, event) for number, _, event in follower.read()] == [(2, ALL[1]), (4, ALL[0])]
+    assert follower.read() == []
+    assert [number for number, *_ in events_after(path, 2)] == [4]
+
+
+def test_the_last_word_is_that_of_the_last_process(tmp_path):
+    path = tmp_path / "events.jsonl"
+    assert last_word(path) is None and last_stage(path) == ""
+    done, begun, stage = events.Finished(("x",)), events.Started(1, ""), events.Progress("photos", 1)
+    path.write_text("".join(events.line_of(event, 0.0) for event in (begun, done)))
+    assert last_word(path) == done
+    path.write_text("".join(events.line_of(event, 0.0) for event in (begun, done, begun, stage)))
+    assert last_word(path) is None and last_stage(path) == "photos"
+    long = events.Failed("x" * 10_000, 2)  # longer than the part that is read at first
+    path.write_text("".join(events.line_of(event, 0.0) for event in (begun, long)))
+    assert last_word(path) == long
+
+
+def test_an_emitter_thins_progress_out_and_keeps_its_end(tmp_path):
+    path = tmp_path / "events.jsonl"
+    made = Emitter(path)
+    for done in range(1000):
+        made.progress("training", done + 1, 1000, lambda: 2.0)
+    made.output(tmp_path)
+    made.output(tmp_path)
+    made.finish()
+    found = [event for _, _, event in events_after(path)]
+    assert found[0] == events.Stage("training")
+    assert found[-2:] == [events.Progress("training", 1000, 1000, 2.0), events.Finished((str(tmp_path),))]
+    assert len(found) < 20  # a thousand steps take a few ms; half a second lies between two events
+
+
+def test_a_full_disk_does_not_end_the_command(tmp_path, capsys):
+    made = Emitter(tmp_path / "events.jsonl")
+    os.close(made._file)
+    made._file = os.open("/dev/full", os.O_WRONLY)
+    for _ in range(3):
+        made.emit(events.Stage("a"))
+    assert (
+        capsys.readouterr().err == "the job's events cannot be written any more (No space left on device)\n"
+    )
+
+
+def test_nothing_is_written_outside_of_a_job(monkeypatch):
+    monkeypatch.delenv(events.EVENTS, raising=False)
+    before = emitter._emitter
+    emitter.start()
+    emitter.progress("a", 1, 2, lambda: pytest.fail("the forecast was computed for nobody"))
+    assert emitter._emitter is before is None
+
+
+def test_a_process_is_known_by_its_start(tmp_path):
+    known = identity(os.getpid())
+    assert known and runs(os.getpid(), known)
+    assert not runs(os.getpid(), known + "1") and not runs(os.getpid(), "")
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
+    assert identity(child) is None  # it has ended, although its number is still taken
+    os.waitpid(child, 0)

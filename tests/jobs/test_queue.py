@@ -1,0 +1,272 @@
+"""The queue runs real processes: small programs that write events as commands do."""
+
+import json
+import os
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.jobs import queue as queue_module
+from gsplat_edu.jobs.process import identity
+from gsplat_edu.jobs.queue import JobQueue
+from gsplat_edu.jobs.record import Job, JobFolder, State, resumed
+
+PROGRAM = """
+import json, os, signal, sys, time
+file = open(os.environ["GSPLAT_EDU_EVENTS"], "a", buffering=1)
+def emit(event, **fields):
+    file.write(json.dumps({"event": event, "time": 0, **fields}) + "\\n")
+def stop(number, frame):
+    if "stubborn" not in sys.argv:
+        emit("interrupted", line="interrupted after a checkpoint")
+        sys.exit(130)
+signal.signal(signal.SIGINT, stop)
+if "stubborn" in sys.argv:
+    signal.signal(signal.SIGTERM, stop)
+open(sys.argv[2] + ".ran", "a").write(sys.argv[2] + "\\n")
+emit("stage", name="work")
+print("printed", flush=True)
+if "fails" in sys.argv:
+    emit("failed", line="it failed", code=2)
+    sys.exit(2)
+if "crashes" in sys.argv:
+    print("Traceback and all", file=sys.stderr)
+    sys.exit(1)
+while "waits" in sys.argv and not os.path.exists(sys.argv[2]):
+    emit("progress", stage="work", done=1)
+    time.sleep(0.02)
+emit("finished", outputs=[sys.argv[2]])
+"""
+
+
+@pytest.fixture
+def opened(tmp_path):
+    """Open queues on one folder; they are closed at the end, and their processes ended."""
+    made = []
+
+    def open_queue(**options):
+        program = (sys.executable, "-S", "-c", PROGRAM)
+        made.append(JobQueue(tmp_path / "jobs", program=program, **options))
+        return made[-1]
+
+    yield open_queue
+    for queue in made:
+        queue._closed.set()
+        queue._thread.join()
+        for child in queue._children.values():
+            child.kill()
+            child.wait()
+
+
+def until(condition, patience=20.0):
+    end = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
+
+
+def reached(queue, name, *states):
+    until(lambda: queue.get(name).state in states)
+    return queue.get(name)
+
+
+def abandon(queue):
+    """End a queue as kill -9 would: nothing is written any more, and its processes run on."""
+    queue._closed.set()
+    queue._thread.join()
+
+
+def test_jobs_run_one_after_the_other_and_their_results_are_kept(opened, tmp_path):
+    changes = []
+    queue = opened(changed=lambda name, job: changes.append((name, job and job.state)))
+    first = queue.submit(["run", str(tmp_path / "a"), "waits"], "first", "runs/a")
+    second = queue.submit(["run", str(tmp_path / "b")])
+    third = queue.submit(["run", str(tmp_path / "c"), "fails"])
+    fourth = queue.submit(["run", str(tmp_path / "d"), "crashes"])
+    reached(queue, first.id, State.RUNNING)
+    assert {queue.get(job.id).state for job in (second, third, fourth)} == {State.QUEUED}
+    (tmp_path / "a").touch()
+    done = reached(queue, first.id, State.DONE)
+    assert done.outputs == (str(tmp_path / "a"),) and done.ended >= done.started >= done.created
+    assert reached(queue, second.id, State.DONE).line == ""
+    assert reached(queue, third.id, State.FAILED).line == "it failed"
+    assert reached(queue, fourth.id, State.FAILED).line == "Traceback and all"
+    assert "printed" in queue.files(first.id).output.read_text()
+    assert [state for name, state in changes if name == first.id] == ["queued", "running", "running", "done"]
+    queue.remove(first.id)
+    assert changes[-1] == (first.id, None) and not (queue.folder / first.id).exists()
+    with pytest.raises(ArgumentError, match="does not exist"):
+        queue.get(first.id)
+
+
+def test_two_run_at_once_if_told_so(opened, tmp_path):
+    queue = opened(at_once=2)
+    jobs = [queue.submit(["run", str(tmp_path / name), "waits"]) for name in "abc"]
+    for job in jobs[:2]:
+        reached(queue, job.id, State.RUNNING)
+    assert queue.get(jobs[2].id).state is State.QUEUED
+
+
+def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
+    queue = opened()
+    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
+    waiting = queue.submit(["run", str(tmp_path / "b")])
+    assert queue.cancel(waiting.id).state is State.CANCELLED
+    until((tmp_path / "a.ran").exists)
+    queue.cancel(job.id)
+    ended = reached(queue, job.id, State.CANCELLED)
+    assert ended.line == "interrupted after a checkpoint" and ended.resumable
+    with pytest.raises(ArgumentError, match="is cancelled"):
+        queue.cancel(job.id)
+    (tmp_path / "a").touch()
+    queue.resume(job.id)
+    done = reached(queue, job.id, State.DONE)
+    assert done.attempts == 2 and (tmp_path / "a.ran").read_text().count("\n") == 2
+    with pytest.raises(ArgumentError, match="cannot be resumed"):
+        queue.resume(job.id)
+    assert not (tmp_path / "b.ran").exists()
+
+
+def test_a_job_that_does_not_listen_is_killed(opened, tmp_path):
+    queue = opened(patience={"interrupt": 0.2, "terminate": 0.2})
+    job = queue.submit(["run", str(tmp_path / "a"), "waits", "stubborn"])
+    until((tmp_path / "a.ran").exists)
+    queue.cancel(job.id)
+    assert reached(queue, job.id, State.CANCELLED).line == "it was ended"
+
+
+def test_a_paused_job_stands_still(opened, tmp_path):
+    queue = opened()
+    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
+    with pytest.raises(ArgumentError):
+        queue.pause("000099")
+    until((tmp_path / "a.ran").exists)
+    assert queue.pause(job.id).state is State.PAUSED
+    events = queue.files(job.id).events
+    until(lambda: _is_stopped(queue.get(job.id).pid))
+    size = events.stat().st_size
+    time.sleep(0.1)
+    assert events.stat().st_size == size
+    with pytest.raises(ArgumentError, match="is paused"):
+        queue.pause(job.id)
+    queue.resume(job.id)
+    until(lambda: events.stat().st_size > size)
+    queue.pause(job.id)
+    queue.cancel(job.id)  # a stopped process has to be continued to hear it
+    reached(queue, job.id, State.CANCELLED)
+
+
+def _is_stopped(pid):
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+
+
+def test_jobs_outlive_a_killed_queue_and_the_next_one_finds_them(opened, tmp_path):
+    queue = opened()
+    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
+    after = queue.submit(["run", str(tmp_path / "b")])
+    until((tmp_path / "a.ran").exists)
+    abandon(queue)
+    found = opened()
+    assert found.get(job.id).state is State.RUNNING and found.get(after.id).state is State.QUEUED
+    (tmp_path / "a").touch()
+    os.waitpid(queue._children[job.id].pid, 0)  # an orphan's process is waited for by init
+    assert reached(found, job.id, State.DONE).attempts == 1
+    reached(found, after.id, State.DONE)
+    assert (tmp_path / "a.ran").read_text().count("\n") == 1
+
+
+def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
+    queue = opened()
+    done, killed = (queue.submit(["run", str(tmp_path / name), "waits"]) for name in "ab")
+    until((tmp_path / "a.ran").exists)
+    abandon(queue)
+    (tmp_path / "a").touch()
+    queue._children[done.id].wait()
+    folder = JobFolder(
+        queue.folder / killed.id
+    )  # as if it had been running when the computer was switched off
+    folder.write(
+        Job(**{**vars(queue.get(killed.id)), "state": State.RUNNING, "pid": 1, "identity": "other boot"})
+    )
+    found = opened()
+    assert found.get(done.id).state is State.DONE
+    lost = found.get(killed.id)
+    assert (
+        lost.state is State.INTERRUPTED and lost.resumable and lost.line == "its process ended without a word"
+    )
+    time.sleep(0.3)
+    assert (tmp_path / "a.ran").read_text().count("\n") == 1 and not (tmp_path / "b.ran").exists()
+
+
+def test_a_queue_killed_before_it_noted_the_process_finds_it_by_its_first_event(opened, tmp_path):
+    queue = opened()
+    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
+    until((tmp_path / "a.ran").exists)
+    abandon(queue)
+    pid = queue.get(job.id).pid
+    line = {"event": "started", "time": 0, "pid": pid, "identity": identity(pid)}
+    with queue.files(job.id).events.open("a") as file:
+        file.write(json.dumps(line) + "\n")
+    JobFolder(queue.folder / job.id).write(Job(**{**vars(queue.get(job.id)), "pid": None, "identity": ""}))
+    assert opened().get(job.id).pid == pid
+
+
+def test_closing_interrupts_what_runs_and_keeps_what_waits(opened, tmp_path):
+    queue = opened()
+    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
+    waiting = queue.submit(["run", str(tmp_path / "b"), "waits"])
+    until((tmp_path / "a.ran").exists)
+    queue.close()
+    assert queue.get(job.id).state is State.INTERRUPTED and queue.get(waiting.id).state is State.QUEUED
+    again = opened()
+    reached(again, waiting.id, State.RUNNING)
+    assert again.get(job.id).state is State.INTERRUPTED
+
+
+def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path, monkeypatch):
+    monkeypatch.setattr(queue_module, "MOST_QUEUED", 2)
+    queue = opened()
+    queue.submit(["run", str(tmp_path / "a"), "waits"])
+    until((tmp_path / "a.ran").exists)
+    kept = [queue.submit(["run", str(tmp_path / name)]) for name in "bc"]
+    with pytest.raises(ArgumentError, match=r"^jobs: 2 are waiting; cancel some"):
+        queue.submit(["run", "d"])
+    with pytest.raises(ArgumentError, match="cancel it first"):
+        queue.remove(queue.jobs()[0].id)
+    abandon(queue)
+    queue.files(kept[0].id).record.write_text("{")
+    shutil.copytree(queue.folder / kept[1].id, queue.folder / "000077")
+    found = opened()
+    assert len(found.damaged) == 2 and all(line.count("\n") == 0 for line in found.damaged)
+    assert found.submit(["run", str(tmp_path / "e")]).id == "000078"  # no id is used twice
+
+
+def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch):
+    queue = opened()
+    write = JobFolder.write
+    full = [True]
+
+    def failing(self, job):
+        if full[0] and job.state is not State.QUEUED:
+            raise OSError(28, "No space left on device", str(self.record))
+        write(self, job)
+
+    monkeypatch.setattr(JobFolder, "write", failing)
+    job = queue.submit(["run", str(tmp_path / "a")])
+    until(lambda: queue.trouble)
+    assert "no space left on device" in queue.trouble and queue.get(job.id).state is State.QUEUED
+    full[0] = False
+    reached(queue, job.id, State.DONE)
+    assert (tmp_path / "a.ran").read_text().count("\n") == 1
+
+
+def test_a_training_resumes_once_its_run_has_begun(tmp_path):
+    argv = ("train", "capture", "--out", str(tmp_path))
+    assert resumed(argv) == argv
+    (tmp_path / "config.json").touch()
+    assert resumed(argv) == (*argv, "--resume") == resumed(resumed(argv))
+    assert resumed(("sfm", "photos", str(tmp_path))) == ("sfm", "photos", str(tmp_path))

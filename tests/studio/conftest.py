@@ -1,0 +1,65 @@
+"""A studio in the test's process, without its queue starting anything unless a test asks for it."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+from starlette.testclient import TestClient
+
+from gsplat_edu.studio.app import application
+from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.studio.state import Studio
+from gsplat_edu.studio.uploads import Limits
+from gsplat_edu.studio.worker import answer
+
+TOKEN = "a-token"
+HOST = "http://127.0.0.1:8090"
+
+
+class Inline:
+    """The worker's tasks in this process, which has imported torch already."""
+
+    def ask(self, task, **arguments):
+        import json
+
+        found = answer(json.dumps({"task": task, **arguments}).encode())
+        if "error" in found:
+            raise RefusedError(found["error"])
+        return found["result"]
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def studio(tmp_path, request):
+    """A studio with small limits."""
+    limits = getattr(request, "param", Limits(file=1 << 20, spare=0))
+    made = Studio(tmp_path / "library", limits=limits)
+    made.queue.at_once = 0
+    made.worker = made.prober = Inline()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def page(studio):
+    """A client like the studio's page: with the cookie, and the Origin that browsers add."""
+    with TestClient(application(studio, TOKEN), base_url=HOST) as client:
+        assert client.get("/", params={"token": TOKEN}).status_code == 200
+        client.headers["Origin"] = HOST
+        yield client
+
+
+@pytest.fixture
+def jpeg():
+    """The bytes of a small photo."""
+    return picture("JPEG")
+
+
+def picture(form, size=(24, 18), **options):
+    data = io.BytesIO()
+    pixels = np.random.default_rng(5).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(data, format=form, **options)
+    return data.getvalue()

@@ -1,0 +1,116 @@
+"""Only the studio's own page may talk to the server."""
+
+import pytest
+from starlette.testclient import TestClient
+
+from gsplat_edu.studio.app import application
+from studio.conftest import HOST, TOKEN
+
+
+@pytest.fixture
+def stranger(studio):
+    """A client without cookie, Origin or token."""
+    with TestClient(application(studio, TOKEN), base_url=HOST) as client:
+        yield client
+
+
+def test_the_url_with_the_token_opens_the_page_and_sets_the_cookie(stranger):
+    answer = stranger.get("/", params={"token": TOKEN}, headers={"Sec-Fetch-Site": "cross-site"})
+    assert answer.status_code == 200 and "<title>" in answer.text
+    cookie = answer.headers["set-cookie"]
+    assert "HttpOnly" in cookie and "SameSite=Strict" in cookie and "Path=/" in cookie
+    assert stranger.get("/api/library").status_code == 200  # the cookie suffices
+    assert "set-cookie" not in stranger.get("/api/library").headers
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"Authorization": "Bearer wrong"},
+        {"Authorization": TOKEN},
+        {"Cookie": "gsplat_edu_studio=wrong"},
+        {"Cookie": "gsplat_edu_other=a-token"},
+        {"Authorization": f"Bearer {TOKEN}", "Host": "evil.example"},  # DNS rebinding
+        {"Authorization": f"Bearer {TOKEN}", "Host": "127.0.0.1.evil.example:8090"},
+        {"Authorization": f"Bearer {TOKEN}", "Origin": "http://evil.example"},
+        {"Authorization": f"Bearer {TOKEN}", "Origin": "http://127.0.0.1:8091"},
+        {"Authorization": f"Bearer {TOKEN}", "Origin": "null"},
+        {"Authorization": f"Bearer {TOKEN}", "Sec-Fetch-Site": "cross-site"},
+        {"Authorization": f"Bearer {TOKEN}", "Sec-Fetch-Site": "same-site"},
+    ],
+    ids=str,
+)
+def test_others_are_refused(stranger, headers):
+    for path in ("/api/library", "/", "/web/index.html", "/api/events", "/nothing"):
+        answer = stranger.get(path, headers=headers)
+        assert answer.status_code == 403 and answer.text.startswith("403 Forbidden: "), path
+        assert "set-cookie" not in answer.headers and "access-control-allow-origin" not in answer.headers
+
+
+@pytest.mark.parametrize("path", ["/?token=wrong", "/api/library?token=a-token"])
+def test_a_token_elsewhere_opens_nothing(stranger, path):
+    assert stranger.get(path).status_code == 403
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH"])
+def test_a_change_needs_an_origin_besides_the_cookie(page, method):
+    del page.headers["Origin"]
+    assert page.request(method, "/api/trash").status_code == 403
+    assert page.request(method, "/api/trash", headers={"Origin": "http://evil.example"}).status_code == 403
+
+
+def test_programs_use_the_token_in_a_header(stranger):
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    assert stranger.get("/api/library", headers=headers).status_code == 200
+    assert stranger.delete("/api/trash", headers=headers).status_code == 200
+
+
+def test_every_answer_keeps_others_out(page, stranger):
+    for answer in (page.get("/"), page.get("/api/library"), page.get("/api/nothing/x"), stranger.get("/")):
+        policy = answer.headers["content-security-policy"]
+        assert (
+            "default-src 'none'" in policy and "unsafe" not in policy and "frame-ancestors 'none'" in policy
+        )
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert answer.headers["cross-origin-resource-policy"] == "same-origin"
+        assert answer.headers["referrer-policy"] == "no-referrer"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/web/../app.py",
+        "/web/%2e%2e/app.py",
+        "/web/..%2fapp.py",
+        "/viewer/__init__.py",
+        "/web/nothing.js",
+        "/web/",
+    ],
+)
+def test_only_the_files_of_the_page_are_served(page, path):
+    assert page.get(path).status_code in (404, 405)
+
+
+def test_the_scripts_of_the_viewer_are_served(page):
+    answer = page.get("/viewer/scene.js")
+    assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/javascript")
+    again = page.get("/viewer/scene.js", headers={"If-None-Match": answer.headers["etag"]})
+    assert again.status_code == 304
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status"),
+    [
+        (b"{", "application/json", 400),
+        (b"[1]", "application/json", 400),
+        (b'{"kind":"photos"}', "text/plain", 415),
+        (b'{"kind":"photos"}', "application/x-www-form-urlencoded", 415),
+        (b'{"a":NaN}', "application/json", 400),
+        (b"[" * 100_000, "application/json", 400),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_other_bodies_are_refused_in_one_line(page, body, kind, status):
+    answer = page.post("/api/adopt", content=body, headers={"Content-Type": kind})
+    assert answer.status_code == status and answer.json()["error"].count("\n") == 0

@@ -1,0 +1,203 @@
+"""Entries: listed, adopted, renamed, removed and restored; names of every kind."""
+
+import shutil
+import threading
+
+import pytest
+
+from studio.conftest import picture
+
+NAMES = ["toy", "Hütte im Schnee", "写真", "<img src=x onerror=alert(1)>", "a'b`c$(d)", "ا"]  # noqa: RUF001
+
+REFUSED = [
+    "",
+    " ",
+    "..",
+    ".hidden",
+    "-rf",
+    "a/b",
+    "a\\b",
+    "a\nb",
+    "a\x00b",
+    "a\u202eb",
+    "end.",
+    "end ",
+    "x" * 121,
+    "C:",
+    "a?",
+]
+
+
+def entry(studio, kind, name, **files):
+    folder = studio.library.root / kind / name
+    folder.mkdir()
+    for file, data in files.items():
+        (folder / file.replace("__", ".")).write_bytes(data)
+    return folder
+
+
+def listed(page, kind):
+    return [found["name"] for found in page.get("/api/library").json()[kind]]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_any_script_are_kept(page, studio, name, jpeg):
+    answer = page.put(f"/api/photos/{quoted(name)}/files/{quoted(name)}.jpg", content=jpeg)
+    assert answer.status_code == 201, answer.text
+    assert listed(page, "photos") == [name]
+    photos = page.get(f"/api/photos/{quoted(name)}/photos").json()["photos"]
+    assert [(photo["name"], photo["W"], photo["H"]) for photo in photos] == [(f"{name}.jpg", 24, 18)]
+
+
+def quoted(name):
+    from urllib.parse import quote
+
+    return quote(name, safe="")
+
+
+@pytest.mark.parametrize("name", REFUSED, ids=ascii)
+def test_other_names_are_refused_in_one_line(page, studio, tmp_path, name):
+    entry(studio, "photos", "there")
+    answer = page.post("/api/photos/there/rename", json={"to": name})
+    assert answer.status_code == 400 and answer.json()["error"].count("\n") == 0
+    (tmp_path / "outside").mkdir()
+    answer = page.post("/api/adopt", json={"kind": "photos", "path": str(tmp_path / "outside"), "name": name})
+    assert answer.status_code == 400
+    assert listed(page, "photos") == ["there"]
+
+
+def test_two_spellings_of_a_letter_are_one_name(page, studio, jpeg):
+    assert page.put("/api/photos/e\u0301/files/a.jpg", content=jpeg).status_code == 201
+    assert listed(page, "photos") == ["\u00e9"]
+    assert page.put("/api/photos/\u00e9/files/a.jpg", content=jpeg).status_code == 409
+
+
+def test_a_folder_elsewhere_is_adopted_and_only_its_link_removed(page, studio, tmp_path, jpeg):
+    outside = tmp_path / "photos of a trip"
+    (outside / "day 1").mkdir(parents=True)
+    (outside / "day 1" / "a.jpg").write_bytes(jpeg)
+    found = page.post("/api/adopt", json={"kind": "photos", "path": str(outside), "name": "trip"}).json()
+    assert found["adopted"] == str(outside) and found["photos"] == 1
+    assert page.get("/api/photos/trip/thumbs/day 1/a.jpg").status_code == 200
+    assert page.put("/api/photos/trip/files/b.jpg", content=jpeg).status_code == 409
+    number = page.delete("/api/photos/trip").json()["trash"]
+    assert page.post(f"/api/trash/{number}/restore").status_code == 200 and listed(page, "photos") == ["trip"]
+    page.delete("/api/photos/trip")
+    assert page.delete("/api/trash").json() == {"trash": []}
+    assert (outside / "day 1" / "a.jpg").is_file() and listed(page, "photos") == []
+
+
+def test_what_cannot_be_adopted(page, studio, tmp_path):
+    (tmp_path / "notes.txt").touch()
+    for path in (
+        "relative",
+        "/nowhere",
+        str(studio.library.root),
+        str(tmp_path),
+        str(tmp_path / "notes.txt"),
+    ):
+        answer = page.post("/api/adopt", json={"kind": "photos", "path": path, "name": "x"})
+        assert answer.status_code == 400, path
+    (tmp_path / "holiday.mp4").touch()
+    found = page.post(
+        "/api/adopt", json={"kind": "photos", "path": str(tmp_path / "holiday.mp4"), "name": "x"}
+    )
+    assert found.json()["videos"] == 1
+    assert (
+        page.post(
+            "/api/adopt", json={"kind": "photos", "path": str(tmp_path / "holiday.mp4"), "name": "x"}
+        ).status_code
+        == 409
+    )
+
+
+def test_rename_remove_and_restore(page, studio, jpeg):
+    entry(studio, "captures", "a", photo__jpg=jpeg)
+    entry(studio, "captures", "b")
+    assert page.post("/api/captures/a/rename", json={"to": "b"}).status_code == 409
+    assert page.post("/api/captures/a/rename", json={"to": "c"}).json()["entry"] == "captures/c"
+    assert page.get("/api/captures/a").status_code == 404
+    first = page.delete("/api/captures/c").json()["trash"]
+    entry(studio, "captures", "c")
+    assert page.post(f"/api/trash/{first}/restore").status_code == 409  # another one has its name now
+    shutil.rmtree(studio.library.root / "captures" / "c")
+    assert page.post(f"/api/trash/{first}/restore").json()["photos"] == 1
+    assert page.post(f"/api/trash/{first}/restore").status_code == 404
+
+
+def test_what_a_job_uses_stays_where_it_is(page, studio):
+    entry(studio, "captures", "a")
+    entry(studio, "captures", "ab")
+    job = page.post("/api/jobs", json={"command": "train", "subject": "captures/a", "to": "r"}).json()
+    assert page.post("/api/captures/a/rename", json={"to": "x"}).status_code == 409
+    assert page.delete("/api/captures/a").status_code == 409
+    assert page.post("/api/captures/ab/rename", json={"to": "x"}).status_code == 200
+    page.post(f"/api/jobs/{job['id']}/cancel")
+    assert page.delete("/api/captures/a").status_code == 200
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../a.jpg",
+        "%2e%2e/a.jpg",
+        "..%2f..%2fsecret.jpg",
+        "%2fetc%2fpasswd",
+        "x/../../secret.jpg",
+        ".hidden.jpg",
+        "%00.jpg",
+    ],
+)
+def test_no_path_leads_out_of_an_entry(page, studio, jpeg, path):
+    entry(studio, "photos", "a")
+    (studio.library.root / "secret.jpg").write_bytes(jpeg)
+    for answer in (
+        page.get(f"/api/photos/a/thumbs/{path}"),
+        page.put(f"/api/photos/a/files/{path}", content=jpeg),
+        page.get(f"/api/scenes/{path}/scene"),
+        page.get(f"/api/scenes/a/exports/{path}"),
+    ):
+        assert answer.status_code in (400, 404, 405), answer.text
+    assert sorted(p.name for p in studio.library.root.iterdir()) == [
+        ".studio", "captures", "photos", "runs", "scenes", "secret.jpg",
+    ]  # fmt: skip
+
+
+def test_a_link_inside_an_entry_leads_nowhere(page, studio, tmp_path, jpeg):
+    (tmp_path / "secret.jpg").write_bytes(jpeg)
+    (entry(studio, "photos", "a") / "link.jpg").symlink_to(tmp_path / "secret.jpg")
+    assert page.get("/api/photos/a/thumbs/link.jpg").status_code == 400
+
+
+def test_thumbnails_are_upright_small_and_cached(page, studio):
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was held upright
+    entry(studio, "photos", "a", a__jpg=picture("JPEG", (400, 200), exif=exif), broken__jpg=b"no photo")
+    photos = {photo["name"]: photo for photo in page.get("/api/photos/a/photos").json()["photos"]}
+    assert (photos["a.jpg"]["W"], photos["a.jpg"]["H"]) == (200, 400)
+    assert photos["broken.jpg"]["problem"] and photos["broken.jpg"]["W"] is None
+    answer = page.get("/api/photos/a/thumbs/a.jpg?side=128")
+    import io
+
+    with Image.open(io.BytesIO(answer.content)) as image:
+        assert image.size == (64, 128) and image.format == "JPEG"
+    assert answer.headers["content-type"] == "image/jpeg"
+    again = page.get("/api/photos/a/thumbs/a.jpg?side=128", headers={"If-None-Match": answer.headers["etag"]})
+    assert again.status_code == 304
+    assert page.get("/api/photos/a/thumbs/broken.jpg").status_code == 422
+    assert page.get("/api/photos/a/thumbs/a.jpg?side=100000").status_code == 400
+
+
+def test_fifty_clients_get_the_same_list(page, studio, jpeg):
+    entry(studio, "photos", "a", a__jpg=jpeg)
+    answers = []
+    threads = [
+        threading.Thread(target=lambda: answers.append(page.get("/api/library").json())) for _ in range(50)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(answers) == 50 and all(answer == answers[0] for answer in answers)

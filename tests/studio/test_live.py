@@ -1,0 +1,93 @@
+"""The live view of a job's training: its files are asked for only while somebody watches, and pause is the job's."""
+
+import json
+import os
+import threading
+import time
+
+import pytest
+
+from gsplat_edu.jobs import events
+from gsplat_edu.jobs.process import identity
+from gsplat_edu.jobs.record import Job, State
+from gsplat_edu.studio import live_routes
+from gsplat_edu.viewer.live_folder import LiveFolder, framed
+
+STATE = {"state": "training", "iteration": 30, "scene": 30}
+
+
+@pytest.fixture
+def training(studio, page):
+    """A run whose training is a job, as far as the server can see; its folder's live files."""
+    (studio.library.root / "captures" / "a").mkdir()
+    job = page.post("/api/jobs", json={"command": "train", "subject": "captures/a", "to": "r"}).json()["id"]
+    studio.queue._look = lambda: None  # nobody looks whether its process, which is this one, has ended
+    pid = os.getpid()
+    running = {"state": State.RUNNING, "pid": pid, "identity": identity(pid)}
+    studio.queue._jobs[job] = Job(**{**vars(studio.queue.get(job)), **running})
+    run = studio.library.root / "runs" / "r"
+    run.mkdir()
+    (run / "config.json").touch()
+    path = studio.queue.files(job).events
+    path.write_text(events.line_of(events.Progress("training", 30, 100), 1.0))
+    yield LiveFolder(run)
+    studio.queue._jobs[job] = Job(**{**vars(studio.queue.get(job)), "state": State.DONE, "pid": None})
+
+
+def test_files_are_asked_for_while_somebody_asks(page, training):
+    assert not training.is_wanted()
+    training.path.mkdir()
+    training.write(training.state, STATE)
+    training.scene.write_bytes(framed(30, 0, 0, b""))
+    found = page.get("/api/runs/r/live/state").json()
+    assert found["iteration"] == 30 and training.is_wanted()
+    scene = page.get("/api/runs/r/live/scene?after=-1")
+    assert scene.content == training.scene.read_bytes()
+
+
+def test_requests_wait_for_something_new(page, training, monkeypatch):
+    monkeypatch.setattr(live_routes, "WAIT", 0.2)
+    training.path.mkdir()
+    assert page.get("/api/runs/r/live/state").status_code == 204
+    assert page.get("/api/runs/r/live/scene?after=-1").status_code == 204
+    training.write(training.state, STATE)
+    version = page.get("/api/runs/r/live/state").json()["version"]
+    assert page.get(f"/api/runs/r/live/state?after={version}").status_code == 204
+    monkeypatch.setattr(live_routes, "WAIT", 20.0)
+
+    def later():
+        time.sleep(0.2)
+        training.write(training.state, {**STATE, "iteration": 31})
+
+    thread = threading.Thread(target=later)
+    thread.start()
+    assert page.get(f"/api/runs/r/live/state?after={version}").json()["iteration"] == 31
+    thread.join()
+
+
+def test_pause_is_that_of_the_job(page, studio, training):
+    training.path.mkdir()
+    training.write(training.state, STATE)
+    before = page.get("/api/runs/r/live/state").json()["version"]
+    assert page.post("/api/runs/r/live/control", content=json.dumps({"do": "pause"})).status_code == 204
+    assert training.is_paused() and studio.queue.get("000001").state is State.PAUSED
+    said = page.get(f"/api/runs/r/live/state?after={before}").json()
+    assert said["state"] == "paused"  # at once, before the training says so
+    assert page.post("/api/runs/r/live/control", content=json.dumps({"do": "pause"})).status_code == 409
+    assert page.post("/api/jobs/000001/resume").json()["state"] == "running" and not training.is_paused()
+    assert page.post("/api/runs/r/live/control", content=json.dumps({"do": "explode"})).status_code == 400
+    assert page.post("/api/runs/r/live/control", content=b"{").status_code == 400
+
+
+def test_damaged_files_and_finished_runs_have_no_live_view(page, studio, training, monkeypatch):
+    monkeypatch.setattr(live_routes, "WAIT", 0.1)
+    training.path.mkdir()
+    training.state.write_text("{")
+    training.scene.write_bytes(b"\xff" * 40)
+    assert page.get("/api/runs/r/live/state").status_code == 204
+    assert page.get("/api/runs/r/live/scene").status_code == 204
+    studio.queue._jobs["000001"] = Job(**{**vars(studio.queue.get("000001")), "state": State.DONE})
+    for path in ("state", "scene", "page"):
+        assert page.get(f"/api/runs/r/live/{path}").status_code == 409
+    assert page.get("/api/runs/none/live/state").status_code == 409
+    assert not (studio.library.root / "runs" / "none").exists()
