@@ -32,9 +32,19 @@ from wheels.pack import pack  # noqa: E402
 from wheels.targets import TARGETS, Target  # noqa: E402
 from wheels.windows import windows_python  # noqa: E402
 
-WITHOUT_LISTS = 'for word; do shift; case "$word" in -Wl,@*) ;; *) set -- "$@" "$word" ;; esac; done\n'
-"""Shell: drop the files of linker options, which zig cannot read. nanobind's lists symbols that Python will have, which
-the linker option for all undefined symbols covers."""
+FOR_MACOS = """\
+for word; do
+    shift
+    case "$word" in
+        -Wl,@*) ;;
+        -bundle) set -- "$@" -dynamiclib ;;
+        *) set -- "$@" "$word" ;;
+    esac
+done
+"""
+"""Shell: what CMake and nanobind ask of Apple's linker and zig's cannot do. It reads no lists of symbols; nanobind's names
+those that Python will have, which the linker option for all undefined symbols covers. It ends in a fault on a bundle;
+Python imports a dynamic library just the same."""
 
 
 class NotBuiltError(Exception):
@@ -93,7 +103,7 @@ def compilers(build: Path, target: Target) -> dict[str, Path]:
     for tool, options in (("c++", f"-target {target.zig}"), ("ar", ""), ("ranlib", ""), ("rc", "")):
         path = folder / f"zig-{tool}"
         command = f'exec {shlex.quote(sys.executable)} -m ziglang {tool} {options} "$@"'
-        path.write_text(f"#!/bin/sh\n{WITHOUT_LISTS if target.system == 'Darwin' else ''}{command}\n")
+        path.write_text(f"#!/bin/sh\n{FOR_MACOS if target.system == 'Darwin' else ''}{command}\n")
         path.chmod(0o755)
         scripts[tool] = path
     return scripts
