@@ -42,9 +42,9 @@ for word; do
     esac
 done
 """
-"""Shell: what CMake and nanobind ask of Apple's linker and zig's cannot do. It reads no lists of symbols; nanobind's names
-those that Python will have, which the linker option for all undefined symbols covers. It ends in a fault on a bundle;
-Python imports a dynamic library just the same."""
+"""Shell: replace what CMake and nanobind ask of Apple's linker and zig's cannot do. It reads no lists of symbols; nanobind's
+lists those of Python, which the option for all undefined symbols covers. A bundle makes it fault; Python imports a
+dynamic library just the same."""
 
 
 class NotBuiltError(Exception):

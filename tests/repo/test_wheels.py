@@ -220,7 +220,7 @@ def test_every_document_states_the_same_version():
 
 
 def macho(symbols, library=binaries.MACOS_LIBRARY, kind=6, oldest=(13, 0), signed=True):
-    """A 64-bit Mach-O file with load commands and a table of symbols (name, number of their library or None: its own)."""
+    """A 64-bit Mach-O file; symbols are a name and the number of its library, or None for its own."""
     path = library.encode() + b"\0" * (8 - len(library) % 8)
     commands = [
         struct.pack("<6I", 0xC, 24 + len(path), 24, 0, 0, 0) + path,
@@ -248,7 +248,11 @@ GOOD = [("_PyInit__native", None), ("_malloc", 1), ("_PyList_New", 0xFE)]
         (GOOD, {}, []),
         (GOOD[1:], {}, ["does not export PyInit__native"]),
         ([*GOOD, ("_new_in_macos_27", 1)], {}, ["_new_in_macos_27 is not in libSystem"]),
-        ([*GOOD, ("_PyList_GetItemRef", 0xFE)], {}, ["_PyList_GetItemRef is not in the stable ABI"]),  # from 3.13 on
+        (
+            [*GOOD, ("_PyList_GetItemRef", 0xFE)],
+            {},
+            ["_PyList_GetItemRef is not in the stable ABI"],
+        ),  # from 3.13 on
         ([*GOOD, ("_PyDict_Clear", 0)], {}, []),
         (GOOD, {"library": "/opt/lib/libc++.1.dylib"}, ["loads /opt/lib/libc++.1.dylib"]),
         (GOOD, {"oldest": (14, 2)}, ["needs macOS 14.2"]),
@@ -257,7 +261,9 @@ GOOD = [("_PyInit__native", None), ("_malloc", 1), ("_PyList_New", 0xFE)]
     ],
 )
 def test_what_a_module_asks_of_macos_is_found(monkeypatch, symbols, options, wrong):
-    monkeypatch.setattr(binaries, "system_symbols", lambda: {"_malloc", "_free"})  # zig's list is not installed here
+    monkeypatch.setattr(
+        binaries, "system_symbols", lambda: {"_malloc", "_free"}
+    )  # zig's list is not installed here
     assert binaries.macos_problems(macho(symbols, **options), 12, (13, 0), arm=True) == wrong
 
 

@@ -1,6 +1,6 @@
 """What a module for Windows or macOS asks of the system that imports it, read from the file.
 
-Those systems are not here, so a module that asks for a function or a library that they lack would be found by its users.
+Those systems are not here: without this check, users would be the first to meet a missing function or library.
 On Linux auditwheel reads the same from the ELF file.
 """
 
