@@ -42,8 +42,8 @@ for word; do
     esac
 done
 """
-"""Shell: replace what CMake and nanobind ask of Apple's linker and zig's cannot do. It reads no lists of symbols; nanobind's
-lists those of Python, which the option for all undefined symbols covers. A bundle makes it fault; Python imports a
+"""Shell: replace what CMake and nanobind ask of Apple's linker and zig's cannot do. It reads no lists of symbols;
+nanobind's holds those of Python, which one option for all of them covers. A bundle makes it fault; Python imports a
 dynamic library just the same."""
 
 
