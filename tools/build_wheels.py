@@ -29,11 +29,22 @@ sys.path.insert(0, str(ROOT / "tools"))
 from wheels.checks import problems  # noqa: E402
 from wheels.contents import nanobind_parts, zig_parts  # noqa: E402
 from wheels.pack import pack  # noqa: E402
-from wheels.targets import TARGETS, WINDOWS_PYCONFIG, Target  # noqa: E402
+from wheels.targets import TARGETS, Target  # noqa: E402
+from wheels.windows import windows_python  # noqa: E402
 
-WITHOUT_LISTS = 'for word; do shift; case "$word" in -Wl,@*) ;; *) set -- "$@" "$word" ;; esac; done\n'
-"""Shell: drop the files of linker options, which zig cannot read. nanobind's lists symbols that Python will have, which
-the linker option for all undefined symbols covers."""
+FOR_MACOS = """\
+for word; do
+    shift
+    case "$word" in
+        -Wl,@*) ;;
+        -bundle) set -- "$@" -dynamiclib ;;
+        *) set -- "$@" "$word" ;;
+    esac
+done
+"""
+"""Shell: replace what CMake and nanobind ask of Apple's linker and zig's cannot do. It reads no lists of symbols;
+nanobind's holds those of Python, which one option for all of them covers. A bundle makes it fault; Python imports a
+dynamic library just the same."""
 
 
 class NotBuiltError(Exception):
@@ -92,33 +103,24 @@ def compilers(build: Path, target: Target) -> dict[str, Path]:
     for tool, options in (("c++", f"-target {target.zig}"), ("ar", ""), ("ranlib", ""), ("rc", "")):
         path = folder / f"zig-{tool}"
         command = f'exec {shlex.quote(sys.executable)} -m ziglang {tool} {options} "$@"'
-        path.write_text(f"#!/bin/sh\n{WITHOUT_LISTS if target.system == 'Darwin' else ''}{command}\n")
+        path.write_text(f"#!/bin/sh\n{FOR_MACOS if target.system == 'Darwin' else ''}{command}\n")
         path.chmod(0o755)
         scripts[tool] = path
     return scripts
 
 
-def windows_python(build: Path, target: Target, include: Path) -> list[str]:
-    """Make the headers and the import library of Windows's Python; return CMake's options for them."""
-    folder = build / target.name / "python"
-    shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(include, folder / "include")
-    (folder / "include" / "pyconfig.h").write_text(WINDOWS_PYCONFIG)
-    headers = "\n".join(path.read_text() for path in (folder / "include").glob("*.h"))
-    functions = re.findall(r"PyAPI_FUNC\([^)]*\)+\s*\**(\w+)", headers)
-    data = re.findall(r"PyAPI_DATA\([^)]*\)+\s*\**(\w+)", headers)
-    names = sorted({*functions, *data})
-    lines = [f"    {name}{' DATA' if name in data else ''}" for name in names]
-    definition = folder / "python3.def"
-    definition.write_text("\n".join(["LIBRARY python3.dll", "EXPORTS", *lines, ""]))
-    library = folder / "libpython3.a"
-    run(
-        [sys.executable, "-m", "ziglang", "dlltool", "-m", "i386:x86-64", "-d", definition, "-l", library],
-        folder / "dlltool.log",
-    )
-    return [f"-DPython_{name}={library}" for name in ("LIBRARY", "SABI_LIBRARY")] + [
-        f"-DPython_INCLUDE_DIR={folder / 'include'}"
-    ]
+def python_options(build: Path, target: Target, python: Path) -> list[str]:
+    """Return CMake's options for the headers and, on Windows, import libraries of a target's Python."""
+    code = "import sys, sysconfig; print(sys.version_info[1], sysconfig.get_paths()['include'])"
+    done = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True)
+    minor, include = done.stdout.strip().split(maxsplit=1)
+    if not target.windows:
+        return [f"-DPython_EXECUTABLE={python}", f"-DPython_INCLUDE_DIR={include}"]
+    try:
+        made = windows_python(build / target.name / "python", Path(include), int(minor))
+    except RuntimeError as error:
+        raise NotBuiltError(str(error)) from error
+    return [f"-DPython_EXECUTABLE={python}", *made]
 
 
 def build_module(build: Path, target: Target, version: str, python: Path) -> bytes:
@@ -128,21 +130,12 @@ def build_module(build: Path, target: Target, version: str, python: Path) -> byt
     folder = build / target.name / "cmake"  # of both wheels: the kernels do not depend on Python
     log = build / target.name / f"{'abi3' if abi3 else 'cp311'}.log"
     log.unlink(missing_ok=True)
-    include = Path(
-        subprocess.run(
-            [python, "-c", "import sysconfig; print(sysconfig.get_paths()['include'])"],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-    )
     import nanobind
 
     # CMake asks for a tool that would edit paths of libraries, which these modules do not have.
     unused = [f"-DCMAKE_INSTALL_NAME_TOOL={shutil.which('true')}"] if target.system == "Darwin" else []
     options = [
         *("-UPython*", "-U_Python*", "-Unanobind*", "-USKBUILD*"),  # what an earlier run found
-        f"-DPython_EXECUTABLE={python}",
         f"-Dnanobind_ROOT={nanobind.cmake_dir()}",
         f"-DCMAKE_CXX_COMPILER={tools['c++']}",
         f"-DCMAKE_AR={tools['ar']}",
@@ -154,7 +147,7 @@ def build_module(build: Path, target: Target, version: str, python: Path) -> byt
         "-DCMAKE_BUILD_TYPE=Release",
         *unused,
         *(["-DSKBUILD_SABI_COMPONENT=Development.SABIModule"] if abi3 else []),
-        *(windows_python(build, target, include) if target.windows else [f"-DPython_INCLUDE_DIR={include}"]),
+        *python_options(build, target, python),
     ]
     beside = Path(sys.executable).parent
     cmake = beside / "cmake"

@@ -1,6 +1,7 @@
 #!/bin/sh
 # Build the native module for 64-bit ARM with a cross compiler and run its tests under an emulator, with an ARM Python.
 #   tools/neon.sh [PYTEST ARGUMENT...]    default: all tests of the native module but those that start programs
+#   WHEEL=dist/....whl tools/neon.sh ...  test the package in a wheel for this Python instead; nothing is built
 # It needs Debian's g++-aarch64-linux-gnu and qemu-user, which root installs here if they are missing. An ARM Python and the
 # packages that the tests import, 1.1 GiB, go to build/neon and stay there. Nothing else on the machine changes.
 set -eu
@@ -67,18 +68,30 @@ if [ ! -e "$here/site/done" ]; then
     touch "$here/site/done"
 fi
 
-echo "== neon: building the native module for ARM"
-export PATH="$PWD/.venv/bin:$PATH"
-cmake -S . -B "$here/cmake" -G Ninja -DPython_EXECUTABLE="$python" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
-    -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DPython_INCLUDE_DIR="$here/root/usr/include/$version" \
-    -DCMAKE_CXX_FLAGS="-idirafter $here/root/usr/include" > "$here/cmake.log" 2>&1 || { cat "$here/cmake.log" >&2; exit 1; }
-cmake --build "$here/cmake" --target _native > "$here/build.log" 2>&1 || { cat "$here/build.log" >&2; exit 1; }
-mkdir -p "$here/module"
-cp "$here/cmake"/_native*.so "$here/module/_native.so"
+if [ -n "${WHEEL:-}" ]; then
+    echo "== neon: unpacking $WHEEL"
+    rm -rf "$here/wheel"
+    "$python" -m zipfile -e "$WHEEL" "$here/wheel" || fail "$WHEEL is no wheel; make wheels TARGETS=linux-aarch64 builds one"
+    package=$here/wheel
+    set -- -o pythonpath="tests conformance benchmarks" "$@"
+    [ $# -gt 2 ] || set -- "$@" tests/test_losses.py tests/test_noise.py tests/native/test_parity.py -m "not own_process"
+    unset GSPLAT_TEST_NATIVE
+else
+    echo "== neon: building the native module for ARM"
+    export PATH="$PWD/.venv/bin:$PATH"
+    cmake -S . -B "$here/cmake" -G Ninja -DPython_EXECUTABLE="$python" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
+        -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DPython_INCLUDE_DIR="$here/root/usr/include/$version" \
+        -DCMAKE_CXX_FLAGS="-idirafter $here/root/usr/include" > "$here/cmake.log" 2>&1 || { cat "$here/cmake.log" >&2; exit 1; }
+    cmake --build "$here/cmake" --target _native > "$here/build.log" 2>&1 || { cat "$here/build.log" >&2; exit 1; }
+    mkdir -p "$here/module"
+    cp "$here/cmake"/_native*.so "$here/module/_native.so"
+    package=$PWD/src
+    export GSPLAT_TEST_NATIVE="$here/module"
+fi
 
 [ $# -gt 0 ] || set -- tests/test_losses.py tests/test_noise.py tests/train/test_optimizer.py tests/native -m "not own_process"
 echo "== neon: running $*"
 unset OPENBLAS_CORETYPE
-GSPLAT_TEST_NATIVE="$here/module" PYTHONPATH="$PWD/src:$here/site" OPENBLAS_NUM_THREADS=1 \
+PYTHONPATH="$package:$here/site" OPENBLAS_NUM_THREADS=1 \
     qemu-aarch64 -L "$here/root" "$here/root/usr/bin/$version" -m pytest -q -p no:cacheprovider "$@"
 echo "== neon: the native tests pass on 64-bit ARM, emulated"

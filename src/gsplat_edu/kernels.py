@@ -25,7 +25,8 @@ try:
 except ImportError as error:
     _native = None
     remedy = "unset it" if "GSPLAT_EDU_ISA" in str(error) else "install gsplat_edu again"
-    REASON = f"the native module does not load ({error}); {remedy}, or use the backend torch"
+    slow = "the backend torch, whose dense renders take hundreds of times as long"
+    REASON = f"the native module does not load ({error}); {remedy}, or use {slow}"
 else:
     REASON = None
     _native.ask_before_large_blocks(available_memory)

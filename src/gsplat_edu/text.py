@@ -81,12 +81,23 @@ def write_text(path: Path, text: str) -> None:
     path.write_text(legible(text), encoding="utf-8")
 
 
+def decode_file_name(raw: bytes) -> str:
+    """Decode the bytes of a file name for the system's functions; every byte survives.
+
+    Windows refuses bytes that are not UTF-8. No file there has such a name, so the text only has to be printable.
+    """
+    try:
+        return os.fsdecode(raw)
+    except UnicodeDecodeError:
+        return raw.decode("utf-8", "surrogateescape")
+
+
 def as_file_name(name: str) -> str:
     """Convert a file's text to a path for the system's functions, independent of the locale.
 
     File names are UTF-8 bytes on every system in use, but under LC_ALL=C Python would refuse to encode "ü".
     """
     try:
-        return os.fsdecode(name.encode("utf-8", "surrogateescape"))
+        return decode_file_name(name.encode("utf-8", "surrogateescape"))
     except UnicodeError:  # an unpaired surrogate: no file has this name
         return name

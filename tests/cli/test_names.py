@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 from rich.progress import Task, TaskID
 
+from gsplat_edu import text as names
 from gsplat_edu.cli.main import main
 from gsplat_edu.cli.terminal import Field, Terminal
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.evaluate.report import Report, write_report
 from gsplat_edu.runs.folder import image_file_names
-from gsplat_edu.text import as_file_name, legible, printable, short_number, write_text
+from gsplat_edu.text import as_file_name, decode_file_name, legible, printable, short_number, write_text
 
 CHILD = """
 import os, sys
@@ -149,3 +150,12 @@ def test_a_progress_bar_prints_names_unchanged():
 )
 def test_numbers_for_people_have_no_exponent_unless_they_are_absurd(value, digits, text):
     assert short_number(value, digits) == text
+
+
+def test_a_name_of_any_bytes_is_decoded_on_windows_too(monkeypatch):
+    """Windows decodes strictly; a damaged COLMAP model has such names."""
+    assert os.fsencode(decode_file_name(b"view\xff.png")) == b"view\xff.png"
+    monkeypatch.setattr(names.os, "fsdecode", lambda raw: raw.decode("utf-8", "surrogatepass"))
+    assert decode_file_name("né.png".encode()) == "né.png"
+    assert legible(decode_file_name(b"view\xff.png")) == legible("view\udcff.png")
+    assert as_file_name("view\udcff.png") == "view\udcff.png"

@@ -10,11 +10,13 @@ import importlib
 import json
 import os
 import re
+import struct
 import subprocess
 import sys
 import sysconfig
 import venv
 import zipfile
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 
 build_wheels = importlib.import_module("build_wheels")
+binaries = importlib.import_module("wheels.binaries")
 checks = importlib.import_module("wheels.checks")
 nanobind_parts = importlib.import_module("wheels.contents").nanobind_parts
 pack = importlib.import_module("wheels.pack").pack
@@ -216,3 +219,59 @@ def test_every_document_states_the_same_version():
         (stated,) = re.findall(r"^ *version: \"?(\d[\d.]*)", (ROOT / name).read_text(), re.M)
         assert stated == gsplat_edu.__version__, name
     assert f"gsplat_edu-{gsplat_edu.__version__}-" in (ROOT / "docs" / "INSTALL.md").read_text()
+
+
+def macho(symbols, library=binaries.MACOS_LIBRARY, kind=6, oldest=(13, 0), signed=True):
+    """A 64-bit Mach-O file; symbols are a name and the number of its library, or None for its own."""
+    path = library.encode() + b"\0" * (8 - len(library) % 8)
+    commands = [
+        struct.pack("<6I", 0xC, 24 + len(path), 24, 0, 0, 0) + path,
+        struct.pack("<6I", 0x32, 24, 1, oldest[0] << 16 | oldest[1] << 8, 0, 0),
+    ]
+    commands += [struct.pack("<4I", 0x1D, 16, 0, 0)] if signed else []
+    start = 32 + sum(map(len, commands)) + 24
+    names, rows = b"\0", b""
+    for name, number in symbols:
+        own = number is None
+        rows += struct.pack("<IBBHQ", len(names), 0x0F if own else 0x01, 0, 0 if own else number << 8, 0)
+        names += name.encode() + b"\0"
+    commands.append(struct.pack("<6I", 0x2, 24, start, len(symbols), start + len(rows), len(names)))
+    size = sum(map(len, commands))
+    head = struct.pack("<8I", 0xFEEDFACF, 0x0100000C, 0, kind, len(commands), size, 0, 0)
+    return head + b"".join(commands) + rows + names
+
+
+GOOD = [("_PyInit__native", None), ("_malloc", 1), ("_PyList_New", 0xFE)]
+
+
+@pytest.mark.parametrize(
+    ("symbols", "options", "wrong"),
+    [
+        (GOOD, {}, []),
+        (GOOD[1:], {}, ["does not export PyInit__native"]),
+        ([*GOOD, ("_new_in_macos_27", 1)], {}, ["_new_in_macos_27 is not in libSystem"]),
+        (
+            [*GOOD, ("_PyList_GetItemRef", 0xFE)],
+            {},
+            ["_PyList_GetItemRef is not in the stable ABI"],
+        ),  # from 3.13 on
+        ([*GOOD, ("_PyDict_Clear", 0)], {}, []),
+        (GOOD, {"library": "/opt/lib/libc++.1.dylib"}, ["loads /opt/lib/libc++.1.dylib"]),
+        (GOOD, {"oldest": (14, 2)}, ["needs macOS 14.2"]),
+        (GOOD, {"signed": False}, ["is not signed"]),
+        (GOOD, {"kind": 8}, ["is no dynamic library"]),
+    ],
+)
+def test_what_a_module_asks_of_macos_is_found(monkeypatch, symbols, options, wrong):
+    monkeypatch.setattr(
+        binaries, "system_symbols", lambda: {"_malloc", "_free"}
+    )  # zig's list is not installed here
+    assert binaries.macos_problems(macho(symbols, **options), 12, (13, 0), arm=True) == wrong
+
+
+def test_what_a_program_for_windows_lacks_as_a_module_is_found():
+    """A launcher of setuptools: for x86-64, and no module of Python."""
+    (launcher,) = (path for path in distribution("setuptools").files if path.name == "cli-64.exe")
+    found = binaries.windows_problems(Path(launcher.locate()).read_bytes(), 12)
+    assert found[-1] == "does not export PyInit__native"
+    assert "is not for x86-64" not in found

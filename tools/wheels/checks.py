@@ -9,6 +9,8 @@ import sysconfig
 import zipfile
 from pathlib import Path
 
+from wheels.binaries import macos_problems, windows_problems
+
 MAX_BYTES = 10_000_000
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,12 +57,28 @@ def wrong_hashes(wheel: Path) -> list[str]:
     return found
 
 
+def foreign_imports(wheel: Path) -> list[str]:
+    """List what the module of a wheel for Windows or macOS asks for that its system may lack."""
+    if "-macosx_" not in wheel.name and "-win_" not in wheel.name:
+        return []
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (n for n in archive.namelist() if re.fullmatch(r"gsplat_edu/_native[^/]*\.(so|pyd)", n))
+        data = archive.read(name)
+    minor = int(re.findall(r"-cp3(\d+)-", wheel.name)[0])
+    if "-win_" in wheel.name:
+        return [f"{name}: {line}" for line in windows_problems(data, minor)]
+    major, lesser, processor = re.findall(r"macosx_(\d+)_(\d+)_(\w+)", wheel.stem)[0]
+    found = macos_problems(data, minor, (int(major), int(lesser)), processor == "arm64")
+    return [f"{name}: {line}" for line in found]
+
+
 def audit(wheel: Path) -> list[str]:
     """Check the symbols of a wheel's module; return what is wrong.
 
-    auditwheel finds the oldest glibc for Linux, abi3audit the symbols outside the stable ABI, for every system.
+    auditwheel finds the oldest glibc for Linux, abi3audit the symbols outside the stable ABI, for every system. For
+    Windows and macOS, what the module imports is compared with what those systems and Python offer.
     """
-    found = []
+    found = foreign_imports(wheel)
     folder = Path(sys.executable).parent
     if "manylinux" in wheel.name:
         done = subprocess.run(

@@ -20,6 +20,7 @@ from jaxtyping import Float64
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import unreadable
 from gsplat_edu.reading import open_file
+from gsplat_edu.text import decode_file_name
 
 MODELS: tuple[tuple[str, str], ...] = (
     ("SIMPLE_PINHOLE", "f cx cy"),
@@ -61,7 +62,7 @@ class Pose(NamedTuple):
 
 def _name(raw: bytes) -> str:
     """Decode a file name for the system's functions, with slashes."""
-    return os.fsdecode(raw).replace("\\", "/")
+    return decode_file_name(raw).replace("\\", "/")
 
 
 class _Binary:

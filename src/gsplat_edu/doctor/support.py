@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.reading import read_bytes
-from gsplat_edu.text import legible
+from gsplat_edu.text import decode_file_name, legible
 
 _IMAGE = struct.Struct("<I7dI")
 _COUNT = struct.Struct("<Q")
@@ -61,4 +60,4 @@ def _text(data: bytes) -> Iterator[tuple[str, int]]:
 
 
 def _name(raw: bytes) -> str:
-    return legible(os.fsdecode(raw).replace("\\", "/"))
+    return legible(decode_file_name(raw).replace("\\", "/"))

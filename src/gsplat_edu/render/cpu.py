@@ -224,7 +224,8 @@ def _adam_in_backward(call: _Call, moments: Mapping[str, Moments]) -> None:
         images=images, incoming=incoming, means2d_norm=native_array(norms), collected=collected, **groups
     )
     call.norms, call.waiting = norms, None
-    torch.autograd.graph.increment_version(parameters)
+    for parameter in parameters:  # one by one: torch 2.4 takes no sequence
+        torch.autograd.graph.increment_version(parameter)
 
 
 def _group(parameter: Tensor, moments: Moments) -> Any:  # noqa: ANN401
