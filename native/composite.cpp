@@ -36,29 +36,40 @@ GSPLAT_INLINE void draw(const CompositeArgs<T> &args, const AlphaClamp<T> &clamp
     Falloff<T, KIND> falloff{batch.steps, i, steep, clamp};
     falloff.begin_splat(s, box);
     const V red = splat(s.color[0]), green = splat(s.color[1]), blue = splat(s.color[2]);
+    const auto blend = [&](Falloff<T, KIND> &along, int32_t row, int32_t first, int column) {
+        const int at = row * TILE + column;
+        V key;
+        V alpha = along.alpha(row, key), t = load<V>(tile.transmittance.values + at);
+        if constexpr (MODE >= WITH_FEATURES)
+            if (args.settings.pixel_stop) end_pixels<T>(t, alpha);
+        const V w = t * alpha;
+        store(tile.red.values + at, load<V>(tile.red.values + at) + w * red);
+        store(tile.green.values + at, load<V>(tile.green.values + at) + w * green);
+        store(tile.blue.values + at, load<V>(tile.blue.values + at) + w * blue);
+        if (MODE != COLORS) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
+        store(tile.transmittance.values + at, t - w);
+        if constexpr (MODE >= WITH_FEATURES) store(weights + at, w);
+        if constexpr (MODE == WITH_ALL) {
+            const V half = splat(T(0.5)), median = load<V>(tile.median.values + at);
+            store(tile.median.values + at, ((t >= half) & (t - w < half)) ? splat(s.depth) : median);
+        }
+        along.step(row - first);
+    };
     for (int strip = 0; strip < Strips<T>::COUNT; ++strip) {
         const int32_t first = rows.first[strip][i], last = rows.last[strip][i], column = strip * Strips<T>::WIDTH;
-        if (first > last) continue;
-        falloff.begin_strip(s, column, iota<T>() + splat(T(column + box.x0) - s.x));
-        for (int32_t row = first; row <= last; ++row) {
-            const int at = row * TILE + column;
-            V key;
-            V alpha = falloff.alpha(row, key), t = load<V>(tile.transmittance.values + at);
-            if constexpr (MODE >= WITH_FEATURES)
-                if (args.settings.pixel_stop) end_pixels<T>(t, alpha);
-            const V w = t * alpha;
-            store(tile.red.values + at, load<V>(tile.red.values + at) + w * red);
-            store(tile.green.values + at, load<V>(tile.green.values + at) + w * green);
-            store(tile.blue.values + at, load<V>(tile.blue.values + at) + w * blue);
-            if (MODE != COLORS) store(tile.depth.values + at, load<V>(tile.depth.values + at) + w * splat(s.depth));
-            store(tile.transmittance.values + at, t - w);
-            if constexpr (MODE >= WITH_FEATURES) store(weights + at, w);
-            if constexpr (MODE == WITH_ALL) {
-                const V half = splat(T(0.5)), median = load<V>(tile.median.values + at);
-                store(tile.median.values + at, ((t >= half) & (t - w < half)) ? splat(s.depth) : median);
+        const auto begin = [&](Falloff<T, KIND> &along, int32_t at) { along.begin_strip(s, at, iota<T>() + splat(T(at + box.x0) - s.x)); };
+        if constexpr (KIND != STEEP && Strips<T>::COUNT > 1)
+            if (strip % 2 == 0 && first == rows.first[strip + 1][i]) {  // one loop: the processor mispredicts one end instead of two
+                const int32_t other = column + Strips<T>::WIDTH, end = vmax(last, rows.last[strip + 1][i]);
+                Falloff<T, KIND> beside = falloff;
+                begin(falloff, column), begin(beside, other);
+                for (int32_t row = first; row <= end; ++row) blend(falloff, row, first, column), blend(beside, row, first, other);
+                ++strip;
+                continue;
             }
-            falloff.step(row - first);
-        }
+        if (first > last) continue;
+        begin(falloff, column);
+        for (int32_t row = first; row <= last; ++row) blend(falloff, row, first, column);
     }
 }
 

@@ -95,7 +95,7 @@ GSPLAT_INLINE void splat_backward(const Settings &settings, const AlphaClamp<T> 
                     store(tile.group.weights[member].values + at, w);
                 }
             const V drawn = w * cg, rest = load<V>(tile.rest.values + at) - drawn;
-            const V h = falloff.where_open(key, drawn - rest * (alpha * reciprocal(splat(T(1)) - alpha)));
+            const V h = falloff.where_open(key, drawn - rest * odds(alpha));
             store(tile.rest.values + at, rest);
             store(tile.transmittance.values + at, t - w);
             wr += w * r, wg += w * g, wb += w * b;

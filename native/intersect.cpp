@@ -8,7 +8,7 @@
 namespace gsplat {
 namespace GSPLAT_ISA {
 
-constexpr int64_t AHEAD = 16;  // Gaussians whose records are fetched before they are needed
+constexpr int64_t AHEAD = 16;  // Gaussians whose numbers are fetched before they are needed
 
 // An ellipse in the form that the tile search needs.
 template <class T>
@@ -92,6 +92,7 @@ void scatter(const IntersectArgs<T> &args, int64_t begin, int64_t end, uint32_t 
     for (int64_t k = begin; k < end; ++k) {
         const uint32_t id = args.sorted[k];
         const TileRuns &kept = args.runs[k];
+        if (k + AHEAD < end) __builtin_prefetch(args.slot_begin + args.sorted[k + AHEAD]);
         uint32_t slot = args.slot_begin[id];
         auto write = [&](uint32_t first, uint32_t tiles) {
             for (uint32_t tile = first; tile < first + tiles; ++tile) args.pairs[next[tile]++] = Pair{id, slot++};

@@ -225,9 +225,9 @@ struct RecolorArgs {
 };
 
 constexpr int SSIM_HALF = 5;                           // taps on each side of the central one
-constexpr int SSIM_BLOCK = 2 * SSIM_HALF;              // rows that are processed together
-constexpr int64_t SSIM_ROWS = 160;                     // image rows per task, at most
-constexpr int64_t SSIM_STRIP = 768;                    // and numbers of each row; a multiple of every vector width,
+constexpr int SSIM_BLOCK = 16;                         // rows that are processed together, a multiple of every vector width
+constexpr int64_t SSIM_ROWS = 150;                     // image rows per task, at most; with half a window on each side, whole blocks
+constexpr int64_t SSIM_STRIP = 784;                    // and numbers of each row; a multiple of every vector width,
 constexpr int64_t SSIM_EDGE = 16;                      // like this, which is at least half a window
 
 template <class T>
@@ -242,7 +242,10 @@ struct LossArgs {
     // Tasks depend on the size of the image only, so that the order of the sums does.
     int64_t strips() const { return (3 * int64_t(W) + SSIM_STRIP - 1) / SSIM_STRIP; }
     int64_t bands() const { return (H + SSIM_ROWS - 1) / SSIM_ROWS; }
-    int64_t rows() const { return H ? ((H + bands() - 1) / bands() + SSIM_BLOCK - 1) / SSIM_BLOCK * SSIM_BLOCK : 0; }
+    int64_t rows() const {
+        constexpr int64_t AROUND = 2 * SSIM_HALF;
+        return H ? ((H + bands() - 1) / bands() + AROUND + SSIM_BLOCK - 1) / SSIM_BLOCK * SSIM_BLOCK - AROUND : 0;
+    }
     int64_t tasks() const { return strips() * bands(); }
     // Number of scratch values that a thread needs.
     static constexpr int64_t SCRATCH = 2 * 3 * SSIM_BLOCK * (SSIM_STRIP + 2 * SSIM_EDGE);

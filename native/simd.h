@@ -24,6 +24,7 @@
 
 #define GSPLAT_INLINE static inline __attribute__((always_inline))
 #define GSPLAT_METHOD inline __attribute__((always_inline))
+#define GSPLAT_CALLED static __attribute__((noinline))  // the compiler finds better registers for a large function on its own
 
 namespace gsplat {
 namespace GSPLAT_ISA {
@@ -270,7 +271,7 @@ GSPLAT_INLINE VD where_below(VD key, VD limit, VD x) { return key < limit ? x : 
 // 1 / x. AVX-512 has an estimate of 14 bits; one Newton step refines it to 2^-27 at a third of the cost of a division.
 GSPLAT_INLINE VF reciprocal(VF x) {
 #if GSPLAT_VECTOR_BYTES == 64
-    const VF y = (VF)_mm512_rcp14_ps((__m512)x);
+    const VF y = (VF)_mm512_maskz_rcp14_ps(0xFFFF, (__m512)x);  // without a mask GCC 12 warns of its header
     return y * (splat(2.0f) - x * y);
 #else
     return splat(1.0f) / x;
@@ -278,6 +279,70 @@ GSPLAT_INLINE VF reciprocal(VF x) {
 }
 
 GSPLAT_INLINE VD reciprocal(VD x) { return splat(1.0) / x; }
+
+// Turns the rows of a square of numbers, as many as a vector has, into columns: first in squares of four, then these squares.
+GSPLAT_INLINE void transpose_square(const float *in, int64_t stride, float *out, int64_t out_stride) {
+    constexpr int LANES = Vector<float>::LANES;
+    VF v[LANES];
+    for (int i = 0; i < LANES; ++i) v[i] = load<VF>(in + i * stride);
+    for (int i = 0; i < LANES; i += 4) {
+        const VF a = v[i], b = v[i + 1], c = v[i + 2], d = v[i + 3];
+#if GSPLAT_VECTOR_BYTES == 64
+#define GSPLAT_ZIP(x, y, k)                                                                                                             \
+    __builtin_shufflevector(x, y, k, k + 16, k + 1, k + 17, k + 4, k + 20, k + 5, k + 21, k + 8, k + 24, k + 9, k + 25, k + 12, k + 28, \
+                            k + 13, k + 29)
+#define GSPLAT_ZIP_PAIRS(x, y, k)                                                                                                       \
+    __builtin_shufflevector(x, y, k, k + 1, k + 16, k + 17, k + 4, k + 5, k + 20, k + 21, k + 8, k + 9, k + 24, k + 25, k + 12, k + 13, \
+                            k + 28, k + 29)
+#elif GSPLAT_VECTOR_BYTES == 32
+#define GSPLAT_ZIP(x, y, k) __builtin_shufflevector(x, y, k, k + 8, k + 1, k + 9, k + 4, k + 12, k + 5, k + 13)
+#define GSPLAT_ZIP_PAIRS(x, y, k) __builtin_shufflevector(x, y, k, k + 1, k + 8, k + 9, k + 4, k + 5, k + 12, k + 13)
+#else
+#define GSPLAT_ZIP(x, y, k) __builtin_shufflevector(x, y, k, k + 4, k + 1, k + 5)
+#define GSPLAT_ZIP_PAIRS(x, y, k) __builtin_shufflevector(x, y, k, k + 1, k + 4, k + 5)
+#endif
+        const VF ab = GSPLAT_ZIP(a, b, 0), cd = GSPLAT_ZIP(c, d, 0), ab_high = GSPLAT_ZIP(a, b, 2), cd_high = GSPLAT_ZIP(c, d, 2);
+        v[i] = GSPLAT_ZIP_PAIRS(ab, cd, 0), v[i + 1] = GSPLAT_ZIP_PAIRS(ab, cd, 2);
+        v[i + 2] = GSPLAT_ZIP_PAIRS(ab_high, cd_high, 0), v[i + 3] = GSPLAT_ZIP_PAIRS(ab_high, cd_high, 2);
+#undef GSPLAT_ZIP
+#undef GSPLAT_ZIP_PAIRS
+    }
+#if GSPLAT_VECTOR_BYTES == 64
+#define GSPLAT_FOURS(x, y, i, j)                                                                                                          \
+    __builtin_shufflevector(x, y, i, i + 1, i + 2, i + 3, j, j + 1, j + 2, j + 3, i + 16, i + 17, i + 18, i + 19, j + 16, j + 17, j + 18, \
+                            j + 19)
+    for (int i = 0; i < 4; ++i) {
+        const VF ab = GSPLAT_FOURS(v[i], v[i + 4], 0, 4), ab_high = GSPLAT_FOURS(v[i], v[i + 4], 8, 12);
+        const VF cd = GSPLAT_FOURS(v[i + 8], v[i + 12], 0, 4), cd_high = GSPLAT_FOURS(v[i + 8], v[i + 12], 8, 12);
+        v[i] = GSPLAT_FOURS(ab, cd, 0, 8), v[i + 4] = GSPLAT_FOURS(ab, cd, 4, 12);
+        v[i + 8] = GSPLAT_FOURS(ab_high, cd_high, 0, 8), v[i + 12] = GSPLAT_FOURS(ab_high, cd_high, 4, 12);
+    }
+#undef GSPLAT_FOURS
+#elif GSPLAT_VECTOR_BYTES == 32
+    for (int i = 0; i < 4; ++i) {
+        const VF a = v[i], b = v[i + 4];
+        v[i] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11),
+        v[i + 4] = __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+    }
+#endif
+    for (int i = 0; i < LANES; ++i) store(out + i * out_stride, v[i]);
+}
+
+GSPLAT_INLINE void transpose_square(const double *in, int64_t stride, double *out, int64_t out_stride) {
+    for (int i = 0; i < Vector<double>::LANES; ++i)
+        for (int j = 0; j < Vector<double>::LANES; ++j) out[j * out_stride + i] = in[i * stride + j];
+}
+
+// x / (1 - x).
+GSPLAT_INLINE VF odds(VF x) {
+#if GSPLAT_VECTOR_BYTES == 64
+    return x * reciprocal(splat(1.0f) - x);
+#else
+    return x / (splat(1.0f) - x);
+#endif
+}
+
+GSPLAT_INLINE VD odds(VD x) { return x / (splat(1.0) - x); }
 
 // Writes the lane sums of eight vectors to out[0..7]: each round folds pairs of vectors into one.
 GSPLAT_INLINE void sum8(const VF *v, float *out) {
