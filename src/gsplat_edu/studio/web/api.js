@@ -1,0 +1,57 @@
+// The studio's API; docs/STUDIO.md describes it. Errors have the line that the server gives.
+
+export class ApiError extends Error {
+  constructor(line, status) {
+    super(line);
+    this.status = status;
+  }
+}
+
+const GONE = "The studio does not answer. Start it again with: gsplat-edu studio";
+const LOCKED = "This page belongs to an earlier start of the studio. Open the URL that it printed last.";
+
+// "captures/NAME" or parts of a path as an address.
+export const at = (...parts) => `/api/${parts.join("/").split("/").map(encodeURIComponent).join("/")}`;
+
+const lineOf = (status, text) => {
+  if (status === 403) return text.includes("token") ? LOCKED : text.trim();
+  try {
+    return JSON.parse(text).error;
+  } catch {
+    return text.trim().split("\n")[0] || `The studio answered ${status}.`;
+  }
+};
+
+async function ask(method, address, body) {
+  const given = body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
+  const answer = await fetch(address, { method, ...given }).catch(() => {
+    throw new ApiError(GONE, 0);
+  });
+  const text = method === "HEAD" && !answer.ok ? await fetch(address).then((other) => other.text()) : await answer.text();
+  if (!answer.ok) throw new ApiError(lineOf(answer.status, text), answer.status);
+  return (answer.headers.get("content-type") ?? "").startsWith("application/json") ? JSON.parse(text) : text;
+}
+
+export const get = (address) => ask("GET", address);
+export const head = (address) => ask("HEAD", address);
+export const post = (address, body = {}) => ask("POST", address, body);
+export const remove = (address) => ask("DELETE", address);
+
+// Sends a file as it is. progress(bytes) is called while it goes out.
+export function upload(address, file, progress, signal) {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    request.open("PUT", address);
+    request.upload.addEventListener("progress", ({ loaded }) => progress(loaded));
+    request.addEventListener("load", () => {
+      const { status, responseText: text } = request;
+      if (status < 300) resolve(JSON.parse(text));
+      else reject(new ApiError(lineOf(status, text), status));
+    });
+    // the server closes the connection when it refuses a file before it has all of it
+    request.addEventListener("error", () => reject(new ApiError("The connection closed before the file was received.", 0)));
+    request.addEventListener("abort", () => reject(new ApiError("Stopped.", 0)));
+    signal.addEventListener("abort", () => request.abort());
+    request.send(file);
+  });
+}

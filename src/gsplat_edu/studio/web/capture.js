@@ -1,0 +1,145 @@
+// The screen of a capture: previews, the doctor's findings, and the start of a training with its forecast.
+
+import { at, get } from "./api.js";
+import { attempt, bytes, button, duration, errorLine, h, heading, keyed, link, put, whole } from "./dom.js";
+import { doctor } from "./doctor.js";
+import { gallery } from "./gallery.js";
+import { freeName } from "./intake.js";
+import { startJob } from "./jobs.js";
+import { addressOf, entryHead, factsOf, management, withEntry } from "./library.js";
+
+const QUALITIES = [
+  ["draft", "Draft", "a quick look"],
+  ["standard", "Standard", "good for most scenes"],
+  ["high", "High", "fine detail, several times as long"],
+];
+
+export function capture(given) {
+  const { main, store } = given;
+  return withEntry(given, (entry) => {
+    const head = entryHead(entry, "Capture");
+    const line = errorLine();
+    const pictures = gallery(entry.entry);
+    const checked = doctor(
+      store,
+      entry.entry,
+      "Looks for blurred photos, wrong poses, gaps and other faults before you spend time on a training.",
+      (marks) => pictures.mark(marks),
+    );
+    const start = startForm(store, entry);
+    const runs = h("ul", { class: "plain" });
+    const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Runs of this capture"), runs);
+    main.append(head.element, start.element, past, checked.element, pictures.element, line, management(store, entry));
+    return {
+      entry,
+      update(now) {
+        head.update(now);
+        checked.update(now);
+        start.update(now);
+        pictures.read(now).catch((error) => put(line, error.message));
+        const own = store.entries("runs").filter((run) => run.capture && store.entryAt(run.capture)?.entry === entry.entry);
+        past.hidden = !own.length;
+        keyed(runs, own, ({ name }) => name, (run) => h("li", { class: "row" }, link(run.name, addressOf(run)), h("span", { class: "quiet" })), (item, run) => {
+          item.lastChild.textContent = factsOf(run).filter(Boolean).join(" · ");
+        });
+      },
+    };
+  });
+}
+
+// Choose a quality, see what it takes, and start.
+function startForm(store, entry) {
+  const line = errorLine();
+  const forecastLine = errorLine();
+  const said = new Map();
+  const choices = QUALITIES.map(([value, title, hint], index) => {
+    const facts = h("span", { class: "forecast quiet" }, "\u00a0");
+    said.set(value, facts);
+    const input = h("input", { type: "radio", name: "quality", value, checked: index === 1 });
+    return h("label", { class: "choice" }, input, h("strong", {}, title), h("span", { class: "quiet" }, hint), facts);
+  });
+  const fields = {
+    iterations: h("input", { id: "iterations", type: "number", min: 1, max: 1000000, inputmode: "numeric" }),
+    resolution: h("input", { id: "resolution", type: "number", min: 0.1, step: "any", inputmode: "decimal" }),
+    time_limit: h("input", { id: "time-limit", type: "text", placeholder: "30m", autocomplete: "off" }),
+    max_memory: h("input", { id: "max-memory", type: "text", placeholder: "8G", autocomplete: "off" }),
+    max_gaussians: h("input", { id: "max-gaussians", type: "number", min: 1, inputmode: "numeric" }),
+  };
+  const labels = {
+    iterations: "Iterations",
+    resolution: "Photos, 1/… of their width, or px",
+    time_limit: "Time limit",
+    max_memory: "Memory limit",
+    max_gaussians: "Most splats",
+  };
+  const name = h("input", { id: "run-name", type: "text", autocomplete: "off" });
+  const go = h("button", { class: "primary" }, "Start training");
+  const measure = button("Forecast time and memory", () => forecast());
+
+  async function forecast() {
+    measure.hidden = true;
+    for (const facts of said.values()) facts.textContent = "measuring ...";
+    try {
+      const resolution = fields.resolution.value ? `?resolution=${Number(fields.resolution.value)}` : "";
+      const { qualities } = await get(at(entry.entry, "forecast") + resolution);
+      for (const [value, facts] of said) {
+        const { seconds, bytes: memory, gaussians, iterations } = qualities[value];
+        facts.textContent = `about ${duration(seconds)}, ${bytes(memory)} of memory; ${whole(iterations)} iterations, up to ${whole(gaussians)} splats`;
+      }
+    } catch (error) {
+      for (const facts of said.values()) facts.textContent = "\u00a0";
+      put(forecastLine, error.message);
+    }
+    measure.hidden = false;
+    measure.textContent = "Forecast again";
+  }
+
+  const element = h(
+    "section",
+    { "aria-label": "training" },
+    heading(2, "Training"),
+    h(
+      "form",
+      {
+        onsubmit: (event) => {
+          event.preventDefault();
+          attempt(go, line, async () => {
+            const options = { quality: new FormData(event.target).get("quality") };
+            for (const [key, field] of Object.entries(fields)) {
+              if (field.value) options[key] = field.type === "number" ? Number(field.value) : field.value;
+            }
+            const to = name.value || freeName(store, "runs", entry.name);
+            const { job } = await startJob(store, { command: "train", subject: entry.entry, to, options });
+            await store.refresh();
+            location.hash = `#/${job.subject.split("/").map(encodeURIComponent).join("/")}`;
+          });
+        },
+      },
+      h("fieldset", {}, h("legend", {}, "Quality"), h("div", { class: "choices" }, choices)),
+      forecastLine,
+      h(
+        "details",
+        {},
+        h("summary", {}, "Options"),
+        h("div", { class: "grid" }, [
+          h("label", {}, "Name of the run", name),
+          Object.entries(fields).map(([key, field]) => h("label", {}, labels[key], field)),
+        ]),
+      ),
+      h("div", { class: "row" }, go, measure),
+      line,
+    ),
+  );
+  let asked = false;
+  return {
+    element,
+    update() {
+      name.placeholder = freeName(store, "runs", entry.name);
+      if (asked || !store.library) return;
+      asked = true;
+      // measuring takes seconds of the processor, which a running job needs
+      if (![...store.jobs.values()].some(({ active }) => active) && entry.layout) forecast();
+    },
+  };
+}
+

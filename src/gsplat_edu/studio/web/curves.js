@@ -1,0 +1,58 @@
+// Curves over the iterations, with their range and newest value in words.
+
+import { h, whole } from "./dom.js";
+
+const [WIDTH, HEIGHT] = [300, 100]; // units of the drawing, which is stretched to its place
+const MOST = 300; // points that are drawn
+
+// One curve. shown(value) makes the text of a value.
+export function curve(title, shown) {
+  const path = h("path", { fill: "none", "vector-effect": "non-scaling-stroke" });
+  const drawing = h("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", role: "img" }, path);
+  const value = h("output", {}, "–");
+  const [high, low, last] = [h("span", { class: "high" }), h("span", { class: "low" }), h("span", { class: "last" })];
+  const axis = h("div", { class: "axis quiet", "aria-hidden": "true" }, h("span", {}, "0"), h("span", {}, "iteration"), last);
+  const element = h(
+    "figure",
+    { class: "curve" },
+    h("figcaption", {}, h("span", {}, title), value),
+    h("div", { class: "plot" }, high, low, drawing),
+    axis,
+  );
+
+  // Shows values at iterations; a value may be null.
+  function show(iterations, values) {
+    const points = averaged(iterations.map((x, i) => [x, values[i]]).filter(([, y]) => Number.isFinite(y)));
+    if (!points.length) {
+      drawing.setAttribute("aria-label", `${title}: no values yet`);
+      return;
+    }
+    const heights = points.map(([, y]) => y);
+    const [least, most] = [Math.min(...heights), Math.max(...heights)];
+    const end = points.at(-1)[0];
+    const across = (x) => (WIDTH * x) / Math.max(1, end);
+    const down = (y) => HEIGHT - 4 - ((HEIGHT - 8) * (y - least)) / (most - least || 1);
+    const line = points.map(([x, y]) => `${across(x).toFixed(1)} ${down(y).toFixed(1)}`);
+    path.setAttribute("d", points.length > 1 ? `M${line.join("L")}` : `M0 ${down(least)}L${WIDTH} ${down(least)}`);
+    value.textContent = shown(heights.at(-1));
+    [high.textContent, low.textContent] = least === most ? ["", ""] : [shown(most), shown(least)];
+    last.textContent = whole(end);
+    const range = `from ${shown(heights[0])} to ${shown(heights.at(-1))} after ${whole(end)} iterations`;
+    drawing.setAttribute("aria-label", `${title}: ${range}`);
+  }
+
+  show([], []);
+  return { element, show };
+}
+
+// Neighbours are averaged, so that at most `MOST` points are left.
+function averaged(points) {
+  const apart = Math.ceil(points.length / MOST);
+  if (apart <= 1) return points;
+  const found = [];
+  for (let i = 0; i < points.length; i += apart) {
+    const some = points.slice(i, i + apart);
+    found.push([some.at(-1)[0], some.reduce((sum, [, y]) => sum + y, 0) / some.length]);
+  }
+  return found;
+}

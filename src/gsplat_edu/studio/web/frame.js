@@ -1,0 +1,142 @@
+// Our page of a scene in a frame, and a photo laid over the same view.
+
+import { at, get, head } from "./api.js";
+import { button, h, put } from "./dom.js";
+
+const RETRY = 3000; // milliseconds until a page that is not there yet is asked for again
+const LOOK = 250; // milliseconds between two looks at what the frame shows
+const MOST_SIDE = 1024; // px of a picture beside a photo
+
+// A frame that shows a page as soon as the server has it. show(null) empties it.
+export function frame(title) {
+  const inner = h("iframe", { title, allow: "fullscreen; clipboard-write", hidden: true });
+  const message = h("p", { class: "message", role: "status" }, "Loading the scene ...");
+  const photo = h("img", { class: "over-photo", alt: "", hidden: true });
+  const full = button("Full screen", () => element.requestFullscreen?.(), { class: "full" });
+  const element = h("div", { class: "scene" }, inner, photo, message, full);
+  let [address, timer] = [null, 0];
+
+  async function open() {
+    clearTimeout(timer);
+    const wanted = address;
+    if (wanted === null) return;
+    try {
+      await head(wanted);
+      if (address !== wanted) return;
+      inner.src = wanted;
+      inner.hidden = false;
+      put(message, "");
+    } catch (error) {
+      if (address !== wanted) return;
+      put(message, error.message);
+      timer = setTimeout(open, RETRY);
+    }
+  }
+
+  return {
+    element,
+    inner,
+    photo,
+    show(next, why = "Loading the scene ...") {
+      if (next === address) {
+        if (next === null) put(message, why);
+        return;
+      }
+      address = next;
+      inner.hidden = true;
+      inner.removeAttribute("src");
+      put(message, why);
+      open();
+    },
+    close() {
+      address = null;
+      clearTimeout(timer);
+    },
+    // the viewer inside, once it has started
+    get viewer() {
+      try {
+        return inner.contentWindow?.viewer ?? null;
+      } catch {
+        return null;
+      }
+    },
+  };
+}
+
+const stemOf = (name) => name.replace(/\.[^./]+$/, "");
+
+// The photo of a camera: the one whose path ends like the camera's name.
+function photoOf(photos, name) {
+  const stem = stemOf(name);
+  return photos.find((photo) => stemOf(photo.name) === stem || stemOf(photo.name).endsWith(`/${stem}`))?.name ?? null;
+}
+
+// Under a frame: choose one of the capture's views, and slide between its photo and the render.
+export function beside(scene, captureOf) {
+  const select = h("select", { id: "beside-view" }, h("option", { value: "" }, "free view"));
+  const range = h("input", { id: "beside", type: "range", min: 0, max: 100, value: 50, disabled: true });
+  const note = h("span", { class: "quiet" });
+  const element = h(
+    "div",
+    { class: "beside row" },
+    h("label", { for: "beside-view" }, "View"),
+    select,
+    h("label", { for: "beside" }, "Photo ↔ render"),
+    range,
+    note,
+  );
+  let [known, photos, chosen] = [null, null, null];
+
+  function cut() {
+    scene.photo.style.setProperty("--cut", `${100 - Number(range.value)}%`);
+    range.setAttribute("aria-valuetext", `photo ${range.value} %, render ${100 - Number(range.value)} %`);
+  }
+
+  function free() {
+    chosen = null;
+    select.value = "";
+    scene.photo.hidden = range.disabled = true;
+    note.textContent = "";
+  }
+
+  async function choose() {
+    const { viewer } = scene;
+    const camera = viewer?.facts.cameras[Number(select.value)];
+    if (!select.value || !camera) {
+      viewer?.reset();
+      free();
+      return;
+    }
+    const share = Math.min(1, MOST_SIDE / Math.max(camera.W, camera.H));
+    const scaled = (value) => (value + 0.5) * share - 0.5;
+    const size = { W: Math.round(camera.W * share), H: Math.round(camera.H * share) };
+    const lens = { fx: camera.fx * share, fy: camera.fy * share, cx: scaled(camera.cx), cy: scaled(camera.cy) };
+    viewer.goTo(Number(select.value));
+    viewer.exact = chosen = { ...camera, ...lens, ...size };
+    viewer.askFrame();
+    const entry = captureOf();
+    photos ??= entry ? (await get(at(entry.entry, "photos")).catch(() => ({ photos: [] }))).photos : [];
+    const name = photoOf(photos, camera.name);
+    range.disabled = scene.photo.hidden = !name;
+    note.textContent = name ? (camera.held_out ? "held out of the training" : "") : "The photo of this view is not in the library.";
+    if (!name) return;
+    scene.photo.src = `${at(entry.entry, "thumbs", name)}?side=1024`;
+    cut();
+  }
+
+  select.addEventListener("change", choose);
+  range.addEventListener("input", cut);
+  const timer = setInterval(() => {
+    const { viewer } = scene;
+    if (viewer && viewer !== known) {
+      known = viewer;
+      const options = viewer.facts.cameras.map(({ name, held_out: held }, index) => {
+        return h("option", { value: index }, held ? `${name} (held out)` : name);
+      });
+      select.replaceChildren(h("option", { value: "" }, "free view"), ...options);
+      free();
+    }
+    if (chosen && viewer?.exact !== chosen) free(); // the user moved
+  }, LOOK);
+  return { element, close: () => clearInterval(timer) };
+}

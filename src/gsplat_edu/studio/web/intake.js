@@ -1,0 +1,250 @@
+// Takes in photos, folders, zip files, videos and scenes: dropped, chosen, or named by their path.
+
+import { at, post, upload } from "./api.js";
+import { announce, attempt, bytes, button, count, errorLine, h, heading } from "./dom.js";
+
+const AT_ONCE = 3;
+const SCENES = /\.(ply|splat|spz|sog|glb)$/i;
+const POSES = /(?:^|\/)(?:transforms(?:_train|_test|_val)?\.json|cameras\.(?:bin|txt))$/;
+const TAIL = 1 << 20; // bytes at the end of a zip file with the names of its files
+const ZIPPED_POSES = /transforms(?:_train)?\.json|cameras\.(?:bin|txt)/;
+const IGNORED = /(?:^|\/)(?:\.[^/]*|Thumbs\.db|desktop\.ini)$/i;
+const NAMELESS = "photos"; // single files have no folder to be named after
+
+// All files below dropped entries, as {file, path}.
+async function filesOf(transfer) {
+  const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
+  if (!entries.length) return [...transfer.files].map((file) => ({ file, path: file.name }));
+  const found = [];
+  const walk = async (entry, above) => {
+    const path = above + entry.name;
+    if (entry.isFile) {
+      found.push({ file: await new Promise((resolve, reject) => entry.file(resolve, reject)), path });
+      return;
+    }
+    const reader = entry.createReader();
+    for (;;) {
+      const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
+      if (!some.length) return; // a browser lists a hundred at a time
+      for (const one of some) await walk(one, `${path}/`);
+    }
+  };
+  for (const entry of entries) await walk(entry, "");
+  return found;
+}
+
+async function hasPoses(file) {
+  const tail = await file.slice(Math.max(0, file.size - TAIL)).arrayBuffer();
+  return ZIPPED_POSES.test(new TextDecoder("latin1").decode(tail));
+}
+
+// Splits files into entries to make: {kind, name, files: [{file, path}], zip}.
+async function sorted(files, wanted) {
+  const groups = new Map();
+  for (const { file, path } of files) {
+    if (IGNORED.test(path)) continue;
+    const inFolder = path.includes("/");
+    const single = !inFolder && (/\.zip$/i.test(path) || SCENES.test(path));
+    const top = inFolder ? path.slice(0, path.indexOf("/")) : single ? path : "";
+    const rest = inFolder ? path.slice(top.length + 1) : path;
+    if (!groups.has(top)) groups.set(top, { top, single, files: [] });
+    groups.get(top).files.push({ file, path: rest });
+  }
+  const found = [];
+  for (const { top, single, files: own } of groups.values()) {
+    const zip = single && /\.zip$/i.test(top);
+    let kind = "photos";
+    if (single && !zip) kind = "scenes";
+    else if (zip ? await hasPoses(own[0].file) : own.some(({ path }) => POSES.test(path))) kind = "captures";
+    if (wanted !== "auto" && !(single && !zip)) kind = wanted;
+    const video = !top && own.length === 1 && own[0].file.type.startsWith("video/");
+    const stem = single || video ? own[0].path.replace(/\.[^.]+$/, "") : top;
+    found.push({ kind, name: stem || NAMELESS, files: own, zip });
+  }
+  return found;
+}
+
+// A name that no entry has yet.
+export function freeName(store, kind, name) {
+  const cleaned = name.replace(/[\\/:*?"|]/g, "_").replace(/^[.\- ]+|[. ]+$/g, "") || NAMELESS;
+  const taken = new Set(store.entries(kind).map((entry) => entry.name.normalize("NFC")));
+  if (!taken.has(cleaned.normalize("NFC"))) return cleaned;
+  for (let i = 2; ; ++i) if (!taken.has(`${cleaned}-${i}`)) return `${cleaned}-${i}`;
+}
+
+// One upload of many files: its progress, and the files that were refused.
+class Batch {
+  constructor(store, { kind, name, files, zip }) {
+    Object.assign(this, { store, kind, name, files, zip, sent: new Map(), refused: 0 });
+    this.stopping = new AbortController();
+    this.total = files.reduce((sum, { file }) => sum + file.size, 0);
+    this.bar = h("progress", { max: Math.max(1, this.total), value: 0, "aria-label": `upload of ${name}` });
+    this.text = h("span", { class: "left" });
+    this.errors = h("ul", { class: "errors", "aria-label": "files that were not taken in" });
+    this.stop = button("Stop", () => this.stopping.abort());
+    this.element = h(
+      "article",
+      { class: "job" },
+      heading(3, `${kind}/${name}`),
+      h("div", { class: "row progress" }, this.bar, this.text, this.stop),
+      this.errors,
+    );
+  }
+
+  show(done) {
+    const bytesSent = [...this.sent.values()].reduce((sum, some) => sum + some, 0);
+    this.bar.value = Math.min(bytesSent, this.total);
+    this.text.textContent = `${bytes(bytesSent)} of ${bytes(this.total)}, ${done} of ${count(this.files.length, "file")}`;
+  }
+
+  refuse(name, error) {
+    this.refused += 1;
+    // the server's line often begins with what it is about
+    this.errors.append(h("li", { class: "error" }, h("strong", {}, name), ": ", error.message));
+  }
+
+  async one({ file, path }) {
+    const limits = this.store.library?.limits;
+    try {
+      if (limits && file.size > limits.file_bytes) {
+        throw new Error(`has ${bytes(file.size)}, but a file may have ${bytes(limits.file_bytes)}`);
+      }
+      const address = this.zip ? at(this.kind, this.name, "zip") : at(this.kind, this.name, "files", path);
+      const answer = await upload(address, file, (some) => this.note(file, some), this.stopping.signal);
+      this.note(file, file.size);
+      for (const name of answer.left_out ?? []) this.refuse(name, new Error("left out: neither a photo nor a video"));
+      return true;
+    } catch (error) {
+      if (!this.stopping.signal.aborted) this.refuse(path, error);
+      return false;
+    }
+  }
+
+  note(file, some) {
+    this.sent.set(file, Math.min(some, file.size));
+    this.show(this.done);
+  }
+
+  // Resolves to the number of files that were taken in.
+  async run() {
+    this.done = 0;
+    let next = 0;
+    this.show(0);
+    const work = async () => {
+      while (next < this.files.length && !this.stopping.signal.aborted) {
+        if (await this.one(this.files[next++])) this.done += 1;
+        this.show(this.done);
+      }
+    };
+    await Promise.all(Array.from({ length: this.zip ? 1 : AT_ONCE }, work));
+    this.stop.hidden = true;
+    announce(`${this.name}: ${count(this.done, "file")} taken in, ${this.refused} refused`);
+    return this.done;
+  }
+}
+
+let uploading = 0;
+addEventListener("beforeunload", (event) => {
+  if (uploading) event.preventDefault();
+});
+
+// The field into which files are dropped. `into` is an entry {kind, name} that files are added to; null makes new ones.
+export function intake(store, into = null) {
+  const line = errorLine();
+  const batches = h("div", { class: "batches" });
+  const kind = h(
+    "select",
+    { id: "take-as" },
+    h("option", { value: "auto" }, "what they look like"),
+    h("option", { value: "photos" }, "photos without poses"),
+    h("option", { value: "captures" }, "a capture: photos with poses"),
+  );
+
+  async function take(files) {
+    const groups = into ? [{ ...into, files, zip: false }] : await sorted(files, kind.value);
+    if (!groups.some((group) => group.files.length)) throw new Error("There are no files in what was dropped.");
+    let landed = null;
+    for (const group of groups) {
+      if (!into) group.name = freeName(store, group.kind, group.name);
+      const batch = new Batch(store, group);
+      batches.append(batch.element);
+      uploading += 1;
+      const done = await batch.run().finally(() => (uploading -= 1));
+      await store.refresh();
+      if (done && !batch.refused) batch.element.remove();
+      if (done && !batch.refused) landed ??= `#/${group.kind}/${encodeURIComponent(group.name)}`;
+    }
+    // with one entry and nothing refused, the next step is there
+    if (!into && landed && groups.length === 1 && batches.isConnected) location.hash = landed;
+  }
+
+  const choose = (more, text, attributes) => {
+    const input = h("input", {
+      type: "file",
+      multiple: true,
+      hidden: true,
+      ...more,
+      onchange: () => {
+        const files = [...input.files].map((file) => ({ file, path: file.webkitRelativePath || file.name }));
+        input.value = "";
+        attempt(null, line, () => take(files));
+      },
+    });
+    return [input, button(text, () => input.click(), attributes)];
+  };
+
+  const element = h(
+    "section",
+    { class: "drop", "aria-label": into ? "Add photos" : "Add photos, a video or a scene" },
+    h("p", { class: "hint" }, into ? "Drop more photos here, or" : "Drop photos, folders, a zip file, a video or a scene here, or"),
+    h("div", { class: "row" }, choose({}, "Choose files", { "data-key-u": "", class: "primary" }), into ? null : choose({ webkitdirectory: true }, "Choose a folder")),
+    into ? null : h("p", { class: "row" }, h("label", { for: "take-as" }, "Take them in as "), kind),
+    into ? null : pathForm(store),
+    line,
+    batches,
+  );
+  let inside = 0;
+  const mark = (by) => element.classList.toggle("over", (inside = Math.max(0, inside + by)) > 0);
+  element.addEventListener("dragenter", () => mark(1));
+  element.addEventListener("dragleave", () => mark(-1));
+  element.addEventListener("drop", (event) => {
+    event.preventDefault();
+    mark(-inside);
+    attempt(null, line, async () => take(await filesOf(event.dataTransfer)));
+  });
+  return element;
+}
+
+// Uses a folder or file of this computer where it is.
+function pathForm(store) {
+  const line = errorLine();
+  const path = h("input", { id: "path", type: "text", required: true, autocomplete: "off", spellcheck: "false" });
+  const kind = h(
+    "select",
+    { id: "path-kind" },
+    ["photos", "captures", "runs", "scenes"].map((name) => h("option", { value: name }, name)),
+  );
+  const add = h("button", {}, "Add");
+  const form = h(
+    "form",
+    {
+      class: "row",
+      onsubmit: (event) => {
+        event.preventDefault();
+        attempt(add, line, async () => {
+          const stem = path.value.replace(/[\\/]+$/, "").split(/[\\/]/).at(-1).replace(/\.[^.]+$/, "");
+          const name = freeName(store, kind.value, stem);
+          const made = await post("/api/adopt", { kind: kind.value, path: path.value, name });
+          await store.refresh();
+          location.hash = `#/${made.kind}/${encodeURIComponent(made.name)}`;
+        });
+      },
+    },
+    h("label", { for: "path" }, "Path of the folder or file"),
+    path,
+    h("label", { for: "path-kind" }, "It holds"),
+    kind,
+    add,
+  );
+  return h("details", {}, h("summary", {}, "Use a folder of this computer where it is"), form, line);
+}

@@ -1,0 +1,143 @@
+// Jobs: how far each one is, its buttons, and the command that repeats it.
+
+import { at, get, post, remove } from "./api.js";
+import { attempt, button, commandLine, duration, errorLine, h, heading, keyed, link, put } from "./dom.js";
+
+const STATES = {
+  queued: "waiting",
+  running: "running",
+  paused: "paused",
+  done: "done",
+  failed: "failed",
+  cancelled: "stopped",
+  interrupted: "interrupted",
+};
+
+export const badge = (state) => h("span", { class: `badge ${state}` }, STATES[state] ?? state);
+
+// Starts a job; its answer is in the store when this returns.
+export async function startJob(store, request) {
+  return store.put(await post("/api/jobs", request));
+}
+
+// A card of one job. `update()` shows its present state.
+export function jobCard(store, id, { main = false } = {}) {
+  const line = errorLine();
+  const state = h("span", { class: "state" });
+  const stages = h("ol", { class: "stages", "aria-label": "stages" });
+  const bar = h("progress", { max: "1", value: "0" });
+  const left = h("span", { class: "left" });
+  const said = h("p", { class: "said quiet" });
+  const change = (action) => (event) =>
+    attempt(event.currentTarget, line, async () => store.put(await post(at("jobs", id, action))));
+  const pause = button("Pause", change("pause"));
+  const resume = button("Resume", change("resume"), { class: "primary" });
+  const stop = button("Stop", change("cancel"), { title: "A training writes a checkpoint and can be resumed." });
+  const forget = button("Remove from the list", (event) => attempt(event.currentTarget, line, () => remove(at("jobs", id))));
+  if (main) {
+    pause.dataset.keyP = "";
+    resume.dataset.keyP = "";
+  }
+  const output = h("pre", { tabindex: "0", role: "region", "aria-label": "output" });
+  const view = store.jobs.get(id);
+  const more = h(
+    "details",
+    {
+      ontoggle: async () => {
+        if (more.open) output.textContent = (await get(at("jobs", id, "output")).catch((error) => error.message)) || "nothing yet";
+      },
+    },
+    h("summary", {}, "Output"),
+    output,
+  );
+  const element = h(
+    "article",
+    { class: "job", "aria-label": view.job.title },
+    h("div", { class: "row" }, heading(3, view.job.title), state),
+    stages,
+    h("div", { class: "row progress" }, bar, left),
+    said,
+    line,
+    h("div", { class: "row" }, pause, resume, stop, forget),
+    h("p", { class: "label" }, "The same as a command"),
+    commandLine(view.job.command),
+    more,
+  );
+
+  function update() {
+    const found = store.jobs.get(id);
+    if (!found) return;
+    const { job, progress, messages } = found;
+    if (state.dataset.state !== job.state + job.cancelling) {
+      state.dataset.state = job.state + job.cancelling;
+      state.replaceChildren(badge(job.cancelling ? "stopping" : job.state));
+    }
+    const current = found.stage;
+    const ended = job.state === "done";
+    keyed(
+      stages,
+      found.stages.map((name) => ({ name, now: name === current && !ended })),
+      ({ name }) => name,
+      ({ name }) => h("li", {}, name),
+      (item, { now }) => (now ? item.setAttribute("aria-current", "step") : item.removeAttribute("aria-current")),
+    );
+    const known = progress?.total && found.active;
+    bar.setAttribute("aria-label", `progress of ${current || job.title}`);
+    if (known || !found.active) [bar.max, bar.value] = known ? [progress.total, progress.done] : [1, ended ? 1 : 0];
+    else if (job.state === "running") bar.removeAttribute("value");
+    else bar.value = 0;
+    left.textContent = known ? leftOf(progress) : "";
+    said.textContent = found.active ? (messages.at(-1) ?? "") : "";
+    if (job.line) put(line, job.line);
+    pause.hidden = job.state !== "running" || job.cancelling;
+    resume.hidden = !(job.state === "paused" || (job.resumable && !found.active));
+    stop.hidden = !found.active || job.cancelling;
+    forget.hidden = found.active && job.state !== "queued";
+  }
+
+  update();
+  return { element, update, id };
+}
+
+function leftOf({ done, total, seconds_left: left }) {
+  const share = `${Math.floor((100 * done) / total)} %`;
+  return left === null || left === undefined ? share : `${share}, ${duration(left)} left`;
+}
+
+// The newest job about an entry; the card is replaced when another job begins.
+export function jobPlace(store, subject, commands, options = {}) {
+  const element = h("div", { class: "job-place" });
+  let card = null;
+  return {
+    element,
+    get view() {
+      return store.jobsOf(subject, ...commands)[0] ?? null;
+    },
+    update() {
+      const newest = store.jobsOf(subject, ...commands)[0] ?? null;
+      if ((newest?.job.id ?? null) !== (card?.id ?? null)) {
+        card = newest && jobCard(store, newest.job.id, options);
+        element.replaceChildren(...(card ? [card.element] : []));
+      }
+      card?.update();
+    },
+  };
+}
+
+// The screen with all jobs.
+export function jobs({ main, store }) {
+  const cards = new Map();
+  const list = h("div", { class: "cards wide" });
+  const empty = h("p", {}, "No jobs yet. Add photos in the ", link("library", "#/"), ", and start one there.");
+  main.append(heading(1, "Jobs"), empty, list);
+  return {
+    update() {
+      const all = [...store.jobs.values()].reverse();
+      empty.hidden = all.length > 0;
+      keyed(list, all, ({ job }) => job.id, ({ job }) => {
+        cards.set(job.id, jobCard(store, job.id));
+        return h("div", {}, link(job.subject, `#/${job.subject.split("/").map(encodeURIComponent).join("/")}`), cards.get(job.id).element);
+      }, (_, { job }) => cards.get(job.id).update());
+    },
+  };
+}

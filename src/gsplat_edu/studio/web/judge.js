@@ -1,0 +1,130 @@
+// Judges a run by the photos that it was not trained on, and compares two runs.
+
+import { at, get } from "./api.js";
+import { decibels, errorLine, h, heading, keyed, link, put } from "./dom.js";
+import { doctor } from "./doctor.js";
+
+const PICTURES = ["photo", "render", "difference"];
+
+const pictureOf = (entry, index, what) => at(entry, "views", String(index), `${what}.png`);
+
+// Two pictures on top of each other; a slider shows more of one or the other.
+export function slider(left, right, names, label) {
+  const range = h("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": `${label}: ${names.join(" or ")}` });
+  const top = h("img", { class: "top", src: left, alt: `${names[0]} of ${label}` });
+  const stack = h("div", { class: "stack" }, h("img", { src: right, alt: `${names[1]} of ${label}` }), top);
+  const cut = () => {
+    stack.style.setProperty("--cut", `${100 - Number(range.value)}%`);
+    range.setAttribute("aria-valuetext", `${names[0]} ${range.value} %, ${names[1]} ${100 - Number(range.value)} %`);
+  };
+  range.addEventListener("input", cut);
+  cut();
+  return h("figure", { class: "slider" }, stack, h("figcaption", {}, h("span", {}, names[0]), range, h("span", {}, names[1])));
+}
+
+export function judge({ place, store, entry, where }) {
+  const line = errorLine();
+  const facts = h("p", {});
+  const list = h("ul", { class: "views", "aria-label": "held-out views" });
+  const large = h("div", { class: "large" });
+  const order = h(
+    "select",
+    { id: "order", onchange: () => show() },
+    [["worst", "worst first"], ["best", "best first"], ["name", "by name"]].map(([value, text]) => h("option", { value }, text)),
+  );
+  const checked = doctor(store, entry.entry, "Says what may be wrong with this run, and what to change.");
+  const others = h("select", {
+    id: "other",
+    onchange: () => others.value && (location.hash = `#/runs/${encodeURIComponent(entry.name)}/compare/${encodeURIComponent(others.value)}`),
+  });
+  place.append(
+    h("section", { "aria-label": "held-out views" }, heading(2, "Held-out views"), facts, line, large,
+      h("p", { class: "row" }, h("label", { for: "order" }, "Order"), order, h("label", { for: "other" }, "Compare with"), others), list),
+    checked.element,
+  );
+  let [views, read, opened] = [[], "", where.query.get("view")];
+  const base = `#/runs/${encodeURIComponent(entry.name)}/judge`;
+
+  function show() {
+    const ordered = [...views];
+    if (order.value === "best") ordered.reverse();
+    if (order.value === "name") ordered.sort((a, b) => a.name.localeCompare(b.name));
+    keyed(list, ordered, ({ index }) => `${index} ${read}`, ({ index, name, psnr, ssim }) => {
+      const pictures = PICTURES.map((what) => {
+        return h("figure", {}, h("img", { src: pictureOf(entry.entry, index, what), alt: `${what} of ${name}`, loading: "lazy" }), h("figcaption", {}, what));
+      });
+      const score = `${decibels(psnr)}${typeof ssim === "number" ? `, SSIM ${ssim.toFixed(3)}` : ""}`;
+      return h("li", {}, h("p", { class: "row" }, link(name, `${base}?view=${index}`), h("span", { class: "quiet" }, score)), h("div", { class: "triple" }, pictures));
+    });
+    open();
+  }
+
+  function open() {
+    const view = views.find(({ index }) => String(index) === opened);
+    if (large.dataset.view === (view ? opened : "")) return;
+    large.dataset.view = view ? opened : "";
+    large.replaceChildren();
+    if (!view) return;
+    const pictures = ["photo", "render"].map((what) => pictureOf(entry.entry, view.index, what));
+    large.append(heading(3, view.name), slider(...pictures, ["photo", "render"], view.name), link("Close", base, { class: "button" }));
+  }
+
+  return {
+    follows(next) {
+      opened = next.query.get("view");
+      open();
+      if (opened) large.scrollIntoView({ block: "nearest" });
+      return true;
+    },
+    update(now) {
+      checked.update(now);
+      const runs = store.entries("runs").filter(({ name }) => name !== entry.name);
+      const names = runs.map(({ name }) => name).join("\n");
+      if (others.dataset.names !== names) {
+        others.dataset.names = names;
+        others.replaceChildren(h("option", { value: "" }, runs.length ? "another run" : "no other run"), ...runs.map(({ name }) => h("option", { value: name }, name)));
+      }
+      const version = `${now.finished} ${now.psnr} ${now.iterations}`;
+      if (version === read) return;
+      read = version;
+      get(at(entry.entry, "views")).then(
+        ({ views: found }) => {
+          views = found;
+          const mean = now.psnr === null ? "" : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
+          facts.textContent = found.length ? `${mean} Differences are shown 4 times as strong.` : "There are no held-out views yet. They are rendered when the training ends.";
+          show();
+        },
+        (error) => put(line, error.message),
+      );
+    },
+  };
+}
+
+// Two runs, view by view.
+export function compare({ place, entry, where }) {
+  const other = where.more;
+  const line = errorLine();
+  const facts = h("p", {});
+  const list = h("ul", { class: "views", "aria-label": "views of both runs" });
+  const back = `#/runs/${encodeURIComponent(entry.name)}/judge`;
+  place.append(h("section", { "aria-label": "comparison" }, heading(2, `${entry.name} and ${other}`), facts, line, list, link("Close", back, { class: "button" })));
+  const [a, b] = [entry.entry, `runs/${other}`];
+  get(`/api/compare?a=${encodeURIComponent(entry.name)}&b=${encodeURIComponent(other)}`).then(({ views, only_a: onlyA, only_b: onlyB }) => {
+    const better = views.filter(({ gain }) => gain > 0).length;
+    const rest = onlyA.length + onlyB.length ? ` ${onlyA.length + onlyB.length} views are held out of one of them only.` : "";
+    facts.textContent = views.length
+      ? `${other} is better in ${better} of ${views.length} views. The largest losses come first.${rest}`
+      : "These runs hold out no common view.";
+    list.append(...views.map(({ name, a: one, b: two, gain }) => {
+      const pictures = [[a, one, "photo", "photo"], [a, one, "render", entry.name], [b, two, "render", other]].map(([from, view, what, title]) => {
+        const score = what === "render" ? ` ${decibels(view.psnr)}` : "";
+        return h("figure", {}, h("img", { src: pictureOf(from, view.index, what), alt: `${what} of ${name}, ${title}`, loading: "lazy" }), h("figcaption", {}, `${title}${score}`));
+      });
+      const change = typeof gain === "number" ? `${gain > 0 ? "+" : ""}${gain.toFixed(2)} dB` : "";
+      const sides = ["render", "render"].map((what, i) => pictureOf(i ? b : a, (i ? two : one).index, what));
+      const more = h("details", { ontoggle: () => more.open && more.children.length === 1 && more.append(slider(...sides, [entry.name, other], name)) }, h("summary", {}, "Slide between both"));
+      return h("li", {}, h("p", { class: "row" }, h("strong", {}, name), h("span", { class: "quiet" }, change)), h("div", { class: "triple" }, pictures), more);
+    }));
+  }, (error) => put(line, error.message));
+  return { follows: (next) => next.more === other };
+}

@@ -1,0 +1,80 @@
+// The screen of photos without poses: previews, and the first step, which finds the poses.
+
+import { attempt, errorLine, h, heading, link } from "./dom.js";
+import { gallery } from "./gallery.js";
+import { freeName, intake } from "./intake.js";
+import { jobPlace, startJob } from "./jobs.js";
+import { addressOf, entryHead, management, withEntry } from "./library.js";
+
+const MATCHERS = [
+  ["", "as suits the photos"],
+  ["exhaustive", "every photo with every other one"],
+  ["sequential", "photos in the order they were taken"],
+];
+
+export function photos(given) {
+  const { main, store } = given;
+  return withEntry(given, (entry) => {
+    const head = entryHead(entry, "Photos");
+    const pictures = gallery(entry.entry);
+    const line = errorLine();
+    const job = jobPlace(store, entry.entry, ["sfm"], { main: true });
+    const matcher = h("select", { id: "matcher" }, MATCHERS.map(([value, text]) => h("option", { value }, text)));
+    const frames = h("input", { id: "frames", type: "number", min: 3, max: 5000, inputmode: "numeric" });
+    const find = h("button", { class: "primary" }, "Find the poses");
+    const next = h("p", { class: "next", hidden: true });
+    const form = h(
+      "form",
+      {
+        onsubmit: (event) => {
+          event.preventDefault();
+          attempt(find, line, () => {
+            const options = { matcher: matcher.value || null, frames: entry.videos && frames.value ? Number(frames.value) : null };
+            return startJob(store, { command: "sfm", subject: entry.entry, to: freeName(store, "captures", entry.name), options });
+          });
+        },
+      },
+      find,
+      h(
+        "details",
+        {},
+        h("summary", {}, "Options"),
+        h("p", { class: "row" }, h("label", { for: "matcher" }, "Compare"), matcher),
+        h("p", { class: "row", hidden: !entry.videos }, h("label", { for: "frames" }, "Frames of the video"), frames),
+      ),
+    );
+    main.append(
+      head.element,
+      h(
+        "section",
+        { "aria-label": "poses" },
+        heading(2, "Poses"),
+        h("p", {}, "The first step finds where each photo was taken (structure from motion). Photos need to overlap."),
+        form,
+        line,
+        job.element,
+        next,
+      ),
+      pictures.element,
+      entry.adopted ? "" : intake(store, { kind: "photos", name: entry.name }),
+      management(store, entry),
+    );
+    return {
+      entry,
+      update(now) {
+        head.update(now);
+        job.update();
+        pictures.read(now).catch((error) => (line.hidden = !(line.textContent = error.message)));
+        form.hidden = Boolean(job.view?.active);
+        const made = job.view?.job.state === "done" && store.entryAt(job.view.job.outputs[0] ?? "");
+        if (made && next.dataset.entry !== made.entry) {
+          next.dataset.entry = made.entry;
+          next.replaceChildren(link(`Continue with the capture ${made.name}`, addressOf(made), { class: "button primary" }));
+        }
+        next.hidden = !made;
+        find.textContent = made ? "Find the poses again" : "Find the poses";
+        find.classList.toggle("primary", !made);
+      },
+    };
+  });
+}

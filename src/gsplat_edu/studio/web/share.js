@@ -1,0 +1,133 @@
+// Exports of a run or a scene: every format with its size and PSNR, the page for others, a video.
+
+import { at, get, remove } from "./api.js";
+import { attempt, bytes, button, commandLine, decibels, errorLine, h, heading, keyed, link, put } from "./dom.js";
+import { jobPlace, startJob } from "./jobs.js";
+import { addressOf } from "./library.js";
+
+const FORMATS = [
+  ["html", "HTML page", "one file that shows the scene in any browser, also offline"],
+  ["spz", "SPZ", "small; many viewers read it"],
+  ["sog", "SOG", "smallest; for SuperSplat and PlayCanvas"],
+  ["ply", "PLY", "exact and large; every program reads it"],
+  ["compressed.ply", "Compressed PLY", "a quarter of a PLY; for SuperSplat"],
+  ["splat", "SPLAT", "without view-dependent colour"],
+  ["glb", "GLB", "glTF with Gaussians"],
+];
+
+const isVideo = (file) => /\.mp4$/i.test(file);
+
+export function share({ place, store, entry }) {
+  const line = errorLine();
+  const title = h("input", { id: "title", type: "text", required: true, value: entry.name, autocomplete: "off" });
+  const edits = h("input", { type: "checkbox", checked: true });
+  const withEdits = h("label", { class: "check", hidden: true }, edits, " apply the edits");
+  const note = h("p", { class: "quiet" });
+  const choices = FORMATS.map(([value, name, hint], index) => {
+    const input = h("input", { type: "radio", name: "format", value, checked: index === 0, onchange: () => explain() });
+    return h("label", { class: "choice" }, input, h("strong", {}, name), h("span", { class: "quiet" }, hint));
+  });
+  const form = h("form", {});
+  const make = h("button", { class: "primary" }, "Export");
+  const film = button("Make a video", () => attempt(film, line, () => start({ command: "render" })));
+  const job = jobPlace(store, entry.entry, ["convert", "render"], { main: true });
+  const list = h("ul", { class: "plain exports", "aria-label": "exported files" });
+  const none = h("p", { class: "quiet" }, "Nothing is exported yet.");
+  let [read, now] = ["", entry];
+
+  const start = (more) => {
+    const edited = now.edited && edits.checked;
+    return startJob(store, { subject: entry.entry, to: title.value, ...(edited ? { edits: true } : {}), ...more });
+  };
+
+  function explain() {
+    const page = new FormData(form).get("format") === "html";
+    put(note, page ? "The title is the page's heading. Start view, named views and camera path come from the edits: set them under Edit and save." : "");
+  }
+
+  form.append(
+    h("fieldset", {}, h("legend", {}, "Format"), h("div", { class: "choices" }, choices)),
+    h("p", { class: "row" }, h("label", { for: "title" }, "Title and name of the file"), title, withEdits),
+    note,
+    h("div", { class: "row" }, make, film),
+  );
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    attempt(make, line, () => start({ command: "convert", format: new FormData(form).get("format") }));
+  });
+  explain();
+  place.append(
+    h("section", { "aria-label": "export" }, heading(2, "Export"), form, line, job.element),
+    h("section", { "aria-label": "exported files" }, heading(2, "Exported files"), none, list),
+    entry.kind === "runs" ? cleaning(store, entry) : "",
+  );
+
+  function item(found) {
+    const { file, command } = found;
+    const away = button("Remove", () =>
+      attempt(away, line, async () => {
+        await remove(at(entry.entry, "exports", file));
+        read = "";
+        store.refresh();
+      }),
+    );
+    const address = at(entry.entry, "exports", file);
+    return h(
+      "li",
+      {},
+      h("div", { class: "row" }, h("strong", { class: "name" }, file), h("span", { class: "quiet facts" }), link("Download", address, { class: "button", download: file }), away),
+      command ? h("details", {}, h("summary", {}, "The same as a command"), commandLine(command)) : null,
+    );
+  }
+
+  function show(exports) {
+    none.hidden = exports.length > 0;
+    const newest = [...exports].sort((a, b) => b.modified - a.modified);
+    keyed(list, newest, ({ file, modified, job: by }) => `${file} ${modified} ${by}`, item, (element, { file, bytes: size, psnr }) => {
+      const exact = psnr === null ? "" : `PSNR ${decibels(psnr)} against the scene`;
+      element.querySelector(".facts").textContent = [bytes(size), isVideo(file) ? "" : exact].filter(Boolean).join(" · ");
+    });
+  }
+
+  return {
+    update(found) {
+      now = found;
+      withEdits.hidden = !now.edited;
+      job.update();
+      make.disabled = film.disabled = entry.kind === "runs" && !now.files;
+      const states = store.jobsOf(entry.entry, "convert", "render").map(({ job: { id, state } }) => `${id} ${state}`);
+      const version = `${states} ${now.modified} ${now.files}`;
+      if (version === read) return;
+      read = version;
+      get(at(entry.entry, "exports")).then(({ exports }) => show(exports), (error) => put(line, error.message));
+    },
+  };
+}
+
+// Removes what few photos saw, into a new scene.
+function cleaning(store, entry) {
+  const line = errorLine();
+  const job = jobPlace(store, entry.entry, ["clean"]);
+  const next = h("p", { hidden: true });
+  const clean = button("Clean", () => attempt(clean, line, () => startJob(store, { command: "clean", subject: entry.entry })));
+  const update = () => {
+    if (!next.isConnected) return store.removeEventListener("change", update);
+    job.update();
+    const made = job.view?.job.state === "done" && store.entryAt(job.view.job.outputs[0] ?? "");
+    if (made && next.hidden) next.append(link(`Open the scene ${made.name}`, addressOf(made), { class: "button" }));
+    next.hidden = !made;
+    return undefined;
+  };
+  store.addEventListener("change", update);
+  setTimeout(update);
+  return h(
+    "section",
+    { "aria-label": "cleaning" },
+    heading(2, "Clean"),
+    h("p", { class: "quiet" }, "Removes floaters and what contributes nothing, and makes a new scene; the run stays as it is."),
+    clean,
+    line,
+    job.element,
+    next,
+  );
+}

@@ -1,0 +1,175 @@
+// What the studio knows: the library, and jobs with their events as they happen.
+
+import { at, get } from "./api.js";
+
+export const ACTIVE = new Set(["queued", "running", "paused"]);
+
+const RECONNECT = 2000; // milliseconds, after the stream was closed for good
+const TOGETHER = 300; // milliseconds in which changes of the library are read once
+
+// A job and what its events say.
+class JobView {
+  constructor(job) {
+    this.job = job;
+    this.clear();
+  }
+
+  clear() {
+    Object.assign(this, { last: 0, stages: [], progress: null, messages: [], metrics: new Map() });
+  }
+
+  take(event) {
+    if (event.number <= this.last) return;
+    this.last = event.number;
+    if (event.event === "started") Object.assign(this, { stages: [], progress: null });
+    if (event.event === "stage" && !this.stages.includes(event.name)) this.stages.push(event.name);
+    if (event.event === "stage") this.progress = null;
+    if (event.event === "progress") this.progress = event;
+    if (event.event === "message") this.messages = [...this.messages.slice(-199), event.text];
+    if (event.event === "metric") this.metrics.set(`${event.name} ${event.of}`, event);
+  }
+
+  get active() {
+    return ACTIVE.has(this.job.state);
+  }
+
+  get stage() {
+    return this.progress?.stage ?? this.stages.at(-1) ?? "";
+  }
+}
+
+// What is known of a run that has no folder yet.
+function runOf({ subject, created }) {
+  const nothing = { planned: null, iterations: null, psnr: null, ssim: null, num_gaussians: null, seconds: null };
+  const entry = { kind: "runs", name: subject.slice(5), entry: subject, path: "", adopted: null, modified: created };
+  return { ...entry, ...nothing, files: 0, bytes: 0, finished: false, capture: null, problem: null, edited: false };
+}
+
+export class Store extends EventTarget {
+  constructor() {
+    super();
+    Object.assign(this, { library: null, jobs: new Map(), connected: null, trouble: "", read: false });
+  }
+
+  // "change": something is different; detail.job is the id of a job, if it is one.
+  changed(job = null) {
+    this.dispatchEvent(new CustomEvent("change", { detail: { job } }));
+  }
+
+  entry(kind, name) {
+    return this.entries(kind).find((entry) => entry.name === name) ?? null;
+  }
+
+  // Entries of a kind. A run whose training has not yet made its folder is there too.
+  entries(kind) {
+    const found = this.library?.[kind] ?? [];
+    if (kind !== "runs" || !this.library) return found;
+    const names = new Set(found.map(({ entry }) => entry));
+    const coming = [...this.jobs.values()].filter(({ job, active }) => {
+      return job.subject.startsWith("runs/") && job.argv[0] === "train" && !names.has(job.subject) && (active || job.line);
+    });
+    return [...found, ...new Map(coming.map(({ job }) => [job.subject, runOf(job)])).values()];
+  }
+
+  // The entry that a path lies in.
+  entryAt(path) {
+    for (const kind of ["photos", "captures", "runs", "scenes"]) {
+      const found = this.library?.[kind].find((entry) => {
+        return [entry.path, entry.adopted].some((own) => own && (path === own || path.startsWith(`${own}/`)));
+      });
+      if (found) return found;
+    }
+    return null;
+  }
+
+  // Jobs about an entry, newest first.
+  jobsOf(entry, ...commands) {
+    const all = [...this.jobs.values()].filter(({ job }) => job.subject === entry);
+    return all.filter(({ job }) => !commands.length || commands.includes(job.argv[0])).reverse();
+  }
+
+  async refresh() {
+    try {
+      this.library = await get("/api/library");
+      this.trouble = this.library.trouble.join(" ");
+    } catch (error) {
+      this.trouble = error.message;
+    }
+    this.changed();
+  }
+
+  refreshSoon() {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.refresh(), TOGETHER);
+  }
+
+  put(job) {
+    const known = this.jobs.get(job.id);
+    const before = known?.job.state;
+    if (known) known.job = job;
+    else this.jobs.set(job.id, new JobView(job));
+    if (before !== job.state && before !== undefined) this.refreshSoon();
+    this.changed(job.id);
+    return this.jobs.get(job.id);
+  }
+
+  // Reads the events of a job that the stream has not brought.
+  async catchUp(id) {
+    const view = this.jobs.get(id);
+    if (!view) return;
+    const { events } = await get(`${at("jobs", id, "events")}?after=${view.last}`);
+    for (const event of events) view.take(event);
+    this.changed(id);
+  }
+
+  async readJobs() {
+    const { jobs } = await get("/api/jobs");
+    const ids = new Set(jobs.map(({ id }) => id));
+    for (const id of [...this.jobs.keys()]) if (!ids.has(id)) this.jobs.delete(id);
+    this.jobs = new Map(jobs.map((job) => [job.id, this.jobs.get(job.id) ?? new JobView(job)]));
+    for (const job of jobs) this.jobs.get(job.id).job = job;
+    this.read = true;
+    await Promise.all(jobs.slice(-20).map(({ id }) => this.catchUp(id)));
+    this.changed();
+  }
+
+  // Follows the jobs. The browser reconnects by itself after a break and sends the id of the last event that it has.
+  connect() {
+    const source = new EventSource("/api/events");
+    source.addEventListener("open", () => this.setConnected(true));
+    source.addEventListener("error", () => {
+      this.setConnected(false);
+      if (source.readyState !== EventSource.CLOSED) return;
+      setTimeout(() => this.refresh().then(() => this.connect()), RECONNECT);
+    });
+    source.addEventListener("reset", () => {
+      this.readJobs().catch(() => {});
+      this.refreshSoon();
+    });
+    source.addEventListener("job", ({ data }) => this.put(JSON.parse(data)));
+    source.addEventListener("event", ({ data }) => {
+      const event = JSON.parse(data);
+      const view = this.jobs.get(event.job);
+      if (!view) return;
+      if (event.number > view.last + 1) this.catchUp(event.job).catch(() => {});
+      else view.take(event);
+      if (event.event === "stage") this.refreshSoon(); // a stage makes files
+      this.changed(event.job);
+    });
+    source.addEventListener("removed", ({ data }) => {
+      this.jobs.delete(JSON.parse(data).id);
+      this.changed();
+    });
+    source.addEventListener("full", () => {
+      this.trouble = "Too many pages of this studio are open; close one, then reload this one.";
+      source.close();
+      this.changed();
+    });
+  }
+
+  setConnected(connected) {
+    if (this.connected === false && connected) this.refreshSoon();
+    this.connected = connected;
+    this.changed();
+  }
+}

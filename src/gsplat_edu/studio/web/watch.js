@@ -1,0 +1,128 @@
+// A training as it runs: the scene, how far it is, and its curves. Also the view of a finished scene.
+
+import { at, get } from "./api.js";
+import { decibels, duration, h, heading, link, whole } from "./dom.js";
+import { curve } from "./curves.js";
+import { beside, frame } from "./frame.js";
+import { jobPlace } from "./jobs.js";
+import { addressOf } from "./library.js";
+
+const EVERY = 2000; // milliseconds between two looks at the curves
+
+// The screen of a scene without a training.
+export function look({ place, entry }) {
+  const scene = frame(`scene ${entry.name}`);
+  place.append(scene.element);
+  scene.show(at(entry.entry, "page"));
+  return { close: () => scene.close() };
+}
+
+export function watch({ place, store, entry }) {
+  const scene = frame(`scene of ${entry.name}`);
+  const captureOf = () => {
+    const found = entryNow().capture && store.entryAt(entryNow().capture);
+    return found || null;
+  };
+  const entryNow = () => store.entry("runs", entry.name) ?? entry;
+  const slider = beside(scene, captureOf);
+  const job = jobPlace(store, entry.entry, ["train"], { main: true });
+  const figures = h("dl", { class: "figures-list" });
+  const curves = {
+    loss: curve("Loss", (value) => value.toPrecision(3)),
+    psnr: curve("PSNR", decibels),
+    count: curve("Splats", whole),
+  };
+  const next = h("p", { class: "next row", hidden: true });
+  place.append(
+    h(
+      "div",
+      { class: "watch" },
+      h("div", { class: "left-side" }, scene.element, slider.element),
+      h("div", { class: "right-side" }, next, figures, job.element),
+    ),
+    h(
+      "section",
+      { "aria-label": "curves" },
+      heading(2, "Curves"),
+      h("div", { class: "curves" }, Object.values(curves).map(({ element }) => element)),
+    ),
+  );
+  const data = { points: [[], [], []], scores: [[], []], live: [[], []], next: "" };
+  let busy = false;
+
+  async function readCurves() {
+    if (busy) return;
+    busy = true;
+    try {
+      let more = true;
+      while (more) {
+        const found = await get(`${at(entry.entry, "curves")}?after=${encodeURIComponent(data.next)}`);
+        if (found.reset) Object.assign(data, { points: [[], [], []], scores: [[], []] });
+        const { points, scores } = found;
+        [points.iteration, points.loss, points.num_gaussians].forEach((some, i) => data.points[i].push(...some));
+        [scores.iteration, scores.psnr].forEach((some, i) => data.scores[i].push(...some));
+        more = found.more && found.next !== data.next;
+        data.next = found.next;
+      }
+      if (job.view?.active) {
+        const state = await get(at(entry.entry, "live", "state"));
+        if (state?.history) data.live = [state.history.iteration, state.history.psnr];
+      }
+    } catch {
+      // the folder of a new run is not there yet
+    } finally {
+      busy = false;
+    }
+    curves.loss.show(data.points[0], data.points[1]);
+    curves.count.show(data.points[0], data.points[2]);
+    const scores = data.scores[0].length > 1 || !data.live[0].length ? data.scores : data.live;
+    curves.psnr.show(...scores);
+  }
+
+  let ended = null;
+  const timer = setInterval(() => job.view?.active && readCurves(), EVERY);
+
+  return {
+    close() {
+      clearInterval(timer);
+      slider.close();
+      scene.close();
+    },
+    update(now) {
+      job.update();
+      const { view } = job;
+      const active = Boolean(view?.active);
+      if (active !== ended) {
+        ended = active;
+        readCurves();
+      }
+      const waits = view?.job.state === "queued" ? "This training waits for other jobs." : "The training has not begun yet.";
+      if (active && view.job.state !== "queued") scene.show(at(entry.entry, "live", "page"), waits);
+      else if (active) scene.show(null, waits);
+      else if (now.files) scene.show(at(entry.entry, "page"));
+      else scene.show(null, "There is no scene.");
+      showFigures(figures, now, view);
+      if (now.finished && !active && next.hidden) {
+        next.append(link("Judge it", `${addressOf(now)}/judge`, { class: "button" }), link("Share it", `${addressOf(now)}/share`, { class: "button primary" }));
+        next.hidden = false;
+      }
+    },
+  };
+}
+
+function showFigures(list, now, view) {
+  const training = view?.active && /train/.test(view.progress?.stage ?? "") ? view.progress : null;
+  const done = Math.max(training?.done ?? 0, now.iterations ?? 0);
+  const rows = [
+    ["iterations", now.planned ? `${whole(done)} of ${whole(now.planned)}` : "–"],
+    ["PSNR of held-out views", now.psnr === null ? "–" : decibels(now.psnr)],
+    ["SSIM", now.ssim === null ? "–" : now.ssim.toFixed(3)],
+    ["splats", now.num_gaussians ? whole(now.num_gaussians) : "–"],
+    ["time", now.seconds ? duration(now.seconds) : "–"],
+  ];
+  const text = JSON.stringify(rows);
+  if (list.dataset.text === text) return;
+  list.dataset.text = text;
+  list.replaceChildren(...rows.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
+}
+
