@@ -36,7 +36,7 @@ function route() {
   main.replaceChildren();
   shown = (SCREENS[where.kind] ?? library)({ main, store, where });
   update();
-  for (const item of document.querySelectorAll("nav a")) {
+  for (const item of document.querySelectorAll("header nav a")) {
     const jobsShown = where.kind === "jobs";
     const current = (item.hash === "#/jobs") === jobsShown;
     if (current) item.setAttribute("aria-current", jobsShown || where.kind === "" ? "page" : "true");

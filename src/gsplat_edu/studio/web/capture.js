@@ -66,9 +66,9 @@ function startForm(store, entry) {
     max_gaussians: h("input", { id: "max-gaussians", type: "number", min: 1, inputmode: "numeric" }),
   };
   const labels = {
-    iterations: "Iterations",
+    iterations: "Iterations instead of a quality",
     resolution: "Photos, 1/… of their width, or px",
-    time_limit: "Time limit",
+    time_limit: "Time instead of a quality",
     max_memory: "Memory limit",
     max_gaussians: "Most splats",
   };
@@ -104,7 +104,8 @@ function startForm(store, entry) {
         onsubmit: (event) => {
           event.preventDefault();
           attempt(go, line, async () => {
-            const options = { quality: new FormData(event.target).get("quality") };
+            const own = fields.iterations.value || fields.time_limit.value; // takes the place of a quality
+            const options = own ? {} : { quality: new FormData(event.target).get("quality") };
             for (const [key, field] of Object.entries(fields)) {
               if (field.value) options[key] = field.type === "number" ? Number(field.value) : field.value;
             }

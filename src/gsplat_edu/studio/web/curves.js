@@ -9,19 +9,21 @@ const MOST = 300; // points that are drawn
 export function curve(title, shown) {
   const path = h("path", { fill: "none", "vector-effect": "non-scaling-stroke" });
   const drawing = h("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", role: "img" }, path);
+  const name = h("span", {}, title);
   const value = h("output", {}, "–");
   const [high, low, last] = [h("span", { class: "high" }), h("span", { class: "low" }), h("span", { class: "last" })];
   const axis = h("div", { class: "axis quiet", "aria-hidden": "true" }, h("span", {}, "0"), h("span", {}, "iteration"), last);
   const element = h(
     "figure",
     { class: "curve" },
-    h("figcaption", {}, h("span", {}, title), value),
+    h("figcaption", {}, name, value),
     h("div", { class: "plot" }, high, low, drawing),
     axis,
   );
 
-  // Shows values at iterations; a value may be null.
-  function show(iterations, values) {
+  // Shows values at iterations; a value may be null. `of` is what they were measured on.
+  function show(iterations, values, of = "") {
+    name.textContent = of ? `${title} ${of}` : title;
     const points = averaged(iterations.map((x, i) => [x, values[i]]).filter(([, y]) => Number.isFinite(y)));
     if (!points.length) {
       drawing.setAttribute("aria-label", `${title}: no values yet`);

@@ -13,6 +13,6 @@ export function edit({ place, entry }) {
     scene.element,
     h("p", { class: "row" }, link("Share it", `${addressOf(entry)}/share`, { class: "button" })),
   );
-  scene.show(at(entry.entry, "editor"), "Loading the editor ...");
+  scene.show(`${at(entry.entry, "page")}?edit=1`, "Loading the editor ...");
   return { close: () => scene.close() };
 }

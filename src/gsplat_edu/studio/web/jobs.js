@@ -78,7 +78,7 @@ export function jobCard(store, id, { main = false } = {}) {
       stages,
       found.stages.map((name) => ({ name, now: name === current && !ended })),
       ({ name }) => name,
-      ({ name }) => h("li", {}, name),
+      ({ name }) => h("li", { title: name }, name.replace(/\S*\/(?=\S)/g, "")), // files without their folders
       (item, { now }) => (now ? item.setAttribute("aria-current", "step") : item.removeAttribute("aria-current")),
     );
     const known = progress?.total && found.active;
@@ -91,6 +91,7 @@ export function jobCard(store, id, { main = false } = {}) {
     if (job.line) put(line, job.line);
     pause.hidden = job.state !== "running" || job.cancelling;
     resume.hidden = !(job.state === "paused" || (job.resumable && !found.active));
+    resume.textContent = job.state === "failed" ? "Try again" : "Resume";
     stop.hidden = !found.active || job.cancelling;
     forget.hidden = found.active && job.state !== "queued";
   }

@@ -35,6 +35,7 @@ export function factsOf(entry) {
 // Address of a small picture of an entry; null if there is none.
 async function pictureOf(entry) {
   if (entry.kind === "runs") {
+    if (entry.psnr === null) return null; // nothing is rendered yet
     const { views } = await get(at(entry.entry, "views"));
     return views.length ? at(entry.entry, "views", String(views.at(-1).index), "render.png") : null;
   }

@@ -32,7 +32,7 @@ export function watch({ place, store, entry }) {
     psnr: curve("PSNR", decibels),
     count: curve("Splats", whole),
   };
-  const next = h("p", { class: "next row", hidden: true });
+  const next = h("p", { class: "next row" });
   place.append(
     h(
       "div",
@@ -51,7 +51,7 @@ export function watch({ place, store, entry }) {
   let busy = false;
 
   async function readCurves() {
-    if (busy) return;
+    if (busy || !entryNow().files) return;
     busy = true;
     try {
       let more = true;
@@ -75,11 +75,13 @@ export function watch({ place, store, entry }) {
     }
     curves.loss.show(data.points[0], data.points[1]);
     curves.count.show(data.points[0], data.points[2]);
-    const scores = data.scores[0].length > 1 || !data.live[0].length ? data.scores : data.live;
-    curves.psnr.show(...scores);
+    const { iterations, psnr } = entryNow();
+    if (data.scores[0].length > 1) curves.psnr.show(...data.scores, "of held-out views");
+    else if (data.live[0].length) curves.psnr.show(...data.live, "of training photos");
+    else if (psnr !== null) curves.psnr.show([iterations], [psnr], "of held-out views");
   }
 
-  let ended = null;
+  let seen = null;
   const timer = setInterval(() => job.view?.active && readCurves(), EVERY);
 
   return {
@@ -92,19 +94,19 @@ export function watch({ place, store, entry }) {
       job.update();
       const { view } = job;
       const active = Boolean(view?.active);
-      if (active !== ended) {
-        ended = active;
+      const phase = `${active} ${now.files > 0} ${now.iterations}`;
+      if (phase !== seen) {
+        seen = phase;
         readCurves();
       }
       const waits = view?.job.state === "queued" ? "This training waits for other jobs." : "The training has not begun yet.";
-      if (active && view.job.state !== "queued") scene.show(at(entry.entry, "live", "page"), waits);
+      if (active && view.job.state !== "queued" && now.files) scene.show(at(entry.entry, "live", "page"), waits);
       else if (active) scene.show(null, waits);
       else if (now.files) scene.show(at(entry.entry, "page"));
       else scene.show(null, "There is no scene.");
       showFigures(figures, now, view);
-      if (now.finished && !active && next.hidden) {
+      if (now.finished && !active && !next.children.length) {
         next.append(link("Judge it", `${addressOf(now)}/judge`, { class: "button" }), link("Share it", `${addressOf(now)}/share`, { class: "button primary" }));
-        next.hidden = false;
       }
     },
   };
