@@ -1,0 +1,202 @@
+"""The studio's page in Chromium, used as a person would: from a capture, or photos, to a downloaded scene."""
+
+import base64
+import io
+import re
+import shlex
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from browsers import chromium
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.textured_box import box_orbit, photograph_box
+from gsplat_edu.data.writers import write_colmap
+from processes import Program
+from studio.conftest import Inline
+from studio.pages import DROP, Visitor, served
+
+COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main(sys.argv[1:]))"
+HOSTILE = "<img src=x onerror=hacked=1>"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as launched:
+        yield launched
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    with served(tmp_path_factory.mktemp("studio") / "library", Inline()) as (studio, url):
+        yield studio, url
+
+
+@pytest.fixture
+def visitor(browser, library):
+    """Open the page, in a tab of a person who has not been here before."""
+    context = browser.new_context(accept_downloads=True, viewport={"width": 1000, "height": 700})
+    context.set_default_timeout(60_000)
+    made = []
+
+    def visit(url=library[1]):
+        made.append(Visitor(context, url))
+        return made[-1]
+
+    yield visit
+    faults = [fault for one in made for fault in one.faults]
+    context.close()
+    assert faults == []
+
+
+def encoded(data):
+    return base64.b64encode(data).decode()
+
+
+def png(seed, size=(24, 18)):
+    data = io.BytesIO()
+    pixels = np.random.default_rng(seed).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(data, format="PNG")
+    return data.getvalue()
+
+
+def train_and_download(person, name, iterations, tmp_path):
+    """From a capture's screen to a downloaded .spz by clicks; returns its bytes and the commands that were shown."""
+    tab = person.tab
+    tab.locator("summary", has_text="Options").click()
+    tab.get_by_label("Iterations instead of a quality").fill(str(iterations))
+    tab.get_by_role("button", name="Start training").click()
+    person.reach(f"#/runs/{name}")
+    tab.get_by_role("link", name="Share it").click()
+    commands = [person.command(f"training of {name}")] if tab.locator(".watch").count() else []
+    person.reach(f"#/runs/{name}/share")
+    tab.get_by_role("radio", name=re.compile("^SPZ")).check()
+    tab.get_by_role("button", name="Export", exact=True).click()
+    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    with tab.expect_download() as download:
+        tab.get_by_role("link", name="Download").click()
+    assert download.value.suggested_filename == f"{name}.spz"
+    commands.append(person.command(f"export of {name}.spz"))
+    return download.value.path().read_bytes(), commands
+
+
+def repeated(commands, library, folder):
+    """Run printed commands with a folder in place of the library; return the bytes of the .spz."""
+    (folder / "runs").mkdir(parents=True)
+    for command in commands:
+        program, *words = shlex.split(command)
+        assert program == "gsplat-edu"
+        inputs = [word for word in words if word.startswith(str(library / "captures"))]
+        words = [w if w in inputs else w.replace(str(library), str(folder)) for w in words]
+        assert Program(COMMAND, words, folder).ended()[0] == 0
+    return next(folder.rglob("*.spz")).read_bytes()
+
+
+def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path):
+    """Also: a reload and a second tab show the same place, and the printed commands give the same bytes."""
+    write_colmap(tmp_path / "box", *procedural_capture(24, 14))
+    zipped = io.BytesIO()
+    with zipfile.ZipFile(zipped, "w") as archive:
+        for path in sorted((tmp_path / "box").rglob("*")):
+            archive.write(path, path.relative_to(tmp_path))
+    person = visitor()
+    tab = person.tab
+    assert "token" not in tab.url
+    assert "Drop photos" in tab.inner_text(".first")
+    tab.evaluate(DROP, [[["box.zip", encoded(zipped.getvalue())]], ".drop"])
+    person.reach("#/captures/box")  # its names say that it has poses
+    tab.locator(".thumbs img").nth(13).wait_for()
+    tab.locator(".forecast", has_text="of memory").nth(2).wait_for()
+
+    tab.locator("summary", has_text="Options").click()
+    tab.get_by_label("Iterations instead of a quality").fill("60")
+    tab.get_by_role("button", name="Start training").click()
+    person.reach("#/runs/box")
+    train = person.command("training of box")
+    tab.get_by_role("link", name="Share it").wait_for()
+    assert tab.locator(".figures-list").inner_text().split("\n")[1] == "60 of 60"
+    assert "from" in tab.get_by_role("img", name=re.compile("^Loss")).get_attribute("aria-label")
+
+    tab.keyboard.press("2")  # judge
+    person.reach("#/runs/box/judge")
+    assert tab.locator(".views li").first.locator("img").count() == 3
+    tab.locator(".views a").first.click()
+    slider = tab.get_by_role("slider")
+    slider.focus()
+    tab.keyboard.press("ArrowRight")
+    assert slider.get_attribute("aria-valuetext") == "photo 51 %, render 49 %"
+
+    tab.keyboard.press("4")  # share
+    person.reach("#/runs/box/share")
+    tab.get_by_role("radio", name=re.compile("^SPZ")).check()
+    tab.get_by_role("button", name="Export", exact=True).click()
+    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    with tab.expect_download() as download:
+        tab.get_by_role("link", name="Download").click()
+    convert = person.command("export of box.spz")
+    root = library[0].library.root
+    assert repeated([train, convert], root, tmp_path / "again") == download.value.path().read_bytes()
+
+    shown = tab.locator(".exports li").inner_text()
+    tab.reload()
+    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    second = visitor_of(person, tab.url)
+    second.locator(".exports .facts", has_text="PSNR").wait_for()
+    assert tab.locator(".exports li").inner_text() == second.locator(".exports li").inner_text() == shown
+
+
+def visitor_of(person, url):
+    """Another tab of the same person."""
+    tab = person.tab.context.new_page()
+    tab.goto(url)
+    return tab
+
+
+def test_hostile_names_are_text_and_refused_files_say_why(visitor):
+    person = visitor()
+    tab = person.tab
+    files = [[f"{HOSTILE}.png", encoded(png(1))], [f"{HOSTILE}.txt", encoded(b"no photo")]]
+    tab.evaluate(DROP, [files, ".drop"])
+    error = tab.locator(".errors li")
+    error.wait_for()
+    assert error.inner_text().startswith(f"{HOSTILE}.txt: ")
+    assert "neither a photo nor a video" in error.inner_text()
+    card = tab.locator("a.card", has_text="1 photo")
+    card.click()
+    person.reach("#/photos/photos")
+    tab.locator(".thumbs .name", has_text=HOSTILE).wait_for()
+    tab.locator("summary", has_text="Rename or remove").click()
+    tab.get_by_label("Name").fill(HOSTILE)
+    tab.get_by_role("button", name="Rename").click()
+    tab.locator("h1", has_text=HOSTILE).wait_for()
+    assert tab.title().startswith(HOSTILE)
+    tab.reload()
+    tab.locator("h1", has_text=HOSTILE).wait_for()
+    tab.locator("summary", has_text="Rename or remove").click()
+    tab.get_by_role("button", name="Move to the trash").click()
+    person.reach("#/")
+    tab.get_by_role("link", name="Trash").click()
+    tab.locator("main li", has_text=HOSTILE).wait_for()
+    assert tab.evaluate("typeof hacked") == "undefined"
+    assert tab.locator("img[src=x]").count() == 0
+
+
+@pytest.mark.sliced(0)
+def test_from_dropped_photos_to_a_downloaded_scene(visitor, library, tmp_path):
+    pytest.importorskip("pycolmap")
+    files = []
+    for index, camera in enumerate(box_orbit(14)):
+        data = io.BytesIO()
+        Image.fromarray(photograph_box(camera)).save(data, format="PNG")
+        files.append([f"box_{index:02d}.png", encoded(data.getvalue())])
+    person = visitor()
+    tab = person.tab
+    tab.evaluate(DROP, [files, ".drop"])
+    tab.get_by_role("button", name="Find the poses").click()
+    tab.get_by_role("link", name=re.compile("^Continue with the capture")).click(timeout=240_000)
+    name = re.fullmatch("#/captures/(.+)", person.place())[1]
+    data, commands = train_and_download(person, name, 200, tmp_path)
+    assert len(data) > 10_000
+    assert all(command.startswith("gsplat-edu ") for command in commands)
