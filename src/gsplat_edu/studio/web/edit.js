@@ -11,7 +11,7 @@ export function edit({ place, entry }) {
   place.append(
     h("p", { class: "quiet" }, "Save in the editor; then export with the edits. The scene itself stays as it is."),
     scene.element,
-    h("p", { class: "row" }, link("Share it", `${addressOf(entry)}/share`, { class: "button" })),
+    h("div", { class: "row" }, scene.full, link("Share it", `${addressOf(entry)}/share`, { class: "button" })),
   );
   scene.show(`${at(entry.entry, "page")}?edit=1`, "Loading the editor ...");
   return { close: () => scene.close() };

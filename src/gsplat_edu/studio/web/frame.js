@@ -12,8 +12,8 @@ export function frame(title) {
   const inner = h("iframe", { title, allow: "fullscreen; clipboard-write", hidden: true });
   const message = h("p", { class: "message", role: "status" }, "Loading the scene ...");
   const photo = h("img", { class: "over-photo", alt: "", hidden: true });
-  const full = button("Full screen", () => element.requestFullscreen?.(), { class: "full" });
-  const element = h("div", { class: "scene" }, inner, photo, message, full);
+  const full = button("Full screen", () => element.requestFullscreen?.());
+  const element = h("div", { class: "scene" }, inner, photo, message);
   let [address, timer] = [null, 0];
 
   async function open() {
@@ -35,8 +35,8 @@ export function frame(title) {
 
   return {
     element,
-    inner,
     photo,
+    full,
     show(next, why = "Loading the scene ...") {
       if (next === address) {
         if (next === null) put(message, why);
@@ -83,6 +83,7 @@ export function beside(scene, captureOf) {
     select,
     h("label", { for: "beside" }, "Photo ↔ render"),
     range,
+    scene.full,
     note,
   );
   let [known, photos, chosen] = [null, null, null];

@@ -21,7 +21,7 @@ export async function startJob(store, request) {
 }
 
 // A card of one job. `update()` shows its present state.
-export function jobCard(store, id, { main = false } = {}) {
+export function jobCard(store, id, { main = false, level = 3 } = {}) {
   const line = errorLine();
   const state = h("span", { class: "state" });
   const stages = h("ol", { class: "stages", "aria-label": "stages" });
@@ -53,7 +53,7 @@ export function jobCard(store, id, { main = false } = {}) {
   const element = h(
     "article",
     { class: "job", "aria-label": view.job.title },
-    h("div", { class: "row" }, heading(3, view.job.title), state),
+    h("div", { class: "row" }, heading(level, view.job.title), state),
     stages,
     h("div", { class: "row progress" }, bar, left),
     said,
@@ -136,7 +136,7 @@ export function jobs({ main, store }) {
       const all = [...store.jobs.values()].reverse();
       empty.hidden = all.length > 0;
       keyed(list, all, ({ job }) => job.id, ({ job }) => {
-        cards.set(job.id, jobCard(store, job.id));
+        cards.set(job.id, jobCard(store, job.id, { level: 2 }));
         return h("div", {}, link(job.subject, `#/${job.subject.split("/").map(encodeURIComponent).join("/")}`), cards.get(job.id).element);
       }, (_, { job }) => cards.get(job.id).update());
     },

@@ -12,7 +12,7 @@ const EVERY = 2000; // milliseconds between two looks at the curves
 // The screen of a scene without a training.
 export function look({ place, entry }) {
   const scene = frame(`scene ${entry.name}`);
-  place.append(scene.element);
+  place.append(scene.element, h("div", { class: "row" }, scene.full));
   scene.show(at(entry.entry, "page"));
   return { close: () => scene.close() };
 }
@@ -25,7 +25,7 @@ export function watch({ place, store, entry }) {
   };
   const entryNow = () => store.entry("runs", entry.name) ?? entry;
   const slider = beside(scene, captureOf);
-  const job = jobPlace(store, entry.entry, ["train"], { main: true });
+  const job = jobPlace(store, entry.entry, ["train"], { main: true, level: 2 });
   const figures = h("dl", { class: "figures-list" });
   const curves = {
     loss: curve("Loss", (value) => value.toPrecision(3)),
