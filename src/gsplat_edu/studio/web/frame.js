@@ -7,7 +7,7 @@ const RETRY = 3000; // milliseconds until a page that is not there yet is asked 
 const LOOK = 250; // milliseconds between two looks at what the frame shows
 const MOST_SIDE = 1024; // px of a picture beside a photo
 
-// A frame that shows a page as soon as the server has it. show(null) empties it.
+// A frame that shows a page as soon as the server has it; until then, what it showed before.
 export function frame(title) {
   const inner = h("iframe", { title, allow: "fullscreen; clipboard-write", hidden: true });
   const message = h("p", { class: "message", role: "status" }, "Loading the scene ...");
@@ -23,13 +23,13 @@ export function frame(title) {
     try {
       await head(wanted);
       if (address !== wanted) return;
+      put(message, "");
       inner.src = wanted;
       inner.hidden = false;
-      put(message, "");
     } catch (error) {
       if (address !== wanted) return;
-      put(message, error.message);
-      timer = setTimeout(open, RETRY);
+      if (inner.hidden) put(message, error.message); // otherwise the last picture stays
+      if ([0, 409, 503].includes(error.status)) timer = setTimeout(open, RETRY); // it is not there yet
     }
   }
 
@@ -38,14 +38,9 @@ export function frame(title) {
     photo,
     full,
     show(next, why = "Loading the scene ...") {
-      if (next === address) {
-        if (next === null) put(message, why);
-        return;
-      }
+      if (inner.hidden) put(message, why);
+      if (next === address) return;
       address = next;
-      inner.hidden = true;
-      inner.removeAttribute("src");
-      put(message, why);
       open();
     },
     close() {

@@ -81,13 +81,14 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
       ({ name }) => h("li", { title: name }, name.replace(/\S*\/(?=\S)/g, "")), // files without their folders
       (item, { now }) => (now ? item.setAttribute("aria-current", "step") : item.removeAttribute("aria-current")),
     );
-    const known = progress?.total && found.active;
+    const known = progress?.total && !ended;
     bar.setAttribute("aria-label", `progress of ${current || job.title}`);
     if (known || !found.active) [bar.max, bar.value] = known ? [progress.total, progress.done] : [1, ended ? 1 : 0];
     else if (job.state === "running") bar.removeAttribute("value");
     else bar.value = 0;
-    left.textContent = known ? leftOf(progress) : "";
+    left.textContent = known && found.active ? leftOf(progress) : "";
     said.textContent = found.active ? (messages.at(-1) ?? "") : "";
+    line.classList.toggle("error", job.state !== "cancelled"); // stopping is no error
     if (job.line) put(line, job.line);
     pause.hidden = job.state !== "running" || job.cancelling;
     resume.hidden = !(job.state === "paused" || (job.resumable && !found.active));

@@ -8,6 +8,7 @@ import { jobPlace } from "./jobs.js";
 import { addressOf } from "./library.js";
 
 const EVERY = 2000; // milliseconds between two looks at the curves
+const REFRESH = 5; // looks at the curves between two looks at the library
 
 // The screen of a scene without a training.
 export function look({ place, entry }) {
@@ -82,7 +83,12 @@ export function watch({ place, store, entry }) {
   }
 
   let seen = null;
-  const timer = setInterval(() => job.view?.active && readCurves(), EVERY);
+  let ticks = 0;
+  const timer = setInterval(() => {
+    if (!job.view?.active) return;
+    readCurves();
+    if (++ticks % REFRESH === 0) store.refreshSoon();
+  }, EVERY);
 
   return {
     close() {
@@ -104,7 +110,7 @@ export function watch({ place, store, entry }) {
       else if (active) scene.show(null, waits);
       else if (now.files) scene.show(at(entry.entry, "page"));
       else scene.show(null, "There is no scene.");
-      showFigures(figures, now, view);
+      showFigures(figures, now, view, data);
       if (now.finished && !active && !next.children.length) {
         next.append(link("Judge it", `${addressOf(now)}/judge`, { class: "button" }), link("Share it", `${addressOf(now)}/share`, { class: "button primary" }));
       }
@@ -112,14 +118,15 @@ export function watch({ place, store, entry }) {
   };
 }
 
-function showFigures(list, now, view) {
+function showFigures(list, now, view, { points }) {
   const training = view?.active && /train/.test(view.progress?.stage ?? "") ? view.progress : null;
   const done = Math.max(training?.done ?? 0, now.iterations ?? 0);
+  const splats = (view?.active && points[2].at(-1)) || now.num_gaussians;
   const rows = [
     ["iterations", now.planned ? `${whole(done)} of ${whole(now.planned)}` : "–"],
     ["PSNR of held-out views", now.psnr === null ? "–" : decibels(now.psnr)],
     ["SSIM", now.ssim === null ? "–" : now.ssim.toFixed(3)],
-    ["splats", now.num_gaussians ? whole(now.num_gaussians) : "–"],
+    ["splats", splats ? whole(splats) : "–"],
     ["time", now.seconds ? duration(now.seconds) : "–"],
   ];
   const text = JSON.stringify(rows);
