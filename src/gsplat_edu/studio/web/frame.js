@@ -33,6 +33,14 @@ export function frame(title) {
     }
   }
 
+  // the page may have gone between the two requests; the browser then shows an error of its own
+  inner.addEventListener("load", () => {
+    if (inner.hidden || inner.contentDocument) return;
+    inner.hidden = true;
+    put(message, "Loading the scene ...");
+    timer = setTimeout(open, RETRY);
+  });
+
   return {
     element,
     photo,

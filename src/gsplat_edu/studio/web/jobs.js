@@ -17,7 +17,7 @@ export const badge = (state) => h("span", { class: `badge ${state}` }, STATES[st
 
 // Starts a job; its answer is in the store when this returns.
 export async function startJob(store, request) {
-  return store.put(await post("/api/jobs", request));
+  return store.answered(await post("/api/jobs", request), undefined);
 }
 
 // A card of one job. `update()` shows its present state.
@@ -29,7 +29,10 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   const left = h("span", { class: "left" });
   const said = h("p", { class: "said quiet" });
   const change = (action) => (event) =>
-    attempt(event.currentTarget, line, async () => store.put(await post(at("jobs", id, action))));
+    attempt(event.currentTarget, line, async () => {
+      const heard = store.heard.get(id);
+      store.answered(await post(at("jobs", id, action)), heard);
+    });
   const pause = button("Pause", change("pause"));
   const resume = button("Resume", change("resume"), { class: "primary" });
   const stop = button("Stop", change("cancel"), { title: "A training writes a checkpoint and can be resumed." });
@@ -134,7 +137,7 @@ export function jobs({ main, store }) {
   main.append(heading(1, "Jobs"), empty, list);
   return {
     update() {
-      const all = [...store.jobs.values()].reverse();
+      const all = [...store.jobs.values()].sort((a, b) => b.job.id.localeCompare(a.job.id));
       empty.hidden = all.length > 0;
       keyed(list, all, ({ job }) => job.id, ({ job }) => {
         cards.set(job.id, jobCard(store, job.id, { level: 2 }));

@@ -48,7 +48,7 @@ function runOf({ subject, created }) {
 export class Store extends EventTarget {
   constructor() {
     super();
-    Object.assign(this, { library: null, jobs: new Map(), connected: null, trouble: "", read: false });
+    Object.assign(this, { library: null, jobs: new Map(), heard: new Map(), connected: null, trouble: "", read: false });
   }
 
   // "change": something is different; detail.job is the id of a job, if it is one.
@@ -85,7 +85,8 @@ export class Store extends EventTarget {
   // Jobs about an entry, newest first.
   jobsOf(entry, ...commands) {
     const all = [...this.jobs.values()].filter(({ job }) => job.subject === entry);
-    return all.filter(({ job }) => !commands.length || commands.includes(job.argv[0])).reverse();
+    const found = all.filter(({ job }) => !commands.length || commands.includes(job.argv[0]));
+    return found.sort((a, b) => b.job.id.localeCompare(a.job.id));
   }
 
   async refresh() {
@@ -101,6 +102,13 @@ export class Store extends EventTarget {
   refreshSoon() {
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.refresh(), TOGETHER);
+  }
+
+  // Takes a job from an answer. The stream may already have brought a newer state: `heard` is how often it had spoken of
+  // this job when the answer was asked for.
+  answered(job, heard) {
+    if (this.heard.get(job.id) === heard) this.put(job);
+    return this.jobs.get(job.id);
   }
 
   put(job) {
@@ -123,11 +131,12 @@ export class Store extends EventTarget {
   }
 
   async readJobs() {
+    const heard = new Map(this.heard);
     const { jobs } = await get("/api/jobs");
     const ids = new Set(jobs.map(({ id }) => id));
-    for (const id of [...this.jobs.keys()]) if (!ids.has(id)) this.jobs.delete(id);
-    this.jobs = new Map(jobs.map((job) => [job.id, this.jobs.get(job.id) ?? new JobView(job)]));
-    for (const job of jobs) this.jobs.get(job.id).job = job;
+    for (const id of this.jobs.keys()) if (!ids.has(id) && this.heard.get(id) === heard.get(id)) this.jobs.delete(id);
+    for (const job of jobs) if (!this.jobs.has(job.id)) this.jobs.set(job.id, new JobView(job));
+    for (const job of jobs) if (this.heard.get(job.id) === heard.get(job.id)) this.jobs.get(job.id).job = job;
     this.read = true;
     await Promise.all(jobs.slice(-20).map(({ id }) => this.catchUp(id)));
     this.changed();
@@ -146,7 +155,11 @@ export class Store extends EventTarget {
       this.readJobs().catch(() => {});
       this.refreshSoon();
     });
-    source.addEventListener("job", ({ data }) => this.put(JSON.parse(data)));
+    source.addEventListener("job", ({ data }) => {
+      const job = JSON.parse(data);
+      this.heard.set(job.id, (this.heard.get(job.id) ?? 0) + 1);
+      this.put(job);
+    });
     source.addEventListener("event", ({ data }) => {
       const event = JSON.parse(data);
       const view = this.jobs.get(event.job);
