@@ -65,6 +65,7 @@ PICTURES = (
     "docs/images/exposure-before-after.jpg",
     "docs/images/sky-before-after.jpg",
     "docs/images/recipes-snowmiku97.png",
+    "docs/images/studio.jpg",
 )
 TILES = ("notebooks/11_tiles.ipynb", 0)
 """The chapter figure on the landing page: the notebook and the figure's index."""

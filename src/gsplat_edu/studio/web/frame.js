@@ -45,6 +45,11 @@ export function frame(title) {
     element,
     photo,
     full,
+    // hides the panel of the page inside, which would lie on the photo
+    fold() {
+      const inside = (id) => inner.contentDocument?.getElementById(id);
+      if (inside("tools")?.hidden === false) inside("fold")?.click();
+    },
     show(next, why = "Loading the scene ...") {
       if (inner.hidden) put(message, why);
       if (next === address) return;
@@ -115,6 +120,7 @@ export function beside(scene, captureOf) {
     const scaled = (value) => (value + 0.5) * share - 0.5;
     const size = { W: Math.round(camera.W * share), H: Math.round(camera.H * share) };
     const lens = { fx: camera.fx * share, fy: camera.fy * share, cx: scaled(camera.cx), cy: scaled(camera.cy) };
+    scene.fold();
     viewer.goTo(Number(select.value));
     viewer.exact = chosen = { ...camera, ...lens, ...size };
     viewer.askFrame();
