@@ -27,16 +27,17 @@ export function capture(given) {
       (marks) => pictures.mark(marks),
     );
     const start = startForm(store, entry);
+    const later = h("div", { class: "later", hidden: true }, management(store, entry));
     const runs = h("ul", { class: "plain" });
     const past = h("section", { "aria-label": "runs", hidden: true }, heading(2, "Runs of this capture"), runs);
-    main.append(head.element, start.element, past, checked.element, pictures.element, line, management(store, entry));
+    main.append(head.element, start.element, past, checked.element, pictures.element, line, later);
     return {
       entry,
       update(now) {
         head.update(now);
         checked.update(now);
         start.update(now);
-        pictures.read(now).catch((error) => put(line, error.message));
+        pictures.read(now).then(() => (later.hidden = false), (error) => put(line, error.message));
         const own = store.entries("runs").filter((run) => run.capture && store.entryAt(run.capture)?.entry === entry.entry);
         past.hidden = !own.length;
         keyed(runs, own, ({ name }) => name, (run) => h("li", { class: "row" }, link(run.name, addressOf(run)), h("span", { class: "quiet" })), (item, run) => {

@@ -42,6 +42,7 @@ export function judge({ place, store, entry, where }) {
       h("p", { class: "row" }, h("label", { for: "order" }, "Order"), order, h("label", { for: "other" }, "Compare with"), others), list),
     checked.element,
   );
+  checked.element.hidden = true; // until the views above it are there
   let [views, read, opened] = [[], "", where.query.get("view")];
   const base = `#/runs/${encodeURIComponent(entry.name)}/judge`;
 
@@ -93,8 +94,12 @@ export function judge({ place, store, entry, where }) {
           const mean = now.psnr === null ? "" : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
           facts.textContent = found.length ? `${mean} Differences are shown 4 times as strong.` : "There are no held-out views yet. They are rendered when the training ends.";
           show();
+          checked.element.hidden = false;
         },
-        (error) => put(line, error.message),
+        (error) => {
+          put(line, error.message);
+          checked.element.hidden = false;
+        },
       );
     },
   };

@@ -82,17 +82,21 @@ export function library({ main, store }) {
   const first = h("p", { class: "first" }, "This library is empty. Drop photos of something here, taken from all sides, and follow the buttons.");
   first.hidden = true;
   const foot = h("p", { class: "quiet" });
+  const footer = h("footer", {}, foot, link("Trash", "#/trash"));
   main.append(
     heading(1, "Library"),
     first,
     intake(store),
     ...lists.map(({ section }) => section),
-    h("footer", {}, foot, link("Trash", "#/trash")),
+    footer,
   );
+  const later = [...lists.map(({ section }) => section), footer];
+  for (const part of later) part.hidden = true; // until it is known what is in them, so that nothing moves
   return {
     update() {
       const { library: all } = store;
       if (!all) return;
+      for (const part of later) part.hidden = false;
       first.hidden = lists.some(({ kind }) => store.entries(kind).length);
       for (const { kind, list, hint } of lists) {
         hint.hidden = store.entries(kind).length > 0;
@@ -178,7 +182,7 @@ export function withEntry({ main, store, where }, show) {
     close: () => inner?.close?.(),
     update() {
       const entry = store.entry(where.kind, where.name);
-      if (!inner && entry) {
+      if (!inner && entry && store.read) {
         main.replaceChildren();
         inner = show(entry);
       } else if (!inner && store.library && store.read && !main.querySelector(".error")) {

@@ -1,6 +1,6 @@
 // The screen of photos without poses: previews, and the first step, which finds the poses.
 
-import { attempt, errorLine, h, heading, link } from "./dom.js";
+import { attempt, errorLine, h, heading, link, put } from "./dom.js";
 import { gallery } from "./gallery.js";
 import { freeName, intake } from "./intake.js";
 import { jobPlace, startJob } from "./jobs.js";
@@ -43,6 +43,7 @@ export function photos(given) {
         h("p", { class: "row", hidden: !entry.videos }, h("label", { for: "frames" }, "Frames of the video"), frames),
       ),
     );
+    const later = h("div", { class: "later", hidden: true }, entry.adopted ? null : intake(store, { kind: "photos", name: entry.name }), management(store, entry));
     main.append(
       head.element,
       h(
@@ -56,15 +57,14 @@ export function photos(given) {
         next,
       ),
       pictures.element,
-      entry.adopted ? "" : intake(store, { kind: "photos", name: entry.name }),
-      management(store, entry),
+      later,
     );
     return {
       entry,
       update(now) {
         head.update(now);
         job.update();
-        pictures.read(now).catch((error) => (line.hidden = !(line.textContent = error.message)));
+        pictures.read(now).then(() => (later.hidden = false), (error) => put(line, error.message));
         form.hidden = Boolean(job.view?.active);
         const made = job.view?.job.state === "done" && store.entryAt(job.view.job.outputs[0] ?? "");
         if (made && next.dataset.entry !== made.entry) {
