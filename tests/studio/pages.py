@@ -40,7 +40,7 @@ def served(folder, worker):
         port = sock.getsockname()[1]
         ready = threading.Event()
         app = application(studio, TOKEN, cookie=f"studio_{port}")
-        server = _Server(_config(app), ready.set)
+        server = _Server(_config(app), ready.set, studio.stream.close)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [sock]})
         thread.start()
         assert ready.wait(10)

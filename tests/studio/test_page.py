@@ -37,7 +37,7 @@ def library(tmp_path_factory):
 @pytest.fixture
 def visitor(browser, library):
     """Open the page, in a tab of a person who has not been here before."""
-    context = browser.new_context(accept_downloads=True, viewport={"width": 1000, "height": 700})
+    context = browser.new_context(accept_downloads=True, viewport={"width": 480, "height": 400})
     context.set_default_timeout(60_000)
     made = []
 
@@ -121,7 +121,7 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
 
     tab.keyboard.press("2")  # judge
     person.reach("#/runs/box/judge")
-    assert tab.locator(".views li").first.locator("img").count() == 3
+    tab.locator(".views li").first.locator("img").nth(2).wait_for()
     tab.locator(".views a").first.click()
     slider = tab.get_by_role("slider")
     slider.focus()
