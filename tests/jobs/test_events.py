@@ -8,7 +8,7 @@ import pytest
 from gsplat_edu.jobs import emitter, events
 from gsplat_edu.jobs.emitter import Emitter
 from gsplat_edu.jobs.following import Follower, events_after, last_stage, last_word
-from gsplat_edu.jobs.process import identity, runs
+from gsplat_edu.jobs.process import identity, is_running
 
 ALL = [
     events.Started(12, "boot 34"),
@@ -110,15 +110,15 @@ def test_a_full_disk_does_not_end_the_command(tmp_path, capsys):
 def test_nothing_is_written_outside_of_a_job(monkeypatch):
     monkeypatch.delenv(events.EVENTS, raising=False)
     before = emitter._emitter
-    emitter.start()
+    emitter.start_reporting()
     emitter.progress("a", 1, 2, lambda: pytest.fail("the forecast was computed for nobody"))
     assert emitter._emitter is before is None
 
 
 def test_a_process_is_known_by_its_start(tmp_path):
     known = identity(os.getpid())
-    assert known and runs(os.getpid(), known)
-    assert not runs(os.getpid(), known + "1") and not runs(os.getpid(), "")
+    assert known and is_running(os.getpid(), known)
+    assert not is_running(os.getpid(), known + "1") and not is_running(os.getpid(), "")
     child = os.fork()
     if child == 0:
         os._exit(0)

@@ -5,7 +5,15 @@ import argparse
 import pytest
 
 from gsplat_edu.cli.main import build_parser
-from gsplat_edu.studio.commands import CLEAN, CONVERT, DOCTOR, RENDER, SFM, TRAIN, work_of
+from gsplat_edu.studio.commands import (
+    CLEAN_OPTIONS,
+    CONVERT_OPTIONS,
+    DOCTOR_OPTIONS,
+    RENDER_OPTIONS,
+    SFM_OPTIONS,
+    TRAIN_OPTIONS,
+    work_of,
+)
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.refusal import RefusedError
 
@@ -87,12 +95,12 @@ SUBJECTS = {
 @pytest.mark.parametrize(
     ("command", "options"),
     [
-        ("train", TRAIN),
-        ("sfm", SFM),
-        ("doctor", DOCTOR),
-        ("clean", CLEAN),
-        ("convert", CONVERT),
-        ("render", RENDER),
+        ("train", TRAIN_OPTIONS),
+        ("sfm", SFM_OPTIONS),
+        ("doctor", DOCTOR_OPTIONS),
+        ("clean", CLEAN_OPTIONS),
+        ("convert", CONVERT_OPTIONS),
+        ("render", RENDER_OPTIONS),
     ],
 )
 def test_every_option_is_one_of_the_command_line(library, command, options):

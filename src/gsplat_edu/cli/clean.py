@@ -76,5 +76,5 @@ def _write(out: Path, source: Source, console: Terminal) -> None:
             where = ", ".join(f"{x:.6g}" for x in source.origin)
             console.print(f"coordinates are relative to the capture's origin ({where})", soft_wrap=True)
         export.write(out, source)
-    emitter.output(out)
+    emitter.report_output(out)
     console.print(f"wrote {out}: {len(source.scene.gaussians):,} splats", soft_wrap=True)

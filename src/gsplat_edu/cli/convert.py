@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
         else:
             export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
         bar.advance(steps)
-        emitter.output(arguments.out)
+        emitter.report_output(arguments.out)
         count, degree = len(source.scene.gaussians), export.kept_degree(arguments.out, source.scene)
         say(f"wrote {arguments.out}: {count:,} splats, SH degree {degree}")
         if export.has_levels(arguments.out):

@@ -38,7 +38,7 @@ def export_all(
         for note in export.losses(path, source.scene):
             say(note)
         export.write(path, source)
-        emitter.output(path)
+        emitter.report_output(path)
         written.append(check_and_say(path, source, backend, bar, say).document())
     return written
 

@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
     escape_unencodable_characters()
-    emitter.start()
+    emitter.start_reporting()
     try:
         parser = build_parser(words)
         parsed = parser.parse_args(words)

@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace) -> None:
                 bar.advance(task)
 
         written = write_frames(out, advanced(), fps=arguments.fps, names=shot.names)
-    emitter.output(out)
+    emitter.report_output(out)
     each = 1e3 * (time.perf_counter() - started) / len(shot.cameras)
     first = shot.cameras[0]
     also = f" and their maps ({', '.join(maps)})" if maps else ""

@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
             raise KeyboardInterrupt(
                 "interrupted; the same command resumes after the last completed stage"
             ) from None
-    emitter.output(options.out)
+    emitter.report_output(options.out)
     say(f"wrote {options.out}; next: gsplat-edu train {shlex.quote(str(options.out))} --out RUN")
 
 

@@ -287,7 +287,7 @@ def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None])
         say(line)
     for name, unit in (("psnr", "dB"), ("ssim", "")) if result.test else ():
         emitter.emit(Metric(name, result.metrics["test"][name], unit, "test"))
-    emitter.output(capture.folder.path)
+    emitter.report_output(capture.folder.path)
     say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
     if (planned := trainer.config.iterations) > trainer.iteration:
         folder = capture.folder.path

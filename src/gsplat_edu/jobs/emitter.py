@@ -67,7 +67,7 @@ class Emitter:
 _emitter: Emitter | None = None
 
 
-def start() -> None:
+def start_reporting() -> None:
     """Begin to write events if this process is a job; processes that it starts are none."""
     global _emitter  # noqa: PLW0603 - a process has one file of events
     path = os.environ.pop(EVENTS, "")
@@ -93,7 +93,7 @@ def progress(
         _emitter.progress(stage, done, total, seconds_left)
 
 
-def output(path: Path) -> None:
+def report_output(path: Path) -> None:
     """Note a file or folder that the command wrote, if this process is a job."""
     if _emitter is not None:
         _emitter.output(path)

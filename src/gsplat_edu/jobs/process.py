@@ -35,7 +35,7 @@ def identity(pid: int) -> str | None:
     return start.strip() if start and not state.startswith("Z") else None
 
 
-def runs(pid: int, known: str) -> bool:
+def is_running(pid: int, known: str) -> bool:
     """Return whether a process still runs.
 
     Args:
@@ -57,7 +57,7 @@ def send(pid: int, known: str, number: int, *, group: bool = False) -> bool:
     Returns:
         Whether the signal was sent.
     """
-    if not runs(pid, known):
+    if not is_running(pid, known):
         return False
     with contextlib.suppress(ProcessLookupError):
         if group and os.getpgid(pid) == pid:

@@ -24,7 +24,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.files import described, remove_leftovers
 from gsplat_edu.jobs.events import EVENTS, Failed, Finished, Interrupted
 from gsplat_edu.jobs.following import last_start, last_word
-from gsplat_edu.jobs.process import SIGNALS, identity, runs, send
+from gsplat_edu.jobs.process import SIGNALS, identity, is_running, send
 from gsplat_edu.jobs.record import ACTIVE, Job, JobFolder, State
 
 POLL = 0.1
@@ -166,7 +166,7 @@ class JobQueue:
             job = self.get(name)
             if job.state is not State.RUNNING or name in self._endings:
                 raise ArgumentError(f"job {name}: is {job.state}; only a running job can be paused")
-            if job.pid is None or not runs(job.pid, job.identity):
+            if job.pid is None or not is_running(job.pid, job.identity):
                 raise ArgumentError(f"job {name}: has just ended")
             if not self.hold(job, True):
                 send(job.pid, job.identity, signal.SIGSTOP, group=True)
@@ -248,7 +248,7 @@ class JobQueue:
                     continue
                 child = self._children.get(job.id)
                 code = None if child is None else child.poll()
-                if code is None and (child is not None or (job.pid and runs(job.pid, job.identity))):
+                if code is None and (child is not None or (job.pid and is_running(job.pid, job.identity))):
                     self._press(job)
                 else:
                     self._ended(job, code)
@@ -342,7 +342,7 @@ class JobQueue:
                 # the earlier queue was killed between the start of the process and its note
                 job = replace(job, pid=found.pid, identity=found.identity)
             self._jobs[job.id] = job
-            if job.state in ACTIVE and not (job.pid and runs(job.pid, job.identity)):
+            if job.state in ACTIVE and not (job.pid and is_running(job.pid, job.identity)):
                 self._ended(job, None)
 
     def _put(self, job: Job, **changes: Any) -> Job:  # noqa: ANN401

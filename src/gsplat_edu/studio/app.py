@@ -17,7 +17,7 @@ from starlette.routing import BaseRoute
 
 from gsplat_edu.studio import job_routes, library_routes, live_routes, run_routes, scene_routes
 from gsplat_edu.studio.guard import Guard
-from gsplat_edu.studio.refusal import missing
+from gsplat_edu.studio.refusal import not_found
 from gsplat_edu.studio.replies import act, file_answer
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.viewer.serve import LOOPBACK
@@ -76,5 +76,5 @@ def _web(request: Request, package: str, name: str | None = None) -> Response:
     folder: Any = files(package) / "web"
     known = {entry.name for entry in folder.iterdir() if Path(entry.name).suffix in TYPES}
     if name not in known:
-        raise missing(str(name))
+        raise not_found(str(name))
     return file_answer(request, Path(str(folder / name)), TYPES[Path(name).suffix])

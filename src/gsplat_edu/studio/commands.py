@@ -10,7 +10,7 @@ from typing import Any
 
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
-from gsplat_edu.studio.library import Library, scene_file, walked
+from gsplat_edu.studio.library import Library, files_within, scene_file
 from gsplat_edu.studio.names import checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict
 from gsplat_edu.train.config import APPEARANCES, QUALITIES, REFINEMENTS, SKIES, STRATEGIES
@@ -102,7 +102,7 @@ def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-SFM: Mapping[str, Option] = {
+SFM_OPTIONS: Mapping[str, Option] = {
     "frames": _whole(3, 5_000),
     "matcher": _choice(*MATCHERS),
     "mapper": _choice(*MAPPERS),
@@ -114,7 +114,7 @@ SFM: Mapping[str, Option] = {
     "threads": _whole(0, 1_024),
 }
 
-TRAIN: Mapping[str, Option] = {
+TRAIN_OPTIONS: Mapping[str, Option] = {
     "quality": _choice(*QUALITIES),
     "iterations": _whole(1, 1_000_000),
     "time_limit": _text,
@@ -139,16 +139,16 @@ TRAIN: Mapping[str, Option] = {
     "clean": _switch,
 }
 
-DOCTOR: Mapping[str, Option] = {"resolution": _number(0.1, 100_000.0)}
+DOCTOR_OPTIONS: Mapping[str, Option] = {"resolution": _number(0.1, 100_000.0)}
 
-CLEAN: Mapping[str, Option] = {"max_loss": _number(0.0, 100.0)}
+CLEAN_OPTIONS: Mapping[str, Option] = {"max_loss": _number(0.0, 100.0)}
 
-CONVERT: Mapping[str, Option] = {
+CONVERT_OPTIONS: Mapping[str, Option] = {
     "sh_degree": _whole(0, 3),
     "min_opacity": _number(0.0, 1.0),
 }
 
-RENDER: Mapping[str, Option] = {
+RENDER_OPTIONS: Mapping[str, Option] = {
     "frames": _whole(1, 100_000),
     "size": _whole(16, 8_192),
     "fps": _whole(1, 240),
@@ -188,7 +188,7 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
 
 def photos_source(entry: Path) -> Path:
     """Return what sfm reads of an entry of photos: the folder, or its only file if that is a video."""
-    names = [name for name, _, _ in walked(entry)]
+    names = [name for name, _, _ in files_within(entry)]
     if len(names) == 1 and Path(names[0]).suffix.lower() in VIDEO_ENDINGS:
         return entry / names[0]
     return entry
@@ -210,7 +210,7 @@ def scene_of(entry: Path, kind: str) -> Path:
 def _sfm(library: Library, request: Mapping[str, Any]) -> Work:
     kind, entry = _subject(library, request, "photos")
     out = library.fresh("captures", request.get("to") or library.free_name("captures", entry.name))
-    argv = ["sfm", str(photos_source(entry)), str(out), *_options(request, SFM)]
+    argv = ["sfm", str(photos_source(entry)), str(out), *_options(request, SFM_OPTIONS)]
     return Work(tuple(argv), f"poses of {entry.name}", f"{kind}/{entry.name}")
 
 
@@ -221,7 +221,7 @@ def _train(library: Library, request: Mapping[str, Any]) -> Work:
         out = library.entry("runs", str(request.get("to")))
     else:
         out = library.fresh("runs", request.get("to") or library.free_name("runs", entry.name))
-    argv = ["train", str(source), "--out", str(out), *_options(request, TRAIN)]
+    argv = ["train", str(source), "--out", str(out), *_options(request, TRAIN_OPTIONS)]
     argv += ["--resume"] if request.get("resume") is True else []
     return Work(tuple(argv), f"training of {out.name}", f"runs/{out.name}")
 
@@ -229,14 +229,14 @@ def _train(library: Library, request: Mapping[str, Any]) -> Work:
 def _doctor(library: Library, request: Mapping[str, Any]) -> Work:
     kind, entry = _subject(library, request, "captures", "runs")
     words = ["--no-forecast"] if kind == "captures" else []
-    argv = ["doctor", str(entry), *words, *_options(request, DOCTOR if kind == "captures" else {})]
+    argv = ["doctor", str(entry), *words, *_options(request, DOCTOR_OPTIONS if kind == "captures" else {})]
     return Work(tuple(argv), f"doctor of {entry.name}", f"{kind}/{entry.name}")
 
 
 def _clean(library: Library, request: Mapping[str, Any]) -> Work:
     kind, entry = _subject(library, request, "runs")
     out = library.fresh("scenes", request.get("to") or library.free_name("scenes", f"{entry.name}-clean"))
-    argv = ["clean", str(entry), "--out", str(out / f"{out.name}.ply"), *_options(request, CLEAN)]
+    argv = ["clean", str(entry), "--out", str(out / f"{out.name}.ply"), *_options(request, CLEAN_OPTIONS)]
     return Work(tuple(argv), f"cleaning of {entry.name}", f"{kind}/{entry.name}")
 
 
@@ -247,7 +247,7 @@ def _convert(library: Library, request: Mapping[str, Any]) -> Work:
         raise RefusedError(f"format: is {str(form)[:40]!r}, but has to be one of {', '.join(FORMATS)}")
     name = checked_name("to", request.get("to") or entry.name)
     out = entry / EXPORTS / f"{name}.{form}"
-    argv = ["convert", str(scene_of(entry, kind)), str(out), *_options(request, CONVERT)]
+    argv = ["convert", str(scene_of(entry, kind)), str(out), *_options(request, CONVERT_OPTIONS)]
     argv += [*_edits(request, kind, entry), "--verify"]
     return Work(tuple(argv), f"export of {out.name}", f"{kind}/{entry.name}")
 
@@ -256,7 +256,7 @@ def _render(library: Library, request: Mapping[str, Any]) -> Work:
     kind, entry = _subject(library, request, "runs", "scenes")
     name = checked_name("to", request.get("to") or entry.name)
     argv = ["render", str(scene_of(entry, kind)), "--out", str(entry / EXPORTS / f"{name}.mp4")]
-    argv += [*_edits(request, kind, entry), *_options(request, RENDER)]
+    argv += [*_edits(request, kind, entry), *_options(request, RENDER_OPTIONS)]
     return Work(tuple(argv), f"video of {entry.name}", f"{kind}/{entry.name}")
 
 
@@ -272,7 +272,7 @@ def _subject(library: Library, request: Mapping[str, Any], *kinds: str) -> tuple
     kind, entry = library.named(request.get("subject"))
     if kind not in kinds:
         raise RefusedError(f"subject: is of {kind}, but has to be of {' or '.join(kinds)}")
-    if kind == "photos" and not any(True for _ in walked(entry)):
+    if kind == "photos" and not any(True for _ in files_within(entry)):
         raise conflict(f"photos/{entry.name}: is empty; add photos first")
     return kind, entry
 

@@ -12,7 +12,7 @@ from gsplat_edu.errors import ArgumentError
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
 from gsplat_edu.reading import open_file
-from gsplat_edu.studio.refusal import RefusedError, conflict, missing
+from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 from gsplat_edu.studio.replies import act
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.stream import event_document, job_document
@@ -53,14 +53,14 @@ def _job(studio: Studio, request: Request) -> Job:
     try:
         return studio.queue.get(name)
     except ArgumentError:
-        raise missing(f"jobs/{name}") from None
+        raise not_found(f"jobs/{name}") from None
 
 
 def _change(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     job, action = _job(studio, request), request.path_params["action"]
     actions = {"cancel": studio.queue.cancel, "pause": studio.queue.pause, "resume": studio.queue.resume}
     if action not in actions:
-        raise missing(f"jobs/{job.id}/{action}")
+        raise not_found(f"jobs/{job.id}/{action}")
     try:
         return job_document(actions[action](job.id))
     except ArgumentError as error:

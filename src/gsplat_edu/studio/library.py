@@ -26,7 +26,7 @@ from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.files import written_aside
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.names import checked_name
-from gsplat_edu.studio.refusal import RefusedError, conflict, missing
+from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 
 KINDS = ("photos", "captures", "runs", "scenes")
 """Kinds of entries, and their folders."""
@@ -94,7 +94,7 @@ class Library:
         """
         path = self.place(kind, name)
         if not path.is_dir():
-            raise missing(f"{kind}/{name}")
+            raise not_found(f"{kind}/{name}")
         return path
 
     def named(self, subject: object) -> tuple[str, Path]:
@@ -230,7 +230,7 @@ class Library:
                     (folder / entry["name"]).rename(target)
                     _delete(folder)
                     return target
-        raise missing(f"trash/{number}")
+        raise not_found(f"trash/{number}")
 
     def empty_trash(self) -> None:
         """Delete what is in the trash; adopted entries lose only their link."""
@@ -242,10 +242,10 @@ class Library:
             raise conflict(f"{path.parent.name}/{path.name}: {why}")
 
 
-def extent(folder: Path) -> Extent:
+def extent_of(folder: Path) -> Extent:
     """Count what a folder holds, without following links inside."""
     files = num_bytes = photos = videos = 0
-    for _, entry, is_photo in walked(folder):
+    for _, entry, is_photo in files_within(folder):
         files += 1
         num_bytes += entry.stat().st_size
         ending = os.path.splitext(entry.name)[1].lower()  # noqa: PTH122 - a name, thousands of times
@@ -257,13 +257,13 @@ def extent(folder: Path) -> Extent:
 def photo_names(folder: Path) -> list[str]:
     """Return the photos below an entry by their endings, as paths with slashes, sorted."""
     found = []
-    for name, entry, is_photo in walked(folder):
+    for name, entry, is_photo in files_within(folder):
         if is_photo and os.path.splitext(entry.name)[1].lower() in PHOTO_ENDINGS:  # noqa: PTH122
             found.append(name)
     return sorted(found)
 
 
-def walked(folder: Path) -> Iterator[tuple[str, os.DirEntry[str], bool]]:
+def files_within(folder: Path) -> Iterator[tuple[str, os.DirEntry[str], bool]]:
     """Yield the files below a folder: their path with slashes, their entry, and whether photos may lie there."""
     waiting = [(str(folder), "", True)]
     while waiting:

@@ -9,7 +9,7 @@ from typing import Any
 
 from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.studio.library import extent, scene_file
+from gsplat_edu.studio.library import extent_of, scene_file
 from gsplat_edu.text import legible
 
 
@@ -20,7 +20,7 @@ def summary(kind: str, path: Path) -> dict[str, Any]:
         kind: Its kind.
         path: Its folder.
     """
-    size = extent(path)
+    size = extent_of(path)
     facts: dict[str, Any] = {
         "kind": kind,
         "name": legible(path.name),
@@ -63,7 +63,7 @@ def scene_bytes(file: Path | None) -> int:
     """Return the size of a scene: its file, or the folder of an unpacked SOG."""
     if file is None:
         return 0
-    return extent(file.parent).num_bytes if file.suffix == ".json" else file.stat().st_size
+    return extent_of(file.parent).num_bytes if file.suffix == ".json" else file.stat().st_size
 
 
 def run_facts(path: Path) -> dict[str, Any]:

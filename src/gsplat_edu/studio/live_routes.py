@@ -19,7 +19,7 @@ from starlette.routing import BaseRoute, Route
 from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.jobs.record import ACTIVE, Job, State
 from gsplat_edu.reading import parse_json, read_bytes
-from gsplat_edu.studio.refusal import RefusedError, conflict, missing
+from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 from gsplat_edu.studio.replies import act, answered
 from gsplat_edu.studio.scene_routes import BINARY, page_answer
 from gsplat_edu.studio.state import Studio
@@ -151,4 +151,4 @@ async def _control(request: Request) -> Response:
 
 
 async def _no_picture(request: Request) -> Response:
-    raise missing("live/picture")
+    raise not_found("live/picture")

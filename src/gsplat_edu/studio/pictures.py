@@ -12,7 +12,7 @@ from gsplat_edu.errors import DatasetError, NotEnoughMemoryError
 from gsplat_edu.files import written_aside
 from gsplat_edu.studio.library import Library, photo_names
 from gsplat_edu.studio.names import below, checked_path
-from gsplat_edu.studio.refusal import RefusedError, missing
+from gsplat_edu.studio.refusal import RefusedError, not_found
 from gsplat_edu.text import legible
 
 SIDES = (128, 256, 512, 1024)
@@ -61,7 +61,7 @@ def thumbnail(library: Library, entry: Path, name: str, side: str) -> Path:
     try:
         facts = photo.stat()
     except OSError:
-        raise missing(f"{entry.name}/{legible(name)}") from None
+        raise not_found(f"{entry.name}/{legible(name)}") from None
     key = f"{photo} {facts.st_size} {facts.st_mtime_ns} {side}"
     digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
     target = library.hidden("cache") / "thumbs" / digest[:2] / f"{digest[2:]}.jpg"

@@ -20,7 +20,7 @@ class RefusedError(ArgumentError):
         self.status = status
 
 
-def missing(what: str) -> RefusedError:
+def not_found(what: str) -> RefusedError:
     """Return the refusal of something that does not exist."""
     return RefusedError(f"{what}: does not exist; it may have been renamed or removed", HTTPStatus.NOT_FOUND)
 

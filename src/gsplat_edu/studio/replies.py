@@ -16,7 +16,7 @@ from starlette.routing import Route
 from gsplat_edu.errors import SplatError
 from gsplat_edu.files import described
 from gsplat_edu.reading import parse_json
-from gsplat_edu.studio.refusal import RefusedError, missing, too_large
+from gsplat_edu.studio.refusal import RefusedError, not_found, too_large
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
 
@@ -126,7 +126,7 @@ def file_answer(
     try:
         facts = path.stat()
     except OSError:
-        raise missing(path.name) from None
+        raise not_found(path.name) from None
     etag = f'"{version or f"{facts.st_mtime_ns:x}-{facts.st_size:x}"}"'
     headers = {"ETag": etag, "Cache-Control": "no-cache"}
     if request.headers.get("if-none-match") == etag:

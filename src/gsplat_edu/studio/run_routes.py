@@ -17,7 +17,7 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.library import photo_names
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, entry_of, file_answer
-from gsplat_edu.studio.runs import compared, curves, picture, views
+from gsplat_edu.studio.runs import compared, curves, held_out_views, view_picture
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
 
@@ -34,7 +34,7 @@ def routes() -> list[BaseRoute]:
         act(
             "/api/runs/{name}/views",
             "GET",
-            lambda studio, request, body: {"views": views(_run(studio, request))},
+            lambda studio, request, body: {"views": held_out_views(_run(studio, request))},
         ),
         act("/api/runs/{name}/views/{index}/{what}.png", "GET", _picture),
         act("/api/runs/{name}/report", "GET", _report),
@@ -54,7 +54,7 @@ def _curves(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
 
 def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
     params = request.path_params
-    data, version = picture(_run(studio, request), params["index"], params["what"])
+    data, version = view_picture(_run(studio, request), params["index"], params["what"])
     headers = {"ETag": f'"{version}"', "Cache-Control": "no-cache"}
     if request.headers.get("if-none-match") == headers["ETag"]:
         return Response(status_code=304, headers=headers)

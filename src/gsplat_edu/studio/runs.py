@@ -13,7 +13,7 @@ from gsplat_edu.errors import CheckpointError
 from gsplat_edu.image_files import UNDECODABLE, opened_image
 from gsplat_edu.reading import open_file, parse_json
 from gsplat_edu.runs.folder import RunFolder, image_file_names
-from gsplat_edu.studio.refusal import RefusedError, missing
+from gsplat_edu.studio.refusal import RefusedError, not_found
 
 MOST_READ = 8 << 20
 """Bytes of a log in one answer."""
@@ -82,7 +82,7 @@ def _columns(names: tuple[str, ...], entries: list[dict[str, Any]]) -> dict[str,
     return {name: [entry.get(name) for entry in entries] for name in names}
 
 
-def views(folder: RunFolder) -> list[dict[str, Any]]:
+def held_out_views(folder: RunFolder) -> list[dict[str, Any]]:
     """Return the scores of a run's held-out views, worst first, each with its index for `picture`.
 
     Raises:
@@ -95,7 +95,7 @@ def views(folder: RunFolder) -> list[dict[str, Any]]:
 
 def compared(a: RunFolder, b: RunFolder) -> dict[str, Any]:
     """Compare the held-out views that two runs share, by name; the largest loss of `b` first."""
-    one, other = ({view["name"]: view for view in views(folder)} for folder in (a, b))
+    one, other = ({view["name"]: view for view in held_out_views(folder)} for folder in (a, b))
     shared = []
     for name in one:
         if name in other:
@@ -110,7 +110,7 @@ def compared(a: RunFolder, b: RunFolder) -> dict[str, Any]:
     }
 
 
-def picture(folder: RunFolder, index: str, what: str) -> tuple[bytes, str]:
+def view_picture(folder: RunFolder, index: str, what: str) -> tuple[bytes, str]:
     """Return a picture of a held-out view as PNG, and a version of it.
 
     Args:
@@ -123,7 +123,7 @@ def picture(folder: RunFolder, index: str, what: str) -> tuple[bytes, str]:
     """
     scores = _scores(folder)
     if what not in PICTURES or not index.isdecimal() or int(index) >= len(scores):
-        raise missing(f"{folder.path.name}: view {index[:20]}/{what[:20]}")
+        raise not_found(f"{folder.path.name}: view {index[:20]}/{what[:20]}")
     names = image_file_names([str(score["name"]) for score in scores])
     path = folder.renders / "test" / names[int(index)]
     version = f"{path.stat().st_mtime_ns:x}-{what}" if path.is_file() else ""
@@ -135,7 +135,7 @@ def _part(path: Path, what: str) -> bytes:
         with opened_image(path, ("PNG",)) as file:
             both = np.asarray(file.convert("RGB"))
     except UNDECODABLE:
-        raise missing(f"picture {path.name}") from None
+        raise not_found(f"picture {path.name}") from None
     W = (both.shape[1] - SEPARATOR) // 2
     if both.shape[1] != 2 * W + SEPARATOR:
         raise RefusedError(f"{path.name}: is not a render beside a photo; evaluate the run again")

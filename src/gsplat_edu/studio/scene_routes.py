@@ -23,7 +23,7 @@ from gsplat_edu.reading import read_bytes
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, scene_of
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
-from gsplat_edu.studio.refusal import RefusedError, conflict, missing
+from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 from gsplat_edu.studio.replies import CLOSE, MOST_JSON, act, content_length, entry_of, file_answer
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
@@ -148,7 +148,7 @@ def _export_file(studio: Studio, request: Request) -> Path:
     name = checked_name("file", request.path_params["file"], LONGEST_FILE)
     path = entry / EXPORTS / name
     if not path.is_file():
-        raise missing(f"{entry.name}/{EXPORTS}/{name}")
+        raise not_found(f"{entry.name}/{EXPORTS}/{name}")
     return path
 
 

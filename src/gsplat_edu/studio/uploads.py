@@ -18,7 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.image_files import is_image
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
-from gsplat_edu.studio.library import SCENE_ENDINGS, Library, extent
+from gsplat_edu.studio.library import SCENE_ENDINGS, Library, extent_of
 from gsplat_edu.studio.names import below, checked_path
 from gsplat_edu.studio.refusal import RefusedError, conflict, too_large
 from gsplat_edu.studio.unpack import ZipLimits, unpack
@@ -78,7 +78,7 @@ class Uploads:
     def used(self) -> int:
         """Return the bytes of the library's own files, counted once and then kept up with uploads."""
         if self._used is None:
-            self._used = extent(self.library.root).num_bytes
+            self._used = extent_of(self.library.root).num_bytes
         return self._used
 
     def recount(self) -> None:
