@@ -117,7 +117,7 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     train = person.command("training of box")
     tab.get_by_role("link", name="Share it").wait_for()
     assert tab.locator(".figures-list").inner_text().split("\n")[1] == "60 of 60"
-    assert "from" in tab.get_by_role("img", name=re.compile("^Loss")).get_attribute("aria-label")
+    tab.get_by_role("img", name=re.compile("^Loss: .*from")).wait_for()
 
     tab.keyboard.press("2")  # judge
     person.reach("#/runs/box/judge")

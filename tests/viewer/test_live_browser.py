@@ -138,7 +138,7 @@ def test_after_the_training_the_view_stays_until_ctrl_c_and_exits_with_0(capture
         seen = until(
             lambda: (files.ask(), client.ask("GET", "/state"), files.read_state())[2], "a state in a file"
         )
-        assert seen["iterations"] == 60 and header_of(files.scene)["sh_degree"] == 0
+        assert seen["iterations"] == 60 and 0 <= header_of(files.scene)["iteration"] <= 60
         client.states(state="finished", iteration=60)
         assert (out / "metrics.json").exists() and program.runs
         assert client.scene()[0]["iteration"] == 60

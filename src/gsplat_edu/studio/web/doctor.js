@@ -27,7 +27,7 @@ export function doctor(store, entry, hint, marked = () => {}) {
       if (!view || version === read) return;
       read = version;
       get(at(entry, "findings")).then(
-        (answer) => marked(showFindings(found, answer)),
+        (answer) => version === read && marked(showFindings(found, answer)),
         (error) => (line.hidden = !(line.textContent = error.message)),
       );
     },

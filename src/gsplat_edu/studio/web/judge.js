@@ -90,6 +90,7 @@ export function judge({ place, store, entry, where }) {
       read = version;
       get(at(entry.entry, "views")).then(
         ({ views: found }) => {
+          if (version !== read) return; // a newer answer was there first
           views = found;
           const mean = now.psnr === null ? "" : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
           facts.textContent = found.length ? `${mean} Differences are shown 4 times as strong.` : "There are no held-out views yet. They are rendered when the training ends.";

@@ -99,7 +99,8 @@ export function share({ place, store, entry }) {
       const version = `${states} ${now.modified} ${now.files}`;
       if (version === read) return;
       read = version;
-      get(at(entry.entry, "exports")).then(({ exports }) => show(exports), (error) => put(line, error.message));
+      // an answer that comes after that to a newer question is dropped
+      get(at(entry.entry, "exports")).then(({ exports }) => version === read && show(exports), (error) => put(line, error.message));
     },
   };
 }

@@ -49,9 +49,10 @@ export function watch({ place, store, entry }) {
     ),
   );
   const data = { points: [[], [], []], scores: [[], []], live: [[], []], next: "" };
-  let busy = false;
+  let [busy, again] = [false, false];
 
   async function readCurves() {
+    again = busy; // the end of a training may come while an earlier answer is on its way
     if (busy || !entryNow().files) return;
     busy = true;
     try {
@@ -80,6 +81,7 @@ export function watch({ place, store, entry }) {
     if (data.scores[0].length > 1) curves.psnr.show(...data.scores, "of held-out views");
     else if (data.live[0].length) curves.psnr.show(...data.live, "of training photos");
     else if (psnr !== null) curves.psnr.show([iterations], [psnr], "of held-out views");
+    if (again) readCurves();
   }
 
   let seen = null;
