@@ -38,8 +38,12 @@ HOW_TO_REPEAT = f"set GSPLAT_EDU_SLICE={SEED} in the environment to run it again
 FIRST = (
     "tests/repo/test_site.py",
     "tests/repo/test_notebooks.py",
+    "tests/studio/test_page.py",
+    "tests/studio/test_server.py",
+    "tests/viewer/test_edit_page.py",
     "tests/viewer/test_page_drawing.py",
     "tests/viewer/test_live_browser.py",
+    "tests/sfm/test_panoramas.py",
     "tests/runs/test_training.py",
     "tests/runs/test_processes.py",
     "tests/repo/test_wheels.py",

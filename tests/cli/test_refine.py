@@ -18,7 +18,7 @@ def capture(tmp_path_factory):
     return folder
 
 
-@pytest.mark.sliced(2, group="reports on photos that differ")
+@pytest.mark.sliced(1, group="reports on photos that differ")
 def test_a_run_writes_the_refined_capture_and_an_aligned_score(capture, tmp_path, capsys):
     run = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run), "--iterations", "12", "--refine", "both"]

@@ -40,7 +40,7 @@ def stored(run):
     return json.loads((run / "config.json").read_text())["train"]["transients"]
 
 
-@pytest.mark.sliced(2, group="reports on photos that differ")
+@pytest.mark.sliced(1, group="reports on photos that differ")
 def test_masks_are_saved_scored_and_shown(struck, run):
     capture, names = struck
     entries = json.loads((run / "metrics.json").read_text())["transients"]
@@ -123,7 +123,7 @@ def test_few_photos_and_unknown_names_are_refused(tmp_path, capsys):
     assert stored(tmp_path / "run") == "none"
 
 
-@pytest.mark.sliced(2, group="reports on photos that differ")
+@pytest.mark.sliced(1, group="reports on photos that differ")
 def test_doctor_names_the_photos_and_the_option(struck, run, tmp_path, capsys):
     folder = finished(struck[0], tmp_path / "plain")
     capsys.readouterr()

@@ -11,7 +11,7 @@ CASES = {case.name: case for case in run.load_cases()}
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # from NumPy, in the interpreter
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.sliced(10)
+@pytest.mark.sliced(6)
 def test_the_kernels_pass(device, name):
     renderer = Renderer("cuda", torch.float32)
     report = run.check(renderer.render, renderer.gradients, precision="float32", cases=[CASES[name]])

@@ -430,6 +430,7 @@ def test_a_file_in_place_of_the_run_folder_is_a_one_line_error(capture, tmp_path
     ("strategy", "cap"),
     [("fast", 200), ("fast", 500), ("adc", 200), ("adc", 500), ("mcmc", 200), ("mcmc", 240)],
 )
+@pytest.mark.sliced(2)
 def test_the_cap_holds_from_the_first_iteration_to_the_last(capture, tmp_path, strategy, cap):
     """The start cloud has more points than the lower cap."""
     options = [*LONG[2:], "--iterations", "150", "--strategy", strategy, "--max-gaussians", str(cap)]
