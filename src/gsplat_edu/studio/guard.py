@@ -14,7 +14,6 @@ No answer has headers for CORS, so no other page can read one.
 
 from __future__ import annotations
 
-import http.cookies
 import secrets
 import urllib.parse
 from http import HTTPStatus
@@ -23,13 +22,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from gsplat_edu.viewer.guard import READING, cookie_values
 from gsplat_edu.viewer.serve import names_this_computer
-
-TOKEN_BYTES = 16
-"""Random bytes of a token: 2^128 possibilities cannot be guessed."""
-
-SAFE = ("GET", "HEAD")
-"""Methods that change nothing."""
 
 POLICY = "; ".join(
     (
@@ -111,29 +105,18 @@ class Guard:
         bearer = headers.get("authorization", "")
         if self._is_token(bearer.removeprefix("Bearer ")) and bearer.startswith("Bearer "):
             return None
-        if not opened and not any(map(self._is_token, self._cookies(headers))):
+        if not opened and not any(map(self._is_token, cookie_values(headers.getlist("cookie"), self.cookie))):
             return "open the URL that gsplat-edu studio printed, including its token"
-        if scope["method"] not in SAFE and not origins:
+        if scope["method"] not in READING and not origins:
             return "requests that change something need an Origin, or the token in Authorization"
         return None
 
     def _is_opened(self, scope: Scope) -> bool:
         """Return whether the page is opened by its URL with the token."""
-        if scope["type"] != "http" or scope["path"] != "/" or scope["method"] not in SAFE:
+        if scope["type"] != "http" or scope["path"] != "/" or scope["method"] not in READING:
             return False
         query = urllib.parse.parse_qs(scope["query_string"].decode("latin-1"))
         return any(map(self._is_token, query.get("token", [])))
 
     def _is_token(self, given: str) -> bool:
         return secrets.compare_digest(given.encode("utf-8", "surrogatepass"), self.token.encode())
-
-    def _cookies(self, headers: Headers) -> list[str]:
-        found = []
-        for header in headers.getlist("cookie"):
-            try:
-                cookies = http.cookies.SimpleCookie(header)
-            except http.cookies.CookieError:
-                continue
-            if self.cookie in cookies:
-                found.append(cookies[self.cookie].value)
-        return found

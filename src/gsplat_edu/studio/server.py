@@ -16,10 +16,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gsplat_edu.locks import locked
 from gsplat_edu.studio.app import application
-from gsplat_edu.studio.guard import TOKEN_BYTES
 from gsplat_edu.studio.library import HIDDEN
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.uploads import Limits
+from gsplat_edu.viewer.guard import TOKEN_BYTES
 from gsplat_edu.viewer.serve import REQUEST_BYTES, REQUEST_SECONDS, bound_socket, url_of
 
 logging.getLogger("uvicorn.error").setLevel(logging.ERROR)  # not a line for each request that is no HTTP

@@ -81,12 +81,17 @@ class Guard:
     def _given(self, target: str, cookies: Sequence[str]) -> list[str]:
         """Return the tokens of a request, from its URL and its cookies."""
         query = urllib.parse.urlsplit(target).query
-        given = urllib.parse.parse_qs(query).get("token", [])
-        for header in cookies:
-            try:
-                found = http.cookies.SimpleCookie(header)
-            except http.cookies.CookieError:
-                continue
-            if self._name in found:
-                given.append(found[self._name].value)
-        return given
+        return [*urllib.parse.parse_qs(query).get("token", []), *cookie_values(cookies, self._name)]
+
+
+def cookie_values(headers: Sequence[str], name: str) -> list[str]:
+    """Return the values of a cookie in the headers of a request; headers that cannot be parsed have none."""
+    values = []
+    for header in headers:
+        try:
+            found = http.cookies.SimpleCookie(header)
+        except http.cookies.CookieError:
+            continue
+        if name in found:
+            values.append(found[name].value)
+    return values
