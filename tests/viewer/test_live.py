@@ -160,13 +160,13 @@ def test_watching_does_not_change_the_bits_of_a_training(capture, tmp_path, stra
             two.scene()
             assert two.ask("POST", "/picture", camera)[0] == 200
         one.control("resume")
-        scenes, last = 0, -1
+        last = -1
+        # Four scenes came between the steps; how many come now depends on the machine.
         while made.thread.is_alive():
             status, _, data = two.ask("GET", f"/scene?after={last}")
             if status == 200:
-                scenes, last = scenes + 1, unframed(data)[0]["iteration"]
+                last = unframed(data)[0]["iteration"]
         made.ended()
-        assert scenes > 3, "it was watched"
         assert bits(made.run) == bits(alone)
 
 
