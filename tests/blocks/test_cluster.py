@@ -167,6 +167,7 @@ def names_of(plan):
     return sorted({name for block in plan.blocks for name in block.train})
 
 
+@pytest.mark.sliced(1, group="several processes")
 def test_no_scheduler_no_workers_and_lost_workers_are_one_line(split, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(split, run)

@@ -55,7 +55,7 @@ def test_clean_judges_by_the_refined_cameras(capture, tmp_path, monkeypatch):
     assert judged and all(abs(view.camera.eye - refined[view.name].eye).max() < 1e-9 for view in judged)
 
 
-@pytest.mark.sliced(3, group="resumed with more to learn")
+@pytest.mark.sliced(2, group="resumed with more to learn")
 def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(capture, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(pilot, "PILOT_STEPS", 20)
     run = tmp_path / "run"

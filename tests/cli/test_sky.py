@@ -42,7 +42,7 @@ def scene(run):
     return path
 
 
-@pytest.mark.sliced(3, group="resumed with more to learn")
+@pytest.mark.sliced(2, group="resumed with more to learn")
 def test_auto_says_what_it_chose_and_a_resumed_run_keeps_it(outdoors, tmp_path, capsys):
     run = tmp_path / "run"
     assert main(["train", str(outdoors), "--out", str(run), *SHORT]) == 0
@@ -146,7 +146,7 @@ def test_threads_do_not_change_the_bits(outdoors, tmp_path, strategy):
     assert found[0] == found[1] == found[2]
 
 
-@pytest.mark.sliced(3, group="resumed with more to learn")
+@pytest.mark.sliced(2, group="resumed with more to learn")
 def test_a_killed_run_ends_with_the_same_bytes(outdoors, tmp_path):
     words = [*SHORT, "--sky", "shell", "--save-every", "5"]
     whole = trained(outdoors, tmp_path / "whole", torch.get_num_threads(), *words)

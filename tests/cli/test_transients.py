@@ -82,7 +82,7 @@ def test_eval_keeps_the_masks_in_the_report(run, tmp_path):
     assert json.loads((copy / "metrics.json").read_text())["transients"]["photos"]
 
 
-@pytest.mark.sliced(3, group="resumed with more to learn")
+@pytest.mark.sliced(2, group="resumed with more to learn")
 def test_auto_says_why_and_a_resumed_run_keeps_it(struck, tmp_path, capsys):
     folder = finished(struck[0], tmp_path / "run", "--transients", "auto", iterations=40)
     said = " ".join(capsys.readouterr().out.split())

@@ -66,7 +66,7 @@ def script(path, *words, folder):
 
 
 @pytest.mark.own_process
-@pytest.mark.sliced(4)
+@pytest.mark.sliced(2)
 @pytest.mark.parametrize(
     "path",
     [p.parent if p.name == "__main__.py" else p for p in BENCHMARKS if p.name not in SHARED],

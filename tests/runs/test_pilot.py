@@ -27,7 +27,7 @@ def shaken(view, rng):
     return View(CameraTensors.of(view.camera).moved(twist).value(), view.image, name=view.name)
 
 
-@pytest.mark.sliced(2, group="quality that comes back")
+@pytest.mark.sliced(1, group="quality that comes back")
 @pytest.mark.parametrize("wrong", [False, True])
 def test_poses_are_refined_if_they_are_wrong(tmp_path, monkeypatch, wrong):
     monkeypatch.setattr(pilot, "PILOT_STEPS", 250)

@@ -66,7 +66,7 @@ def room(colmap, tmp_path_factory):
     return SimpleNamespace(folder=folder, capture=folder / "capture", said=said)
 
 
-@pytest.mark.sliced(2, group="captures from photos", together=True)
+@pytest.mark.sliced(1, group="captures from photos", together=True)
 def test_panoramas_become_faces_with_one_centre_each(room):
     """All faces get poses, those of one panorama share a centre, and both agree with the truth."""
     assert any("7 panoramas cut into 8 faces each of 163x163 px" in line for line in room.said)
@@ -91,7 +91,7 @@ def test_panoramas_become_faces_with_one_centre_each(room):
         ), name
 
 
-@pytest.mark.sliced(2, group="captures from photos", together=True)
+@pytest.mark.sliced(1, group="captures from photos", together=True)
 def test_masks_of_panoramas_become_masks_of_faces(room):
     """A pixel of a face counts if its ray is less than 60 degrees below the horizon."""
     views = {view.name: view for view in load_dataset(room.capture, DataSettings(test_every=0)).train}
@@ -106,7 +106,7 @@ def test_masks_of_panoramas_become_masks_of_faces(room):
         assert (below > 61).any() == (number >= 4)  # only the lower ring sees so far down
 
 
-@pytest.mark.sliced(2, group="captures from photos", together=True)
+@pytest.mark.sliced(1, group="captures from photos", together=True)
 def test_whole_panoramas_are_held_out(room):
     """A face is never tested by a scene that was trained on its neighbours from the same place."""
     dataset = load_dataset(room.capture, DataSettings(test_every=3))
@@ -117,7 +117,7 @@ def test_whole_panoramas_are_held_out(room):
 
 
 @pytest.mark.slow
-@pytest.mark.sliced(2, group="captures from photos", together=True)
+@pytest.mark.sliced(1, group="captures from photos", together=True)
 def test_panoramas_train_as_well_as_pinhole_photos(room, tmp_path):
     """The same places, directions and start points; cut panoramas against photos drawn ray by ray, with true poses.
 
@@ -235,7 +235,7 @@ def test_gps_reaches_the_faces(tmp_path):
     assert one.place == (48.5, -8.25, 120.5)
 
 
-@pytest.mark.sliced(2, group="captures from photos", together=True)
+@pytest.mark.sliced(1, group="captures from photos", together=True)
 def test_the_work_folder_records_what_was_cut(room):
     facts = json.loads((room.capture / "sfm" / "stages.json").read_text())["stages"]["faces"]["facts"]
     assert [one["name"] for one in facts["panoramas"]] == [f"p{i}.jpg" for i in range(COUNT)]

@@ -81,7 +81,7 @@ def test_masks_lie_like_the_working_copies(tmp_path, name, orientation, kind):
             np.testing.assert_array_equal(np.rot90(np.asarray(kept), -photo.turns) > 0, counts > 0)
 
 
-@pytest.mark.sliced(2, group="captures from photos")
+@pytest.mark.sliced(1, group="captures from photos")
 def test_photos_of_a_phone_become_an_upright_capture_in_srgb(colmap, tmp_path):
     """HEIC in Display P3 in all rotations, and a mirrored JPEG, from one camera."""
     truth, written = {}, {}

@@ -19,7 +19,7 @@ from sfm.engine_check import printed
 
 pytestmark = [
     pytest.mark.usefixtures("colmap"),
-    pytest.mark.sliced(2, group="captures from photos", together=True),
+    pytest.mark.sliced(1, group="captures from photos", together=True),
 ]
 
 SOUND, ALL = 26, 40

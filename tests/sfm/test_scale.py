@@ -95,7 +95,7 @@ def at_scale(camera):
 
 
 @pytest.mark.usefixtures("colmap")
-@pytest.mark.sliced(2, group="captures from photos")
+@pytest.mark.sliced(1, group="captures from photos")
 def test_gps_gives_scale_and_up_end_to_end(tmp_path):
     """Photos with GPS, from a world that is tilted against the cameras' own up: scale to 0.5 %, up to a degree.
 

@@ -15,7 +15,7 @@ from sfm.textured_box import cameras_of
 
 pytestmark = [
     pytest.mark.usefixtures("colmap"),
-    pytest.mark.sliced(2, group="captures from photos", together=True),
+    pytest.mark.sliced(1, group="captures from photos", together=True),
 ]
 
 

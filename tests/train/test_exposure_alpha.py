@@ -64,7 +64,7 @@ def trained(capture, views, appearance):
     return run
 
 
-@pytest.mark.sliced(2, group="quality that comes back")
+@pytest.mark.sliced(1, group="quality that comes back")
 def test_exposures_of_transparent_photos_come_back(capture):
     even, uneven, *_, scales = capture
     held_out = even[HELD_OUT]

@@ -77,7 +77,7 @@ def pose_errors(cameras, views):
     return np.mean(angles), np.mean(shifts)
 
 
-@pytest.mark.sliced(2, group="quality that comes back")
+@pytest.mark.sliced(1, group="quality that comes back")
 def test_wrong_poses_come_back_and_the_held_out_quality_with_them(capture):
     views, wrong, *_ = capture
     best, lost, regained = (
@@ -97,7 +97,7 @@ def test_wrong_poses_come_back_and_the_held_out_quality_with_them(capture):
     assert ours - bad > 0.8 * (good - bad)
 
 
-@pytest.mark.sliced(2, group="quality that comes back")
+@pytest.mark.sliced(1, group="quality that comes back")
 def test_a_wrong_focal_length_comes_back(capture):
     views = capture[0][:HELD_OUT]
     off = []

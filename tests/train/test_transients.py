@@ -58,7 +58,7 @@ def quality(run, capture):
     return summarize(score_views(run.gaussians, capture[1], render, (0.0, 0.0, 0.0)))["psnr"]
 
 
-@pytest.mark.sliced(2, group="quality that comes back")
+@pytest.mark.sliced(1, group="quality that comes back")
 def test_most_of_what_true_masks_give_comes_back(capture):
     lost, ours, best = [], [], []
     for seed in SEEDS:
