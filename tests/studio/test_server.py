@@ -190,6 +190,15 @@ def check_refusals(server):
     assert raw(server, rebound.encode()).startswith(b"HTTP/1.1 403")
     twice = f"GET /api/library HTTP/1.1\r\n{head}Host: evil.example\r\n\r\n"
     assert raw(server, twice.encode()).startswith(b"HTTP/1.1 4")
+    # a browser that is still sending when it is refused gets the answer, too
+    text = f"PUT /api/photos/a/files/a.txt HTTP/1.1\r\n{head}Content-Length: 300000\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=5) as connection:
+        connection.sendall(text.encode())
+        for _ in range(3):
+            time.sleep(0.1)
+            connection.sendall(bytes(100_000))
+        answer = b"".join(iter(lambda: connection.recv(65536), b""))
+        assert b"neither a photo nor a video" in answer
     # an upload that stops in the middle leaves nothing; see the caller
     cut = f"PUT /api/photos/a/files/a.jpg HTTP/1.1\r\n{head}Content-Length: 1000\r\n\r\n"
     with socket.create_connection(("127.0.0.1", server.port)) as connection:

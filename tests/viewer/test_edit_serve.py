@@ -7,10 +7,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from gsplat_edu.edits.document import MOST_BYTES, empty_document
+from gsplat_edu.edits.document import empty_document
 from gsplat_edu.edits.identity import Identity
+from gsplat_edu.edits.stored import MOST_BYTES, NO_FILE
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.viewer.edit_serve import ADDRESS, NO_FILE, EditServer
+from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 
 SCENE = Identity(7, "ab" * 32, (0.0, 0.0, 0.0))
 PAGE = b"<!doctype html><title>page</title>"
@@ -55,7 +56,7 @@ def ask(server, method, path, body=None, **headers):
 
 
 def cookie_of(server):
-    return f"{server.cookie}={server.token}"
+    return server.guard.cookie.partition(";")[0]
 
 
 def put(server, body=TEXT, version=NO_FILE, path=ADDRESS, **headers):
@@ -68,12 +69,12 @@ def put(server, body=TEXT, version=NO_FILE, path=ADDRESS, **headers):
 
 
 def test_the_url_opens_the_page_and_gives_a_cookie_that_no_other_site_can_use(server):
-    status, headers, body = ask(server, "GET", f"/?token={server.token}")
+    status, headers, body = ask(server, "GET", f"/?token={server.guard.token}")
     assert (status, body) == (200, PAGE)
     assert headers["Set-Cookie"] == f"{cookie_of(server)}; Path=/; HttpOnly; SameSite=Strict"
     assert headers["Content-Security-Policy"] == "default-src 'none'; frame-ancestors 'none'"
     assert headers["Referrer-Policy"] == "no-referrer" and "Access-Control-Allow-Origin" not in headers
-    assert server.url == f"http://127.0.0.1:{server.server_port}/?token={server.token}"
+    assert server.url == f"http://127.0.0.1:{server.server_port}/?token={server.guard.token}"
     assert ask(server, "GET", "/", Cookie=cookie_of(server))[2] == PAGE
 
 

@@ -25,6 +25,7 @@ from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Failed, Interrupted
 from gsplat_edu.render.settings import BACKENDS
 from gsplat_edu.text import printable
+from gsplat_edu.viewer.serve import LOOPBACK
 
 EXIT_BUG = 1
 """Exit code of Python for a traceback."""
@@ -123,6 +124,28 @@ def add_backend(parser: argparse._ActionsContainer) -> None:
     names = ", ".join(("auto", *BACKENDS))
     text = f"what renders: {names}; auto takes cuda if a GPU passes a comparison with cpu, else cpu (default: auto)"
     parser.add_argument("--backend", default="auto", metavar="NAME", help=text)
+
+
+def add_address(parser: argparse.ArgumentParser, port: int) -> None:
+    """Add the options of a server's address.
+
+    Args:
+        parser: Receives --host and --port.
+        port: The default port.
+    """
+    parser.add_argument(
+        "--host",
+        default=LOOPBACK,
+        metavar="ADDRESS",
+        help=f"address to listen on (default: {LOOPBACK}, reachable from this computer only)",
+    )
+    parser.add_argument(
+        "--port",
+        type=whole_number_text,
+        default=port,
+        metavar="N",
+        help=f"port to listen on; 0 for any free one (default: {port})",
+    )
 
 
 def whole_number_text(text: str) -> int:

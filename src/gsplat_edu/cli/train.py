@@ -46,9 +46,9 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.viewer.export import check_target
-from gsplat_edu.viewer.live import NAMES, PORT, LiveView
+from gsplat_edu.viewer.live import NAMES, LiveView
 from gsplat_edu.viewer.live_folder import LiveFolder
-from gsplat_edu.viewer.serve import LOOPBACK, exposure, free_port
+from gsplat_edu.viewer.serve import LOOPBACK, PORT, exposure, free_port
 from gsplat_edu.viewer.snapshots import Broadcast, FolderWatcher, Watcher, page_facts
 
 LINES = 20

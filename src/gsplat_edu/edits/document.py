@@ -14,6 +14,7 @@ from gsplat_edu.camera import ROTATION_TOLERANCE
 from gsplat_edu.constants import Z_NEAR
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.identity import Identity
+from gsplat_edu.edits.stored import MOST_BYTES
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.keyframes import Keyframe, check_keyframe, parsed_keyframe, parsed_path
 from gsplat_edu.io.ply_comments import UNITS
@@ -34,7 +35,6 @@ from gsplat_edu.reading import open_file, parse_json
 FORMAT = "gsplat_edu edits"
 VERSION = 1
 
-MOST_BYTES = 64 << 20
 MOST_OPERATIONS = 100_000
 MOST_POINTS = 20_000
 """Points of a lasso or a stroke."""

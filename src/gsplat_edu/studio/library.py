@@ -74,7 +74,10 @@ class Library:
             (self.root / kind).mkdir(parents=True, exist_ok=True)
         for part in ("jobs", "trash", "uploads", "cache"):
             self.hidden(part).mkdir(parents=True, exist_ok=True)
-        for left in self.hidden("uploads").iterdir():
+        pages = (
+            self.hidden("cache") / part for part in ("pages", "live")
+        )  # of this version, or an older one
+        for left in (*self.hidden("uploads").iterdir(), *pages):
             _delete(left)
 
     def hidden(self, part: str) -> Path:

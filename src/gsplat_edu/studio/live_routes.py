@@ -17,6 +17,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.files import written_aside
 from gsplat_edu.jobs.record import ACTIVE, Job, State
 from gsplat_edu.reading import parse_json, read_bytes
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
@@ -76,7 +77,8 @@ def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN
     policy = target.with_suffix(".policy")
     if not (target.is_file() and policy.is_file()):
         made = studio.worker.ask("live_page", facts=str(folder.page), out=str(target))
-        policy.write_text(made["policy"], encoding="utf-8")
+        with written_aside(policy) as aside:
+            aside.write_text(made["policy"], encoding="utf-8")
     return page_answer(request, target, policy.read_text("utf-8"))
 
 

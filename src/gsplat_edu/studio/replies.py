@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import email.utils
 from collections.abc import Awaitable, Callable, Mapping
 from http import HTTPStatus
@@ -21,13 +23,19 @@ from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
 
 MOST_JSON = 16 << 20
-"""Bytes of a JSON body; a lasso of an edit has thousands of points."""
+"""Bytes of a JSON body."""
 
 Act = Callable[[Studio, Request, Any], Any]
 """A route: the studio, the request and its JSON body (None without one); returns what is sent as JSON, or an answer."""
 
 CLOSE = {"Connection": "close"}
-"""Header of an answer to a request whose body was not read: the rest of the body is not worth receiving."""
+"""Header of an answer to a request whose body may not have been read to its end."""
+
+MOST_DRAINED = 64 << 20
+"""Bytes of a refused body that are received all the same; see `drain`."""
+
+LONGEST_DRAIN = 5.0
+"""Seconds in which they have to come."""
 
 
 def act(path: str, method: str, function: Act) -> Route:
@@ -48,15 +56,40 @@ def answered(endpoint: Callable[[Request], Awaitable[Response]]) -> Callable[[Re
         try:
             return await endpoint(request)
         except RefusedError as error:
-            return refusal(str(error), error.status)
+            line, status = str(error), error.status
         except SplatError as error:
-            return refusal(str(error), HTTPStatus.BAD_REQUEST)
+            line, status = str(error), HTTPStatus.BAD_REQUEST
         except ClientDisconnect:
             return refusal("the browser closed the connection", HTTPStatus.BAD_REQUEST)
         except OSError as error:
-            return refusal(described(error), HTTPStatus.INTERNAL_SERVER_ERROR)
+            line, status = described(error), HTTPStatus.INTERNAL_SERVER_ERROR
+        await drain(request, status)
+        return refusal(line, status)
 
     return safe
+
+
+async def drain(request: Request, status: HTTPStatus) -> None:
+    """Receive the rest of a body that is refused: a browser that is still sending would lose the answer.
+
+    A body that is refused for its size, or announced to be larger than `MOST_DRAINED`, is not received.
+
+    Args:
+        request: The request.
+        status: With which it is refused.
+    """
+    length = request.headers.get("content-length", "0")
+    for_size = status in (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.INSUFFICIENT_STORAGE)
+    if for_size or not length.isdecimal() or int(length) > MOST_DRAINED:
+        return
+    size = 0
+    # RuntimeError: the body was received already
+    with contextlib.suppress(ClientDisconnect, RuntimeError, TimeoutError):
+        async with asyncio.timeout(LONGEST_DRAIN):
+            async for piece in request.stream():
+                size += len(piece)
+                if size > MOST_DRAINED:
+                    return
 
 
 def refusal(line: str, status: HTTPStatus) -> JSONResponse:

@@ -14,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
+from gsplat_edu.edits.stored import MOST_BYTES, version_of
 from gsplat_edu.errors import CheckpointError, SplatError
 from gsplat_edu.files import described, written_aside
 from gsplat_edu.jobs.events import Metric
@@ -23,16 +24,13 @@ from gsplat_edu.reading import read_bytes
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, scene_of
 from gsplat_edu.studio.names import LONGEST_FILE, checked_name
-from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
-from gsplat_edu.studio.replies import CLOSE, MOST_JSON, act, content_length, entry_of, file_answer
+from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
+from gsplat_edu.studio.replies import CLOSE, act, content_length, drain, entry_of, file_answer
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
 
 KEPT_PAGES = 12
 """Pages in the cache."""
-
-NO_EDITS = "none"
-"""Version of edits that do not exist."""
 
 BINARY = "application/octet-stream"
 
@@ -177,14 +175,10 @@ def _plain(endpoint: Any) -> Any:  # noqa: ANN401
             line, status = str(error), HTTPStatus.BAD_REQUEST
         except OSError as error:
             line, status = described(error), HTTPStatus.INTERNAL_SERVER_ERROR
+        await drain(request, status)
         return PlainTextResponse(f"{legible(line)}\n", status, headers=CLOSE)
 
     return safe
-
-
-def version_of(data: bytes | None) -> str:
-    """Return the version of an edits file's content."""
-    return NO_EDITS if data is None else hashlib.sha256(data).hexdigest()
 
 
 def _stored(entry: Path) -> bytes | None:
@@ -204,16 +198,15 @@ async def _edits(request: Request) -> Response:
 async def _store_edits(request: Request) -> Response:
     studio: Studio = request.app.state.studio
     kind, entry = entry_of(studio, request)
-    if (content_length(request) or 0) > MOST_JSON:
-        raise RefusedError(f"edits.json: may have {MOST_JSON:,} bytes", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-    data = b""
+    if (content_length(request) or 0) > MOST_BYTES:
+        raise too_large(f"{EDITS}: may have {MOST_BYTES:,} bytes")
+    received = bytearray()
     async with asyncio.timeout(60):
         async for piece in request.stream():
-            data += piece
-            if len(data) > MOST_JSON:
-                raise RefusedError(
-                    f"edits.json: may have {MOST_JSON:,} bytes", HTTPStatus.REQUEST_ENTITY_TOO_LARGE
-                )
+            received += piece
+            if len(received) > MOST_BYTES:
+                raise too_large(f"{EDITS}: may have {MOST_BYTES:,} bytes")
+    data = bytes(received)
     expected = request.headers.get("if-match", "").strip('"')
     version = await run_in_threadpool(_store, studio, kind, entry, data, expected)
     return PlainTextResponse("saved\n", headers={"ETag": f'"{version}"'})

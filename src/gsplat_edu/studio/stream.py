@@ -62,8 +62,8 @@ def event_document(number: int, time: float, event: Event) -> dict[str, Any]:
 class Stream:
     """Collects what happens to jobs, and hands it to everyone who watches.
 
-    Ids are `BOOT-NUMBER`: with the id of another start of the server, or one that is too old, a watcher is told to
-    read the list of jobs again.
+    Ids are `BOOT-NUMBER`. If a watcher's last id is too old or from an earlier start of the server, it gets the event
+    `reset`, upon which it reads the list of jobs again.
     """
 
     def __init__(self) -> None:

@@ -11,8 +11,8 @@ import torch
 
 from gsplat_edu.camera import WORLD_UP, Camera
 from gsplat_edu.edits.apply import Views, placed_view
-from gsplat_edu.edits.document import MOST_BYTES
 from gsplat_edu.edits.identity import identity_of
+from gsplat_edu.edits.stored import MOST_BYTES
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.io.edit import Similarity
 from gsplat_edu.reading import open_file

@@ -1,41 +1,27 @@
 """Serve a page with the editor, and write the edits file that it sends.
 
-A page that can write a file needs more than one that is only read. A request has to name this computer (`PageServer`
-checks Host) and bring the token, random for each server: in the URL that the command prints, later in a cookie that
-only this page's requests carry. A write also has to come from this page (Origin), and from its newest version: another
-tab or program may have written the file in between.
+`gsplat_edu.viewer.guard` checks every request. A write also has to come from a page that has the newest version of the
+file: another tab or program may have written it in between.
 """
 
 from __future__ import annotations
 
-import hashlib
 import http
-import http.cookies
-import secrets
 import threading
 import urllib.parse
 from pathlib import Path
 
-from gsplat_edu.edits.document import MOST_BYTES, parse_edits
+from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.edits.identity import Identity
+from gsplat_edu.edits.stored import MOST_BYTES, version_of
 from gsplat_edu.errors import ArgumentError, SplatError
 from gsplat_edu.files import described, written_aside
 from gsplat_edu.viewer.edit_page import read_content
+from gsplat_edu.viewer.guard import Guard
 from gsplat_edu.viewer.serve import PATIENCE, PageHandler, PageServer, _Request
-
-TOKEN_BYTES = 16
-"""Random bytes of a token: 2^128 possibilities cannot be guessed."""
 
 ADDRESS = "/edits.json"
 """Where the page reads and writes its edits."""
-
-NO_FILE = "none"
-"""Version of a file that does not exist."""
-
-
-def version_of(data: bytes | None) -> str:
-    """Return the version of an edits file's content."""
-    return NO_FILE if data is None else hashlib.sha256(data).hexdigest()
 
 
 class EditServer(PageServer):
@@ -56,14 +42,13 @@ class EditServer(PageServer):
         self.RequestHandlerClass = _Handler
         self.file = file
         self.scene: Identity | None = None
-        self.token = secrets.token_urlsafe(TOKEN_BYTES)
-        self.cookie = f"gsplat_edu_{self.server_port}"
+        self.guard = Guard(host, self.server_port)
         self.writing = threading.Lock()
 
     @property
     def url(self) -> str:
         """The page's address, with the token."""
-        return f"{super().url}?token={self.token}"
+        return f"{super().url}?token={self.guard.token}"
 
     def prepare(self, scene: Identity) -> None:
         """Say which scene is edited, and check the file if it exists.
@@ -135,14 +120,13 @@ class _Handler(PageHandler):
 
     def end_headers(self) -> None:
         if self._known:
-            cookie = f"{self.server.cookie}={self.server.token}; Path=/; HttpOnly; SameSite=Strict"
-            self.send_header("Set-Cookie", cookie)
+            self.send_header("Set-Cookie", self.server.guard.cookie)
         self.send_header("Referrer-Policy", "no-referrer")  # the URL is a secret
         super().end_headers()
 
     def do_PUT(self) -> None:
         """Write the edits file."""
-        if (fault := self._fault() or self._foreign()) is not None:
+        if (fault := self._fault()) is not None:
             return self._refuse(http.HTTPStatus.FORBIDDEN, fault)
         if self.path != ADDRESS:
             return self._refuse(http.HTTPStatus.NOT_FOUND, "there is nothing to write")
@@ -176,28 +160,11 @@ class _Handler(PageHandler):
 
     def _fault(self) -> str | None:
         """Return why a request is refused; None if it is not."""
-        if not self._is_for_us():
-            return "unknown host name for this server"
-        given = [*urllib.parse.parse_qs(urllib.parse.urlsplit(self.path).query).get("token", [])]
-        for header in self.headers.get_all("Cookie") or []:
-            try:
-                cookies = http.cookies.SimpleCookie(header)
-            except http.cookies.CookieError:
-                continue
-            if self.server.cookie in cookies:
-                given.append(cookies[self.server.cookie].value)
-        if not any(secrets.compare_digest(one.encode(), self.server.token.encode()) for one in given):
-            return "open the URL that the command printed, including its token"
-        self._known = True
-        return None
-
-    def _foreign(self) -> str | None:
-        """Return why a write is refused that another page may have sent."""
-        host, origins = self.headers.get("Host", ""), self.headers.get_all("Origin") or []
-        own = {f"{scheme}://{host}".lower() for scheme in ("http", "https")}  # https if a proxy adds it
-        if len(origins) != 1 or origins[0].lower() not in own:
-            return "requests from other pages are not allowed"
-        return None
+        fault = self.server.guard.fault(
+            self.command, self.path, lambda name: self.headers.get_all(name) or []
+        )
+        self._known = fault is None
+        return fault
 
     def _refuse(self, status: http.HTTPStatus, reason: str) -> None:
         self.send_response(status)

@@ -38,10 +38,8 @@ from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.validation import in_range, whole_number
 from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.guard import Guard
-from gsplat_edu.viewer.serve import CHUNK, LOOPBACK, PageHandler, PageServer, url_of
+from gsplat_edu.viewer.serve import CHUNK, LOOPBACK, PORT, PageHandler, PageServer, url_of
 from gsplat_edu.viewer.snapshots import page_facts
-
-PORT = 8080
 
 NAMES = ("--view-host", "--view-port")
 """The user's names for host and port."""

@@ -46,7 +46,7 @@ LEAST_PART, LEAST_POINTS = 0.1, 16
 """Smallest side of the subject in an image, as a fraction of the image's, and fewest points of it."""
 
 MOST_POINTS, MOST_CAMERAS = 4000, 40
-"""Points and cameras that are looked at, evenly chosen."""
+"""At most this many points and cameras are examined, evenly spaced."""
 
 
 @dataclass(frozen=True, eq=False)

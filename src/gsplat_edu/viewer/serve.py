@@ -23,6 +23,9 @@ from gsplat_edu.validation import whole_number
 
 LOOPBACK = "127.0.0.1"
 
+PORT = 8080
+"""Default port of a page."""
+
 LOCAL_NAME = r"(?:127(?:\.\d{1,3}){3}|localhost|\[::1\])(?::\d+)?"
 """Names by which a browser on this computer addresses it, as a regular expression; a tunnel may change the port."""
 

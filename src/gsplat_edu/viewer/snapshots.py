@@ -183,8 +183,8 @@ class Broadcast:
         self._capture, self._stop, self._watchers = capture, stop, watchers
         self._trainer = capture.trainer
         self._figures = Figures(capture.trainer)
-        self._free_at = self._picture_at = self._told_at = -math.inf
-        self._told: tuple[str, int] | None = None
+        self._free_at = self._picture_at = self._stated_at = -math.inf
+        self._stated: tuple[str, int] | None = None
         self._failure, self._seconds = "", 0.0
 
     def show(self, trainer: Trainer, event: Event) -> None:
@@ -246,10 +246,10 @@ class Broadcast:
         behind = [watcher for watcher in watching if watcher.shown() not in (None, iteration)]
         if behind:
             self._send_scene(behind, iteration)
-        since = now - self._told_at
-        news = self._told != (state, iteration)
+        since = now - self._stated_at
+        news = self._stated != (state, iteration)
         if (news and (since >= STATE_EVERY or behind)) or since >= BEAT:
-            self._told, self._told_at = (state, iteration), now
+            self._stated, self._stated_at = (state, iteration), now
             self._figures.measure(self._trainer)
             said = state_of(self._trainer, self._figures, state, self._seconds, self._failure)
             for watcher in watching:

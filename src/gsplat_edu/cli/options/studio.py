@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.cli.arguments import bytes_text, whole_number_text
+from gsplat_edu.cli.arguments import add_address, bytes_text, whole_number_text
 from gsplat_edu.validation import whole_number
-from gsplat_edu.viewer.serve import LOOPBACK
 
 EXAMPLE = "example: gsplat-edu studio ~/scenes"
 
 PORT = 8090
+"""Default port: another one than that of a single page."""
 
 MOST_JOBS = 64
 """Most jobs at the same time."""
@@ -27,19 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         help="library of photos, captures, runs and scenes; created if missing (default: studio)",
     )
-    parser.add_argument(
-        "--host",
-        default=LOOPBACK,
-        metavar="ADDRESS",
-        help=f"address to listen on (default: {LOOPBACK}, reachable from this computer only)",
-    )
-    parser.add_argument(
-        "--port",
-        type=whole_number_text,
-        default=PORT,
-        metavar="N",
-        help=f"port to listen on; 0 for any free one (default: {PORT})",
-    )
+    add_address(parser, PORT)
     parser.add_argument(
         "--jobs",
         type=whole_number_text,

@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.cli.arguments import whole_number_text
-from gsplat_edu.viewer.serve import LOOPBACK
+from gsplat_edu.cli.arguments import add_address, whole_number_text
+from gsplat_edu.viewer.serve import PORT
 
 EXAMPLE = "example: gsplat-edu view runs/plush"
-
-PORT = 8080
 
 BESIDE = Path()
 """Value of --edit without a file."""
@@ -24,19 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SCENE|RUN",
         help="scene file, run folder, or folder with levels of detail",
     )
-    parser.add_argument(
-        "--host",
-        default=LOOPBACK,
-        metavar="ADDRESS",
-        help=f"address to listen on (default: {LOOPBACK}, reachable from this computer only)",
-    )
-    parser.add_argument(
-        "--port",
-        type=whole_number_text,
-        default=PORT,
-        metavar="N",
-        help=f"port to listen on; 0 for any free one (default: {PORT})",
-    )
+    add_address(parser, PORT)
     parser.add_argument(
         "--path",
         type=Path,

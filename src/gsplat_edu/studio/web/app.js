@@ -74,15 +74,15 @@ store.addEventListener("change", ({ detail }) => {
 });
 
 // Says to screen readers when a job begins, ends, or has done another quarter of a stage.
-const told = new Map();
+const announced = new Map();
 function tell(id) {
   const view = store.jobs.get(id);
   if (!view) return;
   const { job, progress, stage } = view;
   const quarter = progress?.total ? Math.floor((4 * progress.done) / progress.total) : 0;
   const text = job.state === "running" && stage ? `${stage} ${25 * quarter} %` : job.state;
-  if (told.has(id) && told.get(id) !== text) announce(`${job.title}: ${text}`);
-  told.set(id, text);
+  if (announced.has(id) && announced.get(id) !== text) announce(`${job.title}: ${text}`);
+  announced.set(id, text);
 }
 
 const usesKeys = () => localStorage.getItem("keys") !== "off";
