@@ -270,3 +270,33 @@ def test_a_training_resumes_once_its_run_has_begun(tmp_path):
     (tmp_path / "config.json").touch()
     assert resumed(argv) == (*argv, "--resume") == resumed(resumed(argv))
     assert resumed(("sfm", "photos", str(tmp_path))) == ("sfm", "photos", str(tmp_path))
+
+
+def test_jobs_name_a_folder_where_it_was_moved(opened, tmp_path):
+    queue = opened()
+    place, other = tmp_path / "runs" / "a", tmp_path / "runs" / "ab"
+    place.mkdir(parents=True)
+    job = queue.submit(["run", str(place / "x"), "fails"], "training of a", "runs/a")
+    near = queue.submit(["run", str(other), "--note", "runs/a"], "doctor of a", "runs/ab")
+    reached(queue, job.id, State.FAILED)
+    before = reached(queue, near.id, State.DONE)
+    moved = place.with_name("b")
+    queue.move(place, moved, ("runs/a", "runs/b"), lambda: place.rename(moved))
+    now = queue.get(job.id)
+    assert (now.argv, now.subject, now.title) == (
+        ("run", str(moved / "x"), "fails"),
+        "runs/b",
+        "training of b",
+    )
+    assert queue.get(near.id) == before  # a name that begins alike is another folder
+    assert JobFolder(queue.folder / job.id).read() == now
+
+    def refused():
+        raise OSError(28, "No space left on device", str(moved))
+
+    with pytest.raises(OSError, match="No space"):
+        queue.move(moved, place, ("runs/b", "runs/a"), refused)
+    assert queue.get(job.id) == now
+    queue.resume(job.id)
+    reached(queue, job.id, State.FAILED)
+    assert (moved / "x.ran").read_text().count("\n") == 2 and not place.exists()

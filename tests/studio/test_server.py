@@ -113,7 +113,7 @@ def logged(folder):
 
 
 def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, capture, tmp_path):
-    """Upload, train, kill the server, find the job, kill both, resume, export: the bytes of the printed commands."""
+    """Upload, train, kill the server, find the job, kill both, rename, resume, export: the bytes of the commands."""
     folder, zipped = capture
     library, run = tmp_path / "library", tmp_path / "library" / "runs" / "box"
     server = served()
@@ -138,14 +138,28 @@ def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, captu
     server = served()
     lost = server.get(f"jobs/{job}")
     assert lost["state"] == "interrupted" and lost["resumable"], lost
+    for kind in ("captures", "runs"):
+        assert server.client.post(f"/api/{kind}/box/rename", json={"to": "egg"}).status_code == 200
+    lost = server.get(f"jobs/{job}")
+    assert (lost["subject"], lost["title"]) == ("runs/egg", "training of egg")
     assert server.client.post(f"/api/jobs/{job}/resume").status_code == 200
     done = server.reached(job, "done")
     assert done["attempts"] == 2 and done["command"].endswith("--resume")
-    export = server.start(command="convert", subject="runs/box", format="spz")
+    assert done["argv"][1:4] == [
+        str(library / "captures" / "egg"),
+        "--out",
+        str(run := library / "runs" / "egg"),
+    ]
+    assert [path.name for path in (library / "runs").iterdir()] == [
+        "egg"
+    ]  # it did not begin anew at the old place
+    export = server.start(command="convert", subject="runs/egg", format="spz")
     found = server.reached(export, "done")
+    assert server.client.post("/api/runs/egg/rename", json={"to": "box"}).status_code == 200
     (written,) = server.get("runs/box/exports")["exports"]
-    assert written["psnr"] > 30 and written["command"] == found["command"]
+    assert written["psnr"] > 30 and written["command"] == found["command"].replace("runs/egg", "runs/box")
     downloaded = server.client.get(f"/api/runs/box/exports/{written['file']}").content
+    run = library / "runs" / "box"
 
     server.process.send_signal(signal.SIGINT)
     assert server.process.wait(PATIENCE) in (0, 130, -signal.SIGINT)

@@ -206,6 +206,32 @@ class JobQueue:
             del self._jobs[name]
             self.changed(name, None)
 
+    def move(self, old: Path, new: Path, subjects: tuple[str, str], rename: Callable[[], object]) -> None:
+        """Move a folder that jobs name; those that have ended then name the new place.
+
+        Args:
+            old: The folder.
+            new: Its new place.
+            subjects: What the jobs work on, before and after; a title that ends with the old name gets the new one.
+            rename: Moves the folder; no job starts meanwhile. If it fails, the jobs are unchanged.
+
+        Raises:
+            OSError: a record cannot be written.
+        """
+        with self._lock:
+            rename()
+            for job in self.jobs():
+                argv, outputs = (
+                    tuple(_moved(word, old, new) for word in some) for some in (job.argv, job.outputs)
+                )
+                changes: dict[str, Any] = {"argv": argv, "outputs": outputs}
+                if job.subject == subjects[0]:
+                    title = job.title.removesuffix(f" of {old.name}")
+                    changed = job.title if title == job.title else f"{title} of {new.name}"
+                    changes |= {"subject": subjects[1], "title": changed}
+                if any(getattr(job, name) != value for name, value in changes.items()):
+                    self._put(job, **changes)
+
     def close(self, interrupt: bool = True) -> None:
         """End the queue; waiting jobs wait for the next one.
 
@@ -354,3 +380,9 @@ class JobQueue:
     def _note(self, job: Job) -> None:
         self._jobs[job.id] = job
         self.changed(job.id, job)
+
+
+def _moved(word: str, old: Path, new: Path) -> str:
+    """Return a word of a command line, a path at or below a folder as it is after a move."""
+    path = Path(word)
+    return str(new / path.relative_to(old)) if path.is_absolute() and path.is_relative_to(old) else word

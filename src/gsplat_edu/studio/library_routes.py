@@ -64,7 +64,7 @@ def _adopt(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # no
 
 def _rename(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     kind, name = request.path_params["kind"], request.path_params["name"]
-    return summary(kind, studio.library.rename(kind, name, fields(body, to=str)["to"]))
+    return summary(kind, studio.rename(kind, name, fields(body, to=str)["to"]))
 
 
 def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -136,7 +136,10 @@ def _made_by(studio: Studio, path: Path) -> dict[str, Any]:
     for job in reversed(studio.queue.jobs()):
         if job.state is State.DONE and str(path) in job.outputs:
             metrics = [event for _, _, event in events_after(studio.queue.files(job.id).events)]
-            of = {m.name: m.value for m in metrics if isinstance(m, Metric) and m.of == str(path)}
+            measured = (
+                m for m in metrics if isinstance(m, Metric) and Path(m.of).name == path.name
+            )  # it may have moved
+            of = {m.name: m.value for m in measured}
             return {"job": job.id, "command": job.command, "psnr": of.get("psnr")}
     return {"job": None, "command": None, "psnr": None}
 

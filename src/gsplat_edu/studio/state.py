@@ -50,6 +50,19 @@ class Studio:
                     raise conflict(f"job {job.id}: {job.title} works there; wait until it ends, or cancel it")
             return self.queue.submit(work.argv, work.title, work.subject)
 
+    def rename(self, kind: str, name: str, to: object) -> Path:
+        """Give an entry another name; jobs that made or used it can be resumed there.
+
+        Raises:
+            RefusedError: see `Library.rename`.
+        """
+        library = self.library
+        with library.lock:
+            old, new = library.entry(kind, name), library.fresh(kind, to)
+            subjects = f"{kind}/{old.name}", f"{kind}/{new.name}"
+            self.queue.move(old, new, subjects, lambda: library.rename(kind, name, to))
+        return new
+
     def close(self) -> None:
         """End running jobs with a checkpoint; waiting ones wait for the next start."""
         self.worker.close()

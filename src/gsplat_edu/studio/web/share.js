@@ -59,7 +59,7 @@ export function share({ place, store, entry }) {
   place.append(
     h("section", { "aria-label": "export" }, heading(2, "Export"), form, line, job.element),
     h("section", { "aria-label": "exported files" }, heading(2, "Exported files"), none, list),
-    entry.kind === "runs" ? cleaning(store, entry) : "",
+    entry.kind === "runs" ? cleaning(store, entry) : noCleaning(),
   );
 
   function item(found) {
@@ -130,5 +130,15 @@ function cleaning(store, entry) {
     line,
     job.element,
     next,
+  );
+}
+
+// Why a scene alone cannot be cleaned.
+function noCleaning() {
+  return h(
+    "section",
+    { "aria-label": "cleaning" },
+    heading(2, "Clean"),
+    h("p", { class: "quiet" }, "Cleaning needs the photos and their cameras, which a scene file does not have: clean the run that made it. To remove splats by hand, open Edit."),
   );
 }
