@@ -1,7 +1,9 @@
 """Entries: listed, adopted, renamed, removed and restored; names of every kind."""
 
+import re
 import shutil
 import threading
+from importlib.resources import files
 
 import pytest
 
@@ -203,3 +205,12 @@ def test_fifty_clients_get_the_same_list(page, studio, jpeg):
     for answer in answers:
         del answer["free_bytes"]  # of the disk, which others use too
     assert len(answers) == 50 and all(answer == answers[0] for answer in answers)
+
+
+def test_the_page_names_all_its_modules_at_once(page):
+    """Otherwise a browser finds them one import after the other, each a round trip later."""
+    text = page.get("/").text
+    asked = set(re.findall(r'(?:rel="modulepreload" href|script type="module" src)="/web/(\w+\.js)"', text))
+    assert asked == {
+        path.name for path in (files("gsplat_edu.studio") / "web").iterdir() if path.suffix == ".js"
+    }

@@ -14,6 +14,7 @@ from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.jobs import events
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.studio import runs
 from gsplat_edu.studio.runs import GAIN
 from processes import Program
 
@@ -105,8 +106,30 @@ def test_held_out_views_are_sorted_and_have_pictures(page, run):
     np.testing.assert_array_equal(pictures["difference"], np.minimum(GAIN * apart, 255))
     score = -10 * np.log10(np.mean((apart / 255) ** 2))
     assert abs(score - views[0]["psnr_8bit"]) < 0.01  # the pictures are the scored ones, of this view
-    for path in ("9/photo.png", "x/photo.png", "0/secret.png"):
+    assert (views[0]["H"], views[0]["W"]) == pictures["photo"].shape[:2]
+    for path in ("9/photo.png", "9/photo.jpg", "0/secret.jpg", "x/photo.png", "0/secret.png"):
         assert page.get(f"/api/runs/r/views/{path}").status_code == 404
+
+
+def test_previews_are_small_and_made_once(page, run, studio, monkeypatch):
+    (index, view) = next(enumerate(run.read_metrics()["test_views"]))
+    (path,) = (run.path / "renders" / "test").glob(f"{view['name'].removesuffix('.png')}*")
+    both = np.zeros((600, 2 * 900 + 4, 3), np.uint8)
+    both[:, :900], both[:, 904:] = (200, 100, 50), (180, 100, 60)
+    Image.fromarray(both).save(path)
+    wanted = {"render": (200, 100, 50), "photo": (180, 100, 60), "difference": (80, 0, 40)}
+    for what, color in wanted.items():
+        answer = page.get(f"/api/runs/r/views/{index}/{what}.jpg")
+        assert answer.headers["content-type"] == "image/jpeg"
+        with Image.open(io.BytesIO(answer.content)) as image:
+            assert image.size == (512, 341)
+            assert np.abs(np.asarray(image, int) - color).max() <= 3  # of 8-bit levels, by JPEG's rounding
+        etag = answer.headers["etag"]
+        assert page.get(answer.request.url, headers={"If-None-Match": etag}).status_code == 304
+    monkeypatch.setattr(runs, "opened_image", None)  # nothing is decoded again
+    assert page.get(f"/api/runs/r/views/{index}/photo.jpg").status_code == 200
+    path.unlink()
+    assert page.get(f"/api/runs/r/views/{index}/photo.jpg").status_code == 404
 
 
 def test_two_runs_are_compared_view_by_view(page, run):

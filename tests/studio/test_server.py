@@ -145,14 +145,9 @@ def test_from_photos_to_a_scene_although_server_and_job_are_killed(served, captu
     assert server.client.post(f"/api/jobs/{job}/resume").status_code == 200
     done = server.reached(job, "done")
     assert done["attempts"] == 2 and done["command"].endswith("--resume")
-    assert done["argv"][1:4] == [
-        str(library / "captures" / "egg"),
-        "--out",
-        str(run := library / "runs" / "egg"),
-    ]
-    assert [path.name for path in (library / "runs").iterdir()] == [
-        "egg"
-    ]  # it did not begin anew at the old place
+    run = library / "runs" / "egg"
+    assert done["argv"][1:4] == [str(library / "captures" / "egg"), "--out", str(run)]
+    assert [path.name for path in run.parent.iterdir()] == ["egg"]  # it did not begin anew at the old place
     export = server.start(command="convert", subject="runs/egg", format="spz")
     found = server.reached(export, "done")
     assert server.client.post("/api/runs/egg/rename", json={"to": "box"}).status_code == 200

@@ -17,7 +17,7 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.library import photo_names
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, entry_of, file_answer
-from gsplat_edu.studio.runs import compared, curves, held_out_views, view_picture
+from gsplat_edu.studio.runs import compared, curves, held_out_views, view_picture, view_preview
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
 
@@ -37,6 +37,7 @@ def routes() -> list[BaseRoute]:
             lambda studio, request, body: {"views": held_out_views(_run(studio, request))},
         ),
         act("/api/runs/{name}/views/{index}/{what}.png", "GET", _picture),
+        act("/api/runs/{name}/views/{index}/{what}.jpg", "GET", _preview),
         act("/api/runs/{name}/report", "GET", _report),
         act("/api/compare", "GET", _compare),
         act("/api/{kind}/{name}/findings", "GET", _findings),
@@ -59,6 +60,12 @@ def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: 
     if request.headers.get("if-none-match") == headers["ETag"]:
         return Response(status_code=304, headers=headers)
     return Response(data, media_type="image/png", headers=headers)
+
+
+def _preview(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    params, cache = request.path_params, studio.library.hidden("cache") / "views"
+    path = view_preview(cache, _run(studio, request), params["index"], params["what"])
+    return file_answer(request, path, "image/jpeg")
 
 
 def _report(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401

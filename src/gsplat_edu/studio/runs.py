@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
 from gsplat_edu.errors import CheckpointError
+from gsplat_edu.files import written_aside
 from gsplat_edu.image_files import UNDECODABLE, opened_image
 from gsplat_edu.reading import open_file, parse_json
 from gsplat_edu.runs.folder import RunFolder, image_file_names
@@ -25,6 +30,11 @@ GAIN = 4
 """Factor of a difference picture."""
 
 PICTURES = ("render", "photo", "difference")
+
+PREVIEW_SIDE = 512
+"""Longest side of a preview, px."""
+
+PREVIEW_QUALITY = 90
 
 POINT = ("iteration", "loss", "num_gaussians", "ms", "seconds")
 SCORE = ("iteration", "psnr", "ssim")
@@ -83,13 +93,19 @@ def _columns(names: tuple[str, ...], entries: list[dict[str, Any]]) -> dict[str,
 
 
 def held_out_views(folder: RunFolder) -> list[dict[str, Any]]:
-    """Return the scores of a run's held-out views, worst first, each with its index for `picture`.
+    """Return the scores of a run's held-out views, worst first, each with its index for `view_picture`.
+
+    W and H are the size of its pictures, None if there are none.
 
     Raises:
         RefusedError: the run is damaged.
     """
     scores = _scores(folder)
-    entries = [{"index": index, **score} for index, score in enumerate(scores)]
+    names = image_file_names([str(score["name"]) for score in scores])
+    sizes = [_size(folder.renders / "test" / name) for name in names]
+    entries = [
+        {"index": i, **score, **size} for i, (score, size) in enumerate(zip(scores, sizes, strict=True))
+    ]
     return sorted(entries, key=lambda entry: (entry.get("psnr") is None, entry.get("psnr")))
 
 
@@ -121,16 +137,64 @@ def view_picture(folder: RunFolder, index: str, what: str) -> tuple[bytes, str]:
     Raises:
         RefusedError: there is no such view or picture.
     """
+    path = _picture_file(folder, index, what)
+    version = f"{path.stat().st_mtime_ns:x}-{what}" if path.is_file() else ""
+    data = io.BytesIO()
+    Image.fromarray(_parts(path)[what]).save(data, format="PNG", compress_level=1)
+    return data.getvalue(), version
+
+
+def view_preview(cache: Path, folder: RunFolder, index: str, what: str) -> Path:
+    """Return the file of a smaller picture of a held-out view, a JPEG, made if there is none yet.
+
+    Args:
+        cache: Folder of such files.
+        folder: The run.
+        index: See `view_picture`.
+        what: See `view_picture`.
+
+    Raises:
+        RefusedError: there is no such view or picture.
+    """
+    path = _picture_file(folder, index, what)
+    try:
+        facts = path.stat()
+    except OSError:
+        raise not_found(f"picture {path.name}") from None
+    key = f"{path} {facts.st_size} {facts.st_mtime_ns}"
+    digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
+    targets = {name: cache / digest[:2] / f"{digest[2:]}-{name}.jpg" for name in PICTURES}
+    with _making:  # a page asks for all three at once
+        if not targets[what].is_file():
+            for name, pixels in _parts(path).items():
+                image = Image.fromarray(pixels)
+                image.thumbnail((PREVIEW_SIDE, PREVIEW_SIDE))
+                with written_aside(targets[name]) as aside:
+                    image.save(aside, format="JPEG", quality=PREVIEW_QUALITY)
+    return targets[what]
+
+
+_making = threading.Lock()
+"""Previews are made one after the other: decoding takes a core and ten bytes per pixel."""
+
+
+def _picture_file(folder: RunFolder, index: str, what: str) -> Path:
     scores = _scores(folder)
     if what not in PICTURES or not index.isdecimal() or int(index) >= len(scores):
         raise not_found(f"{folder.path.name}: view {index[:20]}/{what[:20]}")
-    names = image_file_names([str(score["name"]) for score in scores])
-    path = folder.renders / "test" / names[int(index)]
-    version = f"{path.stat().st_mtime_ns:x}-{what}" if path.is_file() else ""
-    return _part(path, what), version
+    return folder.renders / "test" / image_file_names([str(score["name"]) for score in scores])[int(index)]
 
 
-def _part(path: Path, what: str) -> bytes:
+def _size(path: Path) -> dict[str, int | None]:
+    try:
+        with opened_image(path, ("PNG",)) as file:
+            return {"W": (file.width - SEPARATOR) // 2, "H": file.height}
+    except UNDECODABLE:
+        return {"W": None, "H": None}
+
+
+def _parts(path: Path) -> Mapping[str, UInt8[np.ndarray, "H W 3"]]:
+    """Split a render beside a photo into the pictures."""
     try:
         with opened_image(path, ("PNG",)) as file:
             both = np.asarray(file.convert("RGB"))
@@ -139,12 +203,9 @@ def _part(path: Path, what: str) -> bytes:
     W = (both.shape[1] - SEPARATOR) // 2
     if both.shape[1] != 2 * W + SEPARATOR:
         raise RefusedError(f"{path.name}: is not a render beside a photo; evaluate the run again")
-    render, photo = both[:, :W], both[:, W + SEPARATOR :]
+    render, photo = (np.ascontiguousarray(half) for half in (both[:, :W], both[:, W + SEPARATOR :]))
     apart = np.abs(render.astype(np.int16) - photo)
-    chosen = {"render": render, "photo": photo, "difference": np.minimum(GAIN * apart, 255).astype(np.uint8)}
-    data = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(chosen[what])).save(data, format="PNG", compress_level=1)
-    return data.getvalue()
+    return {"render": render, "photo": photo, "difference": np.minimum(GAIN * apart, 255).astype(np.uint8)}
 
 
 def _scores(folder: RunFolder) -> list[dict[str, Any]]:

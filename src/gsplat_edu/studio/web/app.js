@@ -121,6 +121,7 @@ function start() {
   addEventListener("drop", (event) => event.preventDefault());
   route();
   store.refresh();
+  store.readJobs().catch(() => {}); // the stream says when to read them again
   store.connect();
 }
 

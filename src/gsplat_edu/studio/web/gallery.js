@@ -12,7 +12,7 @@ export function gallery(entry) {
   const facts = h("p", { class: "quiet" });
   const list = h("ul", { class: "thumbs", "aria-label": "photos" });
   const more = h("button", { type: "button", hidden: true, onclick: () => show((shown = Infinity)) });
-  let [photos, marks, shown, version] = [[], new Map(), FIRST, ""];
+  let [photos, marks, shown, version, reading] = [[], new Map(), FIRST, "", null];
 
   function item({ name, W, H, problem, bytes: size }) {
     const detail = problem ?? `${W} × ${H} px, ${bytes(size)}`;
@@ -43,10 +43,14 @@ export function gallery(entry) {
       marks = found;
       show();
     },
-    async read(now) {
+    // Reads the photos if they have changed; resolves once they are shown.
+    read(now) {
       const next = `${now.files} ${now.modified}`;
-      if (next === version) return;
+      if (next !== version) reading = this.readAgain();
       version = next;
+      return reading;
+    },
+    async readAgain() {
       photos = (await get(at(entry, "photos"))).photos;
       const sizes = new Map();
       for (const { W, H, problem } of photos) if (!problem) sizes.set(`${W} × ${H}`, (sizes.get(`${W} × ${H}`) ?? 0) + 1);

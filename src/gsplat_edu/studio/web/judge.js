@@ -7,12 +7,14 @@ import { doctor } from "./doctor.js";
 const PICTURES = ["photo", "render", "difference"];
 
 const pictureOf = (entry, index, what) => at(entry, "views", String(index), `${what}.png`);
+const previewOf = (entry, index, what) => at(entry, "views", String(index), `${what}.jpg`);
 
 // Two pictures on top of each other; a slider shows more of one or the other.
-export function slider(left, right, names, label) {
+export function slider(left, right, names, label, { W, H }) {
   const range = h("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": `${label}: ${names.join(" or ")}` });
-  const top = h("img", { class: "top", src: left, alt: `${names[0]} of ${label}` });
-  const stack = h("div", { class: "stack" }, h("img", { src: right, alt: `${names[1]} of ${label}` }), top);
+  const size = { width: W, height: H }; // they keep the place until they are there
+  const top = h("img", { class: "top", src: left, alt: `${names[0]} of ${label}`, ...size });
+  const stack = h("div", { class: "stack" }, h("img", { src: right, alt: `${names[1]} of ${label}`, ...size }), top);
   const cut = () => {
     stack.style.setProperty("--cut", `${100 - Number(range.value)}%`);
     range.setAttribute("aria-valuetext", `${names[0]} ${range.value} %, ${names[1]} ${100 - Number(range.value)} %`);
@@ -24,7 +26,7 @@ export function slider(left, right, names, label) {
 
 export function judge({ place, store, entry, where }) {
   const line = errorLine();
-  const facts = h("p", {});
+  const facts = h("p", { class: "facts" });
   const list = h("ul", { class: "views", "aria-label": "held-out views" });
   const large = h("div", { class: "large" });
   const order = h(
@@ -37,12 +39,12 @@ export function judge({ place, store, entry, where }) {
     id: "other",
     onchange: () => others.value && (location.hash = `#/runs/${encodeURIComponent(entry.name)}/compare/${encodeURIComponent(others.value)}`),
   });
+  const choice = h("p", { class: "row" }, h("label", { for: "order" }, "Order"), order, h("label", { for: "other" }, "Compare with"), others);
   place.append(
-    h("section", { "aria-label": "held-out views" }, heading(2, "Held-out views"), facts, line, large,
-      h("p", { class: "row" }, h("label", { for: "order" }, "Order"), order, h("label", { for: "other" }, "Compare with"), others), list),
+    h("section", { "aria-label": "held-out views" }, heading(2, "Held-out views"), facts, line, large, choice, list),
     checked.element,
   );
-  checked.element.hidden = true; // until the views above it are there
+  choice.hidden = checked.element.hidden = true; // until what is above them is there
   let [views, read, opened] = [[], "", where.query.get("view")];
   const base = `#/runs/${encodeURIComponent(entry.name)}/judge`;
 
@@ -52,7 +54,7 @@ export function judge({ place, store, entry, where }) {
     if (order.value === "name") ordered.sort((a, b) => a.name.localeCompare(b.name));
     keyed(list, ordered, ({ index }) => `${index} ${read}`, ({ index, name, psnr, ssim }) => {
       const pictures = PICTURES.map((what) => {
-        return h("figure", {}, h("img", { src: pictureOf(entry.entry, index, what), alt: `${what} of ${name}`, loading: "lazy" }), h("figcaption", {}, what));
+        return h("figure", {}, h("img", { src: previewOf(entry.entry, index, what), alt: `${what} of ${name}`, loading: "lazy" }), h("figcaption", {}, what));
       });
       const score = `${decibels(psnr)}${typeof ssim === "number" ? `, SSIM ${ssim.toFixed(3)}` : ""}`;
       return h("li", {}, h("p", { class: "row" }, link(name, `${base}?view=${index}`), h("span", { class: "quiet" }, score)), h("div", { class: "triple" }, pictures));
@@ -67,7 +69,7 @@ export function judge({ place, store, entry, where }) {
     large.replaceChildren();
     if (!view) return;
     const pictures = ["photo", "render"].map((what) => pictureOf(entry.entry, view.index, what));
-    large.append(heading(3, view.name), slider(...pictures, ["photo", "render"], view.name), link("Close", base, { class: "button" }));
+    large.append(heading(3, view.name), slider(...pictures, ["photo", "render"], view.name, view), link("Close", base, { class: "button" }));
   }
 
   return {
@@ -95,11 +97,11 @@ export function judge({ place, store, entry, where }) {
           const mean = now.psnr === null ? "" : `Mean PSNR ${decibels(now.psnr)}${now.ssim === null ? "" : `, SSIM ${now.ssim.toFixed(3)}`}.`;
           facts.textContent = found.length ? `${mean} Differences are shown 4 times as strong.` : "There are no held-out views yet. They are rendered when the training ends.";
           show();
-          checked.element.hidden = false;
+          choice.hidden = checked.element.hidden = false;
         },
         (error) => {
           put(line, error.message);
-          checked.element.hidden = false;
+          choice.hidden = checked.element.hidden = false;
         },
       );
     },
@@ -110,10 +112,10 @@ export function judge({ place, store, entry, where }) {
 export function compare({ place, entry, where }) {
   const other = where.more;
   const line = errorLine();
-  const facts = h("p", {});
+  const facts = h("p", { class: "facts" });
   const list = h("ul", { class: "views", "aria-label": "views of both runs" });
   const back = `#/runs/${encodeURIComponent(entry.name)}/judge`;
-  place.append(h("section", { "aria-label": "comparison" }, heading(2, `${entry.name} and ${other}`), facts, line, list, link("Close", back, { class: "button" })));
+  place.append(h("section", { "aria-label": "comparison" }, heading(2, `${entry.name} and ${other}`), h("p", {}, link("Close", back, { class: "button" })), facts, line, list));
   const [a, b] = [entry.entry, `runs/${other}`];
   get(`/api/compare?a=${encodeURIComponent(entry.name)}&b=${encodeURIComponent(other)}`).then(({ views, only_a: onlyA, only_b: onlyB }) => {
     const better = views.filter(({ gain }) => gain > 0).length;
@@ -124,7 +126,7 @@ export function compare({ place, entry, where }) {
     list.append(...views.map(({ name, a: one, b: two, gain }) => {
       const pictures = [[a, one, "photo", "photo"], [a, one, "render", entry.name], [b, two, "render", other]].map(([from, view, what, title]) => {
         const score = what === "render" ? ` ${decibels(view.psnr)}` : "";
-        return h("figure", {}, h("img", { src: pictureOf(from, view.index, what), alt: `${what} of ${name}, ${title}`, loading: "lazy" }), h("figcaption", {}, `${title}${score}`));
+        return h("figure", {}, h("img", { src: previewOf(from, view.index, what), alt: `${what} of ${name}, ${title}`, loading: "lazy" }), h("figcaption", {}, `${title}${score}`));
       });
       const change = typeof gain === "number" ? `${gain > 0 ? "+" : ""}${gain.toFixed(2)} dB` : "";
       const sides = ["render", "render"].map((what, i) => pictureOf(i ? b : a, (i ? two : one).index, what));

@@ -37,7 +37,7 @@ async function pictureOf(entry) {
   if (entry.kind === "runs") {
     if (entry.psnr === null) return null; // nothing is rendered yet
     const { views } = await get(at(entry.entry, "views"));
-    return views.length ? at(entry.entry, "views", String(views.at(-1).index), "render.png") : null;
+    return views.length ? at(entry.entry, "views", String(views.at(-1).index), "render.jpg") : null;
   }
   if (!entry.photos) return null;
   const { photos } = await get(at(entry.entry, "photos"));
@@ -79,14 +79,14 @@ export function library({ main, store }) {
     const hint = h("p", { class: "quiet" }, empty);
     return { kind, list, hint, section: h("section", { "aria-label": title }, heading(2, title), hint, list) };
   });
-  const first = h("p", { class: "first" }, "This library is empty. Drop photos of something here, taken from all sides, and follow the buttons.");
+  const first = h("p", { class: "first" }, "This library is empty. Drop photos of something above, taken from all sides, and follow the buttons.");
   first.hidden = true;
   const foot = h("p", { class: "quiet" });
   const footer = h("footer", {}, foot, link("Trash", "#/trash"));
   main.append(
     heading(1, "Library"),
-    first,
     intake(store),
+    first,
     ...lists.map(({ section }) => section),
     footer,
   );
