@@ -7,11 +7,13 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
+from browsers import chromium
 from gsplat_edu.studio.app import application
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.uploads import Limits
 from gsplat_edu.studio.worker import answer
+from studio.pages import Visitor, served
 
 TOKEN = "a-token"
 HOST = "http://127.0.0.1:8090"
@@ -63,3 +65,32 @@ def picture(form, size=(24, 18), **options):
     pixels = np.random.default_rng(5).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
     Image.fromarray(pixels).save(data, format=form, **options)
     return data.getvalue()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as launched:
+        yield launched
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    with served(tmp_path_factory.mktemp("studio") / "library", Inline()) as (studio, url):
+        yield studio, url
+
+
+@pytest.fixture
+def visitor(browser, library):
+    """Open the page, in a tab of a person who has not been here before."""
+    context = browser.new_context(accept_downloads=True, viewport={"width": 480, "height": 400})
+    context.set_default_timeout(60_000)
+    made = []
+
+    def visit(url=library[1]):
+        made.append(Visitor(context, url))
+        return made[-1]
+
+    yield visit
+    faults = [fault for one in made for fault in one.faults]
+    context.close()
+    assert faults == []

@@ -1,15 +1,30 @@
 """A studio with real jobs whose page is open in a real browser."""
 
+import base64
 import contextlib
+import io
+import re
+import shlex
 import socket
 import threading
 import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
 
 from gsplat_edu.studio.app import application
 from gsplat_edu.studio.server import _config, _Server
 from gsplat_edu.studio.state import Studio
+from processes import Program
 
 TOKEN = "a-token"
+
+COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main(sys.argv[1:]))"
+"""The command line as a program."""
+
+OUTPUTS = {"sfm": 2, "convert": 2, "train": 3}
+"""Which word of a printed command names what it writes."""
 
 DROP = """([files, place]) => {
   const transfer = new DataTransfer();
@@ -82,3 +97,59 @@ class Visitor:
     def command(self, job):
         """The printed command of a job's card, by the job's title."""
         return self.tab.get_by_role("article", name=job).get_by_role("textbox", name="command").inner_text()
+
+
+def encoded(data):
+    return base64.b64encode(data).decode()
+
+
+def png(seed, size=(24, 18)):
+    data = io.BytesIO()
+    pixels = np.random.default_rng(seed).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(data, format="PNG")
+    return data.getvalue()
+
+
+def train_and_download(person, name, iterations):
+    """From a capture's screen to a downloaded .spz by clicks; returns its bytes and the commands that were shown."""
+    tab = person.tab
+    tab.locator("summary", has_text="Options").click()
+    tab.get_by_label("Iterations instead of a quality").fill(str(iterations))
+    tab.get_by_role("button", name="Start training").click()
+    person.reach(f"#/runs/{name}")
+    commands = [person.command(f"training of {name}")]
+    tab.get_by_role("link", name="Share it").click(timeout=120_000)
+    person.reach(f"#/runs/{name}/share")
+    tab.get_by_role("radio", name=re.compile("^SPZ")).check()
+    tab.get_by_role("button", name="Export", exact=True).click()
+    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    with tab.expect_download() as download:
+        tab.get_by_role("link", name="Download").click()
+    assert download.value.suggested_filename == f"{name}.spz"
+    commands.append(person.command(f"export of {name}.spz"))
+    return download.value.path().read_bytes(), commands
+
+
+def repeated(commands, library, folder):
+    """Run printed commands so that they write below a folder instead of the library; return the bytes of the .spz."""
+    (folder / "runs").mkdir(parents=True)
+    made = []
+    for command in commands:
+        program, *words = shlex.split(command)
+        assert program == "gsplat-edu"
+        made.append(Path(words[OUTPUTS[words[0]]]))
+        words = [
+            str(folder / Path(word).relative_to(library))
+            if any(map(Path(word).is_relative_to, made))
+            else word
+            for word in words
+        ]
+        assert Program(COMMAND, words, folder).ended()[0] == 0
+    return next(folder.rglob("*.spz")).read_bytes()
+
+
+def visitor_of(person, url):
+    """Another tab of the same person."""
+    tab = person.tab.context.new_page()
+    tab.goto(url)
+    return tab

@@ -1,97 +1,18 @@
 """The studio's page in Chromium, used as a person would: from a capture, or photos, to a downloaded scene."""
 
-import base64
 import io
 import re
-import shlex
 import zipfile
 
-import numpy as np
 import pytest
 from PIL import Image
 
-from browsers import chromium
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
 from gsplat_edu.data.writers import write_colmap
-from processes import Program
-from studio.conftest import Inline
-from studio.pages import DROP, Visitor, served
+from studio.pages import DROP, encoded, png, repeated, train_and_download, visitor_of
 
-COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main(sys.argv[1:]))"
 HOSTILE = "<img src=x onerror=hacked=1>"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]) as launched:
-        yield launched
-
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    with served(tmp_path_factory.mktemp("studio") / "library", Inline()) as (studio, url):
-        yield studio, url
-
-
-@pytest.fixture
-def visitor(browser, library):
-    """Open the page, in a tab of a person who has not been here before."""
-    context = browser.new_context(accept_downloads=True, viewport={"width": 480, "height": 400})
-    context.set_default_timeout(60_000)
-    made = []
-
-    def visit(url=library[1]):
-        made.append(Visitor(context, url))
-        return made[-1]
-
-    yield visit
-    faults = [fault for one in made for fault in one.faults]
-    context.close()
-    assert faults == []
-
-
-def encoded(data):
-    return base64.b64encode(data).decode()
-
-
-def png(seed, size=(24, 18)):
-    data = io.BytesIO()
-    pixels = np.random.default_rng(seed).integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(data, format="PNG")
-    return data.getvalue()
-
-
-def train_and_download(person, name, iterations):
-    """From a capture's screen to a downloaded .spz by clicks; returns its bytes and the commands that were shown."""
-    tab = person.tab
-    tab.locator("summary", has_text="Options").click()
-    tab.get_by_label("Iterations instead of a quality").fill(str(iterations))
-    tab.get_by_role("button", name="Start training").click()
-    person.reach(f"#/runs/{name}")
-    commands = [person.command(f"training of {name}")]
-    tab.get_by_role("link", name="Share it").click(timeout=120_000)
-    person.reach(f"#/runs/{name}/share")
-    tab.get_by_role("radio", name=re.compile("^SPZ")).check()
-    tab.get_by_role("button", name="Export", exact=True).click()
-    tab.locator(".exports .facts", has_text="PSNR").wait_for()
-    with tab.expect_download() as download:
-        tab.get_by_role("link", name="Download").click()
-    assert download.value.suggested_filename == f"{name}.spz"
-    commands.append(person.command(f"export of {name}.spz"))
-    return download.value.path().read_bytes(), commands
-
-
-def repeated(commands, library, folder):
-    """Run printed commands with a folder in place of the library; return the bytes of the .spz."""
-    (folder / "runs").mkdir(parents=True)
-    for command in commands:
-        program, *words = shlex.split(command)
-        assert program == "gsplat-edu"
-        inputs = [word for word in words if word.startswith(str(library / "captures"))]
-        words = [w if w in inputs else w.replace(str(library), str(folder)) for w in words]
-        assert Program(COMMAND, words, folder).ended()[0] == 0
-    return next(folder.rglob("*.spz")).read_bytes()
 
 
 def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path):
@@ -147,13 +68,6 @@ def test_from_a_dropped_capture_to_a_downloaded_scene(visitor, library, tmp_path
     assert tab.locator(".exports li").inner_text() == second.locator(".exports li").inner_text() == shown
 
 
-def visitor_of(person, url):
-    """Another tab of the same person."""
-    tab = person.tab.context.new_page()
-    tab.goto(url)
-    return tab
-
-
 def test_hostile_names_are_text_and_refused_files_say_why(visitor):
     person = visitor()
     tab = person.tab
@@ -194,8 +108,15 @@ def test_from_dropped_photos_to_a_downloaded_scene(visitor, library, tmp_path):
     person = visitor()
     tab = person.tab
     tab.evaluate(DROP, [files, ".drop"])
+    tab.get_by_role("button", name="Find the poses").wait_for()
+    tab.locator("summary", has_text="Options").click()
+    tab.get_by_label("the same poses to the bit every time").check()
     tab.get_by_role("button", name="Find the poses").click()
+    place = person.place().removeprefix("#/photos/")
+    sfm = person.command(f"poses of {place}")
     tab.get_by_role("link", name=re.compile("^Continue with the capture")).click(timeout=240_000)
     name = re.fullmatch("#/captures/(.+)", person.place())[1]
     data, commands = train_and_download(person, name, 200)
-    assert repeated(commands, library[0].library.root, tmp_path / "again") == data
+    root = library[0].library.root
+    assert repeated([sfm, *commands], root, tmp_path / "again") == data
+    assert repeated(commands, root, tmp_path / "trained_again") == data

@@ -21,6 +21,7 @@ export function photos(given) {
     const job = jobPlace(store, entry.entry, ["sfm"], { main: true });
     const matcher = h("select", { id: "matcher" }, MATCHERS.map(([value, text]) => h("option", { value }, text)));
     const frames = h("input", { id: "frames", type: "number", min: 3, max: 5000, inputmode: "numeric" });
+    const exact = h("input", { type: "checkbox" });
     const find = h("button", { class: "primary" }, "Find the poses");
     const next = h("p", { class: "next", hidden: true });
     const form = h(
@@ -29,7 +30,7 @@ export function photos(given) {
         onsubmit: (event) => {
           event.preventDefault();
           attempt(find, line, () => {
-            const options = { matcher: matcher.value || null, frames: entry.videos && frames.value ? Number(frames.value) : null };
+            const options = { matcher: matcher.value || null, frames: entry.videos && frames.value ? Number(frames.value) : null, threads: exact.checked ? 1 : null };
             return startJob(store, { command: "sfm", subject: entry.entry, to: freeName(store, "captures", entry.name), options });
           });
         },
@@ -41,6 +42,7 @@ export function photos(given) {
         h("summary", {}, "Options"),
         h("p", { class: "row" }, h("label", { for: "matcher" }, "Compare"), matcher),
         h("p", { class: "row", hidden: !entry.videos }, h("label", { for: "frames" }, "Frames of the video"), frames),
+        h("label", { class: "check" }, exact, " the same poses to the bit every time (one thread, slower)"),
       ),
     );
     const later = h("div", { class: "later", hidden: true }, entry.adopted ? null : intake(store, { kind: "photos", name: entry.name }), management(store, entry));

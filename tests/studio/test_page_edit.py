@@ -1,0 +1,98 @@
+"""The studio's editor in Chromium: what is edited there is saved, kept, guarded and exported."""
+
+import json
+import re
+
+import pytest
+import torch
+
+from gsplat_edu.cli.main import main
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.formats import read_scene, write_scene
+from gsplat_edu.io.scene import Scene
+
+
+@pytest.fixture
+def scene(library):
+    """A wall of splats as an entry of scenes; returns the entry's folder."""
+    x, y = torch.meshgrid(torch.linspace(-1.5, 1.5, 16), torch.linspace(-1, 1, 11), indexing="ij")
+    n = x.numel()
+    folder = library[0].library.root / "scenes" / "wall"
+    folder.mkdir()
+    wall = Gaussians(
+        torch.stack([x.ravel(), y.ravel(), torch.zeros(n)], dim=1),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        torch.log(torch.tensor([0.15, 0.15, 0.01])).repeat(n, 1),
+        torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(3)),
+        torch.zeros(n, 0, 3),
+        torch.full((n,), 4.0),
+    )
+    write_scene(folder / "wall.ply", Scene(wall))
+    return folder
+
+
+def opened(tab, address):
+    """Go to the editor's screen and return the frame with the editor."""
+    tab.goto(f"{address}#/scenes/wall/edit")
+    frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
+    frame.wait_for_selector("#edit")
+    frame.wait_for_function("window.editor && document.getElementById('message').hidden")
+    return frame
+
+
+def select_and_delete(tab, frame, corners):
+    """Drag a rectangle over a part of the picture, by shares of its size, and delete what it holds."""
+    frame.get_by_role("button", name="rectangle", exact=True).click()
+    box = frame.locator("#canvas").bounding_box()
+    (a, b), (c, d) = corners
+    tab.mouse.move(box["x"] + a * box["width"], box["y"] + b * box["height"])
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + c * box["width"], box["y"] + d * box["height"], steps=3)
+    tab.mouse.up()
+    frame.get_by_role("button", name="delete", exact=True).click()
+
+
+def test_edits_are_saved_kept_guarded_and_exported(visitor, scene, tmp_path):
+    person = visitor()
+    tab = person.tab
+    tab.set_viewport_size({"width": 820, "height": 480})
+    address = tab.url.split("#")[0]
+    frame = opened(tab, address)
+    late = tab.context.new_page()
+    late.set_viewport_size({"width": 820, "height": 480})
+    older = opened(late, address)  # before the first tab saves
+
+    select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))
+    left = frame.inner_text("#edit-count")
+    assert (frame.inner_text("#edit-saved"), re.search(r"([\d,]+) of 176 left", left)[1]) != ("", "176")
+    frame.get_by_role("button", name="save", exact=True).click()
+    frame.locator("#edit-saved", has_text=re.compile("^saved$")).wait_for()
+    stored = scene / "edits.json"
+    assert [entry["op"] for entry in json.loads(stored.read_text())["operations"]] == ["select", "delete"]
+
+    mine = stored.read_bytes()
+    select_and_delete(late, older, ((0.3, 0.1), (0.7, 0.3)))
+    older.get_by_role("button", name="save", exact=True).click()
+    older.locator("#edit-message:not(:empty)").wait_for()
+    said = "edits.json was changed elsewhere; download these edits, then reload the page"
+    assert older.inner_text("#edit-message") == said and older.inner_text("#edit-saved") == "not saved"
+    assert stored.read_bytes() == mine
+    late.close()
+
+    tab.reload()
+    frame = opened(tab, address)
+    assert frame.inner_text("#edit-count") == left
+    assert frame.inner_text("#edit-list summary") == "operations (2)"
+
+    tab.keyboard.press("3")  # the page's key, not the editor's: the focus is outside of the frame
+    person.reach("#/scenes/wall/share")
+    tab.get_by_role("radio", name=re.compile("^SPZ")).check()
+    assert tab.get_by_label("apply the edits").is_checked()
+    tab.get_by_role("button", name="Export", exact=True).click()
+    tab.locator(".exports .facts", has_text="PSNR").wait_for()
+    with tab.expect_download() as download:
+        tab.get_by_role("link", name="Download").click()
+    out = tmp_path / "wall.spz"
+    main(["convert", str(scene / "wall.ply"), str(out), "--edits", str(stored)])
+    assert download.value.path().read_bytes() == out.read_bytes()
+    assert f"{len(read_scene(out).gaussians)} of 176 left" in left
