@@ -4,10 +4,14 @@ import io
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from starlette.testclient import TestClient
 
 from browsers import chromium
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.io.formats import write_scene
+from gsplat_edu.io.scene import Scene
 from gsplat_edu.studio.app import application
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.state import Studio
@@ -40,7 +44,7 @@ def studio(tmp_path, request):
     limits = getattr(request, "param", Limits(file=1 << 20, spare=0))
     made = Studio(tmp_path / "library", limits=limits)
     made.queue.at_once = 0
-    made.worker = made.prober = Inline()
+    made.worker = made.prober = made.painter.worker = Inline()
     yield made
     made.close()
 
@@ -94,3 +98,22 @@ def visitor(browser, library):
     faults = [fault for one in made for fault in one.faults]
     context.close()
     assert faults == []
+
+
+@pytest.fixture(scope="module")
+def wall_entry(library):
+    """A wall of splats as an entry of scenes; returns the entry's folder."""
+    x, y = torch.meshgrid(torch.linspace(-1.5, 1.5, 16), torch.linspace(-1, 1, 11), indexing="ij")
+    n = x.numel()
+    folder = library[0].library.root / "scenes" / "wall"
+    folder.mkdir()
+    wall = Gaussians(
+        torch.stack([x.ravel(), y.ravel(), torch.zeros(n)], dim=1),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        torch.log(torch.tensor([0.15, 0.15, 0.01])).repeat(n, 1),
+        torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(3)),
+        torch.zeros(n, 0, 3),
+        torch.full((n,), 4.0),
+    )
+    write_scene(folder / "wall.ply", Scene(wall))
+    return folder

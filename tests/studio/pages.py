@@ -50,7 +50,7 @@ def served(folder, worker):
     """
     studio = Studio(folder)
     studio.worker.close()
-    studio.worker = worker
+    studio.worker = studio.painter.worker = worker
     with socket.create_server(("127.0.0.1", 0)) as sock:
         port = sock.getsockname()[1]
         ready = threading.Event()
@@ -97,6 +97,14 @@ class Visitor:
     def command(self, job):
         """The printed command of a job's card, by the job's title."""
         return self.tab.get_by_role("article", name=job).get_by_role("textbox", name="command").inner_text()
+
+
+def until(tab, frame, condition, patience=60):
+    """Wait until an expression is true in a frame; Playwright's own way needs eval, which our policies forbid."""
+    end = time.monotonic() + patience
+    while not frame.evaluate(condition):
+        assert time.monotonic() < end, condition
+        tab.wait_for_timeout(50)
 
 
 def encoded(data):

@@ -3,32 +3,9 @@
 import json
 import re
 
-import pytest
-import torch
-
 from gsplat_edu.cli.main import main
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.io.formats import read_scene, write_scene
-from gsplat_edu.io.scene import Scene
-
-
-@pytest.fixture
-def scene(library):
-    """A wall of splats as an entry of scenes; returns the entry's folder."""
-    x, y = torch.meshgrid(torch.linspace(-1.5, 1.5, 16), torch.linspace(-1, 1, 11), indexing="ij")
-    n = x.numel()
-    folder = library[0].library.root / "scenes" / "wall"
-    folder.mkdir()
-    wall = Gaussians(
-        torch.stack([x.ravel(), y.ravel(), torch.zeros(n)], dim=1),
-        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        torch.log(torch.tensor([0.15, 0.15, 0.01])).repeat(n, 1),
-        torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(3)),
-        torch.zeros(n, 0, 3),
-        torch.full((n,), 4.0),
-    )
-    write_scene(folder / "wall.ply", Scene(wall))
-    return folder
+from gsplat_edu.io.formats import read_scene
+from studio.pages import until
 
 
 def opened(tab, address):
@@ -36,7 +13,7 @@ def opened(tab, address):
     tab.goto(f"{address}#/scenes/wall/edit")
     frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
     frame.wait_for_selector("#edit")
-    frame.wait_for_function("window.editor && document.getElementById('message').hidden")
+    until(tab, frame, "Boolean(window.editor) && document.getElementById('message').hidden")
     return frame
 
 
@@ -52,14 +29,14 @@ def select_and_delete(tab, frame, corners):
     frame.get_by_role("button", name="delete", exact=True).click()
 
 
-def test_edits_are_saved_kept_guarded_and_exported(visitor, scene, tmp_path):
-    person = visitor()
+def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path):
+    person, scene = visitor(), wall_entry
     tab = person.tab
-    tab.set_viewport_size({"width": 820, "height": 480})
+    tab.set_viewport_size({"width": 1000, "height": 620})
     address = tab.url.split("#")[0]
     frame = opened(tab, address)
     late = tab.context.new_page()
-    late.set_viewport_size({"width": 820, "height": 480})
+    late.set_viewport_size({"width": 1000, "height": 620})
     older = opened(late, address)  # before the first tab saves
 
     select_and_delete(tab, frame, ((0.2, 0.2), (0.5, 0.6)))

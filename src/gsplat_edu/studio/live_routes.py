@@ -20,7 +20,7 @@ from gsplat_edu.errors import ArgumentError, SceneFormatError
 from gsplat_edu.files import written_aside
 from gsplat_edu.jobs.record import ACTIVE, Job, State
 from gsplat_edu.reading import parse_json, read_bytes
-from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
+from gsplat_edu.studio.refusal import RefusedError, conflict
 from gsplat_edu.studio.replies import act, answered
 from gsplat_edu.studio.scene_routes import BINARY, page_answer
 from gsplat_edu.studio.state import Studio
@@ -43,7 +43,7 @@ def routes() -> list[BaseRoute]:
         Route("/api/runs/{name}/live/state", answered(_state), methods=["GET"]),
         Route("/api/runs/{name}/live/scene", answered(_scene), methods=["GET"]),
         Route("/api/runs/{name}/live/control", answered(_control), methods=["POST"]),
-        Route("/api/runs/{name}/live/picture", answered(_no_picture), methods=["POST"]),
+        act("/api/runs/{name}/live/picture", "POST", _picture),
     ]
 
 
@@ -152,5 +152,16 @@ async def _control(request: Request) -> Response:
     return Response(status_code=204)
 
 
-async def _no_picture(request: Request) -> Response:
-    raise not_found("live/picture")
+def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    _, folder = _live(studio, request)
+    until = time.monotonic() + PAGE_WAIT
+    while not folder.scene.is_file():  # the training writes it soon after it was asked
+        if time.monotonic() > until:
+            raise RefusedError(
+                f"{folder.run.name}: has no picture yet; it comes in a few seconds",
+                HTTPStatus.SERVICE_UNAVAILABLE,
+            )
+        time.sleep(POLL)
+        folder.ask()
+    data = studio.painter.paint(studio.is_training, source=str(folder.run), camera=body, live=True)
+    return Response(data, media_type="image/jpeg")

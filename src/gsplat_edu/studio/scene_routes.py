@@ -42,6 +42,7 @@ def routes() -> list[BaseRoute]:
     """Return the routes."""
     return [
         act("/api/{kind}/{name}/page", "GET", _page),
+        act("/api/{kind}/{name}/picture", "POST", _picture),
         act("/api/{kind}/{name}/scene", "GET", _download),
         act("/api/{kind}/{name}/exports", "GET", _exports),
         act("/api/{kind}/{name}/exports/{file}", "GET", _export),
@@ -83,6 +84,14 @@ def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN
             aside.write_text(made["policy"], encoding="utf-8")
         _prune(target.parent)
     return page_answer(request, target, policy.read_text("utf-8"))
+
+
+def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    kind, entry = entry_of(studio, request)
+    current_scene(entry, kind)
+    source = str(scene_of(entry, kind))
+    data = studio.painter.paint(studio.is_training, source=source, camera=body, live=False)
+    return Response(data, media_type="image/jpeg")
 
 
 def page_answer(request: Request, path: Path, policy: str) -> Response:

@@ -10,6 +10,7 @@ from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job, State
 from gsplat_edu.studio.commands import work_of
 from gsplat_edu.studio.library import Library
+from gsplat_edu.studio.painter import Painter
 from gsplat_edu.studio.refusal import conflict
 from gsplat_edu.studio.stream import Stream
 from gsplat_edu.studio.uploads import Limits, Uploads
@@ -34,6 +35,7 @@ class Studio:
         self.uploads = Uploads(self.library, limits or Limits())
         self.stream = Stream()
         self.worker, self.prober = Worker(), Worker()  # a measurement must not hold up a page
+        self.painter = Painter()
         self.queue = JobQueue(self.library.hidden("jobs"), at_once, self.stream.changed, hold=self._hold)
         self._starting = threading.Lock()
 
@@ -67,7 +69,12 @@ class Studio:
         """End running jobs with a checkpoint; waiting ones wait for the next start."""
         self.worker.close()
         self.prober.close()
+        self.painter.close()
         self.queue.close()
+
+    def is_training(self) -> bool:
+        """Return whether a training runs, and does not wait."""
+        return any(job.state is State.RUNNING and job.argv[0] == "train" for job in self.queue.jobs())
 
     def _hold(self, job: Job, wait: bool) -> bool:
         """Let a training wait between two iterations, where its clock stops, if it has come that far."""

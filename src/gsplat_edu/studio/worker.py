@@ -47,7 +47,7 @@ def make_page(source: str, title: str, out: str, edits: str = "", url: str = "")
         editing = editing_of(found, Path(source), Path(edits), url)
         html, policy = page.html(*shown, editing), page_parts.policy(page_parts.EDITOR)
     else:
-        html, policy = page.html(*shown), page_parts.policy()
+        html, policy = page.html(*shown, pictures="picture"), page_parts.policy(page_parts.PICTURED)
     _write(out, html)
     return {"policy": policy, "count": len(found.scene.gaussians)}
 
@@ -63,6 +63,75 @@ def make_live_page(facts: str, out: str) -> dict[str, Any]:
 
     _write(out, page.live_html(parse_json(read_bytes(Path(facts))), step=False))
     return {"policy": page_parts.policy(page_parts.LIVE)}
+
+
+def make_picture(source: str, camera: Any, live: bool, threads: int = 0) -> dict[str, Any]:  # noqa: ANN401
+    """Render what a page's camera sees.
+
+    Args:
+        source: Scene file or run folder.
+        camera: As `gsplat_edu.viewer.live.picture_camera` takes it.
+        live: Whether to draw the newest snapshot of the run's training.
+        threads: Threads to render with; 0 for all.
+
+    Returns:
+        jpeg, in base64, and the seconds of processor time that it took.
+    """
+    import base64
+    import time
+
+    import torch
+
+    from gsplat_edu.render.api import render
+    from gsplat_edu.viewer.live import jpeg_of, picture_camera
+
+    seen = picture_camera(camera)
+    began = time.process_time()
+    gaussians, settings = _snapshot(Path(source)) if live else _opened(source)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads or before)
+    try:
+        output = render(gaussians, seen, settings=settings)
+    finally:
+        torch.set_num_threads(before)
+    data = base64.b64encode(jpeg_of(output)).decode()
+    return {"jpeg": data, "seconds": time.process_time() - began}
+
+
+def _snapshot(run: Path) -> tuple[Any, Any]:
+    """Read the newest splats of a training, and the settings of its page."""
+    from gsplat_edu.errors import SceneFormatError
+    from gsplat_edu.render.settings import RenderSettings
+    from gsplat_edu.viewer import page_data
+    from gsplat_edu.viewer.live_folder import LiveFolder, split
+
+    folder = LiveFolder(run)
+    facts = folder.read_page()
+    if facts is None or not folder.scene.is_file():
+        raise SceneFormatError(f"{run.name}: has not begun to train; try again in a few seconds")
+    header, splats = split(folder.scene, read_bytes(folder.scene))
+    gaussians = page_data.unpacked(folder.scene, splats, header["count"], header["sh_degree"])
+    return gaussians, RenderSettings(**facts["settings"], depth=False)
+
+
+def _opened(source: str) -> tuple[Any, Any]:
+    """Open a finished scene; the last one is kept."""
+    from dataclasses import replace
+
+    from gsplat_edu.runs.source import open_source
+
+    found = open_source(source)
+    facts = found.path.stat()
+    key = f"{found.path} {facts.st_mtime_ns} {facts.st_size}"
+    if key not in _scenes:
+        _scenes.clear()
+        _scenes[key] = found.scene.gaussians, replace(found.settings, depth=False)
+    gaussians, settings = _scenes[key]
+    return gaussians, settings
+
+
+_scenes: dict[str, Any] = {}
+"""The scene that was drawn last."""
 
 
 def check_edits(path: str, name: str, source: str) -> dict[str, Any]:
@@ -133,6 +202,7 @@ def forecast(capture: str, resolution: float | None) -> dict[str, Any]:
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {
     "page": make_page,
     "live_page": make_live_page,
+    "picture": make_picture,
     "check_edits": check_edits,
     "forecast": forecast,
 }
@@ -155,8 +225,13 @@ def answer(line: bytes) -> dict[str, Any]:
         }
 
 
-def main() -> None:
-    """Answer requests until the input ends."""
+def main(nice: int = 0) -> None:
+    """Answer requests until the input ends.
+
+    Args:
+        nice: Steps by which the process gives way to others.
+    """
+    os.nice(nice)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print is no answer
     requests = sys.stdin.buffer
@@ -174,4 +249,4 @@ def _write(out: str, data: bytes) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 0)

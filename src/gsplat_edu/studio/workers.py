@@ -23,9 +23,14 @@ COMMAND = (sys.executable, "-m", "gsplat_edu.studio.worker")
 
 
 class Worker:
-    """A worker process, started when it is needed. It may be used from any thread; requests wait for one another."""
+    """A worker process, started when it is needed. It may be used from any thread; requests wait for one another.
 
-    def __init__(self) -> None:
+    Args:
+        nice: Steps by which it gives way to other processes.
+    """
+
+    def __init__(self, nice: int = 0) -> None:
+        self._command = (*COMMAND, str(nice))
         self._lock = threading.Lock()
         self._closed = False
         self._room = threading.Semaphore(MOST_WAITING)
@@ -85,7 +90,7 @@ class Worker:
         if self._process is None or self._process.poll() is not None:
             self._drop()
             self._process = subprocess.Popen(
-                COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+                self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
             )
         process = self._process
         assert process.stdin is not None and process.stdout is not None

@@ -151,7 +151,7 @@ class LiveView:
 
     def take_picture(self, output: RenderOutput | str) -> None:
         """Give the picture to the page that waits for it."""
-        picture = output if isinstance(output, str) else _jpeg(output)
+        picture = output if isinstance(output, str) else jpeg_of(output)
         with self._news:
             self._wanted, self._picture = None, picture
             self._news.notify_all()
@@ -324,7 +324,8 @@ def picture_camera(value: object) -> Camera:
         raise ArgumentError(f"camera: {str(error)[:200]}") from None
 
 
-def _jpeg(output: RenderOutput) -> bytes:
+def jpeg_of(output: RenderOutput) -> bytes:
+    """Return a render as a JPEG; NaN is black."""
     levels = torch.nan_to_num(output.image).clamp(0.0, 1.0) * 255.0 + 0.5
     made = io.BytesIO()
     Image.fromarray(np.asarray(levels.to(torch.uint8).numpy(force=True))).save(

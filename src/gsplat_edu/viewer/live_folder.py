@@ -13,7 +13,7 @@ The training writes these, each under a temporary name that is then renamed, and
                 once, and a reader may keep it as long as `pid` in state.json stays the same.
     page.html   the page that shows the training, with its own Content-Security-Policy. It asks, relative to its own
                 address, for what `gsplat_edu.viewer.live` lists: a server in front of these files has to answer
-                `state?after=V`, `scene?after=I` and `control`, all but `picture`.
+                `state?after=V`, `scene?after=I` and `control`, and `picture` for browsers without WebGL2.
     state.json  strict JSON on one line; see `gsplat_edu.viewer.snapshots.state_of`. It is written at most twice a
                 second, less often if that would slow the training, and while the training waits at least every two.
     scene.bin   the newest Gaussians. It begins with four bytes, the length H of a header as uint32, little-endian; H is
@@ -217,6 +217,10 @@ def header_of(path: Path) -> dict[str, Any] | None:
             text = file.read(min(length, LONGEST_HEADER))
     except FileNotFoundError:
         return None
+    return _checked_header(path, text)
+
+
+def _checked_header(path: Path, text: bytes) -> dict[str, Any]:
     try:
         header = parse_json(text)
     except ValueError:
@@ -229,6 +233,21 @@ def header_of(path: Path) -> dict[str, Any] | None:
             " gsplat_edu for both programs"
         )
     return header
+
+
+def split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Split the bytes of scene.bin into its header and its splats.
+
+    Args:
+        path: The file's name for messages.
+        data: Its bytes.
+
+    Raises:
+        SceneFormatError: they are damaged, or of another version.
+    """
+    length = HEADER_LENGTH.unpack(data[: HEADER_LENGTH.size])[0] if len(data) >= HEADER_LENGTH.size else 0
+    begin = HEADER_LENGTH.size + min(length, LONGEST_HEADER)
+    return _checked_header(path, data[HEADER_LENGTH.size : begin]), data[begin:]
 
 
 def _age(path: Path) -> float:

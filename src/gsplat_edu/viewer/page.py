@@ -11,7 +11,7 @@ import base64
 import gzip
 import math
 import zlib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,7 @@ def html(
     held_out: Collection[str] = (),
     tour: Tour | None = None,
     editing: Editing | None = None,
+    pictures: str = "",
 ) -> bytes:
     """Return the page's bytes.
 
@@ -127,11 +128,14 @@ def html(
         held_out: As for `write`.
         tour: As for `write`.
         editing: Makes it a page with the editor.
+        pictures: Where its server renders for browsers without WebGL2, relative to the page; empty for nowhere.
 
     Raises:
         ArgumentError: a parameter is NaN or infinite.
     """
-    return b"".join(_pieces(title, scene, views, settings, held_out, tour or Tour(), editing))
+    more: dict[str, Any] = {} if editing is None else {"edit": editing.facts}
+    more |= {"pictures": pictures} if pictures else {}
+    return b"".join(_pieces(title, scene, views, settings, held_out, tour or Tour(), more, editing))
 
 
 def live_facts(
@@ -220,14 +224,14 @@ def _pieces(
     settings: RenderSettings | None,
     held_out: Collection[str],
     tour: Tour,
+    more: Mapping[str, Any] | None = None,
     editing: Editing | None = None,
 ) -> Iterator[bytes]:
     """Yield the file in parts, so that they need not be in memory together."""
     scene.gaussians.check_finite()
     facts = _facts(title, scene, views, settings or file_settings(scene), held_out, tour) | _toured(tour)
     facts["cameras"] = [*facts.pop("views"), *facts["cameras"]]
-    if editing is not None:
-        facts["edit"] = editing.facts
+    facts |= more or {}
     head, tail = web("index.html").split("{{splats}}\n")
     yield filled(head, title, facts).encode("utf-8", errors="replace")  # a file name may not be valid text
     yield from _elements(SPLATS_OPEN, page_data.packed(scene.gaussians))

@@ -72,6 +72,7 @@ class Kind:
 PLAIN = Kind()
 LEVELS = Kind("lod", ("levels.js",), workers=("lod_worker",), own_server=True)
 LIVE = Kind("live", ("live_curves.js", "live_pictures.js", "live.js"), ("live.css",), own_server=True)
+PICTURED = Kind("pictures", ("live_pictures.js",), own_server=True)
 EDITOR = Kind(
     "edit",
     (
@@ -103,7 +104,7 @@ def filled(template: str, title: str, facts: dict[str, Any]) -> str:
         title: Heading of the page.
         facts: The page's metadata, which also decides its kind.
     """
-    kind = next((kind for kind in (LEVELS, LIVE, EDITOR) if kind.fact in facts), PLAIN)
+    kind = next((kind for kind in (LEVELS, LIVE, EDITOR, PICTURED) if kind.fact in facts), PLAIN)
     workers = ("sort_worker", *kind.workers)
     texts = {
         "title": html_text.escape(title),

@@ -5,6 +5,7 @@ import { announce, attempt, bytes, button, count, errorLine, h, heading } from "
 
 const AT_ONCE = 3;
 const SCENES = /\.(ply|splat|spz|sog|glb)$/i;
+const VIDEOS = /\.(mp4|mov|m4v|avi|mkv|webm|mts|m2ts|mpg|mpeg|3gp|wmv)$/i; // a browser does not know the type of each
 const POSES = /(?:^|\/)(?:transforms(?:_train|_test|_val)?\.json|cameras\.(?:bin|txt))$/;
 const TAIL = 1 << 20; // bytes at the end of a zip file with the names of its files
 const ZIPPED_POSES = /transforms(?:_train)?\.json|cameras\.(?:bin|txt)/;
@@ -57,7 +58,7 @@ async function sorted(files, wanted) {
     if (single && !zip) kind = "scenes";
     else if (zip ? await hasPoses(own[0].file) : own.some(({ path }) => POSES.test(path))) kind = "captures";
     if (wanted !== "auto" && !(single && !zip)) kind = wanted;
-    const video = !top && own.length === 1 && own[0].file.type.startsWith("video/");
+    const video = !top && own.length === 1 && VIDEOS.test(own[0].path);
     const stem = single || video ? own[0].path.replace(/\.[^.]+$/, "") : top;
     found.push({ kind, name: stem || NAMELESS, files: own, zip });
   }

@@ -10,7 +10,7 @@ const SURFACE_STEPS = 10; // bisections of log depth, starting from a factor of 
 class Renderer {
   constructor(canvas, splats, facts) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
-    if (!gl) throw new Error("This page needs WebGL2, which this browser does not support or has disabled.");
+    if (!gl) throw new Error("This page draws with WebGL2, which this browser lacks or has switched off. Allow hardware acceleration, use another browser, or make a video: gsplat-edu render");
     if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
       throw new Error("This page needs half-float render targets, which this graphics processor does not support.");
     }

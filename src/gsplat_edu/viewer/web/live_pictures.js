@@ -1,4 +1,4 @@
-// For browsers without WebGL2: the training's computer renders, and the page shows its pictures.
+// For browsers without WebGL2: the computer that serves the page renders, and the page shows its pictures.
 "use strict";
 
 const PICTURE_SIDE = 800; // longest side of a picture while the training runs, px
@@ -6,8 +6,9 @@ const STILL_SIDE = 1600; // while it waits or is finished
 
 // Takes the place of Renderer.
 class Pictures {
-  constructor(canvas) {
-    Object.assign(this, { canvas, asking: false, wanted: null, still: false, failure: "" });
+  // address: where the pictures are, relative to the page. told(line): hears why there is none, or "".
+  constructor(canvas, address, told) {
+    Object.assign(this, { canvas, address, told, asking: false, wanted: null, still: false, failure: "" });
     this.context = canvas.getContext("2d");
   }
 
@@ -36,19 +37,30 @@ class Pictures {
       const side = (length) => Math.max(1, Math.round(share * length));
       const { R, eye, fx, fy, cx, cy, W, H } = fitted(camera, side(camera.W), side(camera.H));
       try {
-        const answer = await fetch("picture", {
+        const answer = await fetch(this.address, {
           method: "POST",
+          headers: { "Content-Type": "application/json" },
           body: JSON.stringify({ R, eye, fx, fy, cx, cy, W, H }),
         });
-        if (!answer.ok) throw new Error((await answer.text()).trim());
+        if (!answer.ok) throw new Error(lineOfError(await answer.text()));
         const picture = await createImageBitmap(await answer.blob());
         this.context.drawImage(picture, 0, 0, this.canvas.width, this.canvas.height);
         this.failure = "";
       } catch (error) {
-        this.failure = error.message;
+        this.failure = error instanceof TypeError ? "The program that draws the pictures cannot be reached." : error.message;
       }
+      this.told(this.failure);
     }
     this.asking = false;
+  }
+}
+
+// The server's line, as text or in JSON.
+function lineOfError(text) {
+  try {
+    return JSON.parse(text).error;
+  } catch {
+    return text.trim();
   }
 }
 
@@ -62,9 +74,15 @@ const hasWebGL2 = () => {
 addEventListener("DOMContentLoaded", (event) => {
   if (hasWebGL2()) return;
   event.stopImmediatePropagation();
+  const told = (line) => {
+    say(line);
+    element("count").textContent = `${FACTS.count.toLocaleString("en")} splats, drawn by the program that serves this page: this browser has no WebGL2`;
+  };
   class PictureViewer extends Viewer {
     makeRenderer() {
-      return new Pictures(this.canvas);
+      const pictures = new Pictures(this.canvas, FACTS.pictures ?? "picture", FACTS.live ? () => {} : told);
+      pictures.still = !FACTS.live;
+      return pictures;
     }
   }
   const viewer = new PictureViewer({ ...FACTS, sh_degree: 0 }, { means: new Float32Array(0) });

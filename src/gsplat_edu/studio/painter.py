@@ -1,0 +1,76 @@
+"""Pictures for browsers without WebGL2, drawn by our own renderer on request, and rarely while a training runs."""
+
+from __future__ import annotations
+
+import base64
+import threading
+import time
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import Any
+
+from gsplat_edu.studio.refusal import RefusedError
+from gsplat_edu.studio.workers import Worker
+
+NICE = 10
+"""Steps by which drawing gives way to a training."""
+
+REST = 24.0
+"""While a training runs, the pause after a picture in multiples of the processor time that it took.
+
+One thread then draws for a twenty-fifth of the time. The training slows by 4 % at most, even if all its threads wait
+for that core.
+"""
+
+LONGEST_REST = 15.0
+"""Seconds; the pause after a picture of a very large scene."""
+
+MOST_WAITING = 4
+"""Requests that wait; each holds a thread of the server."""
+
+POLL = 0.1
+"""Seconds between two looks at whether the pause is over."""
+
+
+class Painter:
+    """Draws for all pages, one picture after the other.
+
+    Args:
+        worker: Renders, by the task "picture".
+    """
+
+    def __init__(self, worker: Worker | None = None) -> None:
+        self.worker = worker or Worker(NICE)
+        self._room = threading.Semaphore(MOST_WAITING)
+        self._one = threading.Lock()
+        self._free_at = 0.0
+        self._closed = False
+
+    def paint(self, is_training: Callable[[], bool], **task: Any) -> bytes:  # noqa: ANN401
+        """Return a JPEG; waits its turn, and out the pause while a training runs.
+
+        Args:
+            is_training: Whether a training runs now.
+            task: See `gsplat_edu.studio.worker.make_picture`.
+
+        Raises:
+            RefusedError: too many requests wait, or the picture cannot be drawn; has the line.
+        """
+        if not self._room.acquire(blocking=False):
+            raise RefusedError(
+                "picture: too many pages wait for one; close some", HTTPStatus.SERVICE_UNAVAILABLE
+            )
+        try:
+            with self._one:
+                while not self._closed and is_training() and time.monotonic() < self._free_at:
+                    time.sleep(POLL)
+                made = self.worker.ask("picture", threads=int(is_training()), **task)
+                self._free_at = time.monotonic() + min(REST * made["seconds"], LONGEST_REST)
+        finally:
+            self._room.release()
+        return base64.b64decode(made["jpeg"])
+
+    def close(self) -> None:
+        """End the worker."""
+        self._closed = True
+        self.worker.close()

@@ -1,0 +1,154 @@
+"""The studio in a Chromium without WebGL: the server's computer draws, by our own renderer, on request."""
+
+import io
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from browsers import chromium
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.evaluate.metrics import psnr
+from gsplat_edu.render.api import render
+from gsplat_edu.runs.source import open_source
+from gsplat_edu.studio.painter import Painter
+from gsplat_edu.viewer import page_data
+from gsplat_edu.viewer.live import picture_camera
+from gsplat_edu.viewer.live_folder import LiveFolder, framed
+from studio.conftest import Inline
+from studio.pages import until
+
+CAMERA = """() => {
+  const { R, eye, fx, fy, cx, cy, W, H } = viewer.camera();
+  return { R, eye, fx, fy, cx, cy, W, H };
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium(["--disable-gpu", "--disable-software-rasterizer", "--disable-3d-apis"]) as launched:
+        yield launched
+
+
+def framed_viewer(tab):
+    """The viewer in the screen's frame, once it has a picture."""
+    frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
+    until(tab, frame, "Boolean(window.viewer) && !viewer.renderer.asking && !viewer.frameAsked")
+    return frame
+
+
+def shown(frame):
+    """What is on the frame's canvas, (H, W, 3)."""
+    data = io.BytesIO(frame.locator("#canvas").screenshot())
+    return np.asarray(Image.open(data).convert("RGB"), dtype=float)
+
+
+def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
+    person = visitor()
+    tab = person.tab
+    assert tab.evaluate("document.createElement('canvas').getContext('webgl2')") is None
+    tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall")
+    frame = framed_viewer(tab)
+    frame.locator("#count", has_text="176 splats, drawn by the program that serves this page").wait_for()
+    assert "no WebGL2" in frame.inner_text("#count") and frame.locator("#message").is_hidden()
+    before = shown(frame)
+    assert before.std() > 5
+
+    camera = frame.evaluate(CAMERA)
+    answer = tab.request.post(
+        f"{tab.url.split('/#')[0]}/api/scenes/wall/picture",
+        data=camera,
+        headers={"Origin": tab.url.split("/#")[0]},
+    )
+    found = open_source(wall_entry / "wall.ply")
+    truth = render(found.scene.gaussians, picture_camera(camera), settings=found.settings).image.clamp(0, 1)
+    drawn = np.asarray(Image.open(io.BytesIO(answer.body())), dtype=np.float64) / 255
+    assert psnr(drawn, truth.double().numpy()) > 35  # JPEG of quality 85
+
+    box = frame.locator("#canvas").bounding_box()
+    tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.5 * box["height"])
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 0.6 * box["height"], steps=2)
+    tab.mouse.up()
+    framed_viewer(tab)
+    assert np.abs(shown(frame) - before).mean() > 2  # from another side
+
+
+def test_the_editor_says_in_one_line_what_is_missing(visitor, wall_entry):
+    tab = visitor().tab
+    tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall/edit")
+    frame = tab.wait_for_selector(".scene iframe:not([hidden])").content_frame()
+    frame.locator("#message", has_text=re.compile("WebGL2.* gsplat-edu render")).wait_for()
+    assert "\n" not in frame.inner_text("#message")
+
+
+def test_a_training_is_drawn_while_it_runs(visitor, library, tmp_path):
+    write_colmap(library[0].library.root / "captures" / "egg", *procedural_capture(24, 6, splats=60))
+    person = visitor()
+    tab = person.tab
+    tab.goto(f"{tab.url.split('#')[0]}#/captures/egg")
+    tab.locator("summary", has_text="Options").click()
+    tab.get_by_label("Iterations instead of a quality").fill("100000")
+    tab.get_by_role("button", name="Start training").click()
+    person.reach("#/runs/egg")
+    tab.get_by_role("button", name="Pause", exact=True).wait_for()
+    frame = framed_viewer(tab)
+    assert "no WebGL2, so the training's computer draws" in frame.inner_text("#live")
+    until(tab, frame, "viewer.renderer.failure === '' && !viewer.renderer.asking")
+    assert shown(frame).std() > 5
+    tab.get_by_role("button", name="Stop", exact=True).click()
+    tab.locator(".job .state", has_text="stopped").wait_for()
+
+
+def test_pictures_wait_for_one_another_only_while_a_training_runs(wall_entry):
+    painter = Painter(Inline())
+    camera = {
+        "R": np.eye(3).tolist(),
+        "eye": [0, 0, -4],
+        "fx": 20,
+        "fy": 20,
+        "cx": 10,
+        "cy": 10,
+        "W": 20,
+        "H": 20,
+    }
+    task = {"source": str(wall_entry / "wall.ply"), "camera": camera, "live": False}
+    first = painter.paint(lambda: True, **task)
+    painter._free_at += 1e6  # as if the picture had taken long
+    asked = []
+
+    def ends_soon():
+        asked.append(len(asked))
+        return len(asked) < 4
+
+    assert (
+        painter.paint(ends_soon, **task) == first and len(asked) == 5
+    )  # it waited until the training had ended
+    painter._free_at += 1e6
+    assert painter.paint(lambda: False, **task) == first  # nothing is slowed, so nothing waits
+
+
+def test_a_snapshot_is_drawn_with_the_settings_of_its_training(wall_entry, tmp_path):
+    found = open_source(wall_entry / "wall.ply")
+    run = LiveFolder(tmp_path)
+    run.path.mkdir()
+    settings = {"background": [0.0, 0.0, 1.0], "sh_degree": 0, "antialiased": False, "jacobian_limit": None}
+    run.page.write_text(json.dumps({"settings": settings}))
+    gaussians = found.scene.gaussians
+    run.scene.write_bytes(framed(7, len(gaussians), 0, page_data.packed(gaussians)))
+    camera = {
+        "R": np.eye(3).tolist(),
+        "eye": [0, 0, -9],
+        "fx": 40,
+        "fy": 40,
+        "cx": 20,
+        "cy": 10,
+        "W": 40,
+        "H": 20,
+    }
+    data = Painter(Inline()).paint(lambda: False, source=str(tmp_path), camera=camera, live=True)
+    pixels = np.asarray(Image.open(io.BytesIO(data)), dtype=int)
+    assert np.abs(pixels[0, 0] - (0, 0, 255)).max() < 8 and pixels[10, 20, 2] < 250
