@@ -33,14 +33,10 @@ POLL = 0.1
 
 
 class Painter:
-    """Draws for all pages, one picture after the other.
+    """Draws for all pages, one picture after the other."""
 
-    Args:
-        worker: Renders, by the task "picture".
-    """
-
-    def __init__(self, worker: Worker | None = None) -> None:
-        self.worker = worker or Worker(NICE)
+    def __init__(self) -> None:
+        self.worker = Worker(NICE)
         self._room = threading.Semaphore(MOST_WAITING)
         self._one = threading.Lock()
         self._free_at = 0.0

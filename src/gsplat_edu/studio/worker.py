@@ -111,7 +111,8 @@ def _snapshot(run: Path) -> tuple[Any, Any]:
         raise SceneFormatError(f"{run.name}: has not begun to train; try again in a few seconds")
     header, splats = split(folder.scene, read_bytes(folder.scene))
     gaussians = page_data.unpacked(folder.scene, splats, header["count"], header["sh_degree"])
-    return gaussians, RenderSettings(**facts["settings"], depth=False)
+    given = facts["settings"] | {"background": tuple(facts["settings"]["background"])}
+    return gaussians, RenderSettings(**given, depth=False)
 
 
 def _opened(source: str) -> tuple[Any, Any]:
