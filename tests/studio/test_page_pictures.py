@@ -60,6 +60,7 @@ def drawn(tab, frame, as_wanted, patience=60):
 def test_a_scene_is_drawn_by_the_server(visitor, wall_entry):
     person = visitor()
     tab = person.tab
+    tab.set_viewport_size({"width": 800, "height": 700})
     assert tab.evaluate("document.createElement('canvas').getContext('webgl2')") is None
     tab.goto(f"{tab.url.split('#')[0]}#/scenes/wall")
     frame = framed_viewer(tab)
@@ -157,14 +158,14 @@ def test_a_snapshot_is_drawn_with_the_settings_of_its_training(wall_entry, tmp_p
     run.scene.write_bytes(framed(7, len(gaussians), 0, page_data.packed(gaussians)))
     camera = {
         "R": np.eye(3).tolist(),
-        "eye": [0, 0, -9],
+        "eye": [0, 0, -18],
         "fx": 40,
         "fy": 40,
-        "cx": 20,
-        "cy": 10,
-        "W": 40,
-        "H": 20,
+        "cx": 40,
+        "cy": 20,
+        "W": 80,
+        "H": 40,
     }
     data = painter_here().paint(lambda: False, source=str(tmp_path), camera=camera, live=True)
     pixels = np.asarray(Image.open(io.BytesIO(data)), dtype=int)
-    assert np.abs(pixels[0, 0] - (0, 0, 255)).max() < 8 and pixels[10, 20, 2] < 250
+    assert np.abs(pixels[0, 0] - (0, 0, 255)).max() < 8 and pixels[20, 40, 2] < 250

@@ -22,9 +22,6 @@ One thread then draws for a twenty-fifth of the time. The training slows by 4 % 
 for that core.
 """
 
-LONGEST_REST = 15.0
-"""Seconds; the pause after a picture of a very large scene."""
-
 MOST_WAITING = 4
 """Requests that wait; each holds a thread of the server."""
 
@@ -61,7 +58,7 @@ class Painter:
                 while not self._closed and is_training() and time.monotonic() < self._free_at:
                     time.sleep(POLL)
                 made = self.worker.ask("picture", threads=int(is_training()), **task)
-                self._free_at = time.monotonic() + min(REST * made["seconds"], LONGEST_REST)
+                self._free_at = time.monotonic() + REST * made["seconds"]
         finally:
             self._room.release()
         return base64.b64decode(made["jpeg"])
