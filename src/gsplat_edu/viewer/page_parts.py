@@ -79,6 +79,7 @@ EDITOR = Kind(
         "edit_member.js",
         "edit_state.js",
         "edit_shapes.js",
+        "edit_pixel.js",
         "edit_draw.js",
         "edit_tools.js",
         "edit_panel.js",

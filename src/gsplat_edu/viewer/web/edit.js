@@ -50,6 +50,7 @@ class Editor {
       draw(camera);
       this.drawOverlay(camera);
     };
+    viewer.depthAt = (camera, column, row) => this.tools.depthAt(camera, column, row);
     const { actions } = viewer.keyframes;
     const changed = actions.pathChanged;
     actions.pathChanged = () => {
@@ -241,14 +242,20 @@ class Editor {
     return `${shortNumber((length * scale.length) / length3(plus(...scale.points, -1)))} ${scale.unit}`;
   }
 
-  // The colour of a pixel without the highlight, as hexadecimal text.
+  // The colour of a pixel without the highlight, as hexadecimal text. Only that pixel is drawn, from the splats that may
+  // cover it.
   pictureColor(camera, column, row) {
-    const { renderer, settings } = this.viewer;
-    const { gl } = renderer;
+    const { renderer, settings, sorter, facts } = this.viewer;
+    const { gl, count } = renderer;
     this.texture.write(this.history.flags.map((flag) => (flag === SELECTED ? 0 : flag)));
+    renderer.setOrder(splatsAt(this.values, this.history.flags, camera, column, row, facts.near));
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(column, camera.H - 1 - row, 1, 1);
     renderer.draw(camera, settings);
     const pixel = new Float32Array(4);
     gl.readPixels(column, camera.H - 1 - row, 1, 1, gl.RGBA, gl.FLOAT, pixel);
+    gl.disable(gl.SCISSOR_TEST);
+    if (!sorter.running) renderer.setOrder(new Uint32Array(sorter.order, 0, count)); // otherwise a new order comes
     this.texture.write(this.history.flags);
     const byte = (value) => Math.round(255 * Math.min(Math.max(value, 0), 1)).toString(16).padStart(2, "0");
     return `#${[...pixel.subarray(0, 3)].map(byte).join("")}`;

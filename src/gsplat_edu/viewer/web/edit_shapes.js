@@ -4,7 +4,6 @@
 const EDIT_UP = [0, -1, 0]; // the world's up direction
 const [BOX_LOW, BOX_HIGH] = [0.02, 0.98]; // quantiles of the splats that a new box encloses
 const MOST_SAMPLED = 20000; // splats that these are taken from
-const DEVIATIONS = 3.4; // beyond these, a splat of any opacity is below 1/255
 const CIRCLE = 48; // corners of a drawn circle
 
 const rotated = (rows, vector) => rows.map((row) => dot(row, vector)); // rows of a matrix times a vector
@@ -24,25 +23,6 @@ function storedView({ R, eye, H, fy }) {
 function seenAt(camera, point) {
   const [x, y, z] = rotated(camera.R, plus(point, camera.eye, -1));
   return { u: (camera.fx * x) / z + camera.cx, v: (camera.fy * y) / z + camera.cy, depth: z };
-}
-
-// The splats that may cover a pixel, far to near: those whose extent, which is overestimated, reaches it.
-function splatsAt({ count, means, log_scales }, flags, camera, column, row, near) {
-  const found = [];
-  const { R, eye, fx, fy, cx, cy } = camera;
-  const focal = Math.max(fx, fy);
-  for (let i = 0, k = 0; i < count; ++i, k += 3) {
-    if (flags[i] > SELECTED) continue;
-    const [a, b, c] = [means[k] - eye[0], means[k + 1] - eye[1], means[k + 2] - eye[2]];
-    const depth = R[2][0] * a + R[2][1] * b + R[2][2] * c;
-    if (!(depth > near)) continue;
-    const x = (R[0][0] * a + R[0][1] * b + R[0][2] * c) / depth;
-    const y = (R[1][0] * a + R[1][1] * b + R[1][2] * c) / depth;
-    const size = Math.exp(Math.max(log_scales[k], log_scales[k + 1], log_scales[k + 2]));
-    const reach = DEVIATIONS * (1 + (focal / depth) * size * (1 + Math.abs(x) + Math.abs(y)));
-    if (Math.abs(fx * x + cx - column) <= reach && Math.abs(fy * y + cy - row) <= reach) found.push({ i, depth });
-  }
-  return Uint32Array.from(found.sort((a, b) => b.depth - a.depth || b.i - a.i), ({ i }) => i);
 }
 
 // The part of a line in front of the camera, as two pixels; null if there is none.

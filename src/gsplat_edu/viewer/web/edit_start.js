@@ -32,8 +32,8 @@ class EditFile {
 
 addEventListener("viewer", async ({ detail: { viewer, splats } }) => {
   const { scene, file, commands, url } = FACTS.edit;
-  const { means, log_scales } = splats;
-  const values = { count: FACTS.count, means, log_scales, ...(await unpackValues(FACTS.count)) };
+  const { means, log_scales, quats } = splats;
+  const values = { count: FACTS.count, means, log_scales, quats, ...(await unpackValues(FACTS.count)) };
   const stored = url && new EditFile(url);
   const edits = stored ? await stored.read() : null;
   window.editor = startEditor({

@@ -170,21 +170,15 @@ class EditTools {
   // The visible surface at a point of the picture; null where there is none.
   surface({ camera, at: { u, v } }) {
     const [column, row] = [Math.round(u), Math.round(v)].map((x, i) => Math.min(Math.max(x, 0), [camera.W, camera.H][i] - 1));
-    const depth = this.viewer.lost ? null : this.depthAt(camera, column, row);
+    const depth = this.depthAt(camera, column, row);
     this.editor.say(depth === null ? "There is nothing at that point; choose one on the scene." : "");
     return depth === null ? null : { point: pointAt(camera, u, v, depth), depth };
   }
 
-  // The search draws many times, so it draws only the splats that may cover the pixel. It draws over that pixel of the
-  // renderer's image, but not on the screen.
   depthAt(camera, column, row) {
-    const { renderer, sorter, settings, facts } = this.viewer;
+    const { settings, facts } = this.viewer;
     const { values, history } = this.editor;
-    const count = renderer.count;
-    renderer.setOrder(splatsAt(values, history.flags, camera, column, row, facts.near));
-    const depth = renderer.surface(camera, settings, column, row);
-    if (!sorter.running) renderer.setOrder(new Uint32Array(sorter.order, 0, count)); // otherwise a new order comes
-    return depth;
+    return depthAtPixel(values, history.flags, camera, settings, column, row, facts.near);
   }
 
   sphereBegins(stroke) {

@@ -113,12 +113,17 @@ class Viewer {
     const { left, top, width, height } = this.canvas.getBoundingClientRect();
     const column = Math.min(camera.W - 1, Math.max(0, Math.floor(((x - left) / width) * camera.W)));
     const row = Math.min(camera.H - 1, Math.max(0, Math.floor(((y - top) / height) * camera.H)));
-    const depth = this.lost ? null : this.renderer.surface(camera, this.settings, column, row);
+    const depth = this.depthAt(camera, column, row);
     if (depth !== null) {
       this.view.orbitAround(pointAt(camera, column, row, depth));
       this.panel.point(x, y);
     }
     this.askFrame();
+  }
+
+  // Camera depth of the visible surface at a pixel; null if there is none.
+  depthAt(camera, column, row) {
+    return this.lost ? null : this.renderer.surface(camera, this.settings, column, row);
   }
 
   goTo(index) {
