@@ -23,6 +23,14 @@ TOKEN = "a-token"
 COMMAND = "import sys; from gsplat_edu.cli.main import main; sys.exit(main(sys.argv[1:]))"
 """The command line as a program."""
 
+SHIFTS = """
+window.shifted = 0;
+new PerformanceObserver((list) => {
+  for (const { value, hadRecentInput } of list.getEntries()) if (!hadRecentInput) shifted += value;
+}).observe({ type: "layout-shift", buffered: true });
+"""
+"""Adds up the layout shifts of a page that follow no input."""
+
 OUTPUTS = {"sfm": 2, "convert": 2, "train": 3}
 """Which word of a printed command names what it writes."""
 
@@ -76,6 +84,7 @@ class Visitor:
         self.tab.on("pageerror", lambda error: self.faults.append(str(error)))
         self.tab.on("console", self._said)
         self.tab.on("dialog", lambda dialog: self.faults.append(dialog.message))
+        self.tab.add_init_script(SHIFTS)
         self.tab.goto(url)
         self.tab.wait_for_selector("footer p:not(:empty)")
 
@@ -93,6 +102,10 @@ class Visitor:
         while self.place() != place:
             assert time.monotonic() < end, (self.place(), self.tab.inner_text("main"))
             self.tab.wait_for_timeout(30)
+
+    def shift(self):
+        """How much the page has moved by itself since it was loaded (cumulative layout shift)."""
+        return self.tab.evaluate("shifted")
 
     def command(self, job):
         """The printed command of a job's card, by the job's title."""

@@ -73,3 +73,50 @@ def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path
     main(["convert", str(scene / "wall.ply"), str(out), "--edits", str(stored)])
     assert download.value.path().read_bytes() == out.read_bytes()
     assert f"{len(read_scene(out).gaussians)} of 176 left" in left
+
+
+def focused(frame):
+    return frame.evaluate("document.activeElement.textContent.trim() || document.activeElement.tagName")
+
+
+def test_the_keyboard_keeps_its_place(visitor, wall_entry, library):
+    person = visitor()
+    tab = person.tab
+    tab.set_viewport_size({"width": 1000, "height": 620})
+    address = tab.url.split("#")[0]
+    (wall_entry / "edits.json").unlink(missing_ok=True)
+    frame = opened(tab, address)
+    for name, then in (
+        ("all", "all"),
+        ("delete", "undo"),
+        ("undo", "undo"),
+        ("undo", "redo"),
+        ("invert", "invert"),
+    ):
+        frame.get_by_role("button", name=name, exact=True).focus()
+        tab.keyboard.press("Enter")
+        assert focused(frame) == then, name  # not the page: the next Tab would begin at its top
+    tab.keyboard.press("h")
+    listed = frame.locator("#help tr:visible td:first-child").all_inner_texts()
+    keys = frame.evaluate("Object.keys(EDIT_KEYS)")
+    shown = " ".join(listed).lower().split()
+    assert [
+        key for key in keys if key != "backspace" and key.replace("Shift+", "") not in " ".join(shown)
+    ] == []
+
+    tab.goto(f"{address}#/")
+    for name in ("one", "two"):
+        (library[0].library.root / "captures" / name).mkdir()
+        library[0].library.remove("captures", name)
+    tab.goto(f"{address}#/trash")
+    tab.get_by_role("button", name="Restore").nth(1).wait_for()
+    tab.get_by_role("button", name="Restore").first.focus()
+    tab.keyboard.press("Enter")
+    until(tab, tab, "document.querySelectorAll('main li').length === 1")
+    until(tab, tab, "document.activeElement.textContent === 'Restore'")
+    tab.keyboard.press("?")
+    until(tab, tab, "document.getElementById('keys').open")
+    tab.keyboard.press("Escape")
+    until(
+        tab, tab, "document.activeElement.textContent === 'Restore'"
+    )  # where it was before the list of keys

@@ -1,6 +1,6 @@
 // The page: which screen the address names, keys, and what every screen shares.
 
-import { announce, put } from "./dom.js";
+import { announce, keptFocus, put } from "./dom.js";
 import { Store } from "./store.js";
 import { library } from "./library.js";
 import { trash } from "./trash.js";
@@ -13,6 +13,7 @@ const SCREENS = { "": library, photos, captures: capture, runs: run, scenes: sce
 const store = new Store();
 const main = document.getElementById("main");
 const keys = document.getElementById("keys");
+const keepFocus = keptFocus();
 let shown = null;
 
 // "#/runs/NAME/judge?view=3" as {kind, name, tab, more, query}.
@@ -58,6 +59,7 @@ function update() {
   const active = [...store.jobs.values()].filter(({ active }) => active).length;
   put(document.getElementById("job-count"), active ? String(active) : "");
   shown?.update?.();
+  keepFocus();
 }
 
 // Many events come at once; one picture needs one update.

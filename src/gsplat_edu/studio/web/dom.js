@@ -100,5 +100,26 @@ export async function attempt(pressed, line, act) {
     return undefined;
   } finally {
     if (pressed) pressed.disabled = false;
+    if (pressed?.isConnected && document.activeElement === document.body) pressed.focus({ preventScroll: true });
   }
+}
+
+// Keeps the keyboard's place: returns a function to call after each change of the page. If what had the focus is gone or
+// hidden by then, what is nearest to it gets the focus.
+export function keptFocus() {
+  let chain = []; // what had the focus last, and what it lies in
+  addEventListener("focusin", ({ target }) => {
+    chain = [];
+    for (let at = target; at; at = at.parentElement) chain.push(at);
+  });
+  return () => {
+    const [last] = chain;
+    if (!last || document.activeElement !== document.body || (last.isConnected && last.checkVisibility())) return;
+    for (const place of chain.slice(1)) {
+      if (!place.isConnected || !place.checkVisibility()) continue;
+      const near = [...place.querySelectorAll("button, a, input, select, summary")];
+      const next = near.find((one) => one.checkVisibility() && !one.disabled);
+      if (next) return next.focus({ preventScroll: true });
+    }
+  };
 }

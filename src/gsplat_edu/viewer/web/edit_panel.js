@@ -126,6 +126,7 @@ class EditPanel {
     this.editor = editor;
     document.body.insertAdjacentHTML("beforeend", EDIT_PANEL);
     this.root = element("edit");
+    this.listKeys();
     this.numbers = { center: this.addNumbers("edit-center"), half: this.addNumbers("edit-half") };
     this.root.addEventListener("click", (event) => this.click(event.target.closest("button")));
     this.root.addEventListener("input", (event) => this.input(event.target));
@@ -140,6 +141,29 @@ class EditPanel {
 
   button(name) {
     return this.root.querySelector(`[data-do=${name}]`);
+  }
+
+  // Adds the editor's keys to the page's help, from the titles of its buttons.
+  listKeys() {
+    const rows = [...this.root.querySelectorAll("[title]")].map(({ title }) => title.match(/^([^:]+): (.+)$/));
+    const more = [
+      [, "Arrows", "move a cross in the picture; by single pixels with Shift"],
+      [, "Enter", "press at the cross, press again to release; then apply"],
+      [, "Space", "held: drags turn the view"],
+      [, "Escape", "drop what is drawn, then leave the tool"],
+      [, "[ ]", "size of the brush"],
+    ];
+    const heading = document.createElement("h2");
+    heading.textContent = "Editor";
+    const table = document.createElement("table");
+    heading.className = table.className = "mouse"; // not on a device that has only a touch screen
+    for (const [, key, what] of [...rows.filter(Boolean), ...more]) {
+      const row = table.insertRow();
+      row.insertCell().textContent = key;
+      row.insertCell().textContent = what;
+    }
+    element("help").append(heading, table);
+    element("help").tabIndex = 0; // it is long enough to scroll
   }
 
   addNumbers(id) {
@@ -160,6 +184,8 @@ class EditPanel {
     if (tool) editor.tools.choose(tool);
     else if (how) editor.chooseHow(how);
     else if (button.dataset.do) this.act(button.dataset.do);
+    // a disabled button loses the focus
+    if (button.disabled) [this.button("undo"), this.button("redo"), this.button("all")].find((one) => !one.disabled).focus();
   }
 
   act(name) {
@@ -281,6 +307,16 @@ class EditPanel {
     fill(element("edit-sphere"), shape?.radius);
   }
 
+  // Replaces the items of a list; the focus stays at its place in it.
+  fill(id, items) {
+    const list = element(id).querySelector("ol");
+    const at = [...list.querySelectorAll("button")].indexOf(document.activeElement);
+    list.replaceChildren(...items);
+    if (at < 0) return;
+    const buttons = list.querySelectorAll("button");
+    (buttons[Math.min(at, buttons.length - 1)] ?? element(id).querySelector("summary")).focus();
+  }
+
   // Lists of views and operations; only after a change of them.
   list() {
     const { history, editor } = { history: this.editor.history, editor: this.editor };
@@ -305,7 +341,7 @@ class EditPanel {
       ),
     );
     if (views.start) rows.unshift(row(button("start", "go to the start view", () => editor.goTo(views.start))));
-    element("edit-views").querySelector("ol").replaceChildren(...rows);
+    this.fill("edit-views", rows);
     element("edit-views").querySelector("summary").textContent = `views (${rows.length})`;
     const operations = [...history.done, ...[...history.undone].reverse()];
     const items = operations.map((operation, i) =>
@@ -313,7 +349,7 @@ class EditPanel {
     );
     if (operations.length) items.unshift(row(button("as opened", "", () => editor.goToStep(0), !history.done.length)));
     items.forEach((item, i) => item.classList.toggle("undone", i > history.done.length));
-    element("edit-list").querySelector("ol").replaceChildren(...items);
+    this.fill("edit-list", items);
     element("edit-list").querySelector("summary").textContent = `operations (${history.done.length})`;
   }
 
