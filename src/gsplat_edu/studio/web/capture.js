@@ -68,10 +68,10 @@ function startForm(store, entry) {
   };
   const labels = {
     iterations: "Iterations instead of a quality",
-    resolution: "Photos, 1/… of their width, or px",
+    resolution: "Size of the photos: 2 for half, or longest side in px",
     time_limit: "Time instead of a quality",
     max_memory: "Memory limit",
-    max_gaussians: "Most splats",
+    max_gaussians: "Splats at most",
   };
   const name = h("input", { id: "run-name", type: "text", autocomplete: "off" });
   const go = h("button", { class: "primary" }, "Start training");

@@ -163,7 +163,7 @@ export function intake(store, into = null) {
 
   async function take(files) {
     const groups = into ? [{ ...into, files, zip: false }] : await sorted(files, kind.value);
-    if (!groups.some((group) => group.files.length)) throw new Error("There are no files in what was dropped.");
+    if (!groups.some((group) => group.files.length)) throw new Error("What was dropped holds no files.");
     let landed = null;
     for (const group of groups) {
       if (!into) group.name = freeName(store, group.kind, group.name);
@@ -247,5 +247,5 @@ function pathForm(store) {
     kind,
     add,
   );
-  return h("details", {}, h("summary", {}, "Use a folder of this computer where it is"), form, line);
+  return h("details", {}, h("summary", {}, "Use a folder on this computer without copying it"), form, line);
 }

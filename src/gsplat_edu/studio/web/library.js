@@ -79,7 +79,7 @@ export function library({ main, store }) {
     const hint = h("p", { class: "quiet" }, empty);
     return { kind, list, hint, section: h("section", { "aria-label": title }, heading(2, title), hint, list) };
   });
-  const first = h("p", { class: "first" }, "This library is empty. Drop photos of something above, taken from all sides, and follow the buttons.");
+  const first = h("p", { class: "first" }, "This library is empty. Drop photos into the field above: of one thing or place, taken from all sides. Then follow the buttons.");
   first.hidden = true;
   const foot = h("p", { class: "quiet" });
   const footer = h("footer", {}, foot, link("Trash", "#/trash"));

@@ -7,7 +7,7 @@ import { jobPlace, startJob } from "./jobs.js";
 import { addressOf, entryHead, management, withEntry } from "./library.js";
 
 const MATCHERS = [
-  ["", "as suits the photos"],
+  ["", "chosen by what the photos are"],
   ["exhaustive", "every photo with every other one"],
   ["sequential", "photos in the order they were taken"],
 ];

@@ -125,7 +125,7 @@ function cleaning(store, entry) {
     "section",
     { "aria-label": "cleaning" },
     heading(2, "Clean"),
-    h("p", { class: "quiet" }, "Removes floaters and what contributes nothing, and makes a new scene; the run stays as it is."),
+    h("p", { class: "quiet" }, "Removes specks that float in the air and splats that no photo needs, and makes a new scene. The run stays as it is."),
     clean,
     line,
     job.element,
