@@ -3,6 +3,8 @@
 import json
 import re
 
+import pytest
+
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.formats import read_scene
 from studio.pages import until
@@ -29,6 +31,7 @@ def select_and_delete(tab, frame, corners):
     frame.get_by_role("button", name="delete", exact=True).click()
 
 
+@pytest.mark.sliced(1, group="the studio in a browser")
 def test_edits_are_saved_kept_guarded_and_exported(visitor, wall_entry, tmp_path):
     person, scene = visitor(), wall_entry
     tab = person.tab
@@ -79,6 +82,7 @@ def focused(frame):
     return frame.evaluate("document.activeElement.textContent.trim() || document.activeElement.tagName")
 
 
+@pytest.mark.sliced(1, group="the studio in a browser")
 def test_the_keyboard_keeps_its_place(visitor, wall_entry, library):
     person = visitor()
     tab = person.tab

@@ -95,6 +95,7 @@ def test_the_editor_says_in_one_line_what_is_missing(visitor, wall_entry):
     assert "\n" not in frame.inner_text("#message")
 
 
+@pytest.mark.sliced(1, group="the studio in a browser")
 def test_a_training_is_drawn_while_it_runs(visitor, library, tmp_path):
     write_colmap(library[0].library.root / "captures" / "egg", *procedural_capture(24, 6, splats=60))
     person = visitor()

@@ -258,7 +258,7 @@ def test_a_browser_without_webgl2_gets_a_message(visit, tmp_path, random_gaussia
     page.write(tmp_path / "a.html", Scene(random_gaussians(3)))
     one = visit(fresh=True)
     one.tab.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    one.open(tmp_path / "a.html").message("This page needs WebGL2")
+    one.open(tmp_path / "a.html").message("This page draws with WebGL2")
 
 
 def test_a_graphics_processor_with_small_textures_gets_a_message(visit, tmp_path, random_gaussians):
