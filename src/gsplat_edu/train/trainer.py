@@ -377,8 +377,9 @@ class Trainer:
         if self._parts.transients is not None:
             target = self._parts.transients.applied(draw.index, target)
         model = self._parts.view_model
-        output = self._render(self.gaussians, model.camera(draw.index, draw.view.camera), settings=settings)
-        seen = Seen(output.image, output.transmittance, background)
+        camera = model.camera(draw.index, draw.view.camera)
+        output = self._render(self.gaussians, camera, settings=settings)
+        seen = Seen(output.image, output.transmittance, background, camera, output.median_depth)
         image = model.image(draw.index, seen, target, self.iteration)
         return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 
@@ -391,6 +392,7 @@ class Trainer:
             antialiased=config.antialiased,
             jacobian_limit=config.jacobian_limit,
             depth=self._objective.needs_depth,
+            median_depth=self._parts.view_model.needs_depth,
         )
 
     def apply(self, in_backward: AdamInBackward | None = None) -> None:
