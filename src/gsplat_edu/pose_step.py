@@ -8,8 +8,8 @@ and change the render I by -∇I·δp. The step is the Gauss-Newton step of
 
     Σ_pixels ω |I - P - ∇I·δp + g (I + 0.055)|² / (K σ²)  +  |(w, t / extent) + d|² / s²
 
-for the photo P. The gains g of the three channels are solved for too and dropped: a photo may be brighter than the
-scene. σ is the spread of the residuals, ω gives less weight to large ones. What the scene does not show correctly yet
+for the photo P. A photo may be brighter than the scene, so the render first gets the median gain of each channel; what
+is left of it, g, is solved for too and dropped. σ is the spread of the residuals, ω gives less weight to large ones. What the scene does not show correctly yet
 is wrong over whole regions, so K pixels count as one observation. d is how far the camera is from its given pose
 already, and s how far off given poses are: where photos say little, the given pose holds.
 
@@ -80,10 +80,10 @@ def pose_step(
         found = _samples(image, depth, photo, mask)
         if found is None:
             return torch.zeros(6, dtype=torch.float64)
-        pixels, z, colors, slopes, residual = found
+        pixels, z, light, slopes, residual = found
         # (n, 3, 9): how each unknown changes the residual of each channel, in units of the spread
         by_twist = -(slopes[..., None] * _flow(camera, pixels, z)[:, None]).sum(dim=2) * spread
-        rows = torch.cat([by_twist, torch.diag_embed(colors + SRGB_OFFSET)], dim=2).reshape(-1, 9)
+        rows = torch.cat([by_twist, torch.diag_embed(light)], dim=2).reshape(-1, 9)
         errors = residual.reshape(-1)
         sigma = 1.4826 * errors.abs().median() + FLOOR
         weights = 1.0 / (1.0 + (errors / (2.0 * sigma)).square()) / (TOGETHER * sigma.square())
@@ -101,8 +101,8 @@ def _samples(
     """Return what counts of a grid of pixels, float64 on the CPU; None if that is too little.
 
     Returns:
-        (n, 2) columns and rows, (n,) depths, (n, 3) colours of the render, (n, 3, 2) their slopes per pixel to the
-        right and down, (n, 3) render minus photo.
+        (n, 2) columns and rows, (n,) depths, (n, 3) colours of the render + 0.055 at the exposure of the photo,
+        (n, 3, 2) their slopes per pixel to the right and down, (n, 3) render minus photo.
     """
     H, W = depth.shape
     step = max(1, math.isqrt(H * W // SAMPLES))
@@ -127,8 +127,9 @@ def _samples(
         counts &= taken(mask) > 0
     if int(counts.sum()) < FEWEST:
         return None
-    both = torch.stack(slopes, dim=2)[counts] / 2.0
-    return pixels[counts], z[counts], colors[counts], both, (colors - truth)[counts]
+    x, y, both = colors[counts] + SRGB_OFFSET, truth[counts] + SRGB_OFFSET, torch.stack(slopes, dim=2)[counts]
+    gains = torch.stack([ratios.contiguous().median() for ratios in (y / x.clamp_min(SRGB_OFFSET)).unbind(dim=1)])
+    return pixels[counts], z[counts], gains * x, gains[:, None] * both / 2.0, gains * x - y
 
 
 def _flow(camera: Camera, pixels: Float64[Tensor, "n 2"], z: Float64[Tensor, " n"]) -> Float64[Tensor, "n 2 6"]:
