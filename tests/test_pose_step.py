@@ -1,4 +1,4 @@
-"""Steps of a pose: they end at the true pose, whatever the exposure, and hold the given one where a photo says nothing."""
+"""Steps of a pose end at the true pose, whatever the exposure, and hold the given one where a photo says nothing."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,9 @@ def aligned(scene, photo, steps=12, moved=None):
     now = CameraTensors.of(camera).moved(OFF).value()
     for _ in range(steps):
         seen = shown(gaussians, now)
-        step = pose_step(seen.image, seen.median_depth, now, photo, NOWHERE if moved is None else moved, SPREAD)
+        step = pose_step(
+            seen.image, seen.median_depth, now, photo, NOWHERE if moved is None else moved, SPREAD
+        )
         now = CameraTensors.of(now).moved(step).value()
     return motion(gaussians, camera, now), now
 
@@ -109,18 +111,22 @@ def test_too_few_pixels_move_nothing(scene):
 
 
 def test_the_flow_is_that_of_finite_differences(scene):
-    gaussians, camera, _ = scene
+    _, camera, _ = scene
     generator, size = torch.Generator().manual_seed(0), 1e-6
     pixels = 90.0 * torch.rand(20, 2, dtype=torch.float64, generator=generator)
     z = 2.0 + torch.rand(20, dtype=torch.float64, generator=generator)
-    rays = np.concatenate([(pixels.numpy() - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones((20, 1))], 1)
+    rays = np.concatenate(
+        [(pixels.numpy() - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones((20, 1))], 1
+    )
     points = (z.numpy()[:, None] * rays) @ camera.R + camera.eye
     for column, direction in enumerate(np.eye(6)):
         other = CameraTensors.of(camera).moved(torch.from_numpy(size * direction)).value()
         seen = (points - other.eye) @ other.R.T
         place = seen[:, :2] / seen[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         found = (place - pixels.numpy()) / size
-        np.testing.assert_allclose(_flow(camera, pixels, z)[:, :, column].numpy(), found, rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose(
+            _flow(camera, pixels, z)[:, :, column].numpy(), found, rtol=1e-4, atol=1e-3
+        )
 
 
 def test_the_bits_do_not_depend_on_the_number_of_threads(scene):

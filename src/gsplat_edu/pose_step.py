@@ -9,9 +9,10 @@ and change the render I by -∇I·δp. The step is the Gauss-Newton step of
     Σ_pixels ω |I - P - ∇I·δp + g (I + 0.055)|² / (K σ²)  +  |(w, t / extent) + d|² / s²
 
 for the photo P. A photo may be brighter than the scene, so the render first gets the median gain of each channel; what
-is left of it, g, is solved for too and dropped. σ is the spread of the residuals, ω gives less weight to large ones. What the scene does not show correctly yet
-is wrong over whole regions, so K pixels count as one observation. d is how far the camera is from its given pose
-already, and s how far off given poses are: where photos say little, the given pose holds.
+is left of it, g, is solved for too and dropped. σ is the spread of
+the residuals, ω gives less weight to large ones. What the scene does not show correctly yet is wrong over whole
+regions, so K pixels count as one observation. d is how far the camera is from its given pose already, and s how far off
+given poses are: where photos say little, the given pose holds.
 
 Unlike Adam, whose steps are as large as its rate even where the pose is right, this step is as large as the error.
 """
@@ -39,7 +40,7 @@ TOGETHER = 1000.0
 """K. With 50 the poses of a clean capture drift by 0.3 instead of 0.1 degrees (docs/RECIPE.md)."""
 
 FLOOR = 1e-3
-"""Smallest σ, a quarter of a byte's step."""
+"""Smallest spread of the residuals, a quarter of a byte's step."""
 
 FREE = 1e-6
 """Weight that holds a gain at 0, so that black photos have a solution."""
@@ -91,8 +92,8 @@ def pose_step(
         normal = (rows * weights[:, None]).T @ rows + torch.diag(held)
         slope = (rows * weights[:, None]).T @ errors
         slope[:6] += moved / spread
-        step = -torch.linalg.solve(normal, slope)[:6] * spread
-    return step
+        step: Float64[Tensor, "6"] = -torch.linalg.solve(normal, slope)[:6] * spread
+        return step
 
 
 def _samples(
@@ -128,11 +129,15 @@ def _samples(
     if int(counts.sum()) < FEWEST:
         return None
     x, y, both = colors[counts] + SRGB_OFFSET, truth[counts] + SRGB_OFFSET, torch.stack(slopes, dim=2)[counts]
-    gains = torch.stack([ratios.contiguous().median() for ratios in (y / x.clamp_min(SRGB_OFFSET)).unbind(dim=1)])
+    gains = torch.stack(
+        [ratios.contiguous().median() for ratios in (y / x.clamp_min(SRGB_OFFSET)).unbind(dim=1)]
+    )
     return pixels[counts], z[counts], gains * x, gains[:, None] * both / 2.0, gains * x - y
 
 
-def _flow(camera: Camera, pixels: Float64[Tensor, "n 2"], z: Float64[Tensor, " n"]) -> Float64[Tensor, "n 2 6"]:
+def _flow(
+    camera: Camera, pixels: Float64[Tensor, "n 2"], z: Float64[Tensor, " n"]
+) -> Float64[Tensor, "n 2 6"]:
     """Return how many pixels each number of a twist moves what pixels show, to the right and down."""
     middle = torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
     focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
@@ -140,5 +145,7 @@ def _flow(camera: Camera, pixels: Float64[Tensor, "n 2"], z: Float64[Tensor, " n
     one, zero = torch.ones_like(x), torch.zeros_like(x)
     # of w: w x x_cam, with x_cam = z (x, y, 1)
     turn = torch.stack([-x * y, 1 + x * x, -y, -(1 + y * y), x * y, x], dim=1).reshape(-1, 2, 3)
-    shift = -torch.stack([one, zero, -x, zero, one, -y], dim=1).reshape(-1, 2, 3) @ torch.from_numpy(camera.R.copy())
+    shift = -torch.stack([one, zero, -x, zero, one, -y], dim=1).reshape(-1, 2, 3) @ torch.from_numpy(
+        camera.R.copy()
+    )
     return torch.cat([turn, shift / z[:, None, None]], dim=2) * focal[:, None]

@@ -10,8 +10,8 @@ in the frame of the capture.
 The poses are measured, not learned by gradient descent: whenever a view is drawn, D moves by the step that its render
 and its photo ask for (`gsplat_edu.pose_step`), and the next render of the view uses it.
 
-Views with equal intrinsics share a lens: fx' = fx exp(a), fy' = fy exp(b), cx' = cx + c W, cy' = cy + d H. They are learned by
-Adam.
+Views with equal intrinsics share a lens, which Adam learns:
+fx' = fx exp(a), fy' = fy exp(b), cx' = cx + c W, cy' = cy + d H.
 """
 
 from __future__ import annotations
@@ -168,4 +168,3 @@ def gauge(cameras: Sequence[Camera], extent: float) -> Float64[np.ndarray, "view
 
 def _rate(rate: float, iterations: int, iteration: int) -> float:
     return float(rate * FINAL ** min(iteration / max(iterations, 1), 1.0))
-
