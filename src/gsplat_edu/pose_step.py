@@ -82,18 +82,40 @@ def pose_step(
         if found is None:
             return torch.zeros(6, dtype=torch.float64)
         pixels, z, light, slopes, residual = found
-        # (n, 3, 9): how each unknown changes the residual of each channel, in units of the spread
-        by_twist = -(slopes[..., None] * _flow(camera, pixels, z)[:, None]).sum(dim=2) * spread
-        rows = torch.cat([by_twist, torch.diag_embed(light)], dim=2).reshape(-1, 9)
-        errors = residual.reshape(-1)
-        sigma = 1.4826 * errors.abs().median() + FLOOR
-        weights = 1.0 / (1.0 + (errors / (2.0 * sigma)).square()) / (TOGETHER * sigma.square())
-        held = torch.tensor([1.0] * 6 + [FREE] * 3, dtype=torch.float64)
-        normal = (rows * weights[:, None]).T @ rows + torch.diag(held)
-        slope = (rows * weights[:, None]).T @ errors
+        sigma = 1.4826 * residual.abs().flatten().median() + FLOOR
+        weights = 1.0 / (1.0 + (residual / (2.0 * sigma)).square()) / (TOGETHER * sigma.square())
+        flow = -(_flow(camera, pixels, z) * spread)
+        normal, slope = _normal_equations(flow, slopes, light, residual, weights)
+        normal += torch.diag(torch.tensor([1.0] * 6 + [FREE] * 3, dtype=torch.float64))
         slope[:6] += moved / spread
         step: Float64[Tensor, "6"] = -torch.linalg.solve(normal, slope)[:6] * spread
         return step
+
+
+def _normal_equations(
+    flow: Float64[Tensor, "n 2 6"],
+    slopes: Float64[Tensor, "n 3 2"],
+    light: Float64[Tensor, "n 3"],
+    residual: Float64[Tensor, "n 3"],
+    weights: Float64[Tensor, "n 3"],
+) -> tuple[Float64[Tensor, "9 9"], Float64[Tensor, "9"]]:
+    """Return the matrix and the right side for six numbers of a twist, by which a pixel flows, and three gains.
+
+    The channels are summed for each pixel first, which leaves a symmetric 2 x 2 matrix for the flow.
+    """
+    moves, heavy = flow.reshape(-1, 6), weights[..., None] * slopes
+    (a, b), (c, d) = ((heavy[..., i, None] * slopes).sum(dim=1).unbind(dim=1) for i in (0, 1))
+    right, down = flow[:, 0], flow[:, 1]
+    pulled = torch.stack(
+        [a[:, None] * right + b[:, None] * down, c[:, None] * right + d[:, None] * down], dim=1
+    )
+    normal = residual.new_zeros(9, 9)
+    normal[:6, :6] = moves.T @ pulled.reshape(-1, 6)
+    normal[:6, 6:] = moves.T @ (heavy * light[..., None]).transpose(1, 2).reshape(-1, 3)
+    normal[6:, :6] = normal[:6, 6:].T
+    normal[6:, 6:] = torch.diag((weights * light.square()).sum(dim=0))
+    along = (heavy * residual[..., None]).sum(dim=1).reshape(-1)
+    return normal, torch.cat([moves.T @ along, (weights * light * residual).sum(dim=0)])
 
 
 def _samples(
