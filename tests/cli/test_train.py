@@ -117,7 +117,7 @@ def test_config_json_has_the_flat_names_of_older_runs(tmp_path):
         "batch",
         "sky",
         "refine",
-        "pose_rate",
+        "pose_spread",
         "lens_rate",
         "transients",
     }

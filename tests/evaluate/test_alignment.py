@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.evaluate.alignment import aligned_psnr
+from gsplat_edu.evaluate.alignment import SQUARES, aligned_psnr, light_squares
 from gsplat_edu.render.api import render
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
@@ -63,8 +63,36 @@ def test_a_photo_of_another_exposure_is_scored_at_its_own(scene, transparent):
 
 def test_no_pixel_in_a_half_gives_no_score(scene):
     view = photo_of(scene, EVEN)
-    mask = np.ones(view.image.shape[:2], dtype=bool)
-    mask[:, :32] = False
-    masked = View(view.camera, view.image, mask=mask, name="a")
-    for colors in (False, True):
-        assert aligned_psnr(scene[0], masked, shown, GREY, EXTENT, colors=colors) is None
+    light = light_squares(*view.image.shape[:2])
+    for mask in (light, ~light):
+        masked = View(view.camera, view.image, mask=mask, name="a")
+        for colors in (False, True):
+            assert aligned_psnr(scene[0], masked, shown, GREY, EXTENT, colors=colors) is None
+
+
+def test_the_scored_half_does_not_move_the_pose(scene):
+    """Grey dark squares: the score is lost, but they change nothing about the pose, so they could not help it."""
+    view = photo_of(scene, EVEN)
+    photo, light = np.ascontiguousarray(view.read().over(GREY)), light_squares(*view.image.shape[:2])
+    images = []
+
+    def watched(gaussians, camera):
+        output = shown(gaussians, camera)
+        images.append(output.image.detach())
+        return output
+
+    ends = []
+    for dark in (photo, np.full_like(photo, 128)):
+        given = View(view.camera, np.where(light[..., None], photo, dark), name="a")
+        aligned_psnr(scene[0], given, watched, GREY, EXTENT)
+        ends.append(images[-1])
+    assert torch.equal(*ends)
+
+
+def test_light_squares_are_half_of_the_photo_in_every_corner():
+    for H, W in ((64, 64), (97, 131), (24, 40)):
+        light = light_squares(H, W)
+        assert abs(light.mean() - 0.5) < 0.05
+        for part in (light[: H // 2], light[H // 2 :], light[:, : W // 2], light[:, W // 2 :]):
+            assert abs(part.mean() - 0.5) < 0.1
+        assert light[0, 0] and not light[0, W // SQUARES + 1]

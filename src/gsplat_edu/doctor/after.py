@@ -249,7 +249,7 @@ def _fit(run: Trained) -> list[Finding]:
         return []
     what = f"the training views reach only {_mean(run.train):.1f} dB on average: the scene does not fit even those"
     place = "" if run.capture is None else f": {command('doctor', run.capture)}"
-    advice = f"check poses and intrinsics{place}"
+    advice = f"check poses and intrinsics{place}; if they are a little off, train with --refine auto"
     if run.reached < run.usual and run.rising:  # too few iterations may be the only cause
         advice = f"train for longer first; if they do not improve, {advice}"
     return [Finding("poor fit", Severity.WARNING, what, advice)]
@@ -329,7 +329,10 @@ def _floaters(run: Trained) -> list[Finding]:
     names = tuple(view.name for view in veiled)
     shares = tuple(f"{100 * view.veiled:.0f} %" for view in veiled)
     what = f"{counted(len(veiled), 'view')} with splats floating close to the camera"
-    advice = "start from real points instead of random ones, and remove exposure jumps; convert --crop removes the rest"
+    advice = (
+        "remove them with gsplat-edu clean, or train with --clean; they are fewer with real start points and no"
+        " exposure jumps"
+    )
     return [Finding("floaters", Severity.WARNING, what, advice, names, shares)]
 
 

@@ -52,7 +52,7 @@ SHOWN = 0.95
 NAMES = {
     "num_gaussians": "Gaussians",
     "seconds": "training time",
-    "psnr_aligned": "test PSNR, right half, pose aligned on the left, as colours if appearance is on (dB)",
+    "psnr_aligned": "test PSNR on half of each photo, pose (and colours, with appearance) fitted on the other (dB)",
 }
 """Labels for the keys of metrics.json that are not plain English."""
 

@@ -22,8 +22,11 @@ SAME = ("train", "render", "data")
 MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("iterations",)}
 """Keys of these sections that may differ: files with the same contents may have moved, and a run may be extended."""
 
-ADDED = ("batch", "appearance", "sky", "refine", "pose_rate", "lens_rate", "transients")
+ADDED = ("batch", "appearance", "sky", "refine", "pose_spread", "lens_rate", "transients")
 """Settings of the training that came after the first version. A run without them was trained with their defaults."""
+
+RETIRED = {"pose_rate": ("poses", "both")}
+"""Settings that are gone, and the values of `refine` for which they mattered: other runs resume without them."""
 
 MOVED = 1e-9
 """Tolerance of camera coordinates, relative and absolute: subtracting an origin and adding it back rounds."""
@@ -53,6 +56,7 @@ def check_options(folder: RunFolder, new: dict[str, Any]) -> None:
         before, now = (_section(folder, config, section) for config in (old, new))
         if section == "train":
             before = {setting.name: setting.default for setting in SETTINGS if setting.name in ADDED} | before
+            idle |= {name for name, users in RETIRED.items() if before["refine"] not in users}
         names = {*before, *now} - idle - set(MAY_DIFFER.get(section, ()))
         # The strategy first: it explains other differences.
         for key in sorted(names, key=lambda name: (name != "strategy", name)):

@@ -84,5 +84,5 @@ def aligned_score(
     if mean is None:
         return {}
     what = "poses aligned and colours fitted" if colors else "poses aligned"
-    say(f"held-out photos, {what} on their left halves: {mean:.2f} dB PSNR of the right halves")
+    say(f"held-out photos, {what} on every other square: {mean:.2f} dB PSNR of the other squares")
     return {"psnr_aligned": round(mean, 4)}

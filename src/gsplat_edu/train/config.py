@@ -328,11 +328,11 @@ class TrainConfig:
         _one_of(TRANSIENTS),
         '"mask": find and mask what only single photos show; "none": use all pixels.',
     )
-    pose_rate: float = _number(
-        2e-3,
-        _not_negative,
-        "Initial learning rate of the poses per visit of a view, radians and fractions of the extent; it falls to a"
-        " hundredth.",
+    pose_spread: float = _number(
+        1e-2,
+        _positive,
+        "How far off the given poses are expected to be, radians and fractions of the extent: where photos say little,"
+        " they hold.",
     )
     lens_rate: float = _number(
         2e-4, _not_negative, "Initial learning rate of the intrinsics, relative; it falls to a hundredth."

@@ -7,34 +7,41 @@ these moves to first order: three shifts, three turns about the cameras' centre,
 D has of them fixes the gauge: the cameras can move relative to one another, but not all together, and the scene stays
 in the frame of the capture.
 
-Views with equal intrinsics share a lens: fx' = fx exp(a), fy' = fy exp(b), cx' = cx + c W, cy' = cy + d H.
+The poses are measured, not learned by gradient descent: whenever a view is drawn, D moves by the step that its render
+and its photo ask for (`gsplat_edu.pose_step`), and the next render of the view uses it.
+
+Views with equal intrinsics share a lens, which Adam learns:
+fx' = fx exp(a), fy' = fy exp(b), cx' = cx + c W, cy' = cy + d H.
 """
 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gsplat_edu.camera import Camera
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.pose_step import pose_step
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
-from gsplat_edu.train.view_model import Identity
+from gsplat_edu.train.view_model import Identity, Seen
 
 TWISTS, LENSES = "twists", "lenses"
 """Names of the parameters."""
 
+WARM_UP = 0.05
+"""Share of the run before the first step of a pose: the scene has to show something."""
+
 FINAL = 0.01
-"""The rates fall log-linearly to this share, over as many iterations as that of the means; then they are constant."""
+"""The rate falls log-linearly to this share, over as many iterations as that of the means; then it is constant."""
 
 
 class Refinement(Identity):
@@ -42,28 +49,28 @@ class Refinement(Identity):
 
     Args:
         cameras: The cameras of the training views, at their full size.
-        config: The settings: which of the two, rates, and the length of the schedule.
+        config: The settings: which of the two, the spread, the rate, and the length of the schedule.
         extent: Size of the scene, world units.
     """
 
     def __init__(self, cameras: Sequence[Camera], config: TrainConfig, extent: float) -> None:
-        self._extent, self._learns = extent, config.refine
+        self._learns = config.refine
         keys = [lens_key(camera) for camera in cameras]
         self._lenses_by_key = {key: number for number, key in enumerate(dict.fromkeys(keys))}
         self._lens_of = [self._lenses_by_key[key] for key in keys]
         self._gauge = torch.from_numpy(gauge(cameras, extent))
-        self._twists = torch.zeros(len(cameras), 6, dtype=torch.float64).requires_grad_()
+        self._twists = torch.zeros(len(cameras), 6, dtype=torch.float64)
         self._lenses = torch.zeros(len(self._lenses_by_key), 4, dtype=torch.float64).requires_grad_()
-        # Each view is drawn once in as many steps as there are views. The root of Adam's second moment is smaller than
-        # the view's gradient by the root of their number, so its steps are larger than the rate by that factor.
-        of_poses = functools.partial(
-            _rate, config.pose_rate / math.sqrt(len(cameras)), config.means_rate_iterations
-        )
-        of_lenses = functools.partial(_rate, config.lens_rate, config.means_rate_iterations)
-        self._groups = {
-            TWISTS: ParameterGroup(of_poses, eps=config.adam_eps, per_gaussian=False),
-            LENSES: ParameterGroup(of_lenses, eps=config.adam_eps, per_gaussian=False),
-        }
+        units = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
+        self._units, self._spread = units, config.pose_spread * units
+        self._begin = WARM_UP * config.means_rate_iterations
+        rate = functools.partial(_rate, config.lens_rate, config.means_rate_iterations)
+        self._group = ParameterGroup(rate, eps=config.adam_eps, per_gaussian=False)
+
+    @property
+    def needs_depth(self) -> bool:
+        """Return whether poses are refined."""
+        return TWISTS in self._names()
 
     def _names(self) -> list[str]:
         wanted = {"poses": [TWISTS], "intrinsics": [LENSES], "both": [TWISTS, LENSES]}
@@ -75,23 +82,43 @@ class Refinement(Identity):
         return {name: tensors[name] for name in self._names()}
 
     def groups(self) -> Mapping[str, ParameterGroup]:
-        """Return their groups."""
-        return {name: self._groups[name] for name in self._names()}
+        """Return the group of the lenses: gradients do not move the poses."""
+        return {name: self._group for name in self._names() if name == LENSES}
 
-    def camera(self, index: int, camera: Camera | CameraTensors) -> CameraTensors:
+    def camera(self, index: int, camera: Camera | CameraTensors) -> Camera | CameraTensors:
         """Return the corrected camera of a training view, at the size of the given one."""
         given = camera if isinstance(camera, CameraTensors) else CameraTensors.of(camera)
         if TWISTS in self._names():
-            twist: Tensor = _Anchored.apply(self._twists, self._gauge, index)  # type: ignore[no-untyped-call]
-            given = given.moved(torch.cat([twist[:3], self._extent * twist[3:]]))
+            given = given.moved(self._moved(index))
         if LENSES in self._names():
             given = given.with_intrinsics(refined_intrinsics(given, self._lenses[self._lens_of[index]]))
-        return given
+        # a camera of numbers spares the kernels its gradient
+        return given if any(tensor.requires_grad for tensor in given.tensors()) else given.value()
+
+    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
+        """Return the image unchanged; measure how the camera should move, for the next render of the view."""
+        if TWISTS in self._names() and iteration >= self._begin:
+            if seen.camera is None or seen.depth is None:
+                raise ArgumentError("seen: has no camera or no depth, but poses are measured with both")
+            camera = seen.camera.value() if isinstance(seen.camera, CameraTensors) else seen.camera
+            moved = self._moved(index)
+            step = pose_step(
+                seen.image, seen.depth, camera, target.image, moved, self._spread, mask=target.mask
+            )
+            self._twists[index] += step / self._units
+        return seen.image
+
+    def _moved(self, index: int) -> Float64[Tensor, "6"]:
+        """Return a view's row of D - Q Qᵀ D, radians and world units."""
+        with one_thread():  # the rounding of sums depends on the number of threads
+            shares = (self._gauge * self._twists[:, :, None]).sum(dim=(0, 1))
+            return (self._twists[index] - (self._gauge[index] * shares).sum(dim=1)) * self._units
 
     def refined(self, index: int, camera: Camera) -> Camera:
         """Return the corrected camera as numbers."""
         with torch.no_grad():
-            return self.camera(index, camera).value()
+            found = self.camera(index, camera)
+            return found.value() if isinstance(found, CameraTensors) else found
 
     def with_refined_lens(self, camera: Camera) -> Camera:
         """Return a camera with the refined intrinsics of its lens, if a training view was taken with that lens."""
@@ -141,25 +168,3 @@ def gauge(cameras: Sequence[Camera], extent: float) -> Float64[np.ndarray, "view
 
 def _rate(rate: float, iterations: int, iteration: int) -> float:
     return float(rate * FINAL ** min(iteration / max(iterations, 1), 1.0))
-
-
-class _Anchored(torch.autograd.Function):
-    """A view's row of D - Q Qᵀ D, with the sums on one thread: their rounding depends on the number of threads."""
-
-    @staticmethod
-    def forward(ctx: Any, twists: Tensor, basis: Tensor, index: int) -> Tensor:  # noqa: ANN401
-        ctx.index = index
-        ctx.save_for_backward(basis)
-        with one_thread():
-            shares = (basis * twists[:, :, None]).sum(dim=(0, 1))
-            return twists[index] - (basis[index] * shares).sum(dim=1)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
-        (basis,) = ctx.saved_tensors
-        with one_thread():
-            shares = (basis[ctx.index] * grad[:, None]).sum(dim=0)
-            found = -(basis * shares).sum(dim=2)
-        found[ctx.index] += grad
-        return found, None, None

@@ -369,28 +369,28 @@ class Trainer:
 
     def _rendered(self, draw: Draw) -> Rendered:
         """Render a view with the settings of the iteration, and apply the view model."""
-        config, background = self.config, self.config.background
-        if config.random_background:
+        background = self.config.background
+        if self.config.random_background:
             background = tuple(self._backgrounds.uniform(size=3).tolist())
-        settings = self._settings(background)
         target = self._feed.target(draw, background)
         if self._parts.transients is not None:
             target = self._parts.transients.applied(draw.index, target)
         model = self._parts.view_model
-        output = self._render(self.gaussians, model.camera(draw.index, draw.view.camera), settings=settings)
-        seen = Seen(output.image, output.transmittance, background)
+        camera = model.camera(draw.index, draw.view.camera)
+        output = self._render(self.gaussians, camera, settings=self._settings(background))
+        seen = Seen(output.image, output.transmittance, background, camera, output.median_depth)
         image = model.image(draw.index, seen, target, self.iteration)
         return Rendered(self.gaussians, draw, output, image, target, self.iteration)
 
     def _settings(self, background: tuple[float, float, float]) -> RenderSettings:
         """Return the render settings of the iteration."""
-        config = self.config
         return RenderSettings(
             background=background,
-            sh_degree=sh_degree(config, self.iteration),
-            antialiased=config.antialiased,
-            jacobian_limit=config.jacobian_limit,
+            sh_degree=sh_degree(self.config, self.iteration),
+            antialiased=self.config.antialiased,
+            jacobian_limit=self.config.jacobian_limit,
             depth=self._objective.needs_depth,
+            median_depth=self._parts.view_model.needs_depth,
         )
 
     def apply(self, in_backward: AdamInBackward | None = None) -> None:

@@ -25,11 +25,15 @@ class Seen(NamedTuple):
         image: (H, W, 3) the render, or what models before have made of it.
         transmittance: (H, W) fraction of light that passes all Gaussians.
         background: Colour behind the Gaussians.
+        camera: The camera that the render shows; None if no model asks for it.
+        depth: (H, W) its median depth, 0 where nothing solid is shown; None unless a model has `needs_depth`.
     """
 
     image: Float[Tensor, "H W 3"]
     transmittance: Float[Tensor, "H W"]
     background: Color
+    camera: Camera | CameraTensors | None = None
+    depth: Float[Tensor, "H W"] | None = None
 
 
 @runtime_checkable
@@ -40,6 +44,11 @@ class ViewModel(Protocol):
     gradients, and the trainer's optimiser updates them in place; the model itself updates the others. Names must differ
     from those of the Gaussians' parameters.
     """
+
+    @property
+    def needs_depth(self) -> bool:
+        """Whether `image` uses the depth of the render; only then is it rendered."""
+        ...
 
     def parameters(self) -> Mapping[str, Tensor]:
         """Return the learned tensors by name; always the same objects."""
@@ -73,6 +82,11 @@ class ViewModel(Protocol):
 class Identity:
     """Corrects nothing and learns nothing; a base class for models that correct only one of camera and image."""
 
+    @property
+    def needs_depth(self) -> bool:
+        """Return false."""
+        return False
+
     def parameters(self) -> Mapping[str, Tensor]:
         """Return none."""
         return {}
@@ -99,6 +113,11 @@ class InTurn:
 
     def __init__(self, models: Sequence[ViewModel]) -> None:
         self.models = tuple(models)
+
+    @property
+    def needs_depth(self) -> bool:
+        """Return whether a model does."""
+        return any(model.needs_depth for model in self.models)
 
     def parameters(self) -> Mapping[str, Tensor]:
         """Return the parameters of all models."""
