@@ -8,6 +8,7 @@ const SOLID = 0.15; // smallest half of the opacity of a pixel that shows a surf
 const BATCH_SPLATS = 4096; // splats per instance: one each would cost a software rasteriser 20 µs per splat
 const SURFACE_STEPS = 10; // bisections of log depth, starting from a factor of 2: accurate to 0.07 %
 
+const POLL = 4; // milliseconds between two looks whether a picture is drawn
 const QUAD = [0, 1, 2, 2, 1, 3]; // corners of the two triangles
 const ORDER = { type: Uint32Array, channels: 1, texels: 1 }; // splats, far to near
 
@@ -27,6 +28,8 @@ class Renderer {
     this.textures = layout(facts).map((part) => this.uploaded(part, splats[part.name]));
     this.next = null; // splats that wait for their order
     this.image = null;
+    this.begun = 0; // images
+    this.thinning = 0;
     this.framebuffer = gl.createFramebuffer();
     this.setUpOrder();
     if (gl.getError() !== gl.NO_ERROR) throw new Error("This scene does not fit into the graphics processor's memory.");
@@ -122,7 +125,9 @@ class Renderer {
     gl.bindVertexArray(null);
   }
 
-  setOrder(order) {
+  // Sets what is drawn: these splats, far to near. Of a sample, `thinning` is above 0.
+  setOrder(order, thinning = 0) {
+    this.thinning = thinning;
     if (this.next) this.adopt();
     this.fill(this.order, ORDER, order);
     this.count = order.length;
@@ -143,17 +148,32 @@ class Renderer {
   // Draws the splats up to a camera depth in the current order: image = alpha colour + (1 - alpha) image, starting with
   // the background.
   draw(camera, settings, background = [...settings.background, 1], farthest = 3e38) {
+    this.begin(camera, background);
+    this.drawPart(camera, settings, 0, this.count, farthest);
+  }
+
+  // Begins an image; returns what tells whether another one has been begun since.
+  begin(camera, background) {
     const gl = this.gl;
     this.resize(camera.W, camera.H);
-    gl.viewport(0, 0, camera.W, camera.H);
     gl.clearBufferfv(gl.COLOR, 0, background);
+    return ++this.begun;
+  }
+
+  // Draws splats from one place in the order to another.
+  drawPart(camera, settings, from, to, farthest = 3e38) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.viewport(0, 0, camera.W, camera.H);
     gl.useProgram(this.program);
     this.setUniforms(camera, settings);
     gl.uniform1f(gl.getUniformLocation(this.program, "farthest"), farthest);
+    gl.uniform1i(gl.getUniformLocation(this.program, "first"), from);
+    gl.uniform1i(gl.getUniformLocation(this.program, "end"), to);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.vertices);
-    const [splats, batches] = [Math.min(this.count, BATCH_SPLATS), Math.ceil(this.count / BATCH_SPLATS)];
+    const [splats, batches] = [Math.min(to - from, BATCH_SPLATS), Math.ceil((to - from) / BATCH_SPLATS)];
     gl.drawElementsInstanced(gl.TRIANGLES, 6 * splats, gl.UNSIGNED_SHORT, 0, batches);
     gl.bindVertexArray(null);
   }
@@ -169,8 +189,8 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0 + this.textures.length);
     gl.bindTexture(gl.TEXTURE_2D, this.order);
     gl.uniform1i(place("order"), this.textures.length);
-    gl.uniform1i(place("count"), this.count);
     gl.uniform1i(place("batch_splats"), BATCH_SPLATS);
+    gl.uniform1f(place("thinning"), this.thinning);
     const { low, high } = ratioBounds(camera, settings.jacobian_limit);
     gl.uniform1i(place("texture_width"), this.textureWidth);
     gl.uniform1i(place("coefficients"), (this.facts.sh_degree + 1) ** 2);
@@ -212,15 +232,38 @@ class Renderer {
     return half >= SOLID ? high : null;
   }
 
-  // Copies the image onto the canvas.
+  // Copies the image onto the canvas, enlarged if the canvas is larger.
   show() {
     const gl = this.gl;
+    const { width, height } = gl.canvas;
+    const enlarged = width !== this.width || height !== this.height;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
     gl.disable(gl.BLEND);
     gl.useProgram(this.screen);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.image);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, enlarged ? gl.LINEAR : gl.NEAREST);
+    gl.uniform1i(gl.getUniformLocation(this.screen, "enlarged"), enlarged ? 1 : 0);
+    gl.uniform2f(gl.getUniformLocation(this.screen, "size"), width, height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Resolves with the milliseconds until what was asked for so far is drawn; the page stays awake meanwhile.
+  drawn() {
+    const gl = this.gl;
+    const began = performance.now();
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return new Promise((resolve) => {
+      const look = () => {
+        const done = gl.isContextLost() || gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.SIGNALED;
+        if (!done) return void setTimeout(look, POLL);
+        gl.deleteSync(fence);
+        resolve(performance.now() - began);
+      };
+      setTimeout(look, 0);
+    });
   }
 
   // Waits until everything is drawn.

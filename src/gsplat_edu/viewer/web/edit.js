@@ -45,9 +45,9 @@ class Editor {
   // Draws the overlay after each picture, and hears of changes of the camera path.
   follow() {
     const { viewer } = this;
-    const draw = viewer.draw.bind(viewer);
-    viewer.draw = (camera) => {
-      draw(camera);
+    const put = viewer.put.bind(viewer);
+    viewer.put = (camera) => {
+      put(camera);
       this.drawOverlay(camera);
     };
     const { actions } = viewer.keyframes;

@@ -11,8 +11,10 @@ uniform highp isampler2D quats;
 uniform highp sampler2D logit_opacities;
 uniform highp sampler2D sh;
 uniform highp usampler2D order;  // splats, far to near
-uniform int count;               // drawn
+uniform int first;               // place in the order of the first one that is drawn
+uniform int end;                 // place behind the last one
 uniform int batch_splats;        // per instance
+uniform float thinning;          // of a sample of the splats, see sort_worker.js; 0 if all are drawn
 #ifdef EDITING
 uniform highp usampler2D flags;  // 0, 1: selected; above: hidden or deleted
 uniform vec3 highlight;          // colour of selected splats
@@ -38,6 +40,8 @@ flat out vec4 paint;   // colour and opacity
 // The rasteriser snaps corners to a grid of 1/16 px or finer; the margin keeps it from losing pixels at the rim. Pixels
 // outside the ellipse are discarded anyway.
 const float SLACK = 0.125;
+
+const float MOST_ENLARGED = 6.0;
 
 ivec2 texel(int i) {
     return ivec2(i % texture_width, i / texture_width);
@@ -70,6 +74,13 @@ vec3 color(int splat, vec3 d) {
     return sum + C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(splat, 12);
 }
 
+// By how much a splat of a sample is enlarged, to cover for others; a little less than they covered, as these overlap.
+float enlarged(vec3 scales, float logit) {
+    float area = scales.x * scales.y * scales.z / min(scales.x, min(scales.y, scales.z));
+    float chance = min(1.0, thinning * sqrt(area / (1.0 + exp(-logit))));
+    return min(MOST_ENLARGED, pow(chance, -0.4));
+}
+
 // Half the extent of the ellipse d' Sigma2d^-1 d = level along a direction.
 float reach(vec2 direction, float a, float b, float c, float level) {
     vec2 squares = direction * direction;
@@ -79,8 +90,8 @@ float reach(vec2 direction, float a, float b, float c, float level) {
 
 void main() {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside the clip volume unless the splat is visible
-    int rank = gl_InstanceID * batch_splats + gl_VertexID / 4;
-    if (rank >= count) return;
+    int rank = first + gl_InstanceID * batch_splats + gl_VertexID / 4;
+    if (rank >= end) return;
     int splat = int(texelFetch(order, texel(rank), 0).r);
     ivec2 place = texel(splat);
 #ifdef EDITING
@@ -96,6 +107,7 @@ void main() {
     if (length2 == 0.0) return;
     mat3 RS = rotation(q / sqrt(length2));
     vec3 scales = exp(texelFetch(log_scales, place, 0).xyz);
+    if (thinning > 0.0) scales *= enlarged(scales, texelFetch(logit_opacities, place, 0).r);
     RS[0] *= scales.x, RS[1] *= scales.y, RS[2] *= scales.z;
 
     vec2 ratio = clamp(p.xy / p.z, ratio_low, ratio_high);
