@@ -20,6 +20,8 @@ class Viewer {
     this.lost = false;
     this.pace = new Pace();
     this.movedAt = -Infinity;
+    this.gauged = false;
+    this.isTraining = false; // the scene, on this computer
     this.isWhole = false; // whether the screen shows the current view with all splats at full resolution
     this.catching = this.outdated = this.timing = false; // see catchUp() and measure()
     this.frameAsked = 0;
@@ -92,22 +94,21 @@ class Viewer {
     this.isWhole = true;
   }
 
-  // The first picture. A scene that this computer draws slowly is shown coarsely first, and completed by frames.
-  async open() {
-    const { count } = this.renderer.facts;
+  // Finds out how fast this computer draws the scene, by a coarse picture of it.
+  async gauge() {
+    const { count } = (this.renderer.next ?? this.renderer).facts;
     const least = DETAILS.at(-1);
-    if (count > least.most) {
-      const camera = this.camera();
-      await this.sorter.sort(camera, least.most);
-      this.coarse(camera, least); // compiles the shaders
-      this.renderer.finish();
+    if (this.gauged || count <= least.most) return;
+    this.gauged = true;
+    const camera = this.camera();
+    await this.sorter.sort(camera, least.most);
+    const times = [1, 2].slice(this.isTraining ? 1 : 0).map(() => {
       const began = performance.now();
       this.coarse(camera, least);
       this.renderer.finish();
-      this.pace.expect(performance.now() - began, count);
-    }
-    if (this.pace.slow) this.askFrame();
-    else await this.settled();
+      return performance.now() - began;
+    }); // the first one compiles the shaders as well; during a training, drawSparing() corrects that
+    this.pace.expect(times.at(-1), least, count);
   }
 
   // Shows other splats in place of all: of this number and degree. Resolves once they are drawn.
@@ -115,6 +116,7 @@ class Viewer {
     const all = { ...this.facts, ...facts };
     await this.sorter.replace(splats, () => this.renderer.replace(all, splats));
     this.panel.counted(all.count);
+    await this.gauge();
     await (this.pace.slow ? this.followed() : this.settled());
   }
 
@@ -211,6 +213,7 @@ class Viewer {
     this.measure();
     if (!this.sorter.running && !this.sorter.fits(camera)) this.sorter.sort(camera).then(() => this.askFrame(), fail);
     this.isWhole = this.sorter.fits(camera);
+    if (this.isWhole) this.onRest?.();
     this.time(now, seconds);
   }
 
@@ -282,8 +285,9 @@ class Viewer {
     const camera = this.camera();
     await this.sorter.sort(camera, SPARING.most);
     this.coarse(camera, SPARING);
-    await this.renderer.drawn();
-    this.rested(false);
+    this.pace.expect(await this.renderer.drawn(), SPARING, this.renderer.facts.count);
+    if (this.pace.slow) this.rested(false);
+    else this.askFrame();
   }
 
   // Draws everything in parts, which a movement interrupts. The screen keeps its picture until all are drawn. Returns
@@ -349,7 +353,11 @@ async function start() {
   const splats = FACTS.lod ? null : await unpackSplats(FACTS);
   const viewer = splats ? new Viewer(FACTS, splats) : streamed(FACTS);
   if (viewer.levels) await viewer.sorter.sort(viewer.camera()); // the first picture comes before the last splat
-  else await viewer.open();
+  else {
+    await viewer.gauge();
+    if (viewer.pace.slow) viewer.askFrame(); // the coarse picture is the first one
+    else await viewer.settled();
+  }
   window.viewer = viewer;
   if (!viewer.levels?.regions.some(({ levels }) => levels.length)) say("");
   dispatchEvent(new CustomEvent("viewer", { detail: { viewer, splats } })); // for further parts of the page

@@ -24,7 +24,7 @@ const DETAILS = [
 ];
 
 // What is drawn of a training that runs on the same processor.
-const SPARING = { most: 100000, share: 0.5 };
+const SPARING = { most: 25000, share: 0.4 };
 
 class Pace {
   constructor() {
@@ -47,10 +47,10 @@ class Pace {
     return (Math.min(most, count) * (1 + 2 * share ** 2)) / 3;
   }
 
-  // Chooses the detail for a scene, given how long a picture of the least one took.
-  expect(milliseconds, count) {
-    const rate = milliseconds / Pace.work(DETAILS.at(-1), count);
-    const fitting = DETAILS.findIndex((detail) => rate * Pace.work(detail, count) <= FRAME);
+  // Chooses the detail for a scene, given how long a picture of some detail took.
+  expect(milliseconds, detail, count) {
+    const rate = milliseconds / Pace.work(detail, count);
+    const fitting = DETAILS.findIndex((other) => rate * Pace.work(other, count) <= FRAME);
     this.level = fitting < 0 ? DETAILS.length - 1 : fitting;
     this.quick = this.late = 0;
   }
