@@ -3,9 +3,9 @@
 
 // Drawing other splats takes this computer's time, which the training needs as well. So the page waits this many times
 // as long as it worked before it asks for the next ones.
-const REST_FACTOR = 30;
+const REST_FACTOR = 20;
 const SHORTEST_REST = 500; // milliseconds
-const LONGEST_REST = 90000;
+const LONGEST_REST = 30000;
 const PHOTOS_VARY = 0.25; // weight of the newest photo in the curves of its loss and PSNR
 const TRIES = 4; // to reach the server again before the page gives up
 const TRY_EVERY = 1000; // milliseconds

@@ -34,7 +34,10 @@ class Viewer {
     this.controls = new Controls(this.canvas, this.view, actions);
     this.panel.mark(this.cameraIndex);
     this.levels?.attach(this.renderer, this.sorter);
-    addEventListener("resize", () => this.askFrame());
+    addEventListener("resize", () => {
+      this.movedAt = performance.now(); // a slow page fills the window with a coarse picture first
+      this.askFrame();
+    });
     this.canvas.addEventListener("webglcontextlost", () => this.lose());
     this.askFrame();
   }
