@@ -121,7 +121,7 @@ class Editor {
     this.panel.list();
     this.panel.saved(this.text() === this.stored ? "" : "not saved");
     this.changed();
-    this.viewer.askFrame();
+    this.viewer.refresh();
   }
 
   // Brings the page's up direction, start view and path to where the operations have them.

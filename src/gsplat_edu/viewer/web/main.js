@@ -34,10 +34,7 @@ class Viewer {
     this.controls = new Controls(this.canvas, this.view, actions);
     this.panel.mark(this.cameraIndex);
     this.levels?.attach(this.renderer, this.sorter);
-    addEventListener("resize", () => {
-      this.movedAt = performance.now(); // a slow page fills the window with a coarse picture first
-      this.askFrame();
-    });
+    addEventListener("resize", () => this.refresh());
     this.canvas.addEventListener("webglcontextlost", () => this.lose());
     this.askFrame();
   }
@@ -67,7 +64,7 @@ class Viewer {
       pathChanged: () => this.stop(),
       degree: (degree) => {
         this.settings.sh_degree = degree;
-        this.askFrame();
+        this.refresh();
       },
     };
   }
@@ -194,6 +191,12 @@ class Viewer {
     this.askFrame();
   }
 
+  // What is seen from here has changed. A slow page shows that in a coarse picture first, as if the view had moved.
+  refresh() {
+    this.movedAt = performance.now();
+    this.askFrame();
+  }
+
   askFrame() {
     this.frameAsked ||= requestAnimationFrame((now) => this.frame(now));
   }
@@ -208,6 +211,7 @@ class Viewer {
     this.isWhole = false;
     if (this.pace.slow) {
       this.lastFrame = now; // for held keys
+      clearTimeout(this.rest);
       this.outdated = true;
       this.catchUp().catch(fail);
       return;
