@@ -2,8 +2,8 @@
 
     python benchmarks/page.py [SCENE ...] [--seconds S] [--pictures FOLDER] [--smoke] [--out FILE.json]
 
-Without scenes, makes two of 200,000 and 1,000,000 splats with harmonics of degree 3: an object on a floor. Serves each by
-`gsplat-edu view` and opens the page in a headless Chromium that draws in software, in a window of a laptop and in one
+Without scenes, makes two of 200,000 and 1,000,000 splats with harmonics of degree 3: an object on a floor. Serves each
+by `gsplat-edu view` and opens the page in a headless Chromium that draws in software, in a window of a laptop and in one
 of a phone. Prints, for each,
 
 - the seconds from opening the page to its first picture, and to the first complete one;
@@ -12,11 +12,13 @@ of a phone. Prints, for each,
   the browser for each;
 - the seconds from the last movement to the complete picture.
 
---pictures writes a screenshot taken while the view turns, and one at rest. --smoke does everything with tiny scenes.
+--pictures writes a screenshot taken while the view turns, and one at rest. --smoke serves and requests the page of a
+tiny scene, without a browser.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import shutil
@@ -24,6 +26,7 @@ import statistics
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -107,6 +110,20 @@ def served(scene: Path) -> Iterator[str]:
         server.wait()
 
 
+@contextmanager
+def browser(smoke: bool) -> Iterator[Any]:
+    """Yield a headless Chromium; None with `smoke`."""
+    if smoke:
+        yield None
+        return
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        launched = driver.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
+        yield launched
+        launched.close()
+
+
 def until(tab: Any, words: str, limit: float = PATIENCE) -> None:  # noqa: ANN401
     """Wait until a condition holds in a page; its policy forbids the waiting by strings that Playwright has."""
     end = time.perf_counter() + limit / 1e3
@@ -132,9 +149,9 @@ def turned(tab: Any, seconds: float, picture: Path | None) -> None:  # noqa: ANN
     tab.mouse.up()
 
 
-def measured(browser: Any, url: str, window: tuple[int, int], seconds: float, pictures: Path | None) -> Any:  # noqa: ANN401
+def measured(opened: Any, url: str, window: tuple[int, int], seconds: float, pictures: Path | None) -> Any:  # noqa: ANN401
     """Open a page and turn it; return the figures."""
-    tab = browser.new_page(viewport={"width": window[0], "height": window[1]})
+    tab = opened.new_page(viewport={"width": window[0], "height": window[1]})
     tab.set_default_timeout(PATIENCE)
     began = time.perf_counter()
     tab.goto(url)
@@ -155,7 +172,7 @@ def measured(browser: Any, url: str, window: tuple[int, int], seconds: float, pi
     rest = time.perf_counter() - let_go
     if pictures:
         tab.screenshot(path=pictures.with_name(f"{pictures.name}-rest.png"))
-    apart = [later - earlier for earlier, later in zip(shown, shown[1:], strict=False)]
+    apart = [later - earlier for earlier, later in itertools.pairwise(shown)]
     detail = tab.evaluate("viewer.pace.detail")
     tab.close()
     return {
@@ -172,15 +189,13 @@ def measured(browser: Any, url: str, window: tuple[int, int], seconds: float, pi
 
 def main() -> None:
     """Measure, print and write the JSON."""
-    from playwright.sync_api import sync_playwright
-
     parser = hardware.parser("The page: frames without a graphics processor.")
     parser.add_argument("scenes", type=Path, nargs="*")
     parser.add_argument("--seconds", type=float, default=8.0, help="of turning")
     parser.add_argument("--pictures", type=Path, help="folder for screenshots")
     arguments = parser.parse_args()
     results: dict[str, Any] = {}
-    with TemporaryDirectory() as scratch, sync_playwright() as driver:
+    with TemporaryDirectory() as scratch, browser(arguments.smoke) as opened:
         scenes = arguments.scenes
         if not scenes:
             scenes = [Path(scratch) / f"{count}.ply" for count in ((300,) if arguments.smoke else COUNTS)]
@@ -188,15 +203,16 @@ def main() -> None:
                 write_scene(path, Scene(room(int(path.stem))))
         if arguments.pictures:
             arguments.pictures.mkdir(parents=True, exist_ok=True)
-        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
         for scene in scenes:
             began = time.perf_counter()
             with served(scene) as url:
                 print(f"{scene.stem}: served after {time.perf_counter() - began:.1f} s")
+                if opened is None:
+                    assert b"<canvas" in urllib.request.urlopen(url, timeout=60).read()
+                    continue
                 for name, window in WINDOWS.items():
                     pictures = arguments.pictures and arguments.pictures / f"{scene.stem}-{name}"
-                    seconds = 0.3 if arguments.smoke else arguments.seconds
-                    found = measured(browser, url, window, seconds, pictures)
+                    found = measured(opened, url, window, arguments.seconds, pictures)
                     results[f"{scene.stem} {name}"] = found
                     print(
                         f"{scene.stem} {name}: first picture {found['first']:.1f} s, complete {found['whole']:.1f} s;"
@@ -204,7 +220,6 @@ def main() -> None:
                         f" {found['busy_ms']:.0f} ms of processor time; complete {found['rest']:.1f} s after it;"
                         f" {found['detail']}"
                     )
-        browser.close()
     hardware.report(results, arguments.out)
 
 
