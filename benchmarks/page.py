@@ -3,8 +3,8 @@
     python benchmarks/page.py [SCENE ...] [--seconds S] [--pictures FOLDER] [--smoke] [--out FILE.json]
 
 Without scenes, makes two of 200,000 and 1,000,000 splats with harmonics of degree 3: an object on a floor. Serves each
-by `gsplat-edu view` and opens the page in a headless Chromium that draws in software, in a window of a laptop and in one
-of a phone. Prints, for each,
+by `gsplat-edu view` and opens the page in a headless Chromium that draws in software, in a window of a laptop and in
+one of a phone. Prints, for each,
 
 - the seconds from opening the page to its first picture, and to the first complete one;
 - the seconds from the command to the address, once per scene;
