@@ -3,10 +3,11 @@
     python benchmarks/live.py [CAPTURE] [--from SCENE] [--resolution R] [--turns N] [--seconds S] [--smoke]
                               [--out FILE.json]
 
-Trains with a live view. In turns, a headless Chromium shows the page, or an empty one, for some seconds each; the first
-seconds of a turn do not count. Prints the iterations per second of each turn, and the median over pairs of neighbours
-of the share that is lost. Without a graphics processor, the page draws on the same cores as the training. What other
-programs take from these disturbs the rates, so the processor time of the browser, on Linux, is printed beside them.
+Trains with a live view. In turns, a headless Chromium shows an empty page, or opens that of the training anew, for some
+seconds each; a watched turn begins with the opening. Prints the iterations per second of each turn, and the median over
+pairs of neighbours of the share that is lost. Without a graphics processor, the page draws on the same cores as the
+training. What other programs take from these disturbs the rates. So iterations per processor second of the training are
+printed beside them, and the processor time of the browser, on Linux, as a share of the training's.
 
 --smoke requests states and snapshots without a browser.
 """
@@ -36,7 +37,7 @@ from gsplat_edu.viewer.snapshots import Broadcast
 
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SETTLING = GRACE + 3.0
-"""Seconds at the start of a turn that do not count: the page loads, or is forgotten."""
+"""Seconds before a turn without the page, in which it is forgotten."""
 
 
 def browser_seconds() -> float:
@@ -119,25 +120,32 @@ def main() -> None:
         run, view = stack.enter_context(training(words, threading.Event()))
         show = stack.enter_context(page(arguments.smoke))
         rates: list[float] = []
+        per_processor: list[float] = []
         busy: list[float] = []
         for turn in range(turns):
-            show(view.url if turn % 2 else "about:blank")
-            time.sleep(settling)
-            before, began, used = run.trainer.iteration, time.perf_counter(), browser_seconds()
-            time.sleep(seconds)
-            taken = time.perf_counter() - began
+            if turn % 2 == 0:
+                show("about:blank")
+                time.sleep(settling)
+            before, began = run.trainer.iteration, time.perf_counter()
+            used, trained = browser_seconds(), time.process_time()
+            if turn % 2:
+                show(view.url)
+            time.sleep(max(0.0, began + seconds - time.perf_counter()))
+            taken, trained = time.perf_counter() - began, time.process_time() - trained
             rates.append((run.trainer.iteration - before) / taken)
-            busy.append((browser_seconds() - used) / taken)
+            per_processor.append((run.trainer.iteration - before) / trained)
+            busy.append((browser_seconds() - used) / trained)
         count = len(run.trainer.gaussians)
         print(f"{count} Gaussians at the end; the last scene shown is of iteration {view.shown()}")
     pairs = [1.0 - watched / alone for alone, watched in zip(rates[::2], rates[1::2], strict=False) if alone]
     lost = statistics.median(pairs) if pairs else 0.0
-    hardware.report({"rates": rates, "browser": busy, "lost": lost, "count": count}, arguments.out)
-    for name, part in (("alone", rates[::2]), ("watched", rates[1::2])):
-        print(f"{name:>8}: {'  '.join(f'{rate:.2f}' for rate in part)} iterations/s")
-    print(
-        f"  browser: {'  '.join(f'{part:.3f}' for part in busy[1::2])} processor seconds per second, watching"
-    )
+    found = {"rates": rates, "per_processor_second": per_processor, "browser": busy, "lost": lost}
+    hardware.report({**found, "count": count}, arguments.out)
+    for name, first in (("alone", 0), ("watched", 1)):
+        for unit, values in (("s", rates), ("processor second", per_processor)):
+            print(f"{name:>8}: {'  '.join(f'{rate:.2f}' for rate in values[first::2])} iterations/{unit}")
+    shares = "  ".join(f"{100 * part:.1f} %" for part in busy[1::2])
+    print(f" browser: {shares} of the training's processor time, watching")
     print(f"lost by watching: {100 * lost:.1f} % (median of {len(pairs)} pairs)")
 
 

@@ -80,6 +80,8 @@ def run_facts(path: Path) -> dict[str, Any]:
         "capture": None,
         "problem": None,
     }
+    if not any(not child.name.startswith(".") for child in path.iterdir()):
+        return facts  # a training that has not begun
     try:
         config, metrics = folder.read_config(), folder.read_metrics()
     except (CheckpointError, OSError) as error:

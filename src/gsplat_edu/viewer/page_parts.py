@@ -19,6 +19,7 @@ SCRIPTS = (
     "path.js",
     "draw.js",
     "sorter.js",
+    "pace.js",
     "controls.js",
     "panel.js",
     "keyframes.js",

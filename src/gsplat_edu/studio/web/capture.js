@@ -137,10 +137,10 @@ function startForm(store, entry) {
     element,
     update() {
       name.placeholder = freeName(store, "runs", entry.name);
-      if (asked || !store.library) return;
+      if (asked || !store.entry("captures", entry.name)?.layout) return; // that of a new capture comes later
       asked = true;
       // measuring takes seconds of the processor, which a running job needs
-      if (![...store.jobs.values()].some(({ active }) => active) && entry.layout) forecast();
+      if (![...store.jobs.values()].some(({ active }) => active)) forecast();
     },
   };
 }

@@ -7,6 +7,11 @@ const FIRST = 60; // previews at once; more come by a button
 
 const thumbOf = (entry, name, side = 256) => `${at(entry, "thumbs", name)}?side=${side}`;
 
+// A file whose size can be read, but not its pixels.
+function damaged({ target }) {
+  target.replaceWith(h("span", { class: "thumb error" }, "cannot be read"));
+}
+
 // The previews of an entry's photos. findings: Map from a photo's name to the names of what was found.
 export function gallery(entry) {
   const facts = h("p", { class: "quiet" });
@@ -21,7 +26,7 @@ export function gallery(entry) {
       { title: `${name}: ${detail}` },
       problem
         ? h("span", { class: "thumb" }, "cannot be read")
-        : h("img", { src: thumbOf(entry, name), alt: name, loading: "lazy", width: 160, height: 120 }),
+        : h("img", { src: thumbOf(entry, name), alt: name, loading: "lazy", width: 160, height: 120, onerror: damaged }),
       h("span", { class: "name" }, name),
       h("span", { class: problem ? "error" : "quiet" }, detail),
       h("span", { class: "mark" }),
@@ -59,7 +64,8 @@ export function gallery(entry) {
       if (all.length > 3) parts.push(`${all.length - 3} other sizes`);
       const bad = photos.filter(({ problem }) => problem).length;
       if (bad) parts.push(`${bad} cannot be read`);
-      facts.textContent = photos.length ? [count(photos.length, "photo"), ...parts].join(" · ") : "";
+      const none = now.videos ? "The next step takes sharp frames of the video as photos." : "";
+      facts.textContent = photos.length ? [count(photos.length, "photo"), ...parts].join(" · ") : none;
       show();
     },
   };

@@ -100,8 +100,9 @@ class Batch {
 
   refuse(name, error) {
     this.refused += 1;
-    // the server's line often begins with what it is about
-    this.errors.append(h("li", { class: "error" }, h("strong", {}, name), ": ", error.message));
+    const repeated = `file: '${name}' `; // some of the server's lines begin so
+    const what = error.message.startsWith(repeated) ? error.message.slice(repeated.length) : error.message;
+    this.errors.append(h("li", { class: "error" }, h("strong", {}, name), ": ", what));
   }
 
   async one({ file, path }) {

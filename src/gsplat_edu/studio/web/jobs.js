@@ -89,7 +89,7 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     if (known || !found.active) [bar.max, bar.value] = known ? [progress.total, progress.done] : [1, ended ? 1 : 0];
     else if (job.state === "running") bar.removeAttribute("value");
     else bar.value = 0;
-    left.textContent = known && found.active ? leftOf(progress) : "";
+    left.textContent = known && found.active ? leftOf(progress, found.stages.length > 1) : "";
     said.textContent = found.active ? (messages.at(-1) ?? "") : "";
     line.classList.toggle("error", job.state !== "cancelled"); // stopping is no error
     if (job.line) put(line, job.line);
@@ -104,9 +104,10 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
   return { element, update, id };
 }
 
-function leftOf({ done, total, seconds_left: left }) {
+// Progress is that of the present stage.
+function leftOf({ done, total, seconds_left: left }, isStage) {
   const share = `${Math.floor((100 * done) / total)} %`;
-  return left === null || left === undefined ? share : `${share}, ${duration(left)} left`;
+  return left === null || left === undefined ? share : `${share}, ${duration(left)} left${isStage ? " in this step" : ""}`;
 }
 
 // The newest job about an entry; the card is replaced when another job begins.

@@ -25,7 +25,7 @@ export function factsOf(entry) {
   if (kind === "scenes") return [entry.file ? entry.file.split(".").at(-1) : "no scene file", bytes(entry.scene_bytes)];
   const done = entry.iterations ?? 0;
   return [
-    entry.finished ? `${whole(done)} iterations` : `${whole(done)} of ${entry.planned ? whole(entry.planned) : "?"} iterations`,
+    entry.finished ? `${whole(done)} iterations` : entry.planned ? `${whole(done)} of ${whole(entry.planned)} iterations` : "no iterations yet",
     entry.psnr === null ? "" : decibels(entry.psnr),
     entry.num_gaussians ? `${whole(entry.num_gaussians)} splats` : "",
     entry.edited ? "edited" : "",

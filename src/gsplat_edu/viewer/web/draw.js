@@ -5,7 +5,12 @@
 "use strict";
 
 const SOLID = 0.15; // smallest half of the opacity of a pixel that shows a surface
+const BATCH_SPLATS = 4096; // splats per instance: one each would cost a software rasteriser 20 µs per splat
 const SURFACE_STEPS = 10; // bisections of log depth, starting from a factor of 2: accurate to 0.07 %
+
+const POLL = 4; // milliseconds between two looks whether a picture is drawn
+const QUAD = [0, 1, 2, 2, 1, 3]; // corners of the two triangles
+const ORDER = { type: Uint32Array, channels: 1, texels: 1 }; // splats, far to near
 
 class Renderer {
   constructor(canvas, splats, facts) {
@@ -23,6 +28,8 @@ class Renderer {
     this.textures = layout(facts).map((part) => this.uploaded(part, splats[part.name]));
     this.next = null; // splats that wait for their order
     this.image = null;
+    this.begun = 0; // images
+    this.thinning = 0;
     this.framebuffer = gl.createFramebuffer();
     this.setUpOrder();
     if (gl.getError() !== gl.NO_ERROR) throw new Error("This scene does not fit into the graphics processor's memory.");
@@ -37,6 +44,7 @@ class Renderer {
       [`${Int16Array.name}4`]: [gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT],
       [`${Uint16Array.name}3`]: [gl.RGB16F, gl.RGB, gl.HALF_FLOAT],
       [`${Uint16Array.name}1`]: [gl.R16F, gl.RED, gl.HALF_FLOAT],
+      [`${Uint32Array.name}1`]: [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT],
     }[`${type.name}${channels}`];
   }
 
@@ -73,49 +81,55 @@ class Renderer {
     this.textures.forEach((texture) => gl.deleteTexture(texture));
     ({ facts: this.facts, textures: this.textures } = this.next);
     this.next = null;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.facts.count, gl.DYNAMIC_DRAW);
+    gl.deleteTexture(this.order);
+    this.order = this.uploaded(ORDER, null);
   }
 
-  // Copies an array into a texture, row by row.
-  uploaded({ channels, texels, type }, values, count = this.facts.count) {
+  // Makes a texture of an array; without one, write() or fill() fills it later.
+  uploaded(part, values, count = this.facts.count) {
     const gl = this.gl;
-    const [stored, format, kind] = this.kind(type, channels);
+    const [stored] = this.kind(part.type, part.channels);
     const width = this.textureWidth;
-    const used = count * texels;
-    const height = Math.max(1, Math.ceil(used / width));
+    const height = Math.max(1, Math.ceil((count * part.texels) / width));
     if (height > width) throw new Error("This scene has more splats than this graphics processor's textures can hold.");
     const texture = nearestTexture(gl);
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     gl.texStorage2D(gl.TEXTURE_2D, 1, stored, width, height);
-    const full = Math.floor(used / width);
-    const rest = used % width;
-    const split = full * width * channels;
-    if (!values) return texture; // filled by write()
-    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, full, format, kind, values.subarray(0, split));
-    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, kind, values.subarray(split));
+    if (values) this.fill(texture, part, values);
     return texture;
   }
 
-  // The order is an attribute that advances by one per splat.
+  // Copies an array to the beginning of a texture, row by row.
+  fill(texture, { channels, type }, values) {
+    const gl = this.gl;
+    const [, format, kind] = this.kind(type, channels);
+    const width = this.textureWidth;
+    const full = Math.floor(values.length / channels / width);
+    const rest = values.length / channels - full * width;
+    const split = full * width * channels;
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, full, format, kind, values.subarray(0, split));
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, kind, values.subarray(split));
+  }
+
+  // Two triangles for each splat of a batch; the shader finds the splat in a texture.
   setUpOrder() {
     const gl = this.gl;
+    this.order = this.uploaded(ORDER, null);
     this.vertices = gl.createVertexArray();
-    this.orderBuffer = gl.createBuffer();
     gl.bindVertexArray(this.vertices);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.facts.count, gl.DYNAMIC_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    const corners = Uint16Array.from({ length: 6 * BATCH_SPLATS }, (_, i) => 4 * Math.floor(i / 6) + QUAD[i % 6]);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
   }
 
-  setOrder(order) {
-    const gl = this.gl;
+  // Sets what is drawn: these splats, far to near. Of a sample, `thinning` is above 0.
+  setOrder(order, thinning = 0) {
+    this.thinning = thinning;
     if (this.next) this.adopt();
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
+    this.fill(this.order, ORDER, order);
     this.count = order.length;
   }
 
@@ -134,17 +148,33 @@ class Renderer {
   // Draws the splats up to a camera depth in the current order: image = alpha colour + (1 - alpha) image, starting with
   // the background.
   draw(camera, settings, background = [...settings.background, 1], farthest = 3e38) {
+    this.begin(camera, background);
+    this.drawPart(camera, settings, 0, this.count, farthest);
+  }
+
+  // Begins an image; returns what tells whether another one has been begun since.
+  begin(camera, background) {
     const gl = this.gl;
     this.resize(camera.W, camera.H);
-    gl.viewport(0, 0, camera.W, camera.H);
     gl.clearBufferfv(gl.COLOR, 0, background);
+    return ++this.begun;
+  }
+
+  // Draws splats from one place in the order to another.
+  drawPart(camera, settings, from, to, farthest = 3e38) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.viewport(0, 0, camera.W, camera.H);
     gl.useProgram(this.program);
     this.setUniforms(camera, settings);
     gl.uniform1f(gl.getUniformLocation(this.program, "farthest"), farthest);
+    gl.uniform1i(gl.getUniformLocation(this.program, "first"), from);
+    gl.uniform1i(gl.getUniformLocation(this.program, "end"), to);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.vertices);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    const [splats, batches] = [Math.min(to - from, BATCH_SPLATS), Math.ceil((to - from) / BATCH_SPLATS)];
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * splats, gl.UNSIGNED_SHORT, 0, batches);
     gl.bindVertexArray(null);
   }
 
@@ -156,6 +186,11 @@ class Renderer {
       gl.bindTexture(gl.TEXTURE_2D, this.textures[unit]);
       gl.uniform1i(place(name), unit);
     });
+    gl.activeTexture(gl.TEXTURE0 + this.textures.length);
+    gl.bindTexture(gl.TEXTURE_2D, this.order);
+    gl.uniform1i(place("order"), this.textures.length);
+    gl.uniform1i(place("batch_splats"), BATCH_SPLATS);
+    gl.uniform1f(place("thinning"), this.thinning);
     const { low, high } = ratioBounds(camera, settings.jacobian_limit);
     gl.uniform1i(place("texture_width"), this.textureWidth);
     gl.uniform1i(place("coefficients"), (this.facts.sh_degree + 1) ** 2);
@@ -197,15 +232,38 @@ class Renderer {
     return half >= SOLID ? high : null;
   }
 
-  // Copies the image onto the canvas.
+  // Copies the image onto the canvas, enlarged if the canvas is larger.
   show() {
     const gl = this.gl;
+    const { width, height } = gl.canvas;
+    const enlarged = width !== this.width || height !== this.height;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
     gl.disable(gl.BLEND);
     gl.useProgram(this.screen);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.image);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, enlarged ? gl.LINEAR : gl.NEAREST);
+    gl.uniform1i(gl.getUniformLocation(this.screen, "enlarged"), enlarged ? 1 : 0);
+    gl.uniform2f(gl.getUniformLocation(this.screen, "size"), width, height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Resolves with the milliseconds until what was asked for so far is drawn; the page stays awake meanwhile.
+  drawn() {
+    const gl = this.gl;
+    const began = performance.now();
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return new Promise((resolve) => {
+      const look = () => {
+        const done = gl.isContextLost() || gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.SIGNALED;
+        if (!done) return void setTimeout(look, POLL);
+        gl.deleteSync(fence);
+        resolve(performance.now() - began);
+      };
+      setTimeout(look, 0);
+    });
   }
 
   // Waits until everything is drawn.

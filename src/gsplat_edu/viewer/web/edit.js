@@ -45,9 +45,9 @@ class Editor {
   // Draws the overlay after each picture, and hears of changes of the camera path.
   follow() {
     const { viewer } = this;
-    const draw = viewer.draw.bind(viewer);
-    viewer.draw = (camera) => {
-      draw(camera);
+    const put = viewer.put.bind(viewer);
+    viewer.put = (camera) => {
+      put(camera);
       this.drawOverlay(camera);
     };
     viewer.depthAt = (camera, column, row) => this.tools.depthAt(camera, column, row);
@@ -122,7 +122,7 @@ class Editor {
     this.panel.list();
     this.panel.saved(this.text() === this.stored ? "" : "not saved");
     this.changed();
-    this.viewer.askFrame();
+    this.viewer.refresh();
   }
 
   // Brings the page's up direction, start view and path to where the operations have them.

@@ -10,7 +10,7 @@ class FlagTexture {
     const gl = renderer.gl;
     this.renderer = renderer;
     this.width = renderer.textureWidth;
-    this.unit = layout(renderer.facts).length;
+    this.unit = renderer.textures.length + 1; // behind the order
     gl.activeTexture(gl.TEXTURE0 + this.unit);
     this.texture = nearestTexture(gl);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R8UI, this.width, Math.max(1, Math.ceil(renderer.facts.count / this.width)));

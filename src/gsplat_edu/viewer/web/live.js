@@ -3,9 +3,9 @@
 
 // Drawing other splats takes this computer's time, which the training needs as well. So the page waits this many times
 // as long as it worked before it asks for the next ones.
-const REST_FACTOR = 30;
+const REST_FACTOR = 20;
 const SHORTEST_REST = 500; // milliseconds
-const LONGEST_REST = 90000;
+const LONGEST_REST = 30000;
 const PHOTOS_VARY = 0.25; // weight of the newest photo in the curves of its loss and PSNR
 const TRIES = 4; // to reach the server again before the page gives up
 const TRY_EVERY = 1000; // milliseconds
@@ -29,6 +29,7 @@ class Live {
   constructor(viewer, { step }) {
     Object.assign(this, { viewer, state: null, over: false, wake: () => {} });
     this.draws = viewer.renderer instanceof Renderer;
+    viewer.isTraining = this.draws; // until a state tells otherwise
     this.build();
     this.step.hidden = !step;
     history.replaceState(null, "", location.pathname); // without the token
@@ -87,6 +88,7 @@ class Live {
       }
     }
     this.over = true;
+    this.spare(false);
     this.wake();
     this.title.textContent = "ended";
     this.pause.disabled = this.step.disabled = true;
@@ -105,6 +107,7 @@ class Live {
     this.pause.textContent = state.state === "paused" ? "resume" : "pause";
     this.pause.disabled = this.step.disabled = !["training", "paused"].includes(state.state);
     const still = ["paused", "finished"].includes(state.state);
+    this.spare(!still);
     if (state.failure || this.draws) this.noted(state.failure);
     if (still) this.wake();
     if (this.draws) return;
@@ -113,6 +116,14 @@ class Live {
     if (this.viewer.renderer.failure) this.noted(this.viewer.renderer.failure);
     if (iteration !== this.pictured) this.viewer.askFrame();
     this.pictured = iteration;
+  }
+
+  // While the training needs the processor, a slow page draws less; afterwards, it completes its picture.
+  spare(isTraining) {
+    const { viewer } = this;
+    const before = viewer.isTraining;
+    viewer.isTraining = isTraining;
+    if (before && !isTraining && viewer.pace.slow) viewer.askFrame();
   }
 
   // Draws the newest splats until the server is gone.
@@ -132,12 +143,11 @@ class Live {
       const { header, splats } = unframed(buffer);
       await this.viewer.replace({ count: header.count, sh_degree: header.sh_degree }, splats);
       this.viewer.renderer.finish();
-      const isFirst = iteration < 0; // the server may have had it ready for a while
       iteration = header.iteration;
-      if (isFirst) say("");
+      say("");
       element("count").textContent += ` after ${whole(iteration)} iterations`;
       const spent = performance.now() - began;
-      if (!isFirst) await this.rest(Math.min(LONGEST_REST, Math.max(SHORTEST_REST, REST_FACTOR * spent)));
+      await this.rest(Math.min(LONGEST_REST, Math.max(SHORTEST_REST, REST_FACTOR * spent)));
     }
   }
 

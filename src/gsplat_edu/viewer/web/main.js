@@ -12,12 +12,18 @@ class Viewer {
     this.settings = { ...facts.settings };
     this.canvas = element("canvas");
     this.renderer = this.makeRenderer(splats);
-    this.sorter = new Sorter(splats.means, facts.near, (order) => this.renderer.setOrder(order));
+    this.sorter = new Sorter(splats, facts.near, (order, thinning) => this.renderer.setOrder(order, thinning));
     const eyes = facts.cameras.filter(({ saved }) => !saved).map(({ eye }) => eye);
     this.view = new View(facts.start, eyes);
     this.cameraIndex = facts.start.index;
     this.exact = null; // the camera given to setCamera, until the user moves
     this.lost = false;
+    this.pace = new Pace();
+    this.movedAt = -Infinity;
+    this.gauged = false;
+    this.isTraining = false; // the scene, on this computer
+    this.isWhole = false; // whether the screen shows the current view with all splats at full resolution
+    this.catching = this.outdated = this.timing = false; // see catchUp() and measure()
     this.frameAsked = 0;
     this.lastFrame = 0; // 0 while the view is still
     this.smoothed = 0; // seconds per frame
@@ -28,7 +34,7 @@ class Viewer {
     this.controls = new Controls(this.canvas, this.view, actions);
     this.panel.mark(this.cameraIndex);
     this.levels?.attach(this.renderer, this.sorter);
-    addEventListener("resize", () => this.askFrame());
+    addEventListener("resize", () => this.refresh());
     this.canvas.addEventListener("webglcontextlost", () => this.lose());
     this.askFrame();
   }
@@ -58,7 +64,7 @@ class Viewer {
       pathChanged: () => this.stop(),
       degree: (degree) => {
         this.settings.sh_degree = degree;
-        this.askFrame();
+        this.refresh();
       },
     };
   }
@@ -85,14 +91,33 @@ class Viewer {
     await this.levels?.load(camera);
     await this.sorter.sort(camera);
     this.draw(camera);
+    this.isWhole = true;
+  }
+
+  // Finds out how fast this computer draws the scene, by a coarse picture of it.
+  async gauge() {
+    const { count } = (this.renderer.next ?? this.renderer).facts;
+    const least = DETAILS.at(-1);
+    if (this.gauged || count <= least.most) return;
+    this.gauged = true;
+    const camera = this.camera();
+    await this.sorter.sort(camera, least.most);
+    const times = [1, 2].slice(this.isTraining ? 1 : 0).map(() => {
+      const began = performance.now();
+      this.coarse(camera, least);
+      this.renderer.finish();
+      return performance.now() - began;
+    }); // the first one compiles the shaders as well; during a training, drawSparing() corrects that
+    this.pace.expect(times.at(-1), least, count);
   }
 
   // Shows other splats in place of all: of this number and degree. Resolves once they are drawn.
   async replace(facts, splats) {
     const all = { ...this.facts, ...facts };
-    await this.sorter.replace(splats.means, () => this.renderer.replace(all, splats));
+    await this.sorter.replace(splats, () => this.renderer.replace(all, splats));
     this.panel.counted(all.count);
-    await this.settled();
+    await this.gauge();
+    await (this.pace.slow ? this.followed() : this.settled());
   }
 
   // Other splats are shown now.
@@ -107,9 +132,10 @@ class Viewer {
   }
 
   // Makes the visible surface at a window position (CSS pixels) the pivot; no change if nothing is visible there.
-  orbitAround(x, y) {
+  async orbitAround(x, y) {
     this.stop();
     const camera = this.camera();
+    if (this.pace.slow) await this.sorter.sort(camera, this.pace.detail.most); // the search draws many times
     const { left, top, width, height } = this.canvas.getBoundingClientRect();
     const column = Math.min(camera.W - 1, Math.max(0, Math.floor(((x - left) / width) * camera.W)));
     const row = Math.min(camera.H - 1, Math.max(0, Math.floor(((y - top) / height) * camera.H)));
@@ -164,8 +190,15 @@ class Viewer {
   moved(cameraIndex) {
     this.stop();
     this.exact = null;
+    this.movedAt = performance.now();
     this.cameraIndex = cameraIndex;
     this.panel.mark(cameraIndex);
+    this.askFrame();
+  }
+
+  // What is seen from here has changed. A slow page shows that in a coarse picture first, as if the view had moved.
+  refresh() {
+    this.movedAt = performance.now();
     this.askFrame();
   }
 
@@ -179,18 +212,130 @@ class Viewer {
     if (this.controls.advance(Math.min(seconds, LONGEST_STEP))) this.moved(-1);
     if (this.journey) this.follow(now);
     const camera = this.camera();
-    this.draw(camera);
     this.levels?.load(camera).catch((error) => this.levels.fail(error));
+    this.isWhole = false;
+    if (this.pace.slow) {
+      this.lastFrame = now; // for held keys
+      clearTimeout(this.rest);
+      this.outdated = true;
+      this.catchUp().catch(fail);
+      return;
+    }
+    this.draw(camera);
+    this.measure();
     if (!this.sorter.running && !this.sorter.fits(camera)) this.sorter.sort(camera).then(() => this.askFrame(), fail);
+    this.isWhole = this.sorter.fits(camera);
+    if (this.isWhole) this.onRest?.();
     this.time(now, seconds);
   }
 
   draw(camera) {
     if (this.lost) return;
+    this.renderer.draw(camera, this.settings);
+    this.put(camera);
+  }
+
+  // Shows what is drawn as the picture of a camera.
+  put(camera) {
     if (this.canvas.width !== camera.W) this.canvas.width = camera.W;
     if (this.canvas.height !== camera.H) this.canvas.height = camera.H;
-    this.renderer.draw(camera, this.settings);
     this.renderer.show();
+  }
+
+  // Draws with less detail.
+  coarse(camera, { share }) {
+    if (this.lost) return;
+    this.renderer.draw(reduced(camera, share), this.settings);
+    this.put(camera);
+  }
+
+  // Notes how long a whole picture takes.
+  async measure() {
+    if (this.timing || !this.renderer.drawn) return;
+    this.timing = true;
+    const taken = await this.renderer.drawn();
+    this.timing = false;
+    if (document.hidden || this.lost) return;
+    this.pace.took(taken, this.renderer.count);
+    if (this.pace.slow) this.askFrame();
+  }
+
+  // Draws pictures until the newest is shown: coarse ones while the view moves, then the whole one.
+  async catchUp() {
+    if (this.catching) return;
+    this.catching = true;
+    try {
+      while (this.outdated && !this.lost) {
+        this.outdated = false;
+        if (this.isMoving()) await this.drawCoarse();
+        else if (this.isTraining) await this.drawSparing();
+        else if (!(await this.drawWhole())) this.outdated = true;
+      }
+    } finally {
+      this.catching = false;
+    }
+  }
+
+  isMoving() {
+    return this.journey !== null || this.controls.held.size > 0 || performance.now() - this.movedAt < STILL;
+  }
+
+  async drawCoarse() {
+    const { detail } = this.pace;
+    const began = performance.now();
+    const camera = this.camera();
+    await this.sorter.sort(camera, detail.most);
+    this.coarse(camera, detail);
+    this.pace.took(await this.renderer.drawn(), this.renderer.facts.count);
+    this.panel.coarse(1000 / (performance.now() - began));
+    clearTimeout(this.rest);
+    this.rest = setTimeout(() => this.askFrame(), STILL);
+  }
+
+  // The picture while a training needs the processor.
+  async drawSparing() {
+    const camera = this.camera();
+    await this.sorter.sort(camera, SPARING.most);
+    this.coarse(camera, SPARING);
+    this.pace.expect(await this.renderer.drawn(), SPARING, this.renderer.facts.count);
+    if (this.pace.slow) this.rested(false);
+    else this.askFrame();
+  }
+
+  // Draws everything in parts, which a movement interrupts. The screen keeps its picture until all are drawn. Returns
+  // whether they are.
+  async drawWhole() {
+    const { renderer } = this;
+    const camera = this.camera();
+    this.panel.completing();
+    await this.sorter.sort(camera);
+    const begun = renderer.begin(camera, [...this.settings.background, 1]);
+    for (let from = 0; from < renderer.count; ) {
+      const to = Math.min(from + this.pace.part, renderer.count);
+      renderer.drawPart(camera, this.settings, from, to);
+      this.pace.partTook(await renderer.drawn());
+      if (this.lost || this.outdated || renderer.begun !== begun) return false;
+      from = to;
+    }
+    this.put(camera);
+    this.rested(true);
+    return true;
+  }
+
+  // A picture of the still view is on the screen.
+  rested(isWhole) {
+    this.isWhole = isWhole;
+    this.lastFrame = 0;
+    this.panel.atRest();
+    this.onRest?.();
+  }
+
+  // Resolves once a picture of the still view is on the screen.
+  followed() {
+    return new Promise((resolve) => {
+      this.onRest = resolve;
+      this.askFrame();
+    });
   }
 
   // Frames are drawn only while something moves; otherwise there is no frame rate.
@@ -220,7 +365,11 @@ async function start() {
   const splats = FACTS.lod ? null : await unpackSplats(FACTS);
   const viewer = splats ? new Viewer(FACTS, splats) : streamed(FACTS);
   if (viewer.levels) await viewer.sorter.sort(viewer.camera()); // the first picture comes before the last splat
-  else await viewer.settled();
+  else {
+    await viewer.gauge();
+    if (viewer.pace.slow) viewer.askFrame(); // the coarse picture is the first one
+    else await viewer.settled();
+  }
   window.viewer = viewer;
   if (!viewer.levels?.regions.some(({ levels }) => levels.length)) say("");
   dispatchEvent(new CustomEvent("viewer", { detail: { viewer, splats } })); // for further parts of the page

@@ -100,6 +100,16 @@ class Panel {
     element("rate").textContent = `${framesPerSecond.toFixed(0)} frames/s`;
   }
 
+  // The view moves, and less than everything is drawn.
+  coarse(framesPerSecond) {
+    element("rate").textContent = `${framesPerSecond.toFixed(0)} frames/s, coarse`;
+  }
+
+  // The view is still, and everything is being drawn.
+  completing() {
+    element("rate").textContent = "drawing all ...";
+  }
+
   // Nothing is drawn while the view is still, so there is no frame rate.
   atRest() {
     element("rate").textContent = "";

@@ -1,11 +1,15 @@
-// Copies the finished image to the canvas, which rounds it to bytes.
+// Copies the finished image to the canvas, which rounds it to bytes; enlarges a smaller one.
 
 precision highp float;
 
 uniform highp sampler2D image;
+uniform bool enlarged;
+uniform vec2 size;  // of the canvas
 
 out vec4 color;
 
 void main() {
-    color = vec4(clamp(texelFetch(image, ivec2(gl_FragCoord.xy), 0).rgb, 0.0, 1.0), 1.0);
+    vec3 light = enlarged ? textureLod(image, gl_FragCoord.xy / size, 0.0).rgb
+                          : texelFetch(image, ivec2(gl_FragCoord.xy), 0).rgb;
+    color = vec4(clamp(light, 0.0, 1.0), 1.0);
 }

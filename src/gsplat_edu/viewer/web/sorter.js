@@ -3,8 +3,8 @@
 "use strict";
 
 class Sorter {
-  // onOrder(order) is called after each sort, before the next one takes the buffer away.
-  constructor(means, near, onOrder) {
+  // onOrder(order, thinning) is called after each sort, before the next one takes the buffer away.
+  constructor(splats, near, onOrder) {
     const source = document.getElementById("sort-worker").textContent;
     const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
     this.worker = new Worker(url);
@@ -14,26 +14,33 @@ class Sorter {
     this.sorted = "";
     this.version = 0; // of the means
     this.camera = null; // of the last sort
-    this.give(means);
+    this.give(splats);
   }
 
-  give(means) {
+  // Gives the worker copies, which it keeps. Without scales and opacities, it ranks no splats.
+  give({ means, log_scales, logit_opacities }) {
     this.order = new ArrayBuffer((means.length / 3) * Uint32Array.BYTES_PER_ELEMENT);
-    const copy = means.slice(); // transferred to the worker, which keeps it
-    this.worker.postMessage({ means: copy, near: this.near }, [copy.buffer]);
+    const copies = [means, log_scales, logit_opacities].map((array) => array?.slice() ?? null);
+    const buffers = copies.filter((copy) => copy).map((copy) => copy.buffer);
+    this.worker.postMessage({ splats: copies, near: this.near }, buffers);
+    this.ranks = Boolean(log_scales && logit_opacities);
   }
 
-  // Takes other means, in place of all. prepare() is called before; the next order is of these means.
-  async replace(means, prepare) {
+  // Takes other splats, in place of all. prepare() is called before; the next order is of these.
+  async replace(splats, prepare) {
     while (this.running) await this.running;
     prepare();
     ++this.version;
-    this.give(means);
+    this.give(splats);
   }
 
-  // Whether the current order was made for this camera.
-  fits(camera) {
-    return this.sorted === this.version + Sorter.key(camera);
+  // Whether the current order was made for this camera, and of a sample of so many splats.
+  fits(camera, most = Infinity) {
+    return this.sorted === this.key(camera, most);
+  }
+
+  key(camera, most) {
+    return `${this.version} ${this.ranks ? most : Infinity} ${Sorter.key(camera)}`;
   }
 
   // An order depends only on depth.
@@ -57,22 +64,24 @@ class Sorter {
     if (this.camera) await this.sort(this.camera);
   }
 
-  async sort(camera) {
+  // Sorts the splats for a camera: all, or a sample of so many, see sort_worker.js.
+  async sort(camera, most = Infinity) {
     while (this.running) await this.running;
-    if (this.fits(camera)) return;
+    if (this.fits(camera, most)) return;
     this.camera = camera;
-    const key = this.version + Sorter.key(camera);
+    const key = this.key(camera, most);
     this.running = new Promise((resolve, reject) => {
       this.worker.onerror = () => reject(new Error("The sorting thread failed; reload the page."));
       this.worker.onmessage = ({ data }) => {
         this.order = data.order;
         this.sorted = key;
         this.running = null;
-        this.onOrder(new Uint32Array(data.order, 0, data.count));
+        this.onOrder(new Uint32Array(data.order, 0, data.count), data.thinning);
         resolve();
       };
     });
-    this.worker.postMessage({ axis: camera.R[2], eye: camera.eye, order: this.order }, [this.order]);
+    const wanted = this.ranks ? most : Infinity;
+    this.worker.postMessage({ axis: camera.R[2], eye: camera.eye, order: this.order, most: wanted }, [this.order]);
     await this.running;
   }
 }

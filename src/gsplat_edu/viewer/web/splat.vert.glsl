@@ -10,6 +10,11 @@ uniform highp sampler2D log_scales;
 uniform highp isampler2D quats;
 uniform highp sampler2D logit_opacities;
 uniform highp sampler2D sh;
+uniform highp usampler2D order;  // splats, far to near
+uniform int first;               // place in the order of the first one that is drawn
+uniform int end;                 // place behind the last one
+uniform int batch_splats;        // per instance
+uniform float thinning;          // of a sample of the splats, see sort_worker.js; 0 if all are drawn
 #ifdef EDITING
 uniform highp usampler2D flags;  // 0, 1: selected; above: hidden or deleted
 uniform vec3 highlight;          // colour of selected splats
@@ -28,8 +33,6 @@ uniform vec2 ratio_high;
 uniform bool antialiased;
 uniform float farthest;  // largest camera depth that is drawn
 
-layout(location = 0) in uint splat;
-
 flat out vec2 mean2d;  // px
 flat out vec3 conic;   // (A, B, C) of A dx² + 2 B dx dy + C dy²
 flat out vec4 paint;   // colour and opacity
@@ -37,6 +40,8 @@ flat out vec4 paint;   // colour and opacity
 // The rasteriser snaps corners to a grid of 1/16 px or finer; the margin keeps it from losing pixels at the rim. Pixels
 // outside the ellipse are discarded anyway.
 const float SLACK = 0.125;
+
+const float MOST_ENLARGED = 6.0;
 
 ivec2 texel(int i) {
     return ivec2(i % texture_width, i / texture_width);
@@ -49,24 +54,31 @@ mat3 rotation(vec4 q) {
                 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));  // columns
 }
 
-vec3 coefficient(int k) {
-    return texelFetch(sh, texel(int(splat) * coefficients + k), 0).rgb;
+vec3 coefficient(int splat, int k) {
+    return texelFetch(sh, texel(splat * coefficients + k), 0).rgb;
 }
 
-vec3 color(vec3 d) {
-    vec3 sum = C0 * coefficient(0) + SH_OFFSET;
+vec3 color(int splat, vec3 d) {
+    vec3 sum = C0 * coefficient(splat, 0) + SH_OFFSET;
     if (degree < 1) return sum;
     float x = d.x, y = d.y, z = d.z;
-    sum += C1 * (-y * coefficient(1) + z * coefficient(2) - x * coefficient(3));
+    sum += C1 * (-y * coefficient(splat, 1) + z * coefficient(splat, 2) - x * coefficient(splat, 3));
     if (degree < 2) return sum;
     float xx = x * x, yy = y * y, zz = z * z;
-    sum += C2[0] * x * y * coefficient(4) + C2[1] * y * z * coefficient(5) + C2[3] * x * z * coefficient(7);
-    sum += C2[2] * (2.0 * zz - xx - yy) * coefficient(6) + C2[4] * (xx - yy) * coefficient(8);
+    sum += C2[0] * x * y * coefficient(splat, 4) + C2[1] * y * z * coefficient(splat, 5) + C2[3] * x * z * coefficient(splat, 7);
+    sum += C2[2] * (2.0 * zz - xx - yy) * coefficient(splat, 6) + C2[4] * (xx - yy) * coefficient(splat, 8);
     if (degree < 3) return sum;
-    sum += C3[0] * y * (3.0 * xx - yy) * coefficient(9) + C3[6] * x * (xx - 3.0 * yy) * coefficient(15);
-    sum += C3[1] * x * y * z * coefficient(10) + C3[5] * z * (xx - yy) * coefficient(14);
-    sum += (4.0 * zz - xx - yy) * (C3[2] * y * coefficient(11) + C3[4] * x * coefficient(13));
-    return sum + C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(12);
+    sum += C3[0] * y * (3.0 * xx - yy) * coefficient(splat, 9) + C3[6] * x * (xx - 3.0 * yy) * coefficient(splat, 15);
+    sum += C3[1] * x * y * z * coefficient(splat, 10) + C3[5] * z * (xx - yy) * coefficient(splat, 14);
+    sum += (4.0 * zz - xx - yy) * (C3[2] * y * coefficient(splat, 11) + C3[4] * x * coefficient(splat, 13));
+    return sum + C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(splat, 12);
+}
+
+// By how much a splat of a sample is enlarged, to cover for others; a little less than they covered, as these overlap.
+float enlarged(vec3 scales, float logit) {
+    float area = scales.x * scales.y * scales.z / min(scales.x, min(scales.y, scales.z));
+    float chance = min(1.0, thinning * sqrt(area / (1.0 + exp(-logit))));
+    return min(MOST_ENLARGED, pow(chance, -0.4));
 }
 
 // Half the extent of the ellipse d' Sigma2d^-1 d = level along a direction.
@@ -78,7 +90,10 @@ float reach(vec2 direction, float a, float b, float c, float level) {
 
 void main() {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside the clip volume unless the splat is visible
-    ivec2 place = texel(int(splat));
+    int rank = first + gl_InstanceID * batch_splats + gl_VertexID / 4;
+    if (rank >= end) return;
+    int splat = int(texelFetch(order, texel(rank), 0).r);
+    ivec2 place = texel(splat);
 #ifdef EDITING
     uint flag = texelFetch(flags, place, 0).r;
     if (flag > 1u) return;
@@ -92,6 +107,7 @@ void main() {
     if (length2 == 0.0) return;
     mat3 RS = rotation(q / sqrt(length2));
     vec3 scales = exp(texelFetch(log_scales, place, 0).xyz);
+    if (thinning > 0.0) scales *= enlarged(scales, texelFetch(logit_opacities, place, 0).r);
     RS[0] *= scales.x, RS[1] *= scales.y, RS[2] *= scales.z;
 
     vec2 ratio = clamp(p.xy / p.z, ratio_low, ratio_high);
@@ -113,7 +129,7 @@ void main() {
     vec2 half_box = sqrt(level * vec2(a, c));
     if (any(lessThan(mean2d + half_box, vec2(-1.0))) || any(greaterThan(mean2d - half_box, size))) return;
 
-    vec3 seen = color(offset / sqrt(dot(offset, offset)));
+    vec3 seen = color(splat, offset / sqrt(dot(offset, offset)));
     if (!(all(lessThanEqual(abs(seen), vec3(COLOR_LIMIT))))) return;
     paint = vec4(max(seen, 0.0), opacity);
 #ifdef EDITING
@@ -127,7 +143,7 @@ void main() {
     vec2 axis = a > c ? vec2(0.5 * (a - c) + root, b) : vec2(b, 0.5 * (c - a) + root);
     axis = root > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
     vec2 across = vec2(-axis.y, axis.x);
-    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+    vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
     vec2 pixel = mean2d + corner.x * reach(axis, a, b, c, level) * axis;
     pixel += corner.y * reach(across, a, b, c, level) * across;
     vec2 device = 2.0 * (pixel + 0.5) / size - 1.0;  // the centre of pixel (0, 0) is half a pixel inside the corner
