@@ -10,6 +10,7 @@ import importlib
 import json
 import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -31,6 +32,7 @@ binaries = importlib.import_module("wheels.binaries")
 checks = importlib.import_module("wheels.checks")
 nanobind_parts = importlib.import_module("wheels.contents").nanobind_parts
 pack = importlib.import_module("wheels.pack").pack
+repeat = importlib.import_module("wheels.repeat")
 
 FAST_TESTS = (
     *("tests/test_camera.py", "tests/io/test_ply.py"),
@@ -152,6 +154,41 @@ def test_the_same_content_makes_the_same_wheel(wheel, module, tmp_path):
     )
     assert again.name == wheel.name
     assert hashlib.sha256(again.read_bytes()).hexdigest() == hashlib.sha256(wheel.read_bytes()).hexdigest()
+
+
+def compiled(folder):
+    """Compile some files of the module, of the kernels and of the rest, from a copy of the checkout."""
+    shutil.copytree(ROOT / "native", folder / "native")
+    shutil.copyfile(ROOT / "CMakeLists.txt", folder / "CMakeLists.txt")
+    tools = Path(sys.executable).parent
+    options = [f"-DPython_EXECUTABLE={sys.executable}", f"-DCMAKE_MAKE_PROGRAM={tools / 'ninja'}"]
+    words = [tools / "cmake", "-S", folder, "-B", folder / "build", "-G", "Ninja", *options]
+    subprocess.run(words, check=True, capture_output=True)
+    kernels = re.findall(r"kernels_\w+", (folder / "build" / "build.ninja").read_text())[0]
+    objects = [f"CMakeFiles/{kernels}.dir/native/{name}.cpp.o" for name in ("adam", "table")]
+    objects += [f"CMakeFiles/_native.dir/native/{name}.cpp.o" for name in ("dispatch", "system")]
+    subprocess.run([tools / "ninja", "-C", folder / "build", *objects], check=True, capture_output=True)
+    return {name: (folder / "build" / name).read_bytes() for name in objects}
+
+
+def test_the_compiler_gives_the_same_bytes_in_every_folder(tmp_path):
+    """Of the whole module, make wheels REPEAT=1 shows the same."""
+    first, second = compiled(tmp_path / "one"), compiled(tmp_path / "another" / "folder")
+    assert [name for name in first if first[name] != second[name]] == []
+
+
+def test_what_differs_between_two_wheels_is_named(module, pure, tmp_path):
+    tag = "cp311-cp311-linux_x86_64"
+    wheel, same = (pack(pure, module, tag, [], tmp_path / name) for name in ("one", "two"))
+    assert repeat.differences(wheel, same) == []
+    other = pack(pure, (module[0], module[1] + b"x"), tag, nanobind_parts(), tmp_path / "three")
+    found = {name.rsplit("/", 1)[1] for name in repeat.differences(wheel, other)}
+    assert found == {module[0], "RECORD", "gsplat_edu.cdx.json", "nanobind.txt", "robin-map.txt"}
+    moved = tmp_path / "moved.whl"
+    with zipfile.ZipFile(wheel) as archive, zipfile.ZipFile(moved, "w") as copy:
+        for name in reversed(archive.namelist()):
+            copy.writestr(name, archive.read(name))
+    assert repeat.differences(wheel, moved) == ["the order, the times or the compression of the files"]
 
 
 def test_the_time_of_every_file_is_the_one_asked_for(module, pure, tmp_path, monkeypatch):
