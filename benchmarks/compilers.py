@@ -2,7 +2,7 @@
 
     python benchmarks/compilers.py FOLDER [FOLDER] [--capture CAPTURE] [--smoke] [--out FILE.json]
 
-A FOLDER holds a compiled module: that of an unpacked wheel is WHEEL/gsplat_edu. The second default is the installed module.
+A FOLDER holds a compiled module: that of an unpacked wheel is WHEEL/gsplat_edu. The installed module is the default.
 Each module has a process of its own with one thread. They take turns with the same training iterations of a capture (as
 train_step.py: render, 0.8 L1 + 0.2 (1 - SSIM), backward with Adam inside), and the processor time of a turn counts, so
 that other work on the machine hardly matters. Printed: the median and the extremes over the turns of the first module's
