@@ -20,6 +20,7 @@ import zipfile
 from importlib.metadata import distribution
 from pathlib import Path
 
+import nanobind
 import pytest
 
 import gsplat_edu._native
@@ -128,6 +129,42 @@ def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert " passed" in done.stdout
+
+
+NEWER = {version: path for version, path in build_wheels.pythons().items() if version != "3.11"}
+
+
+@pytest.mark.sliced(1, group="built whole", together=True)
+@pytest.mark.skipif(not NEWER, reason="no Python 3.12 or newer is here, whose headers the stable ABI needs")
+def test_one_abi3_wheel_is_imported_by_every_newer_python(pure, tmp_path):
+    """What depends on Python, nanobind and the bindings, is compiled again; the set-up's object files are the rest."""
+    objects = list(ROOT.glob("build/cp3*/CMakeFiles/kernels_*.dir/native/*.o"))
+    objects += ROOT.glob("build/cp3*/CMakeFiles/_native.dir/native/*.o")
+    rest = [path for path in objects if path.name != "bindings.cpp.o"]
+    assert len(rest) > 10, "make clean, then make test, compiles them"
+    oldest = min(NEWER, key=lambda version: int(version.split(".")[1]))
+    code = "import sysconfig; print(sysconfig.get_paths()['include'])"
+    done = subprocess.run([NEWER[oldest], "-c", code], capture_output=True, text=True, check=True)
+    include = Path(nanobind.include_dir())
+    folders = [done.stdout.strip(), include, include.parent / "ext" / "robin_map" / "include"]
+    options = ["-std=c++20", "-O0", "-fPIC", "-fvisibility=hidden", "-fno-strict-aliasing"]
+    options += ["-DPy_LIMITED_API=0x030C0000", "-DNDEBUG", "-include", "Python.h", "-include", "stdio.h"]
+    sources = [ROOT / "native" / "bindings.cpp", include.parent / "src" / "nb_combined.cpp"]
+    made = tmp_path / "_native.abi3.so"
+    words = ["c++", *options, *(f"-I{folder}" for folder in folders), *sources, *rest]
+    subprocess.run([*words, "-shared", "-pthread", "-s", "-o", made], check=True)
+
+    listed = subprocess.run(
+        ["nm", "-D", "--undefined-only", made], capture_output=True, text=True, check=True
+    )
+    asked = {name for name in re.findall(r" U (\w+)", listed.stdout) if name.startswith(("Py", "_Py"))}
+    assert len(asked) > 50
+    assert asked - binaries.stable_abi(12) == set()
+    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    wheel = pack(pure, (made.name, made.read_bytes()), f"cp312-abi3-{platform}", nanobind_parts(), tmp_path)
+    assert {version: build_wheels.imported(wheel, path) for version, path in NEWER.items()} == dict.fromkeys(
+        NEWER, ""
+    )
 
 
 def test_a_wheel_has_every_file_of_the_package(wheel):
