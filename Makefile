@@ -22,7 +22,7 @@ help:
 	@echo "make bench       benchmarks; prints tables and writes out/bench/*.json (SMOKE=1: only check that they run)"
 	@echo "make notebooks   execute notebooks/source into notebooks/ (GSPLAT_EDU_BUDGET=reduced for a short run)"
 	@echo "make site        build the site: chapters, documents and reference, out/site/index.html"
-	@echo "make wheels      build and check wheels for every platform that this machine can build for: dist/; 10 minutes and more"
+	@echo "make wheels      build and check wheels for every platform that this machine can build for: dist/; 10 minutes and more (REPEAT=1: twice, and compare)"
 	@echo "make clean       remove .venv, out and caches"
 
 demo:
@@ -88,7 +88,7 @@ site:
 wheels:
 	@tools/set_up.sh wheels
 	@echo "== wheels: building dist/*.whl"
-	@$(BIN)/python tools/build_wheels.py $(if $(TARGETS),--targets $(TARGETS))
+	@$(BIN)/python tools/build_wheels.py $(if $(TARGETS),--targets $(TARGETS)) $(if $(REPEAT),--repeat)
 
 clean:
 	rm -rf .venv out build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

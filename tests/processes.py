@@ -12,8 +12,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["processes", "photos", "gsplat_edu.cli.main", "gsplat_edu.cli.train"])
+CONTEXT = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
+if hasattr(os, "fork"):
+    CONTEXT.set_forkserver_preload(["processes", "photos", "gsplat_edu.cli.main", "gsplat_edu.cli.train"])
 
 
 def _run(code: str, words: Sequence[str], threads: int, out: Path, err: Path) -> None:

@@ -1,7 +1,6 @@
 """A folder has one writer: a second one learns who holds the lock, and no lock outlives its process."""
 
 import errno
-import fcntl
 import os
 import signal
 import subprocess
@@ -11,6 +10,8 @@ import pytest
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.locks import LOCK, locked
+
+fcntl = pytest.importorskip("fcntl", reason="needs POSIX: flock and fork")
 
 HOLDS = """
 import sys, os

@@ -1,12 +1,13 @@
 """Build the wheels that this machine can build, check them, and say which it could not.
 
-    python tools/build_wheels.py [--out dist] [--targets linux-x86_64 ...] [--build build/wheels]
+    python tools/build_wheels.py [--out dist] [--targets linux-x86_64 ...] [--build build/wheels] [--repeat]
 
 zig compiles and links for every platform: for Linux against glibc 2.17, for macOS and Windows against the interfaces
 that it ships. The wheel cp312-abi3 serves Python 3.12 and newer and needs an interpreter from 3.12 on here; the wheel
 cp311 needs Python 3.11. PATH and pyenv's folder are searched for both. Every wheel is checked (tools/wheels/checks.py);
-a wheel for this machine is also imported by each Python found. Exits with 1 if a wheel was asked for and did not come
-out.
+a wheel for this machine is also imported by each Python found. With --repeat, every target is built a second time,
+from a copy of the checkout in another folder, and has to give the same bytes. Exits with 1 if a wheel was asked for
+and did not come out, or came out differently.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 from wheels.checks import problems  # noqa: E402
 from wheels.contents import nanobind_parts, zig_parts  # noqa: E402
 from wheels.pack import pack  # noqa: E402
+from wheels.repeat import unrepeated  # noqa: E402
 from wheels.targets import TARGETS, Target  # noqa: E402
 from wheels.windows import windows_python  # noqa: E402
 
@@ -245,6 +247,24 @@ def make(args: argparse.Namespace) -> list[str]:
     return failed
 
 
+def repeat(args: argparse.Namespace) -> list[str]:
+    """Build each target again and compare; return the lines about those that differ."""
+    failed = []
+    for target in args.targets:
+        start = time.monotonic()
+        try:
+            found = unrepeated(target, args.out)
+        except RuntimeError as error:
+            found = [f"the second build failed: {error}"]
+        line = "; ".join(found) or "the same bytes from another folder"
+        print(
+            f"{target}: {'NOT REPEATED: ' if found else ''}{line}, {time.monotonic() - start:.0f} s",
+            flush=True,
+        )
+        failed += found
+    return failed
+
+
 def main() -> int:
     """Run the tool."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
@@ -254,10 +274,15 @@ def main() -> int:
     )
     parser.add_argument("--build", type=Path, default=ROOT / "build" / "wheels", help="folder of the builds")
     parser.add_argument("--targets", nargs="+", choices=names, default=names, help="platforms (default: all)")
+    parser.add_argument(
+        "--repeat",
+        action="store_true",
+        help="build every target twice, in two folders, and compare the bytes",
+    )
     args = parser.parse_args()
     args.out, args.build = args.out.resolve(), args.build.resolve()
     args.build.mkdir(parents=True, exist_ok=True)
-    return 1 if make(args) else 0
+    return 1 if make(args) or (args.repeat and repeat(args)) else 0
 
 
 if __name__ == "__main__":

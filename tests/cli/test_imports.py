@@ -7,7 +7,7 @@ import pytest
 
 from gsplat_edu.cli.main import COMMANDS
 
-HEAVY = ("torch", "scipy", "cv2", "matplotlib", "PIL", "dask", "distributed")
+HEAVY = ("torch", "scipy", "cv2", "matplotlib", "PIL", "dask", "distributed", "starlette", "uvicorn")
 
 PROBE = """
 import contextlib, io, sys

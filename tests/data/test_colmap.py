@@ -17,6 +17,7 @@ from gsplat_edu.data.colmap_files import MODELS
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import DatasetError
+from systems import needs_posix
 
 EVERYTHING = DataSettings(test_every=0)
 MODEL_FILES = ("cameras", "images", "points3D")
@@ -441,6 +442,7 @@ def test_points_in_the_other_format(capture, text):
     np.testing.assert_array_equal(a.points, b.points)
 
 
+@needs_posix
 @pytest.mark.parametrize("layout", ["colmap", "text"])
 def test_names_from_other_systems(written, layout):
     """A backslash separates folders. A name that is not UTF-8 matches the file with the same bytes."""

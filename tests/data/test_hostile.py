@@ -20,6 +20,7 @@ from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.errors import DatasetError, SceneFormatError
 from gsplat_edu.io.formats import read_scene
+from systems import needs_posix
 
 ROOT = Path(__file__).parents[2]
 EVERYTHING = DataSettings(test_every=0)
@@ -50,6 +51,7 @@ def test_only_one_module_opens_image_files():
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 12\n%%EndComments\nshowpage\n%%EOF\n"
 
 
+@needs_posix
 @pytest.mark.parametrize("read", [decode, decode_mask, image_size])
 def test_a_drawing_named_like_a_photo_starts_no_other_program(tmp_path, monkeypatch, read):
     """Pillow runs Ghostscript for an EPS. A stand-in for `gs` leaves a mark if it runs."""
@@ -96,6 +98,7 @@ def special(folder: Path, kind: str, name: str) -> Path:
 SCENES = ["a.ply", "a.compressed.ply", "a.splat", "a.spz", "a.sog", "a.glb"]
 
 
+@needs_posix
 @pytest.mark.parametrize("kind", ["a pipe", "a socket", "a device", "a folder"])
 def test_special_files_are_refused_by_every_reader(tmp_path, no_hang, kind):
     for name in SCENES:
@@ -114,6 +117,7 @@ def test_special_files_are_refused_by_every_reader(tmp_path, no_hang, kind):
             read(special(tmp_path, kind, name))
 
 
+@needs_posix
 def test_a_pipe_among_the_files_of_a_capture(one_photo, no_hang):
     folder = one_photo(np.zeros((12, 16, 3), np.uint8), ply_file_path="points.ply")
     special(folder, "a pipe", "points.ply")

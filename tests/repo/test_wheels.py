@@ -10,6 +10,7 @@ import importlib
 import json
 import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import zipfile
 from importlib.metadata import distribution
 from pathlib import Path
 
+import nanobind
 import pytest
 
 import gsplat_edu._native
@@ -31,6 +33,7 @@ binaries = importlib.import_module("wheels.binaries")
 checks = importlib.import_module("wheels.checks")
 nanobind_parts = importlib.import_module("wheels.contents").nanobind_parts
 pack = importlib.import_module("wheels.pack").pack
+repeat = importlib.import_module("wheels.repeat")
 
 FAST_TESTS = (
     *("tests/test_camera.py", "tests/io/test_ply.py"),
@@ -128,6 +131,42 @@ def test_fast_tests_pass_on_the_installed_package(installed, tmp_path):
     assert " passed" in done.stdout
 
 
+NEWER = {version: path for version, path in build_wheels.pythons().items() if version != "3.11"}
+
+
+@pytest.mark.sliced(1, group="built whole", together=True)
+@pytest.mark.skipif(not NEWER, reason="no Python 3.12 or newer is here, whose headers the stable ABI needs")
+def test_one_abi3_wheel_is_imported_by_every_newer_python(pure, tmp_path):
+    """What depends on Python, nanobind and the bindings, is compiled again; the set-up's object files are the rest."""
+    objects = list(ROOT.glob("build/cp3*/CMakeFiles/kernels_*.dir/native/*.o"))
+    objects += ROOT.glob("build/cp3*/CMakeFiles/_native.dir/native/*.o")
+    rest = [path for path in objects if path.name != "bindings.cpp.o"]
+    assert len(rest) > 10, "make clean, then make test, compiles them"
+    oldest = min(NEWER, key=lambda version: int(version.split(".")[1]))
+    code = "import sysconfig; print(sysconfig.get_paths()['include'])"
+    done = subprocess.run([NEWER[oldest], "-c", code], capture_output=True, text=True, check=True)
+    include = Path(nanobind.include_dir())
+    folders = [done.stdout.strip(), include, include.parent / "ext" / "robin_map" / "include"]
+    options = ["-std=c++20", "-O0", "-fPIC", "-fvisibility=hidden", "-fno-strict-aliasing"]
+    options += ["-DPy_LIMITED_API=0x030C0000", "-DNDEBUG", "-include", "Python.h", "-include", "stdio.h"]
+    sources = [ROOT / "native" / "bindings.cpp", include.parent / "src" / "nb_combined.cpp"]
+    made = tmp_path / "_native.abi3.so"
+    words = ["c++", *options, *(f"-I{folder}" for folder in folders), *sources, *rest]
+    subprocess.run([*words, "-shared", "-pthread", "-s", "-o", made], check=True)
+
+    listed = subprocess.run(
+        ["nm", "-D", "--undefined-only", made], capture_output=True, text=True, check=True
+    )
+    asked = {name for name in re.findall(r" U (\w+)", listed.stdout) if name.startswith(("Py", "_Py"))}
+    assert len(asked) > 50
+    assert asked - binaries.stable_abi(12) == set()
+    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    wheel = pack(pure, (made.name, made.read_bytes()), f"cp312-abi3-{platform}", nanobind_parts(), tmp_path)
+    assert {version: build_wheels.imported(wheel, path) for version, path in NEWER.items()} == dict.fromkeys(
+        NEWER, ""
+    )
+
+
 def test_a_wheel_has_every_file_of_the_package(wheel):
     package = ROOT / "src" / "gsplat_edu"
     wanted = {
@@ -152,6 +191,41 @@ def test_the_same_content_makes_the_same_wheel(wheel, module, tmp_path):
     )
     assert again.name == wheel.name
     assert hashlib.sha256(again.read_bytes()).hexdigest() == hashlib.sha256(wheel.read_bytes()).hexdigest()
+
+
+def compiled(folder):
+    """Compile some files of the module, of the kernels and of the rest, from a copy of the checkout."""
+    shutil.copytree(ROOT / "native", folder / "native")
+    shutil.copyfile(ROOT / "CMakeLists.txt", folder / "CMakeLists.txt")
+    tools = Path(sys.executable).parent
+    options = [f"-DPython_EXECUTABLE={sys.executable}", f"-DCMAKE_MAKE_PROGRAM={tools / 'ninja'}"]
+    words = [tools / "cmake", "-S", folder, "-B", folder / "build", "-G", "Ninja", *options]
+    subprocess.run(words, check=True, capture_output=True)
+    kernels = re.findall(r"kernels_\w+", (folder / "build" / "build.ninja").read_text())[0]
+    objects = [f"CMakeFiles/{kernels}.dir/native/{name}.cpp.o" for name in ("adam", "table")]
+    objects += [f"CMakeFiles/_native.dir/native/{name}.cpp.o" for name in ("dispatch", "system")]
+    subprocess.run([tools / "ninja", "-C", folder / "build", *objects], check=True, capture_output=True)
+    return {name: (folder / "build" / name).read_bytes() for name in objects}
+
+
+def test_the_compiler_gives_the_same_bytes_in_every_folder(tmp_path):
+    """Of the whole module, make wheels REPEAT=1 shows the same."""
+    first, second = compiled(tmp_path / "one"), compiled(tmp_path / "another" / "folder")
+    assert [name for name in first if first[name] != second[name]] == []
+
+
+def test_what_differs_between_two_wheels_is_named(module, pure, tmp_path):
+    tag = "cp311-cp311-linux_x86_64"
+    wheel, same = (pack(pure, module, tag, [], tmp_path / name) for name in ("one", "two"))
+    assert repeat.differences(wheel, same) == []
+    other = pack(pure, (module[0], module[1] + b"x"), tag, nanobind_parts(), tmp_path / "three")
+    found = {name.rsplit("/", 1)[1] for name in repeat.differences(wheel, other)}
+    assert found == {module[0], "RECORD", "gsplat_edu.cdx.json", "nanobind.txt", "robin-map.txt"}
+    moved = tmp_path / "moved.whl"
+    with zipfile.ZipFile(wheel) as archive, zipfile.ZipFile(moved, "w") as copy:
+        for name in reversed(archive.namelist()):
+            copy.writestr(name, archive.read(name))
+    assert repeat.differences(wheel, moved) == ["the order, the times or the compression of the files"]
 
 
 def test_the_time_of_every_file_is_the_one_asked_for(module, pure, tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ from PIL import Image
 
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.photos import copy_photos, fingerprint, photo_files
+from systems import needs_posix
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (30, 40, 3)).astype(np.uint8)
 
@@ -190,6 +191,7 @@ def test_own_captures_and_runs_are_not_searched_for_photos(tmp_path):
     )
 
 
+@needs_posix
 def test_broken_links_and_pipes_are_not_photos(tmp_path, monkeypatch):
     wanted, asked = photo(tmp_path / "a.png"), []
     (tmp_path / "z.jpg").symlink_to(tmp_path / "gone.jpg")

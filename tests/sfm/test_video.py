@@ -16,6 +16,7 @@ from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
 from sfm.textured_box import cameras_of, check
+from systems import needs_posix
 
 BLURRED = range(7, 90, 9)
 """Frames blurred on purpose, as by camera shake."""
@@ -87,6 +88,7 @@ def test_frames_become_a_capture(walk, colmap, tmp_path):
     assert len(said) == 6 and all(sentence.endswith("(done before)") for sentence in said)
 
 
+@needs_posix
 def test_a_video_name_need_not_be_utf8(walk, tmp_path):
     """OpenCV ends the process when given a name that is not UTF-8."""
     odd = tmp_path / os.fsdecode(b"raw\xff.mp4")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import sys
 import threading
 import webbrowser
 from dataclasses import replace
@@ -18,7 +19,13 @@ NEEDED = ("starlette", "uvicorn", "h11")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Serve the page until Ctrl-C."""
+    """Serve the page until Ctrl-C.
+
+    Raises:
+        ArgumentError: the extra `studio` is not installed, or the system has no signals for its jobs.
+    """
+    if sys.platform == "win32":
+        raise ArgumentError("studio: does not run on Windows; use sfm, train and view, or run it in WSL")
     for name in NEEDED:
         try:
             importlib.import_module(name)

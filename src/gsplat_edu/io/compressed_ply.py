@@ -99,7 +99,7 @@ def read(path: Path) -> Scene:
         log_scales=torch.from_numpy(log_scales.astype(np.float32)),
         sh0=torch.from_numpy(sh0[:, None, :]),
         sh_rest=torch.from_numpy(_sh_rest(sh_rows, len(splats))),
-        logit_opacities=torch.from_numpy(byte_to_logit(words & 255)),
+        logit_opacities=torch.from_numpy(byte_to_logit((words & 255).astype(np.uint8))),
     )
     return Scene(gaussians, *read_comments(path, header.comments))
 

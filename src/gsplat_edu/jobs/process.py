@@ -68,5 +68,10 @@ def send(pid: int, known: str, number: int, *, group: bool = False) -> bool:
     return False
 
 
-SIGNALS = {"interrupt": signal.SIGINT, "terminate": signal.SIGTERM, "kill": signal.SIGKILL}
+# Windows has no SIGKILL. No jobs run there, but every command imports this module.
+SIGNALS = {
+    "interrupt": signal.SIGINT,
+    "terminate": signal.SIGTERM,
+    "kill": getattr(signal, "SIGKILL", signal.SIGTERM),
+}
 """The signals of a cancellation, in their order."""

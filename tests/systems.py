@@ -1,0 +1,9 @@
+"""The mark of tests that only make sense on POSIX: they set its permissions or locks, or make its links or pipes."""
+
+import os
+
+import pytest
+
+needs_posix = pytest.mark.skipif(
+    os.name != "posix", reason="needs POSIX: permissions, locks, signals, links, pipes"
+)
