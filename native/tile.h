@@ -180,14 +180,14 @@ GSPLAT_INLINE void take_back(const KeptRows<T> &kept, Rows<T> &rows) {
         }
 }
 
-// The members of the splats of a batch, member by member; the first splat fills up.
-template <class T, size_t MEMBERS>
-GSPLAT_INLINE void members_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, T (&members)[MEMBERS][BATCH]) {
+// The members of the splats id(0), id(1), ... of a batch, member by member; the first splat fills up.
+template <class T, size_t MEMBERS, class F>
+GSPLAT_INLINE void members_of(const Splat<T> *splats, F id, uint32_t count, T (&members)[MEMBERS][BATCH]) {
     using Q = typename Four<T>::V;
     static_assert(MEMBERS % 4 == 0 && BATCH % 4 == 0);
     for (uint32_t i = 0; i < BATCH; i += 4) {
         const T *four[4];
-        for (uint32_t j = 0; j < 4; ++j) four[j] = reinterpret_cast<const T *>(splats + pairs[i + j < count ? i + j : 0].gaussian);
+        for (uint32_t j = 0; j < 4; ++j) four[j] = reinterpret_cast<const T *>(splats + id(i + j < count ? i + j : 0));
         for (size_t k = 0; k < MEMBERS; k += 4) {
             Q m[4] = {load<Q>(four[0] + k), load<Q>(four[1] + k), load<Q>(four[2] + k), load<Q>(four[3] + k)};
             transpose(m);
@@ -204,7 +204,7 @@ GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t c
                            Rows<T> &rows) {
     using S = Strips<T>;
     T members[sizeof(Splat<T>) / sizeof(T)][BATCH], u[BATCH], v[BATCH], x[BATCH], y[BATCH], drop[BATCH];
-    members_of(splats, pairs, count, members);
+    members_of(splats, [pairs](uint32_t i) { return pairs[i].gaussian; }, count, members);
     const auto of = [&](size_t offset) -> const T * { return members[offset / sizeof(T)]; };
     const T *sx = of(offsetof(Splat<T>, sx)), *sy = of(offsetof(Splat<T>, sy)), *ty = of(offsetof(Splat<T>, ty));
     const T *s0 = of(offsetof(Splat<T>, s0)), *t0 = of(offsetof(Splat<T>, t0)), *log2_o = of(offsetof(Splat<T>, log2_o));
