@@ -119,10 +119,11 @@ void composite_tile(const CompositeArgs<T> &args, int32_t index) {
     uint32_t k = begin;
     Batch<T> batch;
     const Rows<T> &rows = batch.rows;
+    KeptRows<T> *kept = kept_rows(args, index);
     int bright = 0;
     for (; k < end; ++k) {
         const uint32_t i = (k - begin) % BATCH;
-        if (i == 0) batch.begin(args.splats, args.pairs + k, end - k, box, clamp);
+        if (i == 0) batch.template begin<false>(args.splats, args.pairs + k, end - k, box, clamp, KEEPS_ROWS ? kept++ : nullptr);
         if (rows.top[i] > rows.bottom[i]) continue;
         const uint32_t id = args.pairs[k].gaussian;
         T *weights = nullptr;

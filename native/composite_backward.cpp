@@ -208,6 +208,7 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
     const uint32_t stop = begin + forward.done[index];
     Batch<T> batch;
     const Rows<T> &rows = batch.rows;
+    KeptRows<T> *kept = kept_rows(forward, index);
     for (uint32_t k = begin; k < end; ++k) {
         const PairSlots<T> pair = slots_of<T, MODE>(args, forward.pairs[k]);
         const uint32_t i = (k - begin) % BATCH;
@@ -219,7 +220,8 @@ void tile_backward(const CompositeBackwardArgs<T> &args, int32_t index) {
             fetch_row(args.in.features, tile.features.channels, next, forward.camera.W, k - begin);
             fetch_row(forward.out.features, tile.features.channels, next, forward.camera.W, k - begin);
         }
-        if (i == 0 && k < stop) batch.begin(forward.splats, forward.pairs + k, stop - k, box, clamp);
+        if (i == 0 && k < stop)
+            batch.template begin<true>(forward.splats, forward.pairs + k, stop - k, box, clamp, KEEPS_ROWS ? kept++ : nullptr);
         if constexpr (MODE >= WITH_FEATURES)
             if (k < stop && pair.channels && i % FeatureGroup<T>::SIZE == 0) begin_group(args, k, stop, rows, i, tile);
         if (k >= stop || rows.top[i] > rows.bottom[i])

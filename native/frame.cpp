@@ -146,13 +146,15 @@ void Frame<T>::intersect() {
 
 template <class T>
 CompositeArgs<T> Frame<T>::composite_args(const Images<T> &out, const T *features) const {
-    return {splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, out, features, done_.as<uint32_t>()};
+    return {splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, out, features, done_.as<uint32_t>(),
+            rows_.as<uint8_t>()};
 }
 
 template <class T>
 void Frame<T>::composite(const Images<T> &out, const T *features) {
     Timer timer(stages_[3]);
     done_.reserve(size_t(grid_.tiles()) * 4);
+    rows_.reserve(size_t(first_batch(tile_begin_.as<uint32_t>(), grid_.tiles()) + 1) * size_t(kernels<T>().rows_bytes));
     const CompositeArgs<T> args = composite_args(out, features);
     parallel(threads_, grid_.tiles(), [&](int64_t tile, int) { kernels<T>().composite(args, int32_t(tile)); });
 }

@@ -71,7 +71,7 @@ class Frame {
     int threads_;
     int64_t visible_count_ = 0, pairs_count_ = 0;
     std::array<StageTime, 6> stages_{};
-    Buffer splats_, block_ids_, block_begin_, visible_, sorted_, pairs_of_, slot_begin_, pairs_, tile_begin_, done_;
+    Buffer splats_, block_ids_, block_begin_, visible_, sorted_, pairs_of_, slot_begin_, pairs_, tile_begin_, done_, rows_;
 };
 
 }  // namespace gsplat

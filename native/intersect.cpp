@@ -2,8 +2,8 @@
 //
 // The ellipse is (sx dx + sy dy)² + (ty dy)² <= L. Its x interval over a band of rows ends at the rightmost (leftmost) point of
 // the ellipse if that lies in the band, otherwise at the edge of the band nearest to that point.
-#include "gaussian_math.h"
 #include "isa.h"
+#include "tile.h"
 
 namespace gsplat {
 namespace GSPLAT_ISA {
@@ -70,21 +70,90 @@ GSPLAT_INLINE void fetch(const Splat<T> *record) {
     if (sizeof *record > 64) __builtin_prefetch(reinterpret_cast<const char *>(record) + 64);
 }
 
+// The runs of BATCH Gaussians, a lane each, those of up to KEPT rows of tiles; a run of 0 tiles begins at tile 0.
+struct LaneRuns {
+    int32_t rows[BATCH];  // rows of tiles, more than KEPT if the lane is left out
+    int32_t first[TileRuns::KEPT][BATCH], count[TileRuns::KEPT][BATCH];
+};
+
+// The same as `for_each_run`, in plain loops over lanes, which the compiler vectorises.
+template <class T>
+GSPLAT_INLINE void runs_of(const Splat<T> *splats, const uint32_t *ids, uint32_t count, const Camera &cam, const Grid &grid, LaneRuns &runs) {
+    T members[sizeof(Splat<T>) / sizeof(T)][BATCH];
+    members_of(splats, [ids](uint32_t i) { return ids[i]; }, count, members);
+    const auto of = [&](size_t offset) -> const T * { return members[offset / sizeof(T)]; };
+    const T *u = of(offsetof(Splat<T>, u)), *v = of(offsetof(Splat<T>, v));
+    const T *sx = of(offsetof(Splat<T>, sx)), *sy = of(offsetof(Splat<T>, sy)), *ty = of(offsetof(Splat<T>, ty));
+    const T *log2_o = of(offsetof(Splat<T>, log2_o)), *ex = of(offsetof(Splat<T>, extent)), *ey = of(offsetof(Splat<T>, extent) + sizeof(T));
+    T inverse_ey[BATCH], rightmost[BATCH], tangent[BATCH], half[BATCH], slack[BATCH];
+    int32_t top[BATCH], rows[BATCH];
+    const int32_t tiles_x = grid.tiles_x;
+    const T height = T(cam.H), lowest = T(cam.H - 1), width = T(cam.W), end = T(cam.W - 1);
+    for (uint32_t i = 0; i < BATCH; ++i) {
+        inverse_ey[i] = 1 / ey[i], tangent[i] = -sy[i] / sx[i];
+        rightmost[i] = -(sx[i] * sy[i] / (sy[i] * sy[i] + ty[i] * ty[i])) * ex[i];
+        half[i] = sqrt_(vmax(log2_o[i] - T(LOG2_ALPHA_MIN), T(0))) / sx[i];
+        const T above = rim_slack(abs_(v[i]) + ey[i]);
+        const int32_t first = int32_t(vmin(vmax(ceil_(v[i] - ey[i] - above), T(0)), height));
+        const int32_t last = int32_t(vmax(vmin(floor_(v[i] + ey[i] + above), lowest), T(-1)));
+        slack[i] = rim_slack(abs_(u[i]) + abs_(tangent[i]) * vmin(ey[i], abs_(v[i]) + height) + half[i]);
+        top[i] = first / TILE, rows[i] = runs.rows[i] = first > last ? 0 : last / TILE - first / TILE + 1;
+    }
+    for (int32_t r = 0; r < int32_t(TileRuns::KEPT); ++r)
+        for (uint32_t i = 0; i < BATCH; ++i) {
+            T low = T((top[i] + r) * TILE) - v[i], high = T((top[i] + r) * TILE + TILE - 1) - v[i];
+            low = vmax(low, -ey[i]), high = vmin(high, ey[i]);
+            const T middle = (low + high) / 2;
+            const bool crossed = low > high;
+            low = crossed ? middle : low, high = crossed ? middle : high;
+            const T right = vmin(vmax(rightmost[i], low), high), left = vmin(vmax(-rightmost[i], low), high);
+            const T yr = right * inverse_ey[i], yl = left * inverse_ey[i];
+            const T x1 = u[i] + tangent[i] * right + half[i] * sqrt_(vmax(1 - yr * yr, T(0))) + slack[i];
+            const T x0 = u[i] + tangent[i] * left - half[i] * sqrt_(vmax(1 - yl * yl, T(0))) - slack[i];
+            const int32_t c0 = int32_t(vmin(vmax(ceil_(x0), T(0)), width)), c1 = int32_t(vmax(vmin(floor_(x1), end), T(-1)));
+            const bool met = (c0 <= c1) & (r < rows[i]);
+            runs.first[r][i] = met ? (top[i] + r) * tiles_x + c0 / TILE : 0;
+            runs.count[r][i] = met ? c1 / TILE - c0 / TILE + 1 : 0;
+        }
+}
+
+// Counts differences from tile to tile, two numbers per run, and adds them up at the end. No branch depends on a small ellipse.
 template <class T>
 void count(const IntersectArgs<T> &args, int64_t begin, int64_t end, uint32_t *per_tile) {
-    for (int64_t k = begin; k < end; ++k) {
-        const uint32_t id = args.sorted[k];
-        if (k + AHEAD < end) fetch(args.splats + args.sorted[k + AHEAD]);
-        uint32_t total = 0, rows = 0;
-        TileRuns &kept = args.runs[k];
-        for_each_run(ellipse(args.splats[id]), args.camera, args.grid, [&](uint32_t first, uint32_t tiles) {
-            for (uint32_t tile = first; tile < first + tiles; ++tile) ++per_tile[tile];
-            if (rows < TileRuns::KEPT) kept.runs[rows] = {first, tiles};
-            total += tiles, ++rows;
-        });
-        kept.rows = rows;
-        args.pairs_of[id] = total;
+    const uint32_t tiles = uint32_t(args.grid.tiles());
+    const auto add = [&](uint32_t first, uint32_t n) {
+        ++per_tile[first];
+        if (first + n < tiles) --per_tile[first + n];
+    };
+    LaneRuns runs;
+    for (int64_t k = begin; k < end; k += BATCH) {
+        const uint32_t lanes = uint32_t(vmin(int64_t(BATCH), end - k));
+        for (int64_t next = k + BATCH; next < k + 2 * BATCH && next < end; ++next) fetch(args.splats + args.sorted[next]);
+        runs_of(args.splats, args.sorted + k, lanes, args.camera, args.grid, runs);
+        for (uint32_t i = 0; i < lanes; ++i) {
+            const uint32_t id = args.sorted[k + i];
+            uint32_t total = 0, rows = 0;
+            TileRuns &kept = args.runs[k + i];
+            if (runs.rows[i] > int32_t(TileRuns::KEPT)) {
+                for_each_run(ellipse(args.splats[id]), args.camera, args.grid, [&](uint32_t first, uint32_t n) {
+                    add(first, n);
+                    if (rows < TileRuns::KEPT) kept.runs[rows] = {first, n};
+                    total += n, ++rows;
+                });
+            } else {
+                for (uint32_t r = 0; r < TileRuns::KEPT; ++r) {
+                    const uint32_t first = uint32_t(runs.first[r][i]), n = uint32_t(runs.count[r][i]);
+                    add(first, n);
+                    kept.runs[rows] = {first, n};
+                    total += n, rows += n > 0;
+                }
+            }
+            kept.rows = rows;
+            args.pairs_of[id] = total;
+        }
     }
+    uint32_t sum = 0;
+    for (uint32_t tile = 0; tile < tiles; ++tile) per_tile[tile] = sum += per_tile[tile];
 }
 
 template <class T>

@@ -141,7 +141,12 @@ struct CompositeArgs {
     Images<T> out;
     const T *features;                                 // N channels; null if out.features is
     uint32_t *done;                                    // tiles, pairs composited before the tile ended
+    uint8_t *rows;                                     // batches x Kernels::rows_bytes, for the backward pass
 };
+
+// Pairs of a tile that are taken together. The batches of a tile follow those of the tiles before, with at most one unused.
+constexpr uint32_t BATCH = 16;
+inline int64_t first_batch(const uint32_t *tile_begin, int64_t tile) { return tile_begin[tile] / BATCH + tile; }
 
 // What one pair contributes besides gradients: sums over its pixels of |dL/du|, |dL/dv|, w, [w > 0] and w times the error of
 // the pixel, and the largest w.
@@ -268,6 +273,7 @@ struct Kernels {
     void (*noise)(const NoiseArgs<T> &, int64_t begin, int64_t end);
     void (*recolor)(const RecolorArgs<T> &, int64_t task);
     void (*recolor_backward)(const RecolorArgs<T> &, int64_t task);
+    int64_t rows_bytes;                                // of a batch, in CompositeArgs::rows; 0 if none are kept
 };
 
 struct Isa {

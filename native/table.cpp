@@ -1,6 +1,7 @@
 // The table of one instruction set's kernels.
 #include "gaussian_math.h"
 #include "isa.h"
+#include "tile.h"
 
 #define GSPLAT_TEXT_(x) #x
 #define GSPLAT_TEXT(x) GSPLAT_TEXT_(x)
@@ -11,7 +12,7 @@ namespace GSPLAT_ISA {
 template <class T>
 static constexpr Kernels<T> kernels() {
     return {project<T>,       count<T>, scatter<T>, composite<T>, composite_backward<T>, project_backward<T>, adam<T>,
-            adam_backward<T>, loss<T>,  noise<T>,   recolor<T>,   recolor_backward<T>};
+            adam_backward<T>, loss<T>,  noise<T>,   recolor<T>,   recolor_backward<T>, KEEPS_ROWS ? int64_t(sizeof(KeptRows<T>)) : 0};
 }
 
 // Twelve independent chains of vector FMAs, enough to hide their latency and few enough for sixteen registers: a

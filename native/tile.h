@@ -117,8 +117,6 @@ struct Strips {
     static constexpr int WIDTH = Vector<T>::LANES, COUNT = TILE / WIDTH;
 };
 
-constexpr uint32_t BATCH = 16;
-
 // Prefetches the records of the batch after the one that begins at `pairs`; a record may span two cache lines.
 template <class T>
 GSPLAT_INLINE void fetch_next(const Splat<T> *splats, const Pair *pairs, uint32_t left) {
@@ -151,14 +149,45 @@ struct Rows {
     FalloffKind kind[BATCH];
 };
 
-// The members of the splats of a batch, member by member; the first splat fills up.
-template <class T, size_t MEMBERS>
-GSPLAT_INLINE void members_of(const Splat<T> *splats, const Pair *pairs, uint32_t count, T (&members)[MEMBERS][BATCH]) {
+// Whether the forward pass leaves the rows of its batches to the backward pass. On AVX2 that gained nothing.
+constexpr bool KEEPS_ROWS = GSPLAT_VECTOR_BYTES == 64;
+
+// They take a byte for each strip, first + 16 last, and the kind another one. Without a row, first > last.
+template <class T>
+struct KeptRows {
+    uint8_t rows[Strips<T>::COUNT][BATCH], kind[BATCH];
+};
+
+template <class T>
+GSPLAT_INLINE void keep(const Rows<T> &rows, KeptRows<T> &kept) {
+    for (int strip = 0; strip < Strips<T>::COUNT; ++strip)
+        for (uint32_t i = 0; i < BATCH; ++i) {
+            const int32_t first = rows.first[strip][i], last = rows.last[strip][i];
+            kept.rows[strip][i] = uint8_t(first > last ? TILE - 1 : first + TILE * last);
+        }
+    for (uint32_t i = 0; i < BATCH; ++i) kept.kind[i] = uint8_t(rows.kind[i]);
+}
+
+template <class T>
+GSPLAT_INLINE void take_back(const KeptRows<T> &kept, Rows<T> &rows) {
+    __builtin_prefetch(&kept + 1), __builtin_prefetch(reinterpret_cast<const char *>(&kept + 2) - 1);
+    for (uint32_t i = 0; i < BATCH; ++i) rows.top[i] = TILE, rows.bottom[i] = -1, rows.kind[i] = FalloffKind(kept.kind[i]);
+    for (int strip = 0; strip < Strips<T>::COUNT; ++strip)
+        for (uint32_t i = 0; i < BATCH; ++i) {
+            const int32_t first = kept.rows[strip][i] % TILE, last = kept.rows[strip][i] / TILE;
+            rows.first[strip][i] = first, rows.last[strip][i] = last;
+            rows.top[i] = vmin(rows.top[i], first), rows.bottom[i] = vmax(rows.bottom[i], last);
+        }
+}
+
+// The members of the splats id(0), id(1), ... of a batch, member by member; the first splat fills up.
+template <class T, size_t MEMBERS, class F>
+GSPLAT_INLINE void members_of(const Splat<T> *splats, F id, uint32_t count, T (&members)[MEMBERS][BATCH]) {
     using Q = typename Four<T>::V;
     static_assert(MEMBERS % 4 == 0 && BATCH % 4 == 0);
     for (uint32_t i = 0; i < BATCH; i += 4) {
         const T *four[4];
-        for (uint32_t j = 0; j < 4; ++j) four[j] = reinterpret_cast<const T *>(splats + pairs[i + j < count ? i + j : 0].gaussian);
+        for (uint32_t j = 0; j < 4; ++j) four[j] = reinterpret_cast<const T *>(splats + id(i + j < count ? i + j : 0));
         for (size_t k = 0; k < MEMBERS; k += 4) {
             Q m[4] = {load<Q>(four[0] + k), load<Q>(four[1] + k), load<Q>(four[2] + k), load<Q>(four[3] + k)};
             transpose(m);
@@ -175,7 +204,7 @@ GSPLAT_INLINE void rows_of(const Splat<T> *splats, const Pair *pairs, uint32_t c
                            Rows<T> &rows) {
     using S = Strips<T>;
     T members[sizeof(Splat<T>) / sizeof(T)][BATCH], u[BATCH], v[BATCH], x[BATCH], y[BATCH], drop[BATCH];
-    members_of(splats, pairs, count, members);
+    members_of(splats, [pairs](uint32_t i) { return pairs[i].gaussian; }, count, members);
     const auto of = [&](size_t offset) -> const T * { return members[offset / sizeof(T)]; };
     const T *sx = of(offsetof(Splat<T>, sx)), *sy = of(offsetof(Splat<T>, sy)), *ty = of(offsetof(Splat<T>, ty));
     const T *s0 = of(offsetof(Splat<T>, s0)), *t0 = of(offsetof(Splat<T>, t0)), *log2_o = of(offsetof(Splat<T>, log2_o));
@@ -250,19 +279,32 @@ GSPLAT_INLINE void steps_of(const Splat<T> *splats, const Pair *pairs, uint32_t 
     }
 }
 
-// The splats of a tile that are taken together.
+// The splats of a tile that are taken together. If rows are kept, `kept` gets them in the forward pass and has them in the backward
+// pass, otherwise it is null.
 template <class T>
 struct Batch {
     Rows<T> rows;
     Steps<T> steps;
 
-    GSPLAT_METHOD void begin(const Splat<T> *splats, const Pair *pairs, uint32_t left, const TileBox &box, const AlphaClamp<T> &clamp) {
+    template <bool AGAIN>
+    GSPLAT_METHOD void begin(const Splat<T> *splats, const Pair *pairs, uint32_t left, const TileBox &box, const AlphaClamp<T> &clamp,
+                             KeptRows<T> *kept) {
         fetch_next(splats, pairs, left);
         const uint32_t count = vmin(BATCH, left);
-        rows_of(splats, pairs, count, box, clamp, rows);
+        if constexpr (AGAIN && KEEPS_ROWS)
+            take_back(*kept, rows);
+        else
+            rows_of(splats, pairs, count, box, clamp, rows);
+        if constexpr (!AGAIN && KEEPS_ROWS) keep(rows, *kept);
         steps_of(splats, pairs, count, box, rows, steps);
     }
 };
+
+// Where the rows of a tile's batches are kept.
+template <class T>
+GSPLAT_INLINE KeptRows<T> *kept_rows(const CompositeArgs<T> &args, int32_t tile) {
+    return KEEPS_ROWS ? reinterpret_cast<KeptRows<T> *>(args.rows) + first_batch(args.tile_begin, tile) : nullptr;
+}
 
 // The rows of a splat that is not gentle: p = base - (across + shift)².
 template <class T>
