@@ -121,14 +121,24 @@ def _opened(source: str) -> tuple[Any, Any]:
 
     from gsplat_edu.runs.source import open_source
 
-    found = open_source(source)
-    facts = found.path.stat()
-    key = f"{found.path} {facts.st_mtime_ns} {facts.st_size}"
-    if key not in _scenes:
+    if (key := _state_of(source)) not in _scenes:
+        found = open_source(source)
         _scenes.clear()
         _scenes[key] = found.scene.gaussians, replace(found.settings, depth=False)
     gaussians, settings = _scenes[key]
     return gaussians, settings
+
+
+def _state_of(source: str) -> str:
+    """Return what changes when the file of a scene, or the latest scene of a run, changes."""
+    from gsplat_edu.io.formats import file_in
+    from gsplat_edu.runs.folder import RunFolder
+
+    path = file_in(Path(source))
+    if path.is_dir() and RunFolder(path).exists():
+        path, _ = RunFolder(path).latest_scene()
+    facts = path.stat()
+    return f"{path} {facts.st_mtime_ns} {facts.st_size}"
 
 
 _scenes: dict[str, Any] = {}
@@ -148,10 +158,8 @@ def check_edits(path: str, name: str, source: str) -> dict[str, Any]:
     from gsplat_edu.runs.source import open_source
 
     edits = parse_edits(read_bytes(Path(path)), name)
-    found = open_source(source)
-    facts = found.path.stat()
-    key = f"{found.path} {facts.st_mtime_ns} {facts.st_size}"
-    if key not in _identities:
+    if (key := _state_of(source)) not in _identities:
+        found = open_source(source)
         _identities.clear()
         _identities[key] = identity_of(found.scene.gaussians, found.origin)
     edits.check_scene(_identities[key], name)
