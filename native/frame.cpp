@@ -146,8 +146,8 @@ void Frame<T>::intersect() {
 
 template <class T>
 CompositeArgs<T> Frame<T>::composite_args(const Images<T> &out, const T *features) const {
-    return {splats(), pairs_.as<Pair>(), tile_begin_.as<uint32_t>(), grid_, camera_, settings_, out, features, done_.as<uint32_t>(),
-            rows_.as<uint8_t>()};
+    return {splats(), pairs_.as<Pair>(),    tile_begin_.as<uint32_t>(), grid_, camera_, settings_, out,
+            features, done_.as<uint32_t>(), rows_.as<uint8_t>()};
 }
 
 template <class T>

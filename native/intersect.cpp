@@ -78,13 +78,15 @@ struct LaneRuns {
 
 // The same as `for_each_run`, in plain loops over lanes, which the compiler vectorises.
 template <class T>
-GSPLAT_INLINE void runs_of(const Splat<T> *splats, const uint32_t *ids, uint32_t count, const Camera &cam, const Grid &grid, LaneRuns &runs) {
+GSPLAT_INLINE void runs_of(const Splat<T> *splats, const uint32_t *ids, uint32_t count, const Camera &cam, const Grid &grid,
+                           LaneRuns &runs) {
     T members[sizeof(Splat<T>) / sizeof(T)][BATCH];
     members_of(splats, [ids](uint32_t i) { return ids[i]; }, count, members);
     const auto of = [&](size_t offset) -> const T * { return members[offset / sizeof(T)]; };
     const T *u = of(offsetof(Splat<T>, u)), *v = of(offsetof(Splat<T>, v));
     const T *sx = of(offsetof(Splat<T>, sx)), *sy = of(offsetof(Splat<T>, sy)), *ty = of(offsetof(Splat<T>, ty));
-    const T *log2_o = of(offsetof(Splat<T>, log2_o)), *ex = of(offsetof(Splat<T>, extent)), *ey = of(offsetof(Splat<T>, extent) + sizeof(T));
+    const T *log2_o = of(offsetof(Splat<T>, log2_o)), *ex = of(offsetof(Splat<T>, extent)),
+            *ey = of(offsetof(Splat<T>, extent) + sizeof(T));
     T inverse_ey[BATCH], rightmost[BATCH], tangent[BATCH], half[BATCH], slack[BATCH];
     int32_t top[BATCH], rows[BATCH];
     const int32_t tiles_x = grid.tiles_x;

@@ -11,8 +11,19 @@ namespace GSPLAT_ISA {
 
 template <class T>
 static constexpr Kernels<T> kernels() {
-    return {project<T>,       count<T>, scatter<T>, composite<T>, composite_backward<T>, project_backward<T>, adam<T>,
-            adam_backward<T>, loss<T>,  noise<T>,   recolor<T>,   recolor_backward<T>, KEEPS_ROWS ? int64_t(sizeof(KeptRows<T>)) : 0};
+    return {project<T>,
+            count<T>,
+            scatter<T>,
+            composite<T>,
+            composite_backward<T>,
+            project_backward<T>,
+            adam<T>,
+            adam_backward<T>,
+            loss<T>,
+            noise<T>,
+            recolor<T>,
+            recolor_backward<T>,
+            KEEPS_ROWS ? int64_t(sizeof(KeptRows<T>)) : 0};
 }
 
 // Twelve independent chains of vector FMAs, enough to hide their latency and few enough for sixteen registers: a
