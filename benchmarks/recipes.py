@@ -139,6 +139,7 @@ RECIPES = {
     **{f"without-{name}": without(name) for name in PIECES},
     **{f"only-{name}": without(*(other for other in PIECES if other != name)) for name in PIECES},
     "no-piece": without(*PIECES),
+    "fast-4200": Recipe("fast", 4_200),
     "adc-3k": Recipe("adc", STANDARD),
     "mcmc-3k": Recipe("mcmc", STANDARD),
 }
