@@ -51,11 +51,11 @@ export function gallery(entry) {
     // Reads the photos if they have changed; resolves once they are shown.
     read(now) {
       const next = `${now.files} ${now.modified}`;
-      if (next !== version) reading = this.readAgain();
+      if (next !== version) reading = this.readAgain(now);
       version = next;
       return reading;
     },
-    async readAgain() {
+    async readAgain(now) {
       photos = (await get(at(entry, "photos"))).photos;
       const sizes = new Map();
       for (const { W, H, problem } of photos) if (!problem) sizes.set(`${W} × ${H}`, (sizes.get(`${W} × ${H}`) ?? 0) + 1);
