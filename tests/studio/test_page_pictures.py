@@ -114,6 +114,12 @@ def test_a_training_is_drawn_while_it_runs(visitor, library, tmp_path):
     tab.locator(".job .state", has_text="stopped").wait_for()
 
 
+def camera_at(z, focal, W, H):
+    """A page's camera on the z axis that looks along it."""
+    turn = np.eye(3).tolist()
+    return {"R": turn, "eye": [0, 0, z], "fx": focal, "fy": focal, "cx": W / 2, "cy": H / 2, "W": W, "H": H}
+
+
 def painter_here():
     """A painter that draws in this process."""
     painter = Painter()
@@ -123,16 +129,7 @@ def painter_here():
 
 def test_pictures_wait_for_one_another_only_while_a_training_runs(wall_entry):
     painter = painter_here()
-    camera = {
-        "R": np.eye(3).tolist(),
-        "eye": [0, 0, -4],
-        "fx": 20,
-        "fy": 20,
-        "cx": 10,
-        "cy": 10,
-        "W": 20,
-        "H": 20,
-    }
+    camera = camera_at(-4, 20, 20, 20)
     task = {"source": str(wall_entry / "wall.ply"), "camera": camera, "live": False}
     first = painter.paint(lambda: True, **task)
     painter._free_at += 1e6  # as if the picture had taken long
@@ -157,16 +154,7 @@ def test_a_snapshot_is_drawn_with_the_settings_of_its_training(wall_entry, tmp_p
     run.page.write_text(json.dumps({"settings": settings}))
     gaussians = found.scene.gaussians
     run.scene.write_bytes(framed(7, len(gaussians), 0, page_data.packed(gaussians)))
-    camera = {
-        "R": np.eye(3).tolist(),
-        "eye": [0, 0, -18],
-        "fx": 40,
-        "fy": 40,
-        "cx": 40,
-        "cy": 20,
-        "W": 80,
-        "H": 40,
-    }
+    camera = camera_at(-18, 40, 80, 40)
     data = painter_here().paint(lambda: False, source=str(tmp_path), camera=camera, live=True)
     pixels = np.asarray(Image.open(io.BytesIO(data)), dtype=int)
     assert np.abs(pixels[0, 0] - (0, 0, 255)).max() < 8 and pixels[20, 40, 2] < 250

@@ -15,6 +15,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Bool
+from torch import Tensor
 
 from gsplat_edu.adam import adam_step
 from gsplat_edu.camera import Camera
@@ -79,24 +80,24 @@ def aligned_psnr(
     fixed = gaussians.map(lambda tensor: tensor.detach())
     device = fixed.means.device
     target, mask = torch.from_numpy(truth).to(device), torch.from_numpy(fitted).to(device)
+
+    def shown(camera: Camera | CameraTensors) -> Tensor:
+        output = render(fixed, camera)
+        if not colors:
+            return output.image
+        return at_exposure_of(truth, output.image, fitted, seen_through(photo, output, background))
+
     start = CameraTensors.of(view.camera)
     twist = torch.zeros(6, dtype=torch.float64)
     units = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
     first, second = torch.zeros_like(twist), torch.zeros_like(twist)
     for step in range(STEPS):
         leaf = twist.clone().requires_grad_()
-        output = render(fixed, start.moved(leaf * units))
-        image = output.image
-        if colors:
-            image = at_exposure_of(truth, image, fitted, seen_through(photo, output, background))
+        image = shown(start.moved(leaf * units))
         (gradient,) = torch.autograd.grad(photo_loss(image, target, mask), leaf)
         adam_step(twist, first, second, gradient, _numbers(step))
     with torch.no_grad():
-        output = render(fixed, start.moved(twist * units).value())
-        image = output.image
-        if colors:
-            image = at_exposure_of(truth, image, fitted, seen_through(photo, output, background))
-    return psnr(image, truth, scored)
+        return psnr(shown(start.moved(twist * units).value()), truth, scored)
 
 
 def light_squares(H: int, W: int) -> Bool[np.ndarray, "H W"]:

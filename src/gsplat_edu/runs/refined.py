@@ -84,5 +84,7 @@ def aligned_score(
     if mean is None:
         return {}
     what = "poses aligned and colours fitted" if colors else "poses aligned"
-    say(f"held-out photos, {what} on every other square: {mean:.2f} dB PSNR of the other squares")
+    say(
+        f"held-out photos, {what} on every other square of a grid: {mean:.2f} dB PSNR on the remaining squares"
+    )
     return {"psnr_aligned": round(mean, 4)}

@@ -74,9 +74,8 @@ class Library:
             (self.root / kind).mkdir(parents=True, exist_ok=True)
         for part in ("jobs", "trash", "uploads", "cache"):
             self.hidden(part).mkdir(parents=True, exist_ok=True)
-        pages = (
-            self.hidden("cache") / part for part in ("pages", "live")
-        )  # of this version, or an older one
+        # cached pages may be those of an older version
+        pages = [self.hidden("cache") / part for part in ("pages", "live")]
         for left in (*self.hidden("uploads").iterdir(), *pages):
             _delete(left)
 

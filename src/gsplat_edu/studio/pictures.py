@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 from http import HTTPStatus
 from pathlib import Path
@@ -62,14 +63,19 @@ def thumbnail(library: Library, entry: Path, name: str, side: str) -> Path:
         facts = photo.stat()
     except OSError:
         raise not_found(f"{entry.name}/{legible(name)}") from None
-    key = f"{photo} {facts.st_size} {facts.st_mtime_ns} {side}"
-    digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
-    target = library.hidden("cache") / "thumbs" / digest[:2] / f"{digest[2:]}.jpg"
+    target = library.hidden("cache") / "thumbs" / f"{cache_name(photo, facts)}-{side}.jpg"
     if not target.is_file():
         with _decoding:
             if not target.is_file():
                 _make(photo, int(side), target)
     return target
+
+
+def cache_name(path: Path, facts: os.stat_result) -> str:
+    """Return the name of what is made from a file and cached; it changes with the file."""
+    key = f"{path} {facts.st_size} {facts.st_mtime_ns}"
+    digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
+    return f"{digest[:2]}/{digest[2:]}"
 
 
 def _make(photo: Path, side: int, target: Path) -> None:

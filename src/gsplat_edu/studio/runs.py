@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import threading
 from collections.abc import Mapping
@@ -18,6 +17,7 @@ from gsplat_edu.files import written_aside
 from gsplat_edu.image_files import UNDECODABLE, opened_image
 from gsplat_edu.reading import open_file, parse_json
 from gsplat_edu.runs.folder import RunFolder, image_file_names
+from gsplat_edu.studio.pictures import cache_name
 from gsplat_edu.studio.refusal import RefusedError, not_found
 
 MOST_READ = 8 << 20
@@ -161,9 +161,8 @@ def view_preview(cache: Path, folder: RunFolder, index: str, what: str) -> Path:
         facts = path.stat()
     except OSError:
         raise not_found(f"picture {path.name}") from None
-    key = f"{path} {facts.st_size} {facts.st_mtime_ns}"
-    digest = hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()
-    targets = {name: cache / digest[:2] / f"{digest[2:]}-{name}.jpg" for name in PICTURES}
+    made = cache_name(path, facts)
+    targets = {name: cache / f"{made}-{name}.jpg" for name in PICTURES}
     with _making:  # a page asks for all three at once
         if not targets[what].is_file():
             for name, pixels in _parts(path).items():

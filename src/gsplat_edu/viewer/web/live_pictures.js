@@ -6,9 +6,10 @@ const STILL_SIDE = 1600; // while it waits or is finished
 
 // Takes the place of Renderer.
 class Pictures {
-  // address: where the pictures are, relative to the page. told(line): hears why there is none, or "".
-  constructor(canvas, address, told) {
-    Object.assign(this, { canvas, address, told, asking: false, wanted: null, still: false, failure: "" });
+  // address: URL of the pictures, relative to the page. onResult(line): called after each request, with the reason if there
+  // is no picture, and with "" if there is one.
+  constructor(canvas, address, onResult) {
+    Object.assign(this, { canvas, address, onResult, asking: false, wanted: null, still: false, failure: "" });
     this.context = canvas.getContext("2d");
   }
 
@@ -49,7 +50,7 @@ class Pictures {
       } catch (error) {
         this.failure = error instanceof TypeError ? "The program that draws the pictures cannot be reached." : error.message;
       }
-      this.told(this.failure);
+      this.onResult(this.failure);
     }
     this.asking = false;
   }
@@ -74,13 +75,13 @@ const hasWebGL2 = () => {
 addEventListener("DOMContentLoaded", (event) => {
   if (hasWebGL2()) return;
   event.stopImmediatePropagation();
-  const told = (line) => {
+  const showResult = (line) => {
     say(line);
     element("count").textContent = `${FACTS.count.toLocaleString("en")} splats, drawn by the program that serves this page: this browser has no WebGL2`;
   };
   class PictureViewer extends Viewer {
     makeRenderer() {
-      const pictures = new Pictures(this.canvas, FACTS.pictures ?? "picture", FACTS.live ? () => {} : told);
+      const pictures = new Pictures(this.canvas, FACTS.pictures ?? "picture", FACTS.live ? () => {} : showResult);
       pictures.still = !FACTS.live;
       return pictures;
     }

@@ -11,7 +11,7 @@ uniform highp isampler2D quats;
 uniform highp sampler2D logit_opacities;
 uniform highp sampler2D sh;
 uniform highp usampler2D order;  // splats, far to near
-uniform int first;               // place in the order of the first one that is drawn
+uniform int first;               // where in the sorted order this draw call begins
 uniform int end;                 // place behind the last one
 uniform int batch_splats;        // per instance
 uniform float thinning;          // of a sample of the splats, see sort_worker.js; 0 if all are drawn
