@@ -142,7 +142,7 @@ class Live {
       if (!buffer) continue; // the server ended
       const { header, splats } = unframed(buffer);
       await this.viewer.replace({ count: header.count, sh_degree: header.sh_degree }, splats);
-      this.viewer.renderer.finish();
+      await this.viewer.renderer.drawn();
       iteration = header.iteration;
       say("");
       element("count").textContent += ` after ${whole(iteration)} iterations`;
