@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from block_runs import RECIPE
 from gsplat_edu.blocks.layout import BlocksFolder, Done
@@ -115,6 +116,36 @@ def test_a_missing_photo_stops_its_blocks_and_loses_nothing(city, run, serial, c
         BlocksFolder(folder).read_done(number, BlockPlan.read(folder).digest()) for folder in (run, serial)
     )
     assert done.sha256 == known.sha256
+
+
+def test_a_photo_or_a_camera_changed_after_the_split_is_named_before_anything_is_written(
+    city, run, serial, tmp_path, capsys
+):
+    capture = tmp_path / "capture"
+    shutil.copytree(city, capture)
+    plan = BlockPlan.read(run)
+    name = plan.blocks[0].train[-1]
+    other = next(i for i, block in enumerate(plan.blocks) if name not in (*block.train, *block.test))
+    photo, original = capture / "images" / name, (city / "images" / name).read_bytes()
+    with Image.open(photo) as image:
+        image.rotate(180).save(photo)
+    words = ["--data", str(capture)]
+    assert main(["block", str(run), "0", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is not as it was split: different photos: 1 of" in line and f"first {name}" in line
+    assert not (run / "blocks" / "block_00").exists()
+    assert main(["block", str(run), str(other), *words]) == 0, "a block without that photo is trained"
+    photo.write_bytes(original)
+    assert main(["block", str(run), "0", *words]) == 0, "the restored photo is accepted"
+    finished = tmp_path / "finished"
+    shutil.copytree(serial, finished)
+    photo.write_bytes((city / "images" / plan.blocks[0].test[0]).read_bytes())
+    assert main(["merge", str(finished), *words]) == 2
+    assert f"first {name}" in capsys.readouterr().err
+    (run / "photos.json").write_text("{}")
+    third = next(i for i in range(4) if i not in (0, other))
+    assert main(["block", str(run), str(third), *words]) == 2
+    assert "photos.json: is missing or not as it was split" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_one_line_and_the_block_goes_on(run, serial, capsys):

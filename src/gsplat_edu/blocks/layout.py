@@ -1,6 +1,7 @@
 """The folder of a run in blocks, and the records of what is finished.
 
     plan.json                  the cells, the views of each block, and the recipe
+    cameras.json, photos.json  the views when the capture was split; the merged run's, too
     coarse/                    the run of the coarse model, unless a scene was given
     starts/block_00.ply        what each block starts from
     blocks/block_00/           an ordinary run folder for each block

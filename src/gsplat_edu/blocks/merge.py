@@ -13,6 +13,7 @@ import torch
 
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
+from gsplat_edu.blocks.same import check_views
 from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
 from gsplat_edu.blocks.task import block_options
 from gsplat_edu.data.dataset import Dataset, load_dataset
@@ -21,7 +22,7 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
-from gsplat_edu.runs.identity import fingerprint, photo_digests
+from gsplat_edu.runs.identity import fingerprint
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.runs.training import Export, document
@@ -104,8 +105,7 @@ def merge_blocks(
     dataset = load_dataset(options.data, options.data_settings)
     steps = max(done.iterations for done in records)
     run = folder.merged
-    run.write_cameras(dataset.train, dataset.test, dataset.origin)
-    run.write_photos(photo_digests(dataset))
+    check_views(folder, plan, dataset)
     scene = run.scene(steps)
     save_ply(scene, gaussians, plan.origin, options.config.antialiased)
     run.write_config(_config(options, plan, dataset))

@@ -167,6 +167,8 @@ class BlockPlan:
         area: The ground.
         blocks: The blocks.
         recipe: Sections "train", "data" and so on of each block's run, as in config.json.
+        views: SHA-256 of the files that hold the views at the time of the split: cameras.json and, with the digest of
+            every photo and mask, photos.json.
     """
 
     capture: str
@@ -174,6 +176,7 @@ class BlockPlan:
     area: Area
     blocks: tuple[Block, ...]
     recipe: dict[str, Any] = dataclasses.field(default_factory=dict)
+    views: dict[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def cores(self) -> list[Cell]:
@@ -221,9 +224,10 @@ class BlockPlan:
             )
             recipe = dict(found["recipe"])
             capture = str(found["capture"])
+            views = {str(name): str(digest) for name, digest in dict(found["views"]).items()}
         except (ValueError, KeyError, TypeError) as error:
             raise CheckpointError(f"{path}: is damaged ({error}); restore it, or split again") from None
-        return cls(capture, (x, y, z), Area(ground, low, high, heights), blocks, recipe)
+        return cls(capture, (x, y, z), Area(ground, low, high, heights), blocks, recipe, views)
 
     def digest(self) -> str:
         """Return a digest of everything except the capture's path, which differs between machines."""

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsplat_edu.blocks.layout import PLAN, BlocksFolder, file_digest
 from gsplat_edu.blocks.plan import Block, BlockPlan, automatic_count, measured_area
+from gsplat_edu.blocks.same import write_views
 from gsplat_edu.blocks.views import LEAST_VIEWS, assigned, in_any_view, seen_shares
 from gsplat_edu.budget.costs import wanted_gaussians
 from gsplat_edu.camera import Camera
@@ -125,7 +126,9 @@ def split_capture(options: RunOptions, coarse: Path, split: SplitOptions, say: S
             f" {len(kept):,} Gaussians to start from"
         )
     x, y, z = dataset.origin.tolist()
-    plan = BlockPlan(str(options.data.resolve()), (x, y, z), area, tuple(made), recipe_of(options))
+    capture = str(options.data.resolve())
+    known = write_views(folder, made, dataset)
+    plan = BlockPlan(capture, (x, y, z), area, tuple(made), recipe_of(options), known)
     plan.write(folder.path)  # last: its presence means that everything else is there
     return plan
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import platform
 import socket
 from collections.abc import Callable, Sequence
@@ -9,12 +10,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
+from gsplat_edu.blocks.same import check_views
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
+from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.kernels import REASON, native
 from gsplat_edu.locks import locked
 from gsplat_edu.runs.options import RunOptions
@@ -86,7 +86,7 @@ def train_block(
     Raises:
         ArgumentError: there is no such block, or another process is training it.
         CheckpointError: plan, start or run are damaged.
-        DatasetError: a photo is missing or cannot be read here.
+        DatasetError: a photo is missing, cannot be read here, or was changed since the capture was split.
         OSError: a file cannot be written, for example because the disk is full.
     """
     folder = BlocksFolder(path)
@@ -100,9 +100,7 @@ def train_block(
         start = folder.start(number)
         if not start.is_file() or file_digest(start) != plan.blocks[number].start:
             raise CheckpointError(f"{start}: is missing or not as it was split; restore it, or split again")
-        capture = CaptureRun(options, say)
-        if not np.array_equal(capture.dataset.origin, plan.origin):
-            raise DatasetError(f"{options.data}: photos that the plan knows are missing here; copy them here")
+        capture = CaptureRun(options, say, check=functools.partial(check_views, folder, plan))
         if capture.train(stop, callbacks):
             return None
         capture.finish()

@@ -103,20 +103,40 @@ def capture_difference(folder: RunFolder, dataset: Dataset) -> str | None:
     Raises:
         CheckpointError: a file of the run is damaged.
     """
-    here = [(view, "train") for view in dataset.train] + [(view, "test") for view in dataset.test]
-    known = folder.read_cameras(dataset.origin) if folder.cameras.is_file() else None
-    if known is not None and len(known) != len(here):
-        return f"the run was started with {len(known)} views, but this capture has {len(here)}"
-    for (name, split, camera), (view, part) in zip(known or (), here, strict=known is not None):
-        if (name, split) != (view.name, part) or not _alike(camera, view.camera):
-            return f"different cameras: {view.name} differs"
+    here = [(view.name, "train") for view in dataset.train] + [(view.name, "test") for view in dataset.test]
+    if folder.cameras.is_file():
+        known = [(name, split) for name, split, _ in folder.read_cameras(dataset.origin)]
+        if len(known) != len(here):
+            return f"the run was started with {len(known)} views, but this capture has {len(here)}"
+        if changed := [
+            name for (name, split), view in zip(known, here, strict=True) if (name, split) != view
+        ]:
+            return f"different cameras: {changed[0]} differs"
+    if (found := views_difference(folder, dataset)) is not None:
+        return found
+    if folder.photos.is_file() or not _comparable(config := folder.read_config()):
+        return None
+    return "different photos or start points" if config.get("fingerprint") != fingerprint(dataset) else None
+
+
+def views_difference(folder: RunFolder, dataset: Dataset) -> str | None:
+    """Describe how the cameras and photos of a dataset differ from those that a folder knows; None if they do not.
+
+    The folder may know more views than the dataset has, and may have split them otherwise.
+
+    Raises:
+        CheckpointError: a file of the folder is damaged.
+    """
+    if folder.cameras.is_file():
+        known = {name: camera for name, _, camera in folder.read_cameras(dataset.origin)}
+        for view in (*dataset.train, *dataset.test):
+            if view.name not in known or not _alike(known[view.name], view.camera):
+                return f"different cameras: {view.name} differs"
     then = folder.read_photos()
     if then is not None:
         now = photo_digests(dataset)
         if changed := [name for name in now if then.get(name) != now[name]]:
             return f"different photos: {len(changed)} of {len(now)} changed since the run started, first {changed[0]}"
-    elif _comparable(config := folder.read_config()) and config.get("fingerprint") != fingerprint(dataset):
-        return "different photos or start points"
     return None
 
 

@@ -143,6 +143,7 @@ class CaptureRun:
         progress: Receives the number of photos read and their total.
         team: The processes that share the training; each makes this object and calls `train`. Only the first uses the
             folder, so the others may run on machines that do not have it.
+        check: Called with the capture before anything is written; it raises an error for one that must not be trained.
 
     Raises:
         CheckpointError: the folder contains a different run, or one that the options do not resume.
@@ -164,6 +165,7 @@ class CaptureRun:
         say: Callable[[str], None] = lambda sentence: None,
         progress: Callable[[int, int], None] | None = None,
         team: Member = ALONE,
+        check: Callable[[Dataset], None] = lambda dataset: None,
     ) -> None:
         self._team, self._leads = team, team.rank == 0
         options = _checked_folder(options) if self._leads else options
@@ -178,6 +180,7 @@ class CaptureRun:
         self.dataset = load_dataset(options.data, settings, points=options.points)
         for note in self.dataset.notes:
             say(note)
+        check(self.dataset)
         self.dataset.preload(progress)
         if options.config.transients != "none":
             check_enough(len(self.dataset.train))
