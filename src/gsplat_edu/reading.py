@@ -10,7 +10,7 @@ import json
 import os
 import stat
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, BinaryIO
 
 from gsplat_edu.headroom import require_memory
@@ -90,6 +90,20 @@ def parse_json(text: str | bytes, parse_constant: Callable[[str], Any] | None = 
     except ValueError as error:
         # Python's own message advises changing a limit of the interpreter.
         raise ValueError("a number has thousands of digits") if "digits" in str(error) else error from None
+
+
+def stored_path(value: object) -> Path | None:
+    """Return a path that a file names, such as a run's config.json; None if it must not be opened.
+
+    These files are exchanged. On Windows, //server/share is an address: opening it logs in there with the user's name.
+    A network share is therefore never taken from a file, only from the command line.
+
+    Args:
+        value: The value of a field.
+    """
+    if not isinstance(value, str) or not value or "\0" in value:
+        return None
+    return None if PureWindowsPath(value).drive.startswith("\\\\") else Path(value)
 
 
 def _check_regular(path: Path, mode: int) -> None:

@@ -3,6 +3,7 @@
 import json
 import resource
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def test_each_block_keeps_the_gaussians_of_its_cell(serial):
         part = whole[first : first + cell["gaussians"]]
         assert block.core.holds(plan.area.ground.coordinates(part)).all()
         done = folder.read_done(number, plan.digest())
-        trained = load_ply(serial / done.scene).means.numpy()
+        trained = load_ply(folder.scene(number, done.iterations)).means.numpy()
         inside = block.core.holds(plan.area.ground.coordinates(trained))
         np.testing.assert_array_equal(part, trained[inside])
         assert 0 < inside.sum() < len(trained), "a block also has what its views show around it"
@@ -148,6 +149,30 @@ def test_a_photo_or_a_camera_changed_after_the_split_is_named_before_anything_is
     assert "photos.json: is missing or not as it was split" in capsys.readouterr().err
 
 
+def test_a_plan_or_a_record_from_elsewhere_opens_no_other_file(serial, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(serial, copy)
+    folder, plan = BlocksFolder(copy), BlockPlan.read(copy)
+    record = json.loads(folder.record(1).read_text())
+    for change in (
+        {"scene": "../../outside.ply"},
+        {"iterations": "../../outside"},
+        {"seconds": 1e400},
+        {"host": "x" * 2000},
+    ):
+        folder.record(1).write_text(json.dumps(record | change))
+        assert main(["merge", str(copy)]) == 2
+        assert "block_01.json: is damaged" in capsys.readouterr().err
+    folder.record(0).unlink()
+    for capture in ("//server/share", "\\\\server\\share", "a\0b"):
+        replace(plan, capture=capture).write(copy)
+        assert main(["block", str(copy), "0"]) == 2
+        assert "plan.json: capture: is not a path of this computer" in capsys.readouterr().err
+    replace(plan, recipe=plan.recipe | {"backend": "tcp://192.0.2.1:1"}).write(copy)
+    assert main(["block", str(copy), "0"]) == 2
+    assert "recipe is damaged (backend: is" in capsys.readouterr().err
+
+
 def test_a_full_disk_is_one_line_and_the_block_goes_on(run, serial, capsys):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))  # too little for a checkpoint
@@ -170,7 +195,7 @@ def test_what_was_changed_or_damaged_is_named(serial, tmp_path, capsys):
     shutil.copytree(serial, copy)
     folder = BlocksFolder(copy)
     done = folder.read_done(3, BlockPlan.read(copy).digest())
-    with (copy / done.scene).open("ab") as file:
+    with folder.scene(3, done.iterations).open("ab") as file:
         file.write(b"x")
     assert main(["merge", str(copy)]) == 2
     assert "block_03" in (error := capsys.readouterr().err) and "was changed after the training" in error

@@ -157,6 +157,15 @@ def test_a_copy_of_the_capture_is_the_same_and_a_changed_photo_is_named(made, ru
     assert "1 of 6 changed since the run started, first view_002.png" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("place", ["//server/share", "\\\\server\\share\\x", "a\0b", ""])
+def test_a_run_that_names_another_computer_opens_no_connection(run, cli, capsys, place):
+    """On Windows, opening a network share logs in there with the user's name; the run may come from anybody."""
+    config = run.read_config()
+    run.write_config(config | {"data": config["data"] | {"path": place}})
+    assert cli(["eval", str(run.path)]) == 2
+    assert "data: path: is not a path of this computer; give the dataset's folder" in capsys.readouterr().err
+
+
 def test_only_stale_renders_of_other_views_are_removed(run, cli):
     """Older versions left renders of another dataset in the run's folder."""
     folder = run.renders / "test"

@@ -109,7 +109,7 @@ def run_on_cluster(
 
 
 def _task(folder: str, number: int, share: int) -> dict[str, Any]:
-    """Train a block on a worker; return its scene and digest, or what went wrong in one line."""
+    """Train a block on a worker; return the digest of its scene, or what went wrong in one line."""
     import torch
 
     from gsplat_edu.blocks.task import train_block
@@ -130,7 +130,7 @@ def _task(folder: str, number: int, share: int) -> dict[str, Any]:
                 return {"error": described(error)}
             raise
     assert done is not None, "nothing stops a block here"
-    return {"scene": done.scene, "sha256": done.sha256}
+    return {"sha256": done.sha256}
 
 
 def _distributed() -> Any:  # noqa: ANN401

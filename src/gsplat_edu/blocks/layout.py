@@ -17,8 +17,10 @@ import dataclasses
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from gsplat_edu.errors import CheckpointError
+from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.json_fields import checked_text, checked_whole, number_within
 from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.runs.folder import RunFolder, write_json
 
@@ -27,6 +29,13 @@ PLAN = "plan.json"
 
 MOST_BLOCKS = 256
 """Largest number of blocks."""
+
+
+LONGEST_TEXT = 1_000
+"""Characters of a text in a record."""
+
+LARGEST = 2**53
+"""Largest number in a record; JSON's readers keep whole numbers up to it exactly."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,10 @@ class BlocksFolder:
         """Return the run of a block."""
         return RunFolder(self.path / "blocks" / f"block_{number:02d}")
 
+    def scene(self, number: int, iterations: int) -> Path:
+        """Return the trained scene of a block."""
+        return self.run(number).scene(iterations)
+
     def record(self, number: int) -> Path:
         """Return the file that says that a block is finished."""
         return self.path / "blocks" / f"block_{number:02d}.json"
@@ -80,8 +93,8 @@ class BlocksFolder:
         if not path.is_file():
             return None
         try:
-            done = Done(**parse_json(read_text(path)))
-        except (ValueError, TypeError) as error:
+            done = Done.checked(parse_json(read_text(path)))
+        except (ValueError, TypeError, ArgumentError) as error:
             raise CheckpointError(
                 f"{path}: is damaged ({error}); remove it to train the block again"
             ) from None
@@ -99,8 +112,7 @@ class Done:
     Args:
         block: Its number.
         plan: Digest of the plan.
-        scene: Path of its scene, relative to the folder of the run in blocks.
-        sha256: Digest of that file.
+        sha256: Digest of its scene: `BlocksFolder.scene`.
         gaussians: Number of Gaussians in it.
         iterations: Steps of the training.
         seconds: Duration of the training.
@@ -112,7 +124,6 @@ class Done:
 
     block: int
     plan: str
-    scene: str
     sha256: str
     gaussians: int
     iterations: int
@@ -121,6 +132,21 @@ class Done:
     host: str
     instructions: str
     version: str
+
+    @classmethod
+    def checked(cls, entry: dict[str, Any]) -> Done:
+        """Return the record in a JSON object.
+
+        Raises:
+            ArgumentError: a field is of another type or out of range.
+            TypeError: a field is missing or unknown.
+        """
+        for name in ("block", "gaussians", "iterations", "peak_memory"):
+            checked_whole(name, entry.get(name), 0, LARGEST)
+        for name in ("plan", "sha256", "host", "instructions", "version"):
+            checked_text(name, entry.get(name), LONGEST_TEXT)
+        number_within("seconds", entry.get("seconds"), 0, LARGEST)
+        return cls(**entry)
 
     def write(self, folder: BlocksFolder) -> None:
         """Write the record.

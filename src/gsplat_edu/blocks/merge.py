@@ -45,7 +45,7 @@ def finished_blocks(folder: BlocksFolder, plan: BlockPlan) -> list[Done]:
         )
     records = [done for done in found if done is not None]
     for done in records:
-        scene = folder.path / done.scene
+        scene = folder.scene(done.block, done.iterations)
         if not scene.is_file() or file_digest(scene) != done.sha256:
             raise CheckpointError(
                 f"{scene}: is missing or was changed after the training; restore it, or remove"
@@ -67,7 +67,7 @@ def merged(folder: BlocksFolder, plan: BlockPlan, records: list[Done]) -> tuple[
     """
     parts = []
     for block, done in zip(plan.blocks, records, strict=True):
-        gaussians = load_ply(folder.path / done.scene, plan.origin)
+        gaussians = load_ply(folder.scene(done.block, done.iterations), plan.origin)
         places = plan.area.ground.coordinates(gaussians.means.numpy())
         stays = torch.from_numpy(np.flatnonzero(block.core.holds(places)))
         parts.append(gaussians.map(functools.partial(torch.index_select, dim=0, index=stays)))

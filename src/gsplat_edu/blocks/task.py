@@ -15,8 +15,11 @@ from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.json_fields import checked_choice
 from gsplat_edu.kernels import REASON, native
 from gsplat_edu.locks import locked
+from gsplat_edu.reading import stored_path
+from gsplat_edu.render.settings import BACKENDS
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun
 from gsplat_edu.train.config import TrainConfig
@@ -36,22 +39,27 @@ def block_options(folder: BlocksFolder, plan: BlockPlan, number: int, data: Path
 
     Raises:
         ArgumentError: there is no such block.
-        CheckpointError: the plan's recipe is damaged.
+        CheckpointError: the plan's recipe is damaged, or its capture is not on this computer.
     """
     if not 0 <= number < len(plan.blocks):
         raise ArgumentError(f"block: is {number}, but the plan has blocks 0 to {len(plan.blocks) - 1}")
     block = plan.blocks[number]
+    capture = stored_path(plan.capture) if data is None else data
+    if capture is None:
+        raise CheckpointError(
+            f"{folder.plan}: capture: is not a path of this computer; name the capture with --data PATH"
+        )
     try:
         train, settings = (_tuples(plan.recipe[name]) for name in ("train", "data"))
         config = TrainConfig().changed(**train | {"max_gaussians": block.max_gaussians})
         views = {"train_views": block.train, "test_views": block.test}
         return RunOptions(
-            data=Path(plan.capture) if data is None else data,
+            data=capture,
             out=folder.run(number).path,
             config=config,
             data_settings=DataSettings(**settings | views),
             scene=folder.start(number),
-            backend=str(plan.recipe["backend"]),
+            backend=checked_choice("backend", plan.recipe["backend"], BACKENDS),
             eval_every=plan.recipe["eval_every"],
             save_every=plan.recipe["save_every"],
             resume=folder.run(number).exists(),
@@ -114,7 +122,6 @@ def _record(folder: BlocksFolder, plan: BlockPlan, number: int, capture: Capture
     return Done(
         block=number,
         plan=plan.digest(),
-        scene=scene.relative_to(folder.path).as_posix(),
         sha256=file_digest(scene),
         gaussians=int(capture.folder.read_metrics()["num_gaussians"]),
         iterations=capture.trainer.iteration,

@@ -134,7 +134,7 @@ def _after(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis, 
     extent = scene_extent([view.camera for view in dataset.train])
     planned = section.get("iterations") if isinstance(section, dict) else None
     planned = planned if isinstance(planned, int) else None
-    capture = arguments.dataset or Path(config["data"]["path"])
+    capture = arguments.dataset or Path(config["data"]["path"])  # run_dataset has checked it
     beforehand, uncompared = ([], "") if appearance != "none" else _exposure_beforehand(capture, console)
     trained = Trained(
         folder.path,

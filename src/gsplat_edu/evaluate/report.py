@@ -26,6 +26,7 @@ from gsplat_edu.evaluate.images import small_jpeg
 from gsplat_edu.evaluate.masked import MaskedPicture, masked_figures
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
 from gsplat_edu.files import written_aside
+from gsplat_edu.reading import stored_path
 from gsplat_edu.text import write_text
 
 PICTURES = 8
@@ -282,8 +283,8 @@ def _page_link(report: Path, exports: object) -> str:
     """Link to the page that shows the scene, or show the command that makes one."""
     folder = report.parent.absolute()
     entries = exports if isinstance(exports, list) else []
-    named = [str(entry.get("path")) for entry in entries if isinstance(entry, Mapping)]
-    pages = [Path(name) for name in named if name.endswith(".html")] + [folder / "page.html"]
+    named = [stored_path(entry.get("path")) for entry in entries if isinstance(entry, Mapping)]
+    pages = [path for path in named if path is not None and path.suffix == ".html"] + [folder / "page.html"]
     for page in pages:
         if page.is_file() and page.absolute() != report.absolute():
             place = quote(Path(os.path.relpath(page.absolute(), folder)).as_posix())

@@ -9,6 +9,7 @@ from typing import Any
 
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.reading import stored_path
 
 KEYS = ("resolution", "test_every", "background", "image_memory", "train_views", "test_views")
 """Keys of the section "data" that are data settings."""
@@ -53,17 +54,19 @@ def run_dataset(config: dict[str, Any], path: Path | None = None) -> Dataset:
         path: Current path of the dataset; the one in config.json if None.
 
     Raises:
-        CheckpointError: config.json does not name the dataset, or its settings are damaged.
+        CheckpointError: config.json does not name the dataset by a path of this computer, or its settings are damaged.
         DatasetError: the dataset cannot be read.
     """
     settings = data_settings(config)
-    place = config["data"].get("path")
-    if path is None and not isinstance(place, str):
-        raise CheckpointError(
-            "config.json: data: path is missing; give the dataset's folder with --dataset PATH"
-        )
-    if path is None and not Path(place).exists():
-        raise CheckpointError(
-            f"{place}: the run's dataset no longer exists; give its folder with --dataset PATH"
-        )
-    return load_dataset(path or Path(place), settings)
+    if path is None:
+        named = config["data"].get("path")
+        path = stored_path(named)
+        if path is None:
+            raise CheckpointError(
+                "config.json: data: path: is not a path of this computer; give the dataset's folder with --dataset PATH"
+            )
+        if not path.exists():
+            raise CheckpointError(
+                f"{named}: the run's dataset no longer exists; give its folder with --dataset PATH"
+            )
+    return load_dataset(path, settings)

@@ -23,6 +23,7 @@ from gsplat_edu.evaluate.report import machine_facts
 from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.reading import stored_path
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
 from gsplat_edu.runs.dataset import as_trained
@@ -112,7 +113,11 @@ def _with_scene(options: RunOptions) -> RunOptions:
             " leave --from out, or give another --out"
         )
     if stored is not None and options.scene is None and not list_checkpoints(options.folder.checkpoints):
-        return dataclasses.replace(options, scene=Path(str(stored)))
+        if (scene := stored_path(stored)) is None:
+            raise CheckpointError(
+                f"{options.folder.config}: data: scene: is not a path of this computer; name the scene with --from"
+            )
+        return dataclasses.replace(options, scene=scene)
     return options
 
 

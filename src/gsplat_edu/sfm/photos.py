@@ -260,6 +260,20 @@ def copy_photos(
     return facts, unreadable
 
 
+def photo_facts(files: Sequence[Path], source: Path, folder: Path) -> list[PhotoFacts]:
+    """Read the facts of photos from their headers, as `copy_photos` does, including those that cannot be decoded.
+
+    Args:
+        files: The photos.
+        source: Folder that their names are relative to.
+        folder: Folder of the copies.
+
+    Raises:
+        DatasetError: as for `copy_photos`.
+    """
+    return [photo for _, photo in _headers(files, source, folder)[0]]
+
+
 def _headers(
     files: Sequence[Path], source: Path, folder: Path
 ) -> tuple[list[tuple[Path, PhotoFacts]], dict[Path, tuple[Path, int]], list[str]]:

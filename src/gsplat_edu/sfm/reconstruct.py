@@ -38,6 +38,7 @@ from gsplat_edu.sfm.photos import (
     copy_photos,
     fingerprint,
     mask_folder,
+    photo_facts,
     photo_files,
     stored_mask,
 )
@@ -70,6 +71,9 @@ size had their own focal length; before 4, this still held if every photo had it
 
 FACES = 1
 """Version of the method that cuts panoramas."""
+
+PHOTOS = 2
+"""Version of the method that copies photos. Before 2, the facts of the photos were read from stages.json."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
@@ -150,10 +154,12 @@ class _Run:
             "photos": fingerprint(files, source),
             "max_image_size": options.max_image_size,
             "masks": fingerprint(sorted(masks.values()), source) if masks else "",
+            "method": PHOTOS,
         }
         copies = self.folder / "photos"
         facts = self._stage("photos", wanted, lambda: self._copy(files), [copies, mask_folder(copies)])
-        self.photos = [PhotoFacts(**photo | {"place": _place(photo["place"])}) for photo in facts["photos"]]
+        known = set(facts["names"])
+        self.photos = [photo for photo in photo_facts(files, source, copies) if photo.name in known]
         if self.panoramas is None:
             self.groups = _groups(self.photos, options.max_image_size)
         else:
@@ -273,7 +279,7 @@ class _Run:
         self._note_masks(files, photos)
         for note in UnreadColors.of([(photo.name, photo.problem) for photo in photos]):
             self._say(str(note))
-        return {"summary": summary, "photos": [asdict(photo) for photo in photos], "unreadable": unreadable}
+        return {"summary": summary, "names": [photo.name for photo in photos], "unreadable": unreadable}
 
     def _note_masks(self, files: Sequence[Path], photos: Sequence[PhotoFacts]) -> None:
         """Report the masks that are not used, and those whose orientation is ambiguous."""

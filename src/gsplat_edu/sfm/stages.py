@@ -3,13 +3,78 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import math
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.reading import parse_json, read_text
+
+
+def _text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _whole(value: object) -> bool:
+    return type(value) is int and 0 <= value < 2**31
+
+
+def _number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+
+
+def _texts(value: object) -> bool:
+    return isinstance(value, list) and all(map(_text, value))
+
+
+def _model(value: object) -> bool:
+    return isinstance(value, str) and _MODEL.fullmatch(value) is not None
+
+
+def _panoramas(value: object) -> bool:
+    """Accept objects with a name, the names of faces, and a place; a name of a face is a file beside the others."""
+    return isinstance(value, list) and all(
+        isinstance(one, dict)
+        and _text(one.get("name"))
+        and _texts(one.get("faces"))
+        and one["faces"]
+        and all(_PLAIN.fullmatch(face) for face in one["faces"])
+        and (one.get("place") is None or _place(one["place"]))
+        for one in value
+    )
+
+
+def _place(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(map(_number, value))
+
+
+_MODEL = re.compile(r"models/\d{1,4}/\d{1,4}")
+"""Folder of a model, relative to the work folder."""
+
+_PLAIN = re.compile(r"(?!\.)[^/\\\0]{1,255}")
+"""Name of a file without a folder."""
+
+Check = Callable[[object], bool]
+
+FACTS: Mapping[str, Mapping[str, Check]] = {
+    "frames": {},
+    "faces": {"panoramas": _panoramas},
+    "photos": {"names": _texts},
+    "features": {},
+    "matches": {"connected": _whole},
+    "mapping": {"folder": _model, "names": _texts, "doubtful": _texts, "unclear": _texts},
+    "capture": {},
+}
+"""The facts that a resumed run uses, by stage. Each also has "summary", for the user."""
+
+
+def are_facts(name: str, facts: object) -> bool:
+    """Return whether these are facts of a stage; the file may come from somebody else."""
+    checks = {"summary": _text, **FACTS[name]}
+    return isinstance(facts, dict) and all(check(facts.get(field)) for field, check in checks.items())
 
 
 class Stages:
@@ -32,7 +97,10 @@ class Stages:
         if path.is_file():
             try:
                 self._stages = parse_json(read_text(path))["stages"]
-                if not all({"options", "facts"} <= stage.keys() for stage in self._stages.values()):
+                if not all(
+                    {"options", "facts"} <= stage.keys() and isinstance(stage["options"], dict)
+                    for stage in self._stages.values()
+                ):
                     raise ValueError
             except (ValueError, KeyError, TypeError, AttributeError):
                 raise DatasetError(
@@ -50,13 +118,21 @@ class Stages:
         Args:
             name: The stage.
             options: The current options, as JSON values.
+
+        Raises:
+            DatasetError: the facts are damaged.
         """
         known = self._stages.get(name)
         if known is None:
             return None
         if known["options"] == options:
-            facts: dict[str, Any] | None = known["facts"]
-            return facts
+            facts = known["facts"]
+            if facts is not None and not are_facts(name, facts):
+                raise DatasetError(
+                    f"{self.path}: stages.{name}.facts: is damaged; remove {self.path.parent} and run the same command"
+                    " again"
+                )
+            return facts  # type: ignore[no-any-return]
         changed = [key for key in options if known["options"].get(key) != options[key]]
         self._say(
             f"{name}: {', '.join(changed) or 'options'} changed; repeating this stage and the later ones"
