@@ -163,7 +163,8 @@ def test_a_plan_or_a_record_from_elsewhere_opens_no_other_file(serial, tmp_path,
         folder.record(1).write_text(json.dumps(record | change))
         assert main(["merge", str(copy)]) == 2
         assert "block_01.json: is damaged" in capsys.readouterr().err
-    folder.record(0).unlink()
+    for number in range(4):
+        folder.record(number).unlink()
     for capture in ("//server/share", "\\\\server\\share", "a\0b"):
         replace(plan, capture=capture).write(copy)
         assert main(["block", str(copy), "0"]) == 2

@@ -1,12 +1,16 @@
 """Which splats a region holds, on scenes where the answer is plain."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
 
 from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.cells import MOST_TESTS, Work
 from gsplat_edu.edits.document import NEAR
 from gsplat_edu.edits.membership import Values, members
+from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -136,3 +140,63 @@ def test_values_are_those_of_float32(n):
     for array in (values.means, values.log_scales, values.sh0, values.logits):
         assert np.all(array == float(np.float32(1.0 / 3.0)))
     assert len(members(ops.Everything(), values)) == n
+
+
+def picture_points(rng, n):
+    """Splats seen at random places of a picture, among them many at one place and some on one line."""
+    u, v = rng.uniform(-40, 340, (2, n))
+    u[: n // 4], v[: n // 4] = 100.0, 50.0
+    u[n // 4 : n // 3] = 200.0
+    return values_at(*np.stack([(u - 5) / 10, (v - 6) / 20, np.zeros(n)], axis=1))
+
+
+def test_cells_change_no_answer_of_a_lasso_or_a_stroke():
+    """The same tests without cells: every splat against every edge and segment, as the format defines them."""
+    rng, n = np.random.default_rng(3), 500
+    values = picture_points(rng, n)
+    picture = FRONT
+    a, b, c = values.means.T - np.array(picture.position)[:, None]
+    u, v = (picture.fx * a) / c + picture.cx, (picture.fy * b) / c + picture.cy
+    for count in (3, 4, 60):
+        points = rng.uniform(-20, 320, (count, 2)).round(int(rng.integers(0, 3)))
+        corners = tuple(map(tuple, points.tolist()))
+        odd = np.zeros(n, dtype=bool)
+        for (ax, ay), (bx, by) in zip(np.roll(points, 1, axis=0), points, strict=True):
+            crossed = (ay > v) != (by > v)
+            odd[crossed] ^= u[crossed] < ((bx - ax) * (v[crossed] - ay)) / (by - ay) + ax
+        within = (u >= points[:, 0].min()) & (u <= points[:, 0].max())
+        within &= (v >= points[:, 1].min()) & (v <= points[:, 1].max())
+        np.testing.assert_array_equal(members(ops.Lasso(picture, corners), values), odd & within)
+        apart = np.full(n, np.inf)
+        for a, b in itertools.pairwise(points):
+            place, side = np.stack([u, v], axis=1), b - a
+            along = np.clip(((place - a) @ side) / (side @ side), 0, 1)
+            apart = np.minimum(apart, np.linalg.norm(place - a - along[:, None] * side, axis=1))
+        found = members(ops.Brush(picture, 7.0, corners), values)
+        clear = abs(apart - 7.0) > 1e-9  # elsewhere the two formulas may round differently
+        np.testing.assert_array_equal(found[clear], (apart < 7.0)[clear])
+
+
+@pytest.mark.parametrize("kind", ["lasso", "brush"])
+def test_a_long_stroke_compares_each_part_with_the_splats_near_it(kind):
+    """20,000 points round a circle over 20,000 splats: each part touches about two of 64 rows of cells."""
+    rng = np.random.default_rng(4)
+    values = picture_points(rng, 20_000)
+    turn = np.linspace(0, 2 * np.pi, 20_000, endpoint=False)
+    points = tuple(map(tuple, np.stack([150 + 140 * np.cos(turn), 100 + 90 * np.sin(turn)], axis=1).tolist()))
+    work = Work()
+    region = ops.Lasso(FRONT, points) if kind == "lasso" else ops.Brush(FRONT, 1.0, points)
+    inside = members(region, values, work)
+    assert 0 < inside.sum() < len(inside)
+    assert MOST_TESTS - work.left < 20_000 * 20_000 / 20
+
+
+def test_operations_that_take_too_many_tests_are_refused_before_they_are_made():
+    """Strokes across the whole picture, back and forth: the cells cannot help, so the number of tests is bounded."""
+    values = picture_points(np.random.default_rng(5), 1000)
+    zigzag = tuple((0.0, 0.0) if i % 2 else (300.0, 200.0) for i in range(20_000))
+    for region in (ops.Lasso(FRONT, zigzag), ops.Brush(FRONT, 1e-9, zigzag)):
+        with pytest.raises(ArgumentError, match=r"edits: the operations take more than 10,000,000,000 tests"):
+            members(region, values, Work(most=1_000_000))
+    with pytest.raises(ArgumentError, match="tests of a splat"):
+        members(ops.Sphere((0.0, 0.0, 0.0), 1.0), values, Work(most=999))

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsplat_edu.cli.main import main
 from gsplat_edu.edits.apply import SELECTED, flags_after, placed, views_after
+from gsplat_edu.edits.cells import MOST_TESTS, Work
 from gsplat_edu.edits.document import parse_edits, read_edits
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.edits.membership import Values, members
@@ -235,7 +236,8 @@ def test_the_random_sequences_hold_every_gesture():
 
 HOLDS = """([regions, { count, ...arrays }]) => {
   const values = { count, ...Object.fromEntries(Object.entries(arrays).map(([k, v]) => [k, new Float32Array(v)])) };
-  return regions.map((region) => [...members(region, values)]);
+  const work = new EditWork();
+  return [regions.map((region) => [...members(region, values, work)]), MOST_TESTS - work.left];
 }"""
 
 
@@ -293,18 +295,19 @@ def test_both_languages_find_the_same_splats_whatever_their_values(edit, random_
     arrays = {"means": mixed(n, 3), "log_scales": mixed(n, 3), "logits": mixed(n), "sh0": mixed(n, 3)}
     regions = random_regions(rng, 8)
     given = {name: array.ravel().tolist() for name, array in arrays.items()}
-    found = edit(random_gaussians(5)).tab.evaluate(HOLDS, [regions, {"count": n, **given}])
+    found, tests = edit(random_gaussians(5)).tab.evaluate(HOLDS, [regions, {"count": n, **given}])
     values = Values(**{name: array.astype(np.float64) for name, array in arrays.items()})
     scene = identity_of(random_gaussians(5)).document()
     operations = [{"op": "select", "how": "add", **region} for region in regions]
     content = {"format": "gsplat_edu edits", "version": 1, "scene": scene, "operations": operations}
     edits = parse_edits(json.dumps(content).encode(), "e.json")
-    some = 0
+    some, work = 0, Work()
     for select, region, inside in zip(edits.operations, regions, found, strict=True):
-        expected = members(select.region, values)
+        expected = members(select.region, values, work)
         np.testing.assert_array_equal(np.array(inside, bool), expected, err_msg=str(region))
         some += 0 < expected.sum() < n
     assert some > 50, "most regions hold some splats and not others"
+    assert tests == MOST_TESTS - work.left > 0, "both count the same tests, so both refuse the same file"
 
 
 def test_a_scene_without_splats_can_be_opened(edit, random_gaussians):

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from gsplat_edu.camera import WORLD_UP
 from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.cells import Work
 from gsplat_edu.edits.membership import Members, Values, members
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.gaussians import Gaussians
@@ -55,11 +56,14 @@ def flags_after(operations: Sequence[ops.Operation], gaussians: Gaussians) -> Fl
     Args:
         operations: In order.
         gaussians: The scene.
+
+    Raises:
+        ArgumentError: the operations take more than `MOST_TESTS` tests of a splat.
     """
     flags = np.zeros(len(gaussians), dtype=np.uint8)
-    values = Values.of(gaussians)
+    values, work = Values.of(gaussians), Work()
     for operation in operations:
-        _step(operation, values, flags)
+        _step(operation, values, flags, work)
     return flags
 
 
@@ -145,11 +149,13 @@ def upright_rotation(upright: ops.Upright) -> Float64[np.ndarray, "3 3"]:
     return turn
 
 
-def _step(operation: ops.Operation, values: Values, flags: Flags) -> None:
-    """Apply one operation to the states, in place."""
+def _step(operation: ops.Operation, values: Values, flags: Flags, work: Work) -> None:
+    """Apply one operation to the states, in place; an operation on them counts as one test of each splat."""
+    if isinstance(operation, ops.Deselect | ops.Invert | ops.Delete | ops.Hide | ops.Show):
+        work.add(len(flags))
     match operation:
         case ops.Select(how, region):
-            _select(how, members(region, values), flags)
+            _select(how, members(region, values, work), flags)
         case ops.Deselect():
             flags[flags == SELECTED] = 0
         case ops.Invert():
@@ -161,7 +167,7 @@ def _step(operation: ops.Operation, values: Values, flags: Flags) -> None:
         case ops.Show():
             flags[flags == HIDDEN] = 0
         case ops.Crop(box):
-            flags[~members(box, values)] = DELETED
+            flags[~members(box, values, work)] = DELETED
 
 
 def _select(how: str, inside: Members, flags: Flags) -> None:

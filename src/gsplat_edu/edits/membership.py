@@ -7,6 +7,7 @@ library (its order is its own) and no product fused with a sum. NaN belongs to n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,11 +17,11 @@ import torch
 from jaxtyping import Bool, Float64
 
 from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.cells import Cells, Column, Work
 from gsplat_edu.edits.document import NEAR
 from gsplat_edu.gaussians import Gaussians
 
 Members = Bool[np.ndarray, " N"]
-Column = Float64[np.ndarray, " N"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,29 +50,35 @@ class Values:
         return cls(means, log_scales, logits, sh0[:, 0])
 
 
-def members(region: ops.Region, values: Values) -> Members:
+def members(region: ops.Region, values: Values, work: Work | None = None) -> Members:
     """Return which splats a region holds.
 
     Args:
         region: The region.
         values: N splats; NaN and infinity are allowed.
+        work: Counts the tests: one for each splat, and those of the edges of a lasso and the segments of a stroke.
+
+    Raises:
+        ArgumentError: the work is too much.
     """
+    work = Work() if work is None else work
+    work.add(len(values.means))
     with np.errstate(all="ignore"):  # infinite splats
-        found: Members = _members(region, values)
+        found: Members = _members(region, values, work)
     return found
 
 
-def _members(region: ops.Region, values: Values) -> Any:  # noqa: ANN401
+def _members(region: ops.Region, values: Values, work: Work) -> Any:  # noqa: ANN401
     match region:
         case ops.PictureRectangle(picture, (u0, v0, u1, v1)):
             u, v, seen = _seen(picture, values.means)
             return seen & (u >= u0) & (u <= u1) & (v >= v0) & (v <= v1)
         case ops.Lasso(picture, points):
             u, v, seen = _seen(picture, values.means)
-            return _chosen(u, v, seen, lambda u, v: _in_polygon(u, v, points))
+            return _chosen(u, v, seen, lambda u, v: _in_polygon(u, v, points, work))
         case ops.Brush(picture, radius, points):
             u, v, seen = _seen(picture, values.means)
-            return _chosen(u, v, seen, lambda u, v: _on_stroke(u, v, radius, points))
+            return _chosen(u, v, seen, lambda u, v: _on_stroke(u, v, radius, points, work))
         case ops.Sphere(center, radius):
             x, y, z = (values.means[:, i] - center[i] for i in range(3))
             return (x * x + y * y) + z * z <= radius * radius
@@ -105,30 +112,42 @@ def _chosen(u: Column, v: Column, seen: Members, test: Callable[[Column, Column]
     return result
 
 
-def _in_polygon(u: Column, v: Column, points: tuple[ops.Numbers, ...]) -> Members:
+def _in_polygon(u: Column, v: Column, points: tuple[ops.Numbers, ...], work: Work) -> Members:
     """Even-odd rule within the polygon's bounds: count the edges that cross the ray towards larger u."""
     columns, rows = [p[0] for p in points], [p[1] for p in points]
     near = (u >= min(columns)) & (u <= max(columns)) & (v >= min(rows)) & (v <= max(rows))
     at = np.flatnonzero(near)
     u, v, odd = u[at], v[at], np.zeros(len(at), dtype=bool)
+    cells = Cells(u, v, work)
     ax, ay = points[-1]
     for bx, by in points:
-        here = np.flatnonzero((ay > v) != (by > v))
-        odd[here] ^= u[here] < ((bx - ax) * (v[here] - ay)) / (by - ay) + ax
+        if ay != by:
+            # One more column, because the rounded crossing may lie beyond the edge's bounds.
+            some = cells.touched(-math.inf, max(ax, bx), min(ay, by), max(ay, by), margin=1)
+            here = some[(ay > v[some]) != (by > v[some])]
+            odd[here] ^= u[here] < ((bx - ax) * (v[here] - ay)) / (by - ay) + ax
         ax, ay = bx, by
     result = np.zeros(len(near), dtype=bool)
     result[at] = odd
     return result
 
 
-def _on_stroke(u: Column, v: Column, radius: float, points: tuple[ops.Numbers, ...]) -> Members:
+def _on_stroke(u: Column, v: Column, radius: float, points: tuple[ops.Numbers, ...], work: Work) -> Members:
     """Within the radius of a segment, and of the segment's bounds widened by the radius."""
-    result = np.zeros(len(u), dtype=bool)
+    columns, rows = np.array([p[0] for p in points]), np.array([p[1] for p in points])
+    near = (u >= columns.min() - radius) & (u <= columns.max() + radius)
+    near &= (v >= rows.min() - radius) & (v <= rows.max() + radius)
+    inside = np.flatnonzero(near)
+    u, v, found = u[inside], v[inside], np.zeros(len(inside), dtype=bool)
+    cells = Cells(u, v, work)
     ax, ay = points[0]
     for bx, by in points[1:] or points:
         low_u, high_u = min(ax, bx) - radius, max(ax, bx) + radius
         low_v, high_v = min(ay, by) - radius, max(ay, by) + radius
-        at = np.flatnonzero((u >= low_u) & (u <= high_u) & (v >= low_v) & (v <= high_v))
+        some = cells.touched(low_u, high_u, low_v, high_v)
+        some = some[~found[some]]
+        p, q = u[some], v[some]
+        at = some[(p >= low_u) & (p <= high_u) & (q >= low_v) & (q <= high_v)]
         dx, dy = bx - ax, by - ay
         wx, wy = u[at] - ax, v[at] - ay
         along, length2 = wx * dx + wy * dy, dx * dx + dy * dy
@@ -137,8 +156,10 @@ def _on_stroke(u: Column, v: Column, radius: float, points: tuple[ops.Numbers, .
         square = radius * radius
         from_start, from_end = wx * wx + wy * wy <= square, ex * ex + ey * ey <= square
         between = aside * aside <= square * length2
-        result[at] |= np.where(along <= 0.0, from_start, np.where(along >= length2, from_end, between))
+        found[at] = np.where(along <= 0.0, from_start, np.where(along >= length2, from_end, between))
         ax, ay = bx, by
+    result = np.zeros(len(near), dtype=bool)
+    result[inside] = found
     return result
 
 

@@ -77,6 +77,7 @@ PICTURED = Kind("pictures", ("live_pictures.js",), own_server=True)
 EDITOR = Kind(
     "edit",
     (
+        "edit_cells.js",
         "edit_member.js",
         "edit_state.js",
         "edit_shapes.js",

@@ -96,7 +96,12 @@ class Editor {
 
   // Applies an operation and adds it to the list. An error of ours leaves the list as it was.
   perform(operation) {
-    this.history.perform(operation);
+    try {
+      this.history.perform(operation);
+    } catch (error) {
+      this.say(error.message);
+      return;
+    }
     this.say("");
     this.stateChanged();
   }

@@ -6,10 +6,8 @@
 
 const EDIT_NEAR = 0.05; // world units: splats at this camera depth or closer are not seen in a picture
 
-// Calls test(u, v, i) for every splat in front of a picture's camera, and returns the splats for which it is true:
-// u = (fx x) / z + cx, v = (fy y) / z + cy.
-function seenMembers({ camera }, { count, means }, test) {
-  const inside = new Uint8Array(count);
+// Calls found(i, u, v) for every splat in front of a picture's camera: u = (fx x) / z + cx, v = (fy y) / z + cy.
+function eachSeen({ camera }, { count, means }, found) {
   const [ex, ey, ez] = camera.position;
   const [[r00, r01, r02], [r10, r11, r12], [r20, r21, r22]] = camera.rotation; // camera to world: columns are the axes
   const { fx, fy, cx, cy } = camera;
@@ -19,61 +17,78 @@ function seenMembers({ camera }, { count, means }, test) {
     if (!(z > EDIT_NEAR)) continue;
     const x = r00 * a + r10 * b + r20 * c;
     const y = r01 * a + r11 * b + r21 * c;
-    if (test((fx * x) / z + cx, (fy * y) / z + cy)) inside[i] = 1;
+    found(i, (fx * x) / z + cx, (fy * y) / z + cy);
+  }
+}
+
+// The splats seen within bounds, as {at, u, v}: indices, columns and rows.
+function seenWithin(region, values, [lowU, highU], [lowV, highV]) {
+  const at = new Uint32Array(values.count);
+  const us = new Float64Array(values.count);
+  const vs = new Float64Array(values.count);
+  let count = 0;
+  eachSeen(region, values, (i, u, v) => {
+    if (!(u >= lowU && u <= highU && v >= lowV && v <= highV)) return;
+    at[count] = i;
+    us[count] = u;
+    vs[count++] = v;
+  });
+  return { at: at.subarray(0, count), u: us.subarray(0, count), v: vs.subarray(0, count) };
+}
+
+// Even-odd rule within the polygon's bounds: counts the edges that cross the ray towards larger u.
+function lassoMembers(region, values, work) {
+  const { points } = region;
+  const bounds = [0, 1].map((axis) => extent(points.map((point) => point[axis])));
+  const { at, u, v } = seenWithin(region, values, ...bounds);
+  const cells = new Cells(u, v, work);
+  const inside = new Uint8Array(values.count);
+  let [ax, ay] = points.at(-1);
+  for (const [bx, by] of points) {
+    if (ay !== by) {
+      // One more column, because the rounded crossing may lie beyond the edge's bounds.
+      cells.touched(-Infinity, Math.max(ax, bx), Math.min(ay, by), Math.max(ay, by), 1, (k) => {
+        if (ay > v[k] !== by > v[k] && u[k] < ((bx - ax) * (v[k] - ay)) / (by - ay) + ax) inside[at[k]] ^= 1;
+      });
+    }
+    [ax, ay] = [bx, by];
   }
   return inside;
 }
 
-// Even-odd rule within the polygon's bounds: counts the edges that cross the ray towards larger u.
-function inPolygon(points) {
-  const [us, vs] = [0, 1].map((axis) => Float64Array.from(points, (point) => point[axis]));
-  const [lowU, highU] = extent(us);
-  const [lowV, highV] = extent(vs);
-  const count = points.length;
-  return (u, v) => {
-    if (!(u >= lowU && u <= highU && v >= lowV && v <= highV)) return false;
-    let odd = false;
-    for (let j = 0, i = count - 1; j < count; i = j++) {
-      const ay = vs[i];
-      const by = vs[j];
-      if (ay > v !== by > v && u < ((us[j] - us[i]) * (v - ay)) / (by - ay) + us[i]) odd = !odd;
-    }
-    return odd;
-  };
-}
-
 // Within the radius of a segment, and of the segment's bounds widened by the radius.
-function onStroke(points, radius) {
-  const square = radius * radius;
-  const segments = (points.length > 1 ? points.slice(1) : points).map(([bx, by], i) => {
-    const [ax, ay] = points[i];
-    return { ax, ay, bx, by, dx: bx - ax, dy: by - ay };
+function brushMembers(region, values, work) {
+  const { points, radius } = region;
+  const bounds = [0, 1].map((axis) => {
+    const [low, high] = extent(points.map((point) => point[axis]));
+    return [low - radius, high + radius];
   });
-  const bounds = segments.map(({ ax, ay, bx, by }) => [
-    Math.min(ax, bx) - radius,
-    Math.max(ax, bx) + radius,
-    Math.min(ay, by) - radius,
-    Math.max(ay, by) + radius,
-  ]);
-  return (u, v) => {
-    for (let i = 0; i < segments.length; ++i) {
-      const [lowU, highU, lowV, highV] = bounds[i];
-      if (!(u >= lowU && u <= highU && v >= lowV && v <= highV)) continue;
-      const { ax, ay, bx, by, dx, dy } = segments[i];
-      const [wx, wy, ex, ey] = [u - ax, v - ay, u - bx, v - by];
+  const { at, u, v } = seenWithin(region, values, ...bounds);
+  const cells = new Cells(u, v, work);
+  const inside = new Uint8Array(values.count);
+  const square = radius * radius;
+  let [ax, ay] = points[0];
+  for (const [bx, by] of points.length > 1 ? points.slice(1) : points) {
+    const [lowU, highU] = [Math.min(ax, bx) - radius, Math.max(ax, bx) + radius];
+    const [lowV, highV] = [Math.min(ay, by) - radius, Math.max(ay, by) + radius];
+    const [dx, dy] = [bx - ax, by - ay];
+    const length2 = dx * dx + dy * dy;
+    cells.touched(lowU, highU, lowV, highV, 0, (k) => {
+      if (inside[at[k]]) return;
+      const [p, q] = [u[k], v[k]];
+      if (!(p >= lowU && p <= highU && q >= lowV && q <= highV)) return;
+      const [wx, wy, ex, ey] = [p - ax, q - ay, p - bx, q - by];
       const along = wx * dx + wy * dy;
-      const length2 = dx * dx + dy * dy;
-      if (along <= 0) {
-        if (wx * wx + wy * wy <= square) return true;
-      } else if (along >= length2) {
-        if (ex * ex + ey * ey <= square) return true;
-      } else {
+      if (along <= 0) inside[at[k]] = wx * wx + wy * wy <= square;
+      else if (along >= length2) inside[at[k]] = ex * ex + ey * ey <= square;
+      else {
         const aside = wx * dy - wy * dx;
-        if (aside * aside <= square * length2) return true;
+        inside[at[k]] = aside * aside <= square * length2;
       }
-    }
-    return false;
-  };
+    });
+    [ax, ay] = [bx, by];
+  }
+  return inside;
 }
 
 function extent(numbers) {
@@ -107,18 +122,22 @@ const isBetween = (value, low, high) =>
   value === value && (low === undefined || value >= low) && (high === undefined || value <= high);
 
 // Returns 1 for every splat of the region that a "select" describes. values: {count, means, log_scales, logits, sh0}.
-function members(region, values) {
+// work: counts one test for each splat, and those of the edges of a lasso and the segments of a stroke.
+function members(region, values, work = new EditWork()) {
+  work.add(values.count);
   const { means, log_scales, logits, sh0 } = values;
   const { low, high } = region;
   switch (region.by) {
     case "rectangle": {
       const [u0, v0, u1, v1] = region.corners;
-      return seenMembers(region, values, (u, v) => u >= u0 && u <= u1 && v >= v0 && v <= v1);
+      const inside = new Uint8Array(values.count);
+      for (const i of seenWithin(region, values, [u0, u1], [v0, v1]).at) inside[i] = 1;
+      return inside;
     }
     case "lasso":
-      return seenMembers(region, values, inPolygon(region.points));
+      return lassoMembers(region, values, work);
     case "brush":
-      return seenMembers(region, values, onStroke(region.points, region.radius));
+      return brushMembers(region, values, work);
     case "sphere": {
       const [cx, cy, cz] = region.center;
       const square = region.radius * region.radius;

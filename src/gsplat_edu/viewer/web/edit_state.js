@@ -4,14 +4,15 @@
 const [SELECTED, HIDDEN, DELETED] = [1, 2, 4]; // at most one at a time; 0 is a splat that is merely there
 const UNDO_BYTES = 128 << 20; // changes remembered for undo; older operations are undone by repeating those before
 
-// Applies one operation to the states, in place.
-function applyOperation(operation, values, flags) {
+// Applies one operation to the states, in place. Throws an Error, before anything is changed, if the work is too much.
+function applyOperation(operation, values, flags, work) {
   const change = (next) => {
+    if (operation.op !== "crop") work.add(flags.length);
     for (let i = 0; i < flags.length; ++i) flags[i] = next(flags[i], i);
   };
   switch (operation.op) {
     case "select":
-      return applySelect(operation.how, members(operation, values), flags);
+      return applySelect(operation.how, members(operation, values, work), flags);
     case "deselect":
       return change((flag) => (flag === SELECTED ? 0 : flag));
     case "invert":
@@ -23,6 +24,7 @@ function applyOperation(operation, values, flags) {
     case "show":
       return change((flag) => (flag === HIDDEN ? 0 : flag));
     case "crop": {
+      work.add(flags.length);
       const inside = boxMembers(operation, values);
       return change((flag, i) => (inside[i] ? flag : DELETED));
     }
@@ -47,20 +49,29 @@ class EditHistory {
     this.flags = new Uint8Array(values.count);
     this.done = [];
     this.undone = [];
+    this.work = new EditWork();
+    this.tests = []; // of each operation done
     this.changes = []; // of each operation done: which splats had another state before, and which; null if forgotten
     this.bytes = 0;
     for (const operation of operations) this.step(operation);
   }
 
-  // Applies a new operation; what was undone before is forgotten.
+  // Applies a new operation; what was undone before is forgotten. Throws an Error if it takes too much work.
   perform(operation) {
-    this.undone = [];
     this.step(operation);
+    this.undone = [];
   }
 
   step(operation) {
     const before = this.flags.slice();
-    applyOperation(operation, this.values, this.flags);
+    const { left } = this.work;
+    try {
+      applyOperation(operation, this.values, this.flags, this.work);
+    } catch (error) {
+      this.work.left = left;
+      throw error;
+    }
+    this.tests.push(left - this.work.left);
     this.done.push(operation);
     this.remember(before);
   }
@@ -89,13 +100,14 @@ class EditHistory {
     const operation = this.done.pop();
     if (!operation) return undefined;
     this.undone.push(operation);
+    this.work.left += this.tests.pop();
     const change = this.changes.pop();
     if (change) {
       this.bytes -= 5 * change.at.length;
       for (let j = 0; j < change.at.length; ++j) this.flags[change.at[j]] = change.was[j];
     } else {
       this.flags.fill(0);
-      for (const earlier of this.done) applyOperation(earlier, this.values, this.flags);
+      for (const earlier of this.done) applyOperation(earlier, this.values, this.flags, new EditWork());
     }
     return operation;
   }
