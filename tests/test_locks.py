@@ -120,3 +120,16 @@ def test_a_file_system_without_locks_gives_one_message(tmp_path, monkeypatch, nu
     with locked("--out", tmp_path, "gsplat-edu train", said.append):
         assert not (tmp_path / LOCK).exists()
     assert len(said) == 1 and "has no locks" in said[0]
+
+
+def test_a_lock_that_is_a_link_is_refused_and_what_it_leads_to_stays(tmp_path):
+    target = tmp_path / "target.txt"
+    target.write_text("kept")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / ".lock").symlink_to(target)
+    with (
+        pytest.raises(ArgumentError, match="is a link"),
+        locked("FOLDER", tmp_path / "folder", "a test", print),
+    ):
+        pass
+    assert target.read_text() == "kept"

@@ -45,7 +45,8 @@ def locked(
         patience: Seconds to wait for another process that holds the lock.
 
     Raises:
-        ArgumentError: another process holds the lock (the message names it), or the folder is not writable.
+        ArgumentError: another process holds the lock (the message names it), the folder is not writable, or the lock
+            file is a link.
     """
     check_folder(name, folder)
     made = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
@@ -76,7 +77,10 @@ def locked(
 def _acquired(name: str, path: Path, until: float) -> int | None:
     """Return an open, locked file; None if the file system has no locks."""
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)  # child processes do not inherit it
+        if path.is_symlink() or (path.exists() and not path.is_file()):  # it would be emptied
+            raise ArgumentError(f"{name}: {path} is a link or no file; remove it")
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+        handle = os.open(path, flags, 0o666)  # child processes do not inherit it
         try:
             _lock(handle)
         except (BlockingIOError, PermissionError):

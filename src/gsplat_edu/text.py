@@ -15,6 +15,8 @@ _SURROGATES = re.compile("[\ud800-\udfff]")
 _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
 """Characters that move the cursor, change colours, break a line or reverse the direction of text."""
 
+_WHOLE = re.compile("[0-9]{1,20}")
+
 MOST_SPELLED = 1e12
 """From this on `short_number` uses an exponent."""
 
@@ -63,6 +65,28 @@ def printable(text: str) -> str:
     Otherwise a file name could clear the screen, hide a warning or fake a line of output.
     """
     return _CONTROLS.sub(_escaped, legible(text))
+
+
+def shortened(text: str, most: int = 80) -> str:
+    """Return a text of limited length: the middle of a longer one is replaced by "...".
+
+    Args:
+        text: The text.
+        most: Most characters; at least 5.
+    """
+    if len(text) <= most:
+        return text
+    end = (most - 3) // 3
+    return f"{text[: most - 3 - end]}...{text[len(text) - end :]}"
+
+
+def whole_of(text: str) -> int | None:
+    """Return the number that a text of at most 20 digits from 0 to 9 spells; None for any other text.
+
+    `int` also accepts signs, spaces, underscores and the digits of other scripts, and fails beyond 4,300 digits;
+    `str.isdigit` accepts superscripts, which `int` does not.
+    """
+    return int(text) if _WHOLE.fullmatch(text) else None
 
 
 def _escaped(match: re.Match[str]) -> str:

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from gsplat_edu.jobs import emitter, events
+from gsplat_edu.jobs import emitter, events, following
 from gsplat_edu.jobs.emitter import Emitter
 from gsplat_edu.jobs.following import Follower, events_after, last_stage, last_word
 from gsplat_edu.jobs.process import identity, is_running
@@ -48,6 +48,13 @@ def test_a_figure_that_json_lacks_is_null():
     [
         *("", "{", "[]", "3", '{"event":"begun","time":1}', '{"event":"stage","time":1}'),
         '{"event":"stage","time":"x","name":"a"}',
+        *('{"event":"stage","time":NaN,"name":"a"}', '{"event":"stage","time":1e999,"name":"a"}'),
+        *('{"event":"stage","time":1,"name":["a"]}', '{"event":"stage","time":1,"name":"a","more":1}'),
+        '{"event":"finished","time":1,"outputs":"abc"}',
+        '{"event":"finished","time":1,"outputs":["a",2]}',
+        '{"event":"started","time":1,"pid":true,"identity":""}',
+        '{"event":"progress","time":1,"stage":"a","done":1' + "0" * 400 + "}",
+        '{"event":"diagnosed","time":1,"facts":[["a"]],"fine":[],"advice":[]}',
     ],
 )
 def test_other_lines_are_refused(line):
@@ -67,6 +74,21 @@ def test_a_reader_sees_whole_lines_once(tmp_path):
     assert [(number, event) for number, _, event in follower.read()] == [(2, ALL[1]), (4, ALL[0])]
     assert follower.read() == []
     assert [number for number, *_ in events_after(path, 2)] == [4]
+
+
+def test_a_line_without_an_end_is_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(following, "PIECE", 1000)
+    monkeypatch.setattr(following, "LONGEST_LINE", 2000)
+    path = tmp_path / "events.jsonl"
+    last = events.line_of(ALL[0], 1.0)
+    path.write_text("x" * 50_000 + "\n" + last)
+    follower, found = Follower(path), []
+    for _ in range(60):
+        found += follower.read()
+        assert len(follower._rest) <= 3000
+    assert [(number, event) for number, _, event in found] == [(2, ALL[0])]
+    monkeypatch.setattr(following, "MOST_READ", 40_000)
+    assert events_after(path) == []
 
 
 def test_the_last_word_is_that_of_the_last_process(tmp_path):

@@ -3,17 +3,19 @@
 import json
 import os
 import shutil
+import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.jobs import queue as queue_module
-from gsplat_edu.jobs.process import identity
+from gsplat_edu.jobs.process import carries, identity, is_running
 from gsplat_edu.jobs.queue import JobQueue
-from gsplat_edu.jobs.record import Job, JobFolder, State, resumed
+from gsplat_edu.jobs.record import Job, JobFolder, Purpose, State, Work
 
 PROGRAM = """
 import json, os, signal, sys, time
@@ -43,6 +45,17 @@ emit("finished", outputs=[sys.argv[2]])
 """
 
 
+def asked(argv, title="", subject=""):
+    """The work of a request that is a command line already."""
+    return rebuild({"argv": list(argv), "title": title, "subject": subject}, Purpose.BEGIN)
+
+
+def rebuild(request, purpose):
+    if not isinstance(request.get("argv"), list) or "refused" in request["argv"]:
+        raise ArgumentError("argv: is not allowed")
+    return Work(request, tuple(request["argv"]), request["title"], request["subject"])
+
+
 @pytest.fixture
 def opened(tmp_path):
     """Open queues on one folder; they are closed at the end, and their processes ended."""
@@ -50,7 +63,7 @@ def opened(tmp_path):
 
     def open_queue(**options):
         program = (sys.executable, "-S", "-c", PROGRAM)
-        made.append(JobQueue(tmp_path / "jobs", program=program, **options))
+        made.append(JobQueue(tmp_path / "jobs", rebuild, program=program, **options))
         return made[-1]
 
     yield open_queue
@@ -83,10 +96,10 @@ def abandon(queue):
 def test_jobs_run_one_after_the_other_and_their_results_are_kept(opened, tmp_path):
     changes = []
     queue = opened(changed=lambda name, job: changes.append((name, job and job.state)))
-    first = queue.submit(["run", str(tmp_path / "a"), "waits"], "first", "runs/a")
-    second = queue.submit(["run", str(tmp_path / "b")])
-    third = queue.submit(["run", str(tmp_path / "c"), "fails"])
-    fourth = queue.submit(["run", str(tmp_path / "d"), "crashes"])
+    first = queue.submit(asked(["run", str(tmp_path / "a"), "waits"], "first", "runs/a"))
+    second = queue.submit(asked(["run", str(tmp_path / "b")]))
+    third = queue.submit(asked(["run", str(tmp_path / "c"), "fails"]))
+    fourth = queue.submit(asked(["run", str(tmp_path / "d"), "crashes"]))
     reached(queue, first.id, State.RUNNING)
     assert {queue.get(job.id).state for job in (second, third, fourth)} == {State.QUEUED}
     (tmp_path / "a").touch()
@@ -105,7 +118,7 @@ def test_jobs_run_one_after_the_other_and_their_results_are_kept(opened, tmp_pat
 
 def test_two_run_at_once_if_told_so(opened, tmp_path):
     queue = opened(at_once=2)
-    jobs = [queue.submit(["run", str(tmp_path / name), "waits"]) for name in "abc"]
+    jobs = [queue.submit(asked(["run", str(tmp_path / name), "waits"])) for name in "abc"]
     for job in jobs[:2]:
         reached(queue, job.id, State.RUNNING)
     assert queue.get(jobs[2].id).state is State.QUEUED
@@ -113,8 +126,8 @@ def test_two_run_at_once_if_told_so(opened, tmp_path):
 
 def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
     queue = opened()
-    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
-    waiting = queue.submit(["run", str(tmp_path / "b")])
+    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
+    waiting = queue.submit(asked(["run", str(tmp_path / "b")]))
     assert queue.cancel(waiting.id).state is State.CANCELLED
     until((tmp_path / "a.ran").exists)
     queue.cancel(job.id)
@@ -133,7 +146,7 @@ def test_cancel_interrupts_and_resume_runs_again(opened, tmp_path):
 
 def test_a_job_that_does_not_listen_is_killed(opened, tmp_path):
     queue = opened(patience={"interrupt": 0.2, "terminate": 0.2})
-    job = queue.submit(["run", str(tmp_path / "a"), "waits", "stubborn"])
+    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits", "stubborn"]))
     until((tmp_path / "a.ran").exists)
     queue.cancel(job.id)
     assert reached(queue, job.id, State.CANCELLED).line == "it was ended"
@@ -141,7 +154,7 @@ def test_a_job_that_does_not_listen_is_killed(opened, tmp_path):
 
 def test_a_paused_job_stands_still(opened, tmp_path):
     queue = opened()
-    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
+    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
     with pytest.raises(ArgumentError):
         queue.pause("000099")
     until((tmp_path / "a.ran").exists)
@@ -166,22 +179,24 @@ def _is_stopped(pid):
 
 def test_jobs_outlive_a_killed_queue_and_the_next_one_finds_them(opened, tmp_path):
     queue = opened()
-    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
-    after = queue.submit(["run", str(tmp_path / "b")])
+    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
+    after = queue.submit(asked(["run", str(tmp_path / "b")]))
     until((tmp_path / "a.ran").exists)
     abandon(queue)
     found = opened()
-    assert found.get(job.id).state is State.RUNNING and found.get(after.id).state is State.QUEUED
+    assert found.get(job.id).state is State.RUNNING and found.get(after.id).state is State.HELD
     (tmp_path / "a").touch()
     os.waitpid(queue._children[job.id].pid, 0)  # an orphan's process is waited for by init
     assert reached(found, job.id, State.DONE).attempts == 1
+    assert found.get(after.id).state is State.HELD and not (tmp_path / "b.ran").exists()
+    found.resume(after.id)
     reached(found, after.id, State.DONE)
     assert (tmp_path / "a.ran").read_text().count("\n") == 1
 
 
 def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
     queue = opened()
-    done, killed = (queue.submit(["run", str(tmp_path / name), "waits"]) for name in "ab")
+    done, killed = (queue.submit(asked(["run", str(tmp_path / name), "waits"])) for name in "ab")
     until((tmp_path / "a.ran").exists)
     abandon(queue)
     (tmp_path / "a").touch()
@@ -190,7 +205,7 @@ def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
         queue.folder / killed.id
     )  # as if it had been running when the computer was switched off
     folder.write(
-        Job(**{**vars(queue.get(killed.id)), "state": State.RUNNING, "pid": 1, "identity": "other boot"})
+        Job(**{**vars(queue.get(killed.id)), "state": State.RUNNING, "pid": 2, "identity": "other boot"})
     )
     found = opened()
     assert found.get(done.id).state is State.DONE
@@ -204,7 +219,7 @@ def test_what_ended_without_a_queue_is_not_run_again(opened, tmp_path):
 
 def test_a_queue_killed_before_it_noted_the_process_finds_it_by_its_first_event(opened, tmp_path):
     queue = opened()
-    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
+    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
     until((tmp_path / "a.ran").exists)
     abandon(queue)
     pid = queue.get(job.id).pid
@@ -217,12 +232,14 @@ def test_a_queue_killed_before_it_noted_the_process_finds_it_by_its_first_event(
 
 def test_closing_interrupts_what_runs_and_keeps_what_waits(opened, tmp_path):
     queue = opened()
-    job = queue.submit(["run", str(tmp_path / "a"), "waits"])
-    waiting = queue.submit(["run", str(tmp_path / "b"), "waits"])
+    job = queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
+    waiting = queue.submit(asked(["run", str(tmp_path / "b"), "waits"]))
     until((tmp_path / "a.ran").exists)
     queue.close()
     assert queue.get(job.id).state is State.INTERRUPTED and queue.get(waiting.id).state is State.QUEUED
     again = opened()
+    assert again.get(waiting.id).state is State.HELD
+    again.resume(waiting.id)
     reached(again, waiting.id, State.RUNNING)
     assert again.get(job.id).state is State.INTERRUPTED
 
@@ -230,19 +247,19 @@ def test_closing_interrupts_what_runs_and_keeps_what_waits(opened, tmp_path):
 def test_a_full_queue_and_a_damaged_record_are_one_line(opened, tmp_path, monkeypatch):
     monkeypatch.setattr(queue_module, "MOST_QUEUED", 2)
     queue = opened()
-    queue.submit(["run", str(tmp_path / "a"), "waits"])
+    queue.submit(asked(["run", str(tmp_path / "a"), "waits"]))
     until((tmp_path / "a.ran").exists)
-    kept = [queue.submit(["run", str(tmp_path / name)]) for name in "bc"]
+    kept = [queue.submit(asked(["run", str(tmp_path / name)])) for name in "bc"]
     with pytest.raises(ArgumentError, match=r"^jobs: 2 are waiting; cancel some"):
-        queue.submit(["run", "d"])
+        queue.submit(asked(["run", "d"]))
     with pytest.raises(ArgumentError, match="cancel it first"):
         queue.remove(queue.jobs()[0].id)
     abandon(queue)
     queue.files(kept[0].id).record.write_text("{")
     shutil.copytree(queue.folder / kept[1].id, queue.folder / "000077")
     found = opened()
-    assert len(found.damaged) == 2 and all(line.count("\n") == 0 for line in found.damaged)
-    assert found.submit(["run", str(tmp_path / "e")]).id == "000078"  # no id is used twice
+    assert len(found.damaged) == 2 and all(line.count("\n") == 0 for line in found.damaged.values())
+    assert found.submit(asked(["run", str(tmp_path / "e")])).id == "000078"  # no id is used twice
 
 
 def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch):
@@ -256,7 +273,7 @@ def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch)
         write(self, job)
 
     monkeypatch.setattr(JobFolder, "write", failing)
-    job = queue.submit(["run", str(tmp_path / "a")])
+    job = queue.submit(asked(["run", str(tmp_path / "a")]))
     until(lambda: queue.trouble)
     assert "no space left on device" in queue.trouble and queue.get(job.id).state is State.QUEUED
     full[0] = False
@@ -264,24 +281,27 @@ def test_records_on_a_full_disk_are_written_later(opened, tmp_path, monkeypatch)
     assert (tmp_path / "a.ran").read_text().count("\n") == 1
 
 
-def test_a_training_resumes_once_its_run_has_begun(tmp_path):
-    argv = ("train", "capture", "--out", str(tmp_path))
-    assert resumed(argv) == argv
-    (tmp_path / "config.json").touch()
-    assert resumed(argv) == (*argv, "--resume") == resumed(resumed(argv))
-    assert resumed(("sfm", "photos", str(tmp_path))) == ("sfm", "photos", str(tmp_path))
-
-
 def test_jobs_name_a_folder_where_it_was_moved(opened, tmp_path):
     queue = opened()
     place, other = tmp_path / "runs" / "a", tmp_path / "runs" / "ab"
     place.mkdir(parents=True)
-    job = queue.submit(["run", str(place / "x"), "fails"], "training of a", "runs/a")
-    near = queue.submit(["run", str(other), "--note", "runs/a"], "doctor of a", "runs/ab")
+    job = queue.submit(asked(["run", str(place / "x"), "fails"], "training of a", "runs/a"))
+    near = queue.submit(asked(["run", str(other), "--note", "runs/a"], "doctor of a", "runs/ab"))
     reached(queue, job.id, State.FAILED)
     before = reached(queue, near.id, State.DONE)
     moved = place.with_name("b")
-    queue.move(place, moved, ("runs/a", "runs/b"), lambda: place.rename(moved))
+
+    def renamed(request):
+        if request["subject"] != "runs/a":
+            return request
+        return {
+            **request,
+            "argv": ["run", str(moved / "x"), "fails"],
+            "title": "training of b",
+            "subject": "runs/b",
+        }
+
+    queue.move(place, moved, renamed, lambda: place.rename(moved))
     now = queue.get(job.id)
     assert (now.argv, now.subject, now.title) == (
         ("run", str(moved / "x"), "fails"),
@@ -289,14 +309,40 @@ def test_jobs_name_a_folder_where_it_was_moved(opened, tmp_path):
         "training of b",
     )
     assert queue.get(near.id) == before  # a name that begins alike is another folder
-    assert JobFolder(queue.folder / job.id).read() == now
+    assert JobFolder(queue.folder / job.id).read(rebuild) == now
 
     def refused():
         raise OSError(28, "No space left on device", str(moved))
 
     with pytest.raises(OSError, match="No space"):
-        queue.move(moved, place, ("runs/b", "runs/a"), refused)
+        queue.move(moved, place, renamed, refused)
     assert queue.get(job.id) == now
     queue.resume(job.id)
     reached(queue, job.id, State.FAILED)
     assert (moved / "x.ran").read_text().count("\n") == 2 and not place.exists()
+
+
+def test_a_request_is_checked_again_before_its_job_is_started_again(opened, tmp_path):
+    queue = opened()
+    job = queue.submit(asked(["run", str(tmp_path / "a"), "fails"]))
+    failed = reached(queue, job.id, State.FAILED)
+    request = {**failed.work.request, "argv": ["refused"]}
+    queue._jobs[job.id] = replace(failed, work=replace(failed.work, request=request))
+    with pytest.raises(ArgumentError, match="is not allowed"):
+        queue.resume(job.id)
+    assert queue.get(job.id).state is State.FAILED
+
+
+def test_a_process_proves_by_its_environment_that_a_job_started_it():
+    variables = {"GSPLAT_EDU_EVENTS": "/jobs/000001/events.jsonl"}
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, env=variables)
+    try:
+        until(lambda: carries(child.pid, "GSPLAT_EDU_EVENTS", "/jobs/000001/events.jsonl"))
+        assert not carries(child.pid, "GSPLAT_EDU_EVENTS", "/jobs/000001/events")
+        assert not carries(child.pid, "GSPLAT_EDU_EVENTS", "/jobs/000002/events.jsonl")
+    finally:
+        child.kill()
+        child.wait()
+        child.stdin.close()
+    assert not carries(child.pid, "GSPLAT_EDU_EVENTS", "/jobs/000001/events.jsonl")
+    assert not is_running(1, identity(1) or "x") and not is_running(os.getpid(), "")

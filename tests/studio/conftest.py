@@ -38,6 +38,14 @@ class Inline:
         pass
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _own_list_of_adopted_places(tmp_path_factory):
+    """Tests do not write into the user's list; servers that they start inherit it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture
 def studio(tmp_path, request):
     """A studio with small limits."""

@@ -5,6 +5,7 @@ import argparse
 import pytest
 
 from gsplat_edu.cli.main import build_parser
+from gsplat_edu.jobs.record import Purpose
 from gsplat_edu.studio.commands import (
     CLEAN_OPTIONS,
     CONVERT_OPTIONS,
@@ -12,6 +13,7 @@ from gsplat_edu.studio.commands import (
     RENDER_OPTIONS,
     SFM_OPTIONS,
     TRAIN_OPTIONS,
+    renamed,
     work_of,
 )
 from gsplat_edu.studio.library import Library
@@ -70,6 +72,51 @@ def test_the_commands_and_their_defaults(library):
     assert words(command="render", subject="scenes/a", options={"frames": 30, "orbit": True}) == [
         *("render", "scenes/a/toy.spz", "--out", "scenes/a/exports/a.mp4", "--frames", "30", "--orbit")
     ]
+
+
+def test_a_request_with_its_choices_makes_the_same_command_again(library):
+    for request in (
+        {"command": "sfm", "subject": "photos/a b"},
+        {"command": "train", "subject": "captures/a", "options": {"quality": "draft"}},
+        {"command": "clean", "subject": "runs/a"},
+        {"command": "convert", "subject": "scenes/a", "format": "spz"},
+        {"command": "render", "subject": "runs/a", "to": "film"},
+        {"command": "doctor", "subject": "captures/a"},
+    ):
+        work = work_of(library, request)
+        for purpose in Purpose:
+            assert work_of(library, work.request, purpose) == work
+
+
+def test_a_training_resumes_once_its_run_has_begun(library):
+    work = work_of(library, {"command": "train", "subject": "captures/a"})
+    out = library.root / "runs" / "a-2"
+    out.mkdir()
+    assert work_of(library, work.request, Purpose.CONTINUE).argv == work.argv
+    (out / "config.json").touch()
+    resumed = work_of(library, work.request, Purpose.CONTINUE)
+    assert resumed.argv == (*work.argv, "--resume")
+    assert {work_of(library, resumed.request, purpose) == resumed for purpose in Purpose} == {True}
+    with pytest.raises(RefusedError, match="exists already"):
+        work_of(library, work.request, Purpose.BEGIN)
+
+
+def test_what_is_gone_can_be_shown_but_not_started(library):
+    work = work_of(library, {"command": "train", "subject": "captures/a"})
+    (library.root / "captures" / "a").rmdir()
+    assert work_of(library, work.request, Purpose.SHOW) == work
+    for purpose in (Purpose.BEGIN, Purpose.CONTINUE):
+        with pytest.raises(RefusedError, match="captures/a: does not exist"):
+            work_of(library, work.request, purpose)
+
+
+def test_requests_follow_a_rename(library):
+    request = work_of(library, {"command": "train", "subject": "captures/a", "to": "x"}).request
+    assert renamed(request, "captures", "a", "b") == {**request, "subject": "captures/b"}
+    assert renamed(request, "runs", "x", "y") == {**request, "to": "y"}
+    assert renamed(request, "scenes", "x", "y") == renamed(request, "runs", "a", "y") == request
+    export = work_of(library, {"command": "convert", "subject": "runs/a", "format": "ply"}).request
+    assert renamed(export, "runs", "a", "b") == {**export, "subject": "runs/b"}  # its file keeps its name
 
 
 SAMPLES = {

@@ -12,6 +12,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.jobs import events
+from gsplat_edu.jobs.record import Work
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.studio import runs
@@ -232,7 +233,7 @@ def test_exports_are_listed_with_their_figures(page, studio, run):
     (run.path / "exports").mkdir()
     path = run.path / "exports" / "<b>r.compressed.ply"
     path.write_bytes(b"scene")
-    job = studio.queue.submit(["convert", str(run.path), str(path)])
+    job = studio.queue.submit(Work({}, ("convert", str(run.path), str(path))))
     lines = [events.Metric("psnr", 31.5, "dB", str(path)), events.Finished((str(path),))]
     studio.queue.files(job.id).events.write_text("".join(events.line_of(event, 1.0) for event in lines))
     studio.queue._ended(studio.queue.get(job.id), 0)

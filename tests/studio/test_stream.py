@@ -4,6 +4,7 @@ import asyncio
 import json
 
 from gsplat_edu.jobs import events
+from gsplat_edu.jobs.record import Work
 from gsplat_edu.studio import stream as stream_module
 from gsplat_edu.studio.stream import Stream
 
@@ -54,7 +55,7 @@ def test_streams_are_limited(monkeypatch):
 
 def test_the_events_of_jobs_are_published_once_and_in_order(studio):
     studio.queue.at_once = 0
-    job = studio.queue.submit(["train", "x"])
+    job = studio.queue.submit(Work({}, ("train", "x")))
     path = studio.queue.files(job.id).events
     studio.queue._jobs[job.id] = running = type(job)(
         **{**vars(job), "state": stream_module.ACTIVE[0], "pid": 1}

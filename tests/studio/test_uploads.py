@@ -1,6 +1,8 @@
 """Uploads: limits hold before and while bytes come in, and nothing incomplete is ever seen."""
 
+import contextlib
 import io
+import random
 import stat
 import struct
 import zipfile
@@ -9,7 +11,7 @@ import pytest
 
 from gsplat_edu.studio import unpack as unpacking
 from gsplat_edu.studio.refusal import RefusedError
-from gsplat_edu.studio.unpack import ZipLimits, unpack
+from gsplat_edu.studio.unpack import ZipLimits, _check_directory, unpack
 from gsplat_edu.studio.uploads import Limits
 from studio.conftest import picture
 
@@ -195,21 +197,121 @@ def test_an_encrypted_entry_is_refused(tmp_path):
         unpack(tmp_path / "a.zip", tmp_path / "into", ZipLimits())
 
 
-def test_the_directory_of_a_zip64_file_is_measured_too(tmp_path):
-    """zipfile believes the zip64 record, however harmless the ordinary one looks."""
-    plain = zipped({"a.jpg": b"x"})
-    record = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44, 45, 45, 0, 0, 1 << 40, 1 << 40, 1 << 50, 0)
-    locator = struct.pack("<IIQI", 0x07064B50, 0, len(plain) - 22, 1)
-    (tmp_path / "a.zip").write_bytes(plain[:-22] + record + locator + plain[-22:])
-    with pytest.raises(RefusedError, match="entries may be in it"):
-        unpack(tmp_path / "a.zip", tmp_path / "into", ZipLimits())
+def wide(plain, *, fields=None, offset=None, extra=b"", end=None):
+    """Give a zip file the records of zip64, with the fields of its end or others."""
+    count, length, begin = struct.unpack_from("<HII", plain, len(plain) - 12)
+    fields = (0, 0, count, count, length, begin) if fields is None else fields
+    record = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44 + len(extra), 45, 45, *fields) + extra
+    locator = struct.pack("<IIQI", 0x07064B50, 0, len(plain) - 22 if offset is None else offset, 1)
+    return plain[:-22] + record + locator + (plain[-22:] if end is None else end)
+
+
+MAXIMAL = struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
+"""An end record that leaves everything to that of zip64."""
+
+
+def test_a_zip64_file_is_unpacked(tmp_path):
+    for end in (None, MAXIMAL):
+        (tmp_path / "a.zip").write_bytes(wide(zipped({"a.jpg": b"x", "b.jpg": b"yz"}), end=end))
+        assert unpack(tmp_path / "a.zip", tmp_path / f"into{end is None}", ZipLimits()) == (2, [])
+
+
+def two_ends():
+    """A locator leads to a harmless end record at the start of the file; another one lies directly before it."""
+    many = zipped({f"{i}.jpg": b"" for i in range(300)})
+    harmless = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44, 45, 45, 0, 0, 1, 1, 50, 0)
+    count, length, begin = struct.unpack_from("<HII", many, len(many) - 12)
+    ordinary = struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, 1, 1, 50, 0, 0)
+    whole = (0, 0, count, count, length, begin + len(harmless))
+    return harmless + wide(many, fields=whole, offset=0, end=ordinary)
+
+
+def with_comment(plain, comment):
+    return plain[:-2] + struct.pack("<H", len(comment)) + comment
+
+
+def changed_end(plain, **values):
+    names = ("signature", "disk", "first", "here", "count", "length", "begin", "comment")
+    end = dict(zip(names, struct.unpack("<IHHHHIIH", plain[-22:]), strict=True)) | values
+    return plain[:-22] + struct.pack("<IHHHHIIH", *end.values())
+
+
+def nameless():
+    """A zip file whose only entry has an empty name, which `zipfile` reads but does not write."""
+    local = struct.pack("<4s5H3I2H", b"PK\x03\x04", 20, 0, 0, 0, 33, 0, 0, 0, 0, 0)
+    entry = struct.pack("<4s6H3I5H2I", b"PK\x01\x02", 20, 20, 0, 0, 0, 33, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    return local + entry + struct.pack("<4s4H2IH", b"PK\x05\x06", 0, 0, 1, 1, len(entry), len(local), 0)
+
+
+PLAIN = zipped({"a.jpg": b"x", "b.jpg": b"y"})
+BEGIN = struct.unpack_from("<I", PLAIN, len(PLAIN) - 6)[0]
+
+AMBIGUOUS = {
+    "two ends": two_ends(),
+    "claims too much": wide(PLAIN, fields=(0, 0, 1 << 40, 1 << 40, 1 << 50, 0)),
+    "ends that disagree": wide(PLAIN, fields=(0, 0, 1, 1, 50, 0)),
+    "locator that leads elsewhere": wide(PLAIN, offset=0),
+    "locator behind the file": wide(PLAIN, offset=1 << 60),
+    "record with something behind": wide(PLAIN, extra=b"more"),
+    "another disk": wide(PLAIN, fields=(1, 1, 2, 2, len(PLAIN) - 22 - BEGIN, BEGIN)),
+    "end in a comment": with_comment(PLAIN, changed_end(PLAIN)[-22:]),
+    "end in a longer comment": with_comment(PLAIN, b"x" + PLAIN[-22:] + b"y"),
+    "something in front": b"in front" + PLAIN,
+    "something behind": PLAIN + b"behind",
+    "fewer entries claimed": changed_end(PLAIN, here=1, count=1),
+    "more entries claimed": changed_end(PLAIN, here=3, count=3),
+    "a part of the directory": changed_end(PLAIN, length=54),
+    "directory elsewhere": changed_end(PLAIN, begin=BEGIN - 1),
+    "one of several disks": changed_end(PLAIN, disk=1),
+    "no name": nameless(),
+    "name that begins with NUL": zipped({"zz.jpg": b"x"}).replace(b"zz.jpg", b"\0z.jpg"),
+}
+
+
+@pytest.mark.parametrize("name", AMBIGUOUS)
+def test_a_zip_file_that_readers_could_read_differently_is_refused(page, tmp_path, name):
+    (tmp_path / "a.zip").write_bytes(AMBIGUOUS[name])
+    with pytest.raises(RefusedError, match=r"^zip: [^\n]*$"):
+        unpack(tmp_path / "a.zip", tmp_path / "into", ZipLimits(entries=250))
+    assert not (tmp_path / "into").exists()
+    if "name" not in name:  # before `zipfile` reads the directory
+        with pytest.raises(RefusedError):
+            _check_directory(tmp_path / "a.zip", ZipLimits(entries=250))
+    answer = page.put("/api/photos/x/zip", content=AMBIGUOUS[name])
+    assert answer.status_code in (400, 413) and answer.json()["error"].startswith("zip: ")
+
+
+def test_a_comment_is_no_harm(tmp_path):
+    (tmp_path / "a.zip").write_bytes(with_comment(PLAIN, b"holidays"))
+    assert unpack(tmp_path / "a.zip", tmp_path / "into", ZipLimits())[0] == 2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_zipfile_reads_the_directory_that_was_measured(tmp_path, seed):
+    """Damaged ends, of both kinds: whatever passes the check has as many entries for `zipfile` as were counted."""
+    draw, passed = random.Random(seed), 0
+    for number in range(150):
+        data = bytearray(wide(PLAIN) if number % 2 else with_comment(PLAIN, b"PK\5\6" + bytes(30)))
+        for _ in range(draw.randint(0, 2)):
+            data[draw.randrange(BEGIN, len(data))] = draw.choice(
+                [0, 1, 2, 3, 0xFF, 0x50, draw.randrange(256)]
+            )
+        path = tmp_path / "a.zip"
+        path.write_bytes(data)
+        with contextlib.suppress(RefusedError):
+            _check_directory(path, ZipLimits(entries=10))
+            with (
+                contextlib.suppress(zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError),
+                zipfile.ZipFile(path) as archive,
+            ):
+                passed += 1
+                assert len(archive.infolist()) == 2
+    assert passed
 
 
 @pytest.mark.sliced(40)
 @pytest.mark.parametrize("seed", range(400))
 def test_damaged_zip_files_end_in_one_line(tmp_path, seed):
-    import random
-
     draw = random.Random(seed)
     data = bytearray(zipped({"a.jpg": draw.randbytes(300), "b/c.jpg": bytes(1000)}))
     for _ in range(draw.randint(1, 4)):

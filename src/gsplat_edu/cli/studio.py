@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-import threading
-import webbrowser
 from dataclasses import replace
 
 from gsplat_edu.cli.printing import say
-from gsplat_edu.cli.screen import has_screen
+from gsplat_edu.cli.screen import has_screen, open_in_browser
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.viewer.serve import exposure
 
@@ -46,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
     def opened(url: str) -> None:
         say(f"{url}   (press Ctrl-C to stop)")
         if not arguments.no_open and has_screen():
-            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+            open_in_browser(url)
 
     try:
         serve(arguments.folder, arguments.host, arguments.port, arguments.jobs, limits, say, opened)

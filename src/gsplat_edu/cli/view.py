@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import threading
-import webbrowser
 from pathlib import Path
 
 import numpy as np
 
 from gsplat_edu.cli.options.view import BESIDE
-from gsplat_edu.cli.screen import has_screen
+from gsplat_edu.cli.screen import has_screen, open_in_browser
 from gsplat_edu.cli.terminal import Terminal
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.errors import ArgumentError
@@ -48,8 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
             console.print(warning, soft_wrap=True)
         console.print(f"{server.url}   (press Ctrl-C to stop)", soft_wrap=True)
         if not arguments.no_open and has_screen():
-            # in a thread: some browsers have to exit before webbrowser returns
-            threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
+            open_in_browser(server.url)
         try:
             server.serve_forever()
         except KeyboardInterrupt:

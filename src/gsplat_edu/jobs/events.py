@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,10 @@ from gsplat_edu.reading import parse_json
 
 EVENTS = "GSPLAT_EDU_EVENTS"
 """Environment variable that names the file of events."""
+
+
+LARGEST = 1e300
+"""Largest magnitude of a number in a line."""
 
 
 @dataclass(frozen=True)
@@ -192,16 +197,41 @@ def parse_line(line: str | bytes) -> tuple[float, Event]:
     if not isinstance(entry, dict):
         raise ValueError("is not an event")
     kind, time = KINDS.get(str(entry.pop("event", None))), entry.pop("time", 0.0)
-    if kind is None or type(time) not in (int, float):
+    if kind is None or not _is_number(time):
         raise ValueError("is not an event")
+    known = {field.name: str(field.type) for field in dataclasses.fields(kind)}
+    for name, value in entry.items():
+        if name not in known or not TYPES[known[name]](value):
+            raise ValueError(f"its field {name[:40]!r} is not known, or has an impossible value")
     try:
         return float(time), kind(**{name: _tuple(value) for name, value in entry.items()})
-    except TypeError as error:
-        raise ValueError(f"has other fields ({error})") from None
+    except TypeError:
+        raise ValueError("lacks a field") from None
+
+
+def _is_number(value: Any) -> bool:  # noqa: ANN401
+    return type(value) in (int, float) and abs(value) <= LARGEST  # not NaN either
+
+
+def _is_texts(value: Any) -> bool:  # noqa: ANN401
+    return isinstance(value, list) and all(isinstance(text, str) for text in value)
+
+
+TYPES: Mapping[str, Callable[[Any], bool]] = {
+    "int": lambda value: type(value) is int and abs(value) <= LARGEST,
+    "float": _is_number,
+    "float | None": lambda value: value is None or _is_number(value),
+    "str": lambda value: isinstance(value, str),
+    "tuple[str, ...]": _is_texts,
+    "tuple[tuple[str, str], ...]": lambda value: (
+        isinstance(value, list) and all(_is_texts(pair) and len(pair) == 2 for pair in value)
+    ),
+}
+"""What a line may have as a field, by the field's type."""
 
 
 def _tuple(value: Any) -> Any:  # noqa: ANN401
-    return tuple(_tuple(entry) for entry in value) if isinstance(value, list) else value
+    return tuple(map(_tuple, value)) if isinstance(value, list) else value
 
 
 def _finite(value: Any) -> Any:  # noqa: ANN401

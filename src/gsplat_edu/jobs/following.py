@@ -13,7 +13,13 @@ PIECE = 1 << 20
 """Most bytes to read at once."""
 
 LAST = 4096
-"""Bytes at the end of a file in which its last events are looked for; a longer event is read whole."""
+"""Bytes at the end of a file in which its last events are looked for; `PIECE` if there is no whole event."""
+
+LONGEST_LINE = 8 << 20
+"""Bytes of a line; a longer one is damaged."""
+
+MOST_READ = 256 << 20
+"""Bytes of a file of events that are read: a day's training writes a few MB."""
 
 
 @dataclass
@@ -51,7 +57,13 @@ class Follower:
         except OSError:
             return []
         self.offset += len(data)
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        first, *others = data.split(b"\n")
+        if len(self._rest) <= LONGEST_LINE:  # else the line is damaged already, and ends some time
+            self._rest += first
+        if not others:
+            return []
+        *lines, rest = self._rest, *others
+        self._rest = rest
         return lines
 
 
@@ -66,7 +78,7 @@ def events_after(path: Path, number: int = 0) -> list[tuple[int, float, Event]]:
         The number of each line, counted from 1, its time and its event.
     """
     follower, found = Follower(path), []
-    size = path.stat().st_size if path.is_file() else 0
+    size = min(path.stat().st_size, MOST_READ) if path.is_file() else 0
     while follower.offset < size:
         before = follower.offset
         found += [entry for entry in follower.read() if entry[0] > number]
@@ -83,7 +95,7 @@ def last_word(path: Path) -> Failed | Interrupted | Finished | None:
             file.seek(max(size - LAST, 0))
             data = file.read()
             if size > LAST and data.count(b"\n") < 2:
-                file.seek(0)
+                file.seek(max(size - PIECE, 0))
                 data = file.read()
     except OSError:
         return None

@@ -42,7 +42,26 @@ def is_running(pid: int, known: str) -> bool:
         pid: Process id.
         known: Its `identity` when it was started.
     """
-    return bool(known) and identity(pid) == known
+    return pid > 1 and bool(known) and identity(pid) == known
+
+
+def carries(pid: int, variable: str, value: str) -> bool:
+    """Return whether a process was started with a variable in its environment.
+
+    Args:
+        pid: Process id.
+        variable: Name of the variable.
+        value: Its value.
+    """
+    entry = os.fsencode(f"{variable}={value}")
+    if PROC.is_dir():
+        try:
+            return entry in (PROC / f"{pid}/environ").read_bytes().split(b"\0")
+        except OSError:
+            return False
+    words = ["ps", "eww", "-o", "command=", "-p", str(pid)]
+    done = subprocess.run(words, capture_output=True, check=False)
+    return entry in done.stdout
 
 
 def send(pid: int, known: str, number: int, *, group: bool = False) -> bool:

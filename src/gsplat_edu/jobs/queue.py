@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,20 @@ from typing import Any
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.files import described, remove_leftovers
 from gsplat_edu.jobs.events import EVENTS, Failed, Finished, Interrupted
-from gsplat_edu.jobs.following import last_start, last_word
-from gsplat_edu.jobs.process import SIGNALS, identity, is_running, send
-from gsplat_edu.jobs.record import ACTIVE, Job, JobFolder, State
+from gsplat_edu.jobs.following import LAST, last_start, last_word
+from gsplat_edu.jobs.process import SIGNALS, carries, identity, is_running, send
+from gsplat_edu.jobs.record import (
+    ACTIVE,
+    ID,
+    MOST_OUTPUTS,
+    Job,
+    JobFolder,
+    Purpose,
+    Rebuild,
+    State,
+    Work,
+    one_line,
+)
 
 POLL = 0.1
 """Seconds between two looks at the processes."""
@@ -35,9 +45,6 @@ PATIENCE = {"interrupt": 60.0, "terminate": 10.0}
 
 MOST_QUEUED = 200
 """Jobs that may wait; more are a program gone wrong."""
-
-ID = re.compile(r"\d{6}")
-"""Ids of jobs: numbers in the order of their creation."""
 
 PROGRAM = (sys.executable, "-m", "gsplat_edu")
 """What runs a command line."""
@@ -50,6 +57,7 @@ class JobQueue:
 
     Args:
         folder: One folder per job; created if missing.
+        rebuild: Validates the request of a record again; see `Rebuild`.
         at_once: Jobs that run at the same time.
         changed: Called with every new state of a job, from any thread and while the queue is locked; with None for a
             job that was removed.
@@ -62,6 +70,7 @@ class JobQueue:
     def __init__(
         self,
         folder: Path,
+        rebuild: Rebuild,
         at_once: int = 1,
         changed: Callable[[str, Job | None], None] = lambda name, job: None,
         patience: dict[str, float] | None = None,
@@ -70,11 +79,11 @@ class JobQueue:
     ) -> None:
         self.folder, self.at_once = folder, at_once
         self.changed, self.hold = changed, hold
-        self.damaged: list[str] = []
-        """A line for each record that could not be read."""
+        self.damaged: dict[str, str] = {}
+        """A line for each record that could not be read or asks for what is not allowed, by id."""
         self.trouble = ""
         """Why records cannot be written; empty if they can."""
-        self._program = tuple(program)
+        self._rebuild, self._program = rebuild, tuple(program)
         self._patience = PATIENCE if patience is None else patience
         self._lock = threading.RLock()
         self._jobs: dict[str, Job] = {}
@@ -107,13 +116,11 @@ class JobQueue:
         """Return the folder of a job; errors as for `get`."""
         return JobFolder(self.folder / self.get(name).id)
 
-    def submit(self, argv: Sequence[str], title: str = "", subject: str = "") -> Job:
+    def submit(self, work: Work) -> Job:
         """Add a job to the end of the queue.
 
         Args:
-            argv: Words after `gsplat-edu`.
-            title: See `Job`.
-            subject: See `Job`.
+            work: What it does.
 
         Raises:
             ArgumentError: too many jobs are waiting.
@@ -125,7 +132,7 @@ class JobQueue:
                 raise ArgumentError(f"jobs: {waiting} are waiting; cancel some, or wait until they are done")
             known = [int(name) for name in os.listdir(self.folder) if ID.fullmatch(name)]  # noqa: PTH208
             name = f"{max(known, default=0) + 1:06d}"
-            job = Job(name, tuple(argv), State.QUEUED, time.time(), title, subject)
+            job = Job(name, work, State.QUEUED, time.time())
             folder = JobFolder(self.folder / name)
             folder.path.mkdir()
             try:
@@ -144,7 +151,7 @@ class JobQueue:
         """
         with self._lock:
             job = self.get(name)
-            if job.state is State.QUEUED:
+            if job.state in (State.QUEUED, State.HELD):
                 return self._put(job, state=State.CANCELLED, ended=time.time(), cancelled=True)
             if job.state not in ACTIVE:
                 raise ArgumentError(
@@ -173,10 +180,10 @@ class JobQueue:
             return self._put(job, state=State.PAUSED)
 
     def resume(self, name: str) -> Job:
-        """Continue a paused job, or queue one again that failed, was cancelled or was interrupted.
+        """Continue a paused job, or queue one that was held, failed, was cancelled or was interrupted.
 
         Raises:
-            ArgumentError: there is none of this id, or it is waiting, running or done.
+            ArgumentError: there is none of this id, it is waiting, running or done, or it is not allowed any more.
         """
         with self._lock:
             job = self.get(name)
@@ -187,32 +194,42 @@ class JobQueue:
                 return self._put(job, state=State.RUNNING)
             if not job.resumable:
                 raise ArgumentError(f"job {name}: is {job.state}; it cannot be resumed")
-            return self._put(
-                job, state=State.QUEUED, ended=None, line="", cancelled=False, pid=None, identity=""
-            )
+            work = self._rebuild(job.work.request, Purpose.CONTINUE if job.attempts else Purpose.BEGIN)
+            job = replace(job, work=work, ended=None, line="", cancelled=False, pid=None, identity="")
+            return self._put(job, state=State.QUEUED)
 
     def remove(self, name: str) -> None:
-        """Forget a job that waits or has ended, and delete its record; what it wrote elsewhere stays.
+        """Forget a job that waits or has ended or is damaged, and delete its record; what it wrote elsewhere stays.
 
         Raises:
             ArgumentError: there is none of this id, or it is running.
             OSError: its folder cannot be removed.
         """
         with self._lock:
-            job = self.get(name)
-            if job.state in ACTIVE:
-                raise ArgumentError(f"job {name}: is {job.state}; cancel it first")
-            shutil.rmtree(self.folder / name)
-            del self._jobs[name]
+            if name not in self.damaged and self.get(name).state in ACTIVE:
+                raise ArgumentError(f"job {name}: is {self.get(name).state}; cancel it first")
+            path = self.folder / name
+            if path.is_symlink() or not path.is_dir():  # of a damaged one
+                path.unlink(missing_ok=True)
+            else:
+                shutil.rmtree(path)
+            self._jobs.pop(name, None)
+            self.damaged.pop(name, None)
             self.changed(name, None)
 
-    def move(self, old: Path, new: Path, subjects: tuple[str, str], rename: Callable[[], object]) -> None:
+    def move(
+        self,
+        old: Path,
+        new: Path,
+        renamed: Callable[[Mapping[str, Any]], Mapping[str, Any]],
+        rename: Callable[[], object],
+    ) -> None:
         """Move a folder that jobs name; those that have ended then name the new place.
 
         Args:
             old: The folder.
             new: Its new place.
-            subjects: What the jobs work on, before and after; a title that ends with the old name gets the new one.
+            renamed: Returns a request as it is after the move.
             rename: Moves the folder; no job starts meanwhile. If it fails, the jobs are unchanged.
 
         Raises:
@@ -221,16 +238,10 @@ class JobQueue:
         with self._lock:
             rename()
             for job in self.jobs():
-                argv, outputs = (
-                    tuple(_moved(word, old, new) for word in some) for some in (job.argv, job.outputs)
-                )
-                changes: dict[str, Any] = {"argv": argv, "outputs": outputs}
-                if job.subject == subjects[0]:
-                    title = job.title.removesuffix(f" of {old.name}")
-                    changed = job.title if title == job.title else f"{title} of {new.name}"
-                    changes |= {"subject": subjects[1], "title": changed}
-                if any(getattr(job, name) != value for name, value in changes.items()):
-                    self._put(job, **changes)
+                outputs = tuple(_moved(word, old, new) for word in job.outputs)
+                request = renamed(job.work.request)
+                if (request, outputs) != (job.work.request, job.outputs):
+                    self._put(job, work=self._rebuild(request, Purpose.SHOW), outputs=outputs)
 
     def close(self, interrupt: bool = True) -> None:
         """End the queue; waiting jobs wait for the next one.
@@ -281,10 +292,7 @@ class JobQueue:
 
     def _start(self, job: Job) -> None:
         folder = JobFolder(self.folder / job.id)
-        argv = job.again() if job.attempts else job.argv
-        job = self._put(
-            job, state=State.RUNNING, argv=argv, started=time.time(), attempts=job.attempts + 1, pid=None
-        )
+        job = self._put(job, state=State.RUNNING, started=time.time(), attempts=job.attempts + 1, pid=None)
         try:
             with folder.output.open("ab") as output:
                 child = subprocess.Popen(
@@ -292,11 +300,11 @@ class JobQueue:
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=subprocess.STDOUT,
-                    env={**os.environ, EVENTS: str(folder.events.resolve()), "PYTHONUNBUFFERED": "1"},
+                    env={**os.environ, EVENTS: _marker(folder), "PYTHONUNBUFFERED": "1"},
                     start_new_session=True,  # Ctrl-C in the server's terminal does not reach it
                 )
         except OSError as error:
-            self._put(job, state=State.FAILED, ended=time.time(), line=described(error))
+            self._put(job, state=State.FAILED, ended=time.time(), line=one_line(described(error)))
             return
         self._children[job.id] = child
         self._note(
@@ -333,11 +341,11 @@ class JobQueue:
         said = last_word(JobFolder(self.folder / job.id).events)
         changes: dict[str, Any] = {"state": State.INTERRUPTED, "line": "", "pid": None, "identity": ""}
         if isinstance(said, Finished):
-            changes |= {"state": State.DONE, "outputs": said.outputs}
+            changes |= {"state": State.DONE, "outputs": tuple(map(one_line, said.outputs[:MOST_OUTPUTS]))}
         elif isinstance(said, Failed):
-            changes |= {"state": State.FAILED, "line": said.line}
+            changes |= {"state": State.FAILED, "line": one_line(said.line)}
         elif isinstance(said, Interrupted):
-            changes["line"] = said.line
+            changes["line"] = one_line(said.line)
         elif code is not None and code > 0:
             changes |= {"state": State.FAILED, "line": self._last_line(job, code)}
         else:
@@ -349,27 +357,32 @@ class JobQueue:
     def _last_line(self, job: Job, code: int) -> str:
         """Return the last line that a job printed, for one that failed before it could write events."""
         with contextlib.suppress(OSError):
-            text = JobFolder(self.folder / job.id).output.read_text("utf-8", errors="replace").strip()
+            with JobFolder(self.folder / job.id).output.open("rb") as file:
+                file.seek(max(os.fstat(file.fileno()).st_size - LAST, 0))
+                text = file.read().decode("utf-8", errors="replace").strip()
             if text:
-                return text.splitlines()[-1]
+                return one_line(text.splitlines()[-1])
         return f"ended with exit code {code}"
 
     def _recover(self) -> None:
-        """Read the records that an earlier queue left, and find its processes."""
+        """Read the records that an earlier queue left, and find its processes. Nothing starts."""
         for path in sorted(self.folder.iterdir()):
             if not ID.fullmatch(path.name):
                 continue
+            folder = JobFolder(path)
             try:
-                job = JobFolder(path).read()
-            except (ArgumentError, OSError) as error:
-                self.damaged.append(str(error))
+                job = folder.read(self._rebuild)
+            except ArgumentError as error:
+                self.damaged[path.name] = str(error)
                 continue
-            if job.state in ACTIVE and job.pid is None and (found := last_start(JobFolder(path).events)):
+            if job.state in ACTIVE and job.pid is None and (found := last_start(folder.events)):
                 # the earlier queue was killed between the start of the process and its note
                 job = replace(job, pid=found.pid, identity=found.identity)
             self._jobs[job.id] = job
-            if job.state in ACTIVE and not (job.pid and is_running(job.pid, job.identity)):
-                self._ended(job, None)
+            if job.state in ACTIVE and not _is_of(job, folder):
+                self._ended(replace(job, pid=None, identity=""), None)
+            elif job.state is State.QUEUED:
+                self._put(job, state=State.HELD)
 
     def _put(self, job: Job, **changes: Any) -> Job:  # noqa: ANN401
         job = replace(job, **changes)
@@ -380,6 +393,20 @@ class JobQueue:
     def _note(self, job: Job) -> None:
         self._jobs[job.id] = job
         self.changed(job.id, job)
+
+
+def _marker(folder: JobFolder) -> str:
+    """Return the value of `EVENTS` in the environment of a job's processes, which tells them from all others."""
+    return str(folder.events.resolve())
+
+
+def _is_of(job: Job, folder: JobFolder) -> bool:
+    """Return whether the process that a record names runs and was started for this job: only then it gets signals."""
+    return (
+        job.pid is not None
+        and is_running(job.pid, job.identity)
+        and carries(job.pid, EVENTS, _marker(folder))
+    )
 
 
 def _moved(word: str, old: Path, new: Path) -> str:

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.jobs.record import Purpose, Work
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.library import Library, files_within, scene_file
 from gsplat_edu.studio.names import checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict
+from gsplat_edu.text import shortened
 from gsplat_edu.train.config import APPEARANCES, QUALITIES, REFINEMENTS, SKIES, STRATEGIES
 from gsplat_edu.train.setting import TRANSIENTS
 
@@ -25,27 +27,15 @@ EDITS = "edits.json"
 FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb", "html")
 """Endings of exported files."""
 
+MADE = {"sfm": "captures", "train": "runs", "clean": "scenes"}
+"""Kinds of the entries that commands make; the others write into the entry that they work on."""
+
 LONGEST_TEXT = 200
 """Characters of an option's text."""
 
 Words = list[str]
 Option = Callable[[str, Any], Words]
 """Turns name and value of an option into words of the command line."""
-
-
-@dataclass(frozen=True)
-class Work:
-    """A command line to run.
-
-    Args:
-        argv: Words after `gsplat-edu`.
-        title: A few words for people.
-        subject: The entry that it works on.
-    """
-
-    argv: tuple[str, ...]
-    title: str
-    subject: str
 
 
 def _choice(*values: str) -> Option:
@@ -157,16 +147,18 @@ RENDER_OPTIONS: Mapping[str, Option] = {
 }
 
 
-def work_of(library: Library, request: Mapping[str, Any]) -> Work:
-    """Turn a request into a command line.
+def work_of(library: Library, request: Mapping[str, Any], purpose: Purpose = Purpose.BEGIN) -> Work:
+    """Turn a request into a command line, whose paths all lie in the library or in what it has adopted.
 
     Args:
         library: Where the entries are.
         request: command, subject ("captures/toy"), to (the name of what is made), options, and for each command
             what docs/STUDIO.md lists.
+        purpose: What for; only `BEGIN` chooses a name where `to` is missing.
 
     Raises:
-        RefusedError: the command is unknown, an option is not allowed, or an entry does not exist or exists already.
+        RefusedError: the command is unknown, an option is not allowed, an entry does not exist or exists already, or
+            a path leads out of the library.
     """
     command = request.get("command")
     makers = {
@@ -182,8 +174,104 @@ def work_of(library: Library, request: Mapping[str, Any]) -> Work:
         raise RefusedError(f"command: is {str(command)[:40]!r}, but has to be one of {', '.join(makers)}")
     known = {"command", "subject", "to", "options", "format", "edits", "resume"}
     if unknown := sorted(set(request) - known):
-        raise RefusedError(f"{unknown[0]}: is not known; see docs/STUDIO.md")
-    return maker(library, request)
+        raise RefusedError(f"{shortened(unknown[0])}: is not known; see docs/STUDIO.md")
+    work = maker(_Asked(library, request, purpose))
+    for word in work.argv:
+        if word.startswith("/"):
+            library.check_within(Path(word))
+    return work
+
+
+def renamed(request: Mapping[str, Any], kind: str, old: str, new: str) -> Mapping[str, Any]:
+    """Return a request as it is after an entry that it may name got another name.
+
+    Args:
+        request: A request of a `Work`.
+        kind: The entry's kind.
+        old: Its name.
+        new: Its new name.
+    """
+    changes = {}
+    if request.get("subject") == f"{kind}/{old}":
+        changes["subject"] = f"{kind}/{new}"
+    if MADE.get(request["command"]) == kind and request.get("to") == old:
+        changes["to"] = new
+    return {**request, **changes}
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A request on its way to a command line.
+
+    Args:
+        library: Where the entries are.
+        request: The request.
+        purpose: What the command line is for.
+    """
+
+    library: Library
+    request: Mapping[str, Any]
+    purpose: Purpose
+
+    def subject(self, *kinds: str) -> tuple[str, Path]:
+        """Return kind and path of the entry that is worked on."""
+        given = self.request.get("subject")
+        kind, _, name = given.partition("/") if isinstance(given, str) else ("", "", "")
+        if kind not in kinds:
+            raise RefusedError(
+                f"subject: is {shortened(str(given))!r}, but has to be of {' or '.join(kinds)}"
+            )
+        if self.purpose is Purpose.SHOW:
+            return kind, self.library.place(kind, name)
+        entry = self.library.entry(kind, name)
+        if kind == "photos" and not any(True for _ in files_within(entry)):
+            raise conflict(f"photos/{entry.name}: is empty; add photos first")
+        return kind, entry
+
+    def made(self, kind: str, name: str) -> Path:
+        """Return the entry that is made, and that a job which is continued has made in part."""
+        given = self.request.get("to")
+        if self.purpose is Purpose.BEGIN:
+            return self.library.fresh(kind, given or self.library.free_name(kind, name))
+        place = self.library.place(kind, given)
+        if self.purpose is Purpose.CONTINUE and place.exists():
+            self.library.check_tree(place)
+        return place
+
+    def options(self, known: Mapping[str, Option]) -> Words:
+        """Return the words of the options."""
+        given = self.request.get("options", {})
+        if not isinstance(given, dict):
+            raise RefusedError("options: has to be an object")
+        words: Words = []
+        for name, value in given.items():
+            if name not in known:
+                raise RefusedError(
+                    f"options.{shortened(str(name))}: is not one of {', '.join(known) or 'none'}"
+                )
+            if value is not None:
+                words += known[name](name, value)
+        return words
+
+    def edits(self, kind: str, entry: Path) -> Words:
+        """Return the words that apply the edits of the entry that is worked on."""
+        if self.request.get("edits") is not True:
+            return []
+        if self.purpose is not Purpose.SHOW and not (entry / EDITS).is_file():
+            raise RefusedError(
+                f"edits: {kind}/{entry.name} has none; edit the scene first, or leave them out"
+            )
+        return ["--edits", str(entry / EDITS)]
+
+    def scene(self, kind: str, entry: Path) -> Path:
+        """Return what convert and render read."""
+        if self.purpose is Purpose.SHOW and not entry.is_dir():
+            return entry
+        return scene_of(entry, kind)
+
+    def work(self, argv: Words, title: str, subject: str, **chosen: object) -> Work:
+        """Return the work, whose request has what was chosen."""
+        return Work({**self.request, **chosen}, tuple(argv), title, subject)
 
 
 def photos_source(entry: Path) -> Path:
@@ -207,84 +295,58 @@ def scene_of(entry: Path, kind: str) -> Path:
     raise RefusedError(f"{kind}/{entry.name}: holds no scene; choose a run or a scene")
 
 
-def _sfm(library: Library, request: Mapping[str, Any]) -> Work:
-    kind, entry = _subject(library, request, "photos")
-    out = library.fresh("captures", request.get("to") or library.free_name("captures", entry.name))
-    argv = ["sfm", str(photos_source(entry)), str(out), *_options(request, SFM_OPTIONS)]
-    return Work(tuple(argv), f"poses of {entry.name}", f"{kind}/{entry.name}")
+def _sfm(asked: _Asked) -> Work:
+    kind, entry = asked.subject("photos")
+    out = asked.made("captures", entry.name)
+    argv = ["sfm", str(photos_source(entry)), str(out), *asked.options(SFM_OPTIONS)]
+    return asked.work(argv, f"poses of {entry.name}", f"{kind}/{entry.name}", to=out.name)
 
 
-def _train(library: Library, request: Mapping[str, Any]) -> Work:
-    kind, entry = _subject(library, request, "captures", "photos")
+def _train(asked: _Asked) -> Work:
+    kind, entry = asked.subject("captures", "photos")
     source = photos_source(entry) if kind == "photos" else entry
-    if request.get("resume") is True:
-        out = library.entry("runs", str(request.get("to")))
+    resumes = asked.request.get("resume") is True
+    if resumes and asked.purpose is not Purpose.SHOW:
+        out = asked.library.entry("runs", asked.request.get("to"))
+        asked.library.check_tree(out)
     else:
-        out = library.fresh("runs", request.get("to") or library.free_name("runs", entry.name))
-    argv = ["train", str(source), "--out", str(out), *_options(request, TRAIN_OPTIONS)]
-    argv += ["--resume"] if request.get("resume") is True else []
-    return Work(tuple(argv), f"training of {out.name}", f"runs/{out.name}")
+        out = asked.made("runs", entry.name)
+        resumes |= asked.purpose is Purpose.CONTINUE and (out / "config.json").is_file()
+    argv = ["train", str(source), "--out", str(out), *asked.options(TRAIN_OPTIONS)]
+    argv += ["--resume"] if resumes else []
+    chosen = {"to": out.name} | ({"resume": True} if resumes else {})
+    return asked.work(argv, f"training of {out.name}", f"runs/{out.name}", **chosen)
 
 
-def _doctor(library: Library, request: Mapping[str, Any]) -> Work:
-    kind, entry = _subject(library, request, "captures", "runs")
+def _doctor(asked: _Asked) -> Work:
+    kind, entry = asked.subject("captures", "runs")
     words = ["--no-forecast"] if kind == "captures" else []
-    argv = ["doctor", str(entry), *words, *_options(request, DOCTOR_OPTIONS if kind == "captures" else {})]
-    return Work(tuple(argv), f"doctor of {entry.name}", f"{kind}/{entry.name}")
+    argv = ["doctor", str(entry), *words, *asked.options(DOCTOR_OPTIONS if kind == "captures" else {})]
+    return asked.work(argv, f"doctor of {entry.name}", f"{kind}/{entry.name}")
 
 
-def _clean(library: Library, request: Mapping[str, Any]) -> Work:
-    kind, entry = _subject(library, request, "runs")
-    out = library.fresh("scenes", request.get("to") or library.free_name("scenes", f"{entry.name}-clean"))
-    argv = ["clean", str(entry), "--out", str(out / f"{out.name}.ply"), *_options(request, CLEAN_OPTIONS)]
-    return Work(tuple(argv), f"cleaning of {entry.name}", f"{kind}/{entry.name}")
+def _clean(asked: _Asked) -> Work:
+    kind, entry = asked.subject("runs")
+    out = asked.made("scenes", f"{entry.name}-clean")
+    argv = ["clean", str(entry), "--out", str(out / f"{out.name}.ply"), *asked.options(CLEAN_OPTIONS)]
+    return asked.work(argv, f"cleaning of {entry.name}", f"{kind}/{entry.name}", to=out.name)
 
 
-def _convert(library: Library, request: Mapping[str, Any]) -> Work:
-    kind, entry = _subject(library, request, "runs", "scenes")
-    form = request.get("format")
+def _convert(asked: _Asked) -> Work:
+    kind, entry = asked.subject("runs", "scenes")
+    form = asked.request.get("format")
     if form not in FORMATS:
         raise RefusedError(f"format: is {str(form)[:40]!r}, but has to be one of {', '.join(FORMATS)}")
-    name = checked_name("to", request.get("to") or entry.name)
+    name = checked_name("to", asked.request.get("to") or entry.name)
     out = entry / EXPORTS / f"{name}.{form}"
-    argv = ["convert", str(scene_of(entry, kind)), str(out), *_options(request, CONVERT_OPTIONS)]
-    argv += [*_edits(request, kind, entry), "--verify"]
-    return Work(tuple(argv), f"export of {out.name}", f"{kind}/{entry.name}")
+    argv = ["convert", str(asked.scene(kind, entry)), str(out), *asked.options(CONVERT_OPTIONS)]
+    argv += [*asked.edits(kind, entry), "--verify"]
+    return asked.work(argv, f"export of {out.name}", f"{kind}/{entry.name}", to=name)
 
 
-def _render(library: Library, request: Mapping[str, Any]) -> Work:
-    kind, entry = _subject(library, request, "runs", "scenes")
-    name = checked_name("to", request.get("to") or entry.name)
-    argv = ["render", str(scene_of(entry, kind)), "--out", str(entry / EXPORTS / f"{name}.mp4")]
-    argv += [*_edits(request, kind, entry), *_options(request, RENDER_OPTIONS)]
-    return Work(tuple(argv), f"video of {entry.name}", f"{kind}/{entry.name}")
-
-
-def _edits(request: Mapping[str, Any], kind: str, entry: Path) -> Words:
-    if request.get("edits") is not True:
-        return []
-    if not (entry / EDITS).is_file():
-        raise RefusedError(f"edits: {kind}/{entry.name} has none; edit the scene first, or leave them out")
-    return ["--edits", str(entry / EDITS)]
-
-
-def _subject(library: Library, request: Mapping[str, Any], *kinds: str) -> tuple[str, Path]:
-    kind, entry = library.named(request.get("subject"))
-    if kind not in kinds:
-        raise RefusedError(f"subject: is of {kind}, but has to be of {' or '.join(kinds)}")
-    if kind == "photos" and not any(True for _ in files_within(entry)):
-        raise conflict(f"photos/{entry.name}: is empty; add photos first")
-    return kind, entry
-
-
-def _options(request: Mapping[str, Any], known: Mapping[str, Option]) -> Words:
-    given = request.get("options", {})
-    if not isinstance(given, dict):
-        raise RefusedError("options: has to be an object")
-    words: Words = []
-    for name, value in given.items():
-        if name not in known:
-            raise RefusedError(f"options.{str(name)[:40]}: is not one of {', '.join(known) or 'none'}")
-        if value is not None:
-            words += known[name](name, value)
-    return words
+def _render(asked: _Asked) -> Work:
+    kind, entry = asked.subject("runs", "scenes")
+    name = checked_name("to", asked.request.get("to") or entry.name)
+    argv = ["render", str(asked.scene(kind, entry)), "--out", str(entry / EXPORTS / f"{name}.mp4")]
+    argv += [*asked.edits(kind, entry), *asked.options(RENDER_OPTIONS)]
+    return asked.work(argv, f"video of {entry.name}", f"{kind}/{entry.name}", to=name)

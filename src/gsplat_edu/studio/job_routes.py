@@ -16,6 +16,7 @@ from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 from gsplat_edu.studio.replies import act
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.stream import event_document, job_document
+from gsplat_edu.text import shortened, whole_of
 
 MOST_EVENTS = 2_000
 """Events of a job in one answer: the latest ones."""
@@ -39,7 +40,11 @@ def routes() -> list[BaseRoute]:
 
 
 def _jobs(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
-    return {"boot": studio.stream.boot, "jobs": [job_document(job) for job in studio.queue.jobs()]}
+    return {
+        "boot": studio.stream.boot,
+        "jobs": [job_document(job) for job in studio.queue.jobs()],
+        "damaged": [{"id": name, "line": line} for name, line in sorted(studio.queue.damaged.items())],
+    }
 
 
 def _start(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -53,14 +58,14 @@ def _job(studio: Studio, request: Request) -> Job:
     try:
         return studio.queue.get(name)
     except ArgumentError:
-        raise not_found(f"jobs/{name}") from None
+        raise not_found(f"jobs/{shortened(name)}") from None
 
 
 def _change(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     job, action = _job(studio, request), request.path_params["action"]
-    actions = {"cancel": studio.queue.cancel, "pause": studio.queue.pause, "resume": studio.queue.resume}
+    actions = {"cancel": studio.queue.cancel, "pause": studio.queue.pause, "resume": studio.resume}
     if action not in actions:
-        raise not_found(f"jobs/{job.id}/{action}")
+        raise not_found(f"jobs/{job.id}/{shortened(action)}")
     try:
         return job_document(actions[action](job.id))
     except ArgumentError as error:
@@ -68,19 +73,21 @@ def _change(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
 
 
 def _remove(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
-    job = _job(studio, request)
+    name = request.path_params["id"]
+    if name not in studio.queue.damaged:
+        _job(studio, request)
     try:
-        studio.queue.remove(job.id)
+        studio.queue.remove(name)
     except ArgumentError as error:
         raise conflict(str(error)) from None
-    return {"removed": job.id}
+    return {"removed": name}
 
 
 def _events(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
-    text = request.query_params.get("after", "0")
-    if not text.isdecimal():
+    after = whole_of(request.query_params.get("after", "0"))
+    if after is None:
         raise RefusedError("after: has to be the number of an event")
-    found = events_after(studio.queue.files(_job(studio, request).id).events, int(text))
+    found = events_after(studio.queue.files(_job(studio, request).id).events, after)
     return {
         "events": [event_document(*entry) for entry in found[-MOST_EVENTS:]],
         "left_out": max(len(found) - MOST_EVENTS, 0),

@@ -7,7 +7,8 @@
     .studio/         jobs/, trash/, uploads/ (parts of files), cache/ (thumbnails, pages)
 
 An adopted entry is a link to a folder elsewhere (for a scene and a video: a folder with a link to the file).
-Removing it removes the link.
+Removing it removes the link. A link that was not adopted by this user on this computer is not followed
+(`gsplat_edu.studio.adopted`): somebody else may have made the library.
 """
 
 from __future__ import annotations
@@ -24,15 +25,21 @@ from typing import Any
 
 from gsplat_edu.data.capture import PHOTO_ENDINGS
 from gsplat_edu.files import written_aside
+from gsplat_edu.reading import open_file
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
+from gsplat_edu.studio.adopted import adopted, note_adopted
 from gsplat_edu.studio.names import checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
+from gsplat_edu.text import legible, shortened, whole_of
 
 KINDS = ("photos", "captures", "runs", "scenes")
 """Kinds of entries, and their folders."""
 
 HIDDEN = ".studio"
 """Folder of what the studio keeps for itself."""
+
+PARTS = ("jobs", "trash", "uploads", "cache")
+"""Folders in `HIDDEN`."""
 
 SCENE_ENDINGS = (".ply", ".splat", ".spz", ".sog", ".glb")
 """Endings of scene files that can be taken in."""
@@ -64,19 +71,24 @@ class Library:
     Args:
         root: The folder; its parts are created if missing.
         in_use: Returns why a path may not be moved, or None; called with absolute paths.
+
+    Raises:
+        RefusedError: one of the library's own folders is a link or a file.
     """
 
     def __init__(self, root: Path, in_use: Callable[[Path], str | None] = lambda path: None) -> None:
         self.root = root.resolve()
         self.in_use = in_use
         self.lock = threading.RLock()
+        check_own_folders(self.root)
+        self._adopted = adopted(self.root)
         for kind in KINDS:
             (self.root / kind).mkdir(parents=True, exist_ok=True)
-        for part in ("jobs", "trash", "uploads", "cache"):
+        for part in PARTS:
             self.hidden(part).mkdir(parents=True, exist_ok=True)
         # cached pages may be those of an older version
         pages = [self.hidden("cache") / part for part in ("pages", "live")]
-        for left in (*self.hidden("uploads").iterdir(), *pages):
+        for left in (*self.hidden("uploads").iterdir(), *pages, *_links(self.hidden("cache"))):
             _delete(left)
 
     def hidden(self, part: str) -> Path:
@@ -86,17 +98,58 @@ class Library:
     def entries(self, kind: str) -> list[Path]:
         """Return the entries of a kind, by name."""
         found = (self.root / kind).iterdir()
-        return sorted(path for path in found if path.name[0] != "." and path.is_dir())
+        return sorted(
+            path for path in found if path.name[0] != "." and path.is_dir() and self.is_within(path)
+        )
 
-    def entry(self, kind: str, name: str) -> Path:
+    def strange_links(self) -> list[str]:
+        """Return a line for each entry that is a link which was not adopted here."""
+        links = [path for kind in KINDS for path in (self.root / kind).iterdir() if path.is_symlink()]
+        return [self._strange(path) for path in sorted(links) if not self.is_within(path)]
+
+    def is_within(self, path: Path) -> bool:
+        """Return whether a path, with all its links followed, lies in the library or in what it has adopted."""
+        try:
+            path = path.resolve()
+        except (OSError, RuntimeError):  # a circle of links, before and since Python 3.13
+            return False
+        return any(path.is_relative_to(place) for place in (self.root, *self._adopted))
+
+    def check_within(self, path: Path) -> None:
+        """Check that a path lies in the library or in what it has adopted.
+
+        Raises:
+            RefusedError: it does not.
+        """
+        if not self.is_within(path):
+            raise conflict(self._strange(path))
+
+    def check_tree(self, folder: Path) -> None:
+        """Check that no link in a folder, at any depth, leads out of the library.
+
+        Raises:
+            RefusedError: one does.
+        """
+        for link in _links(folder):
+            self.check_within(link)
+
+    def _strange(self, path: Path) -> str:
+        name = path.relative_to(self.root) if path.is_relative_to(self.root) else path
+        return (
+            f"{legible(shortened(str(name), 300))}: leads out of the library by a link that was not adopted here;"
+            " remove the link, or adopt the place that it leads to under the same name"
+        )
+
+    def entry(self, kind: str, name: object) -> Path:
         """Return an existing entry.
 
         Raises:
-            RefusedError: there is none of this kind and name.
+            RefusedError: there is none of this kind and name, or it is a link that was not adopted here.
         """
         path = self.place(kind, name)
         if not path.is_dir():
-            raise not_found(f"{kind}/{name}")
+            raise not_found(f"{kind}/{path.name}")
+        self.check_within(path)
         return path
 
     def named(self, subject: object) -> tuple[str, Path]:
@@ -115,7 +168,9 @@ class Library:
             RefusedError: kind or name is not allowed.
         """
         if kind not in KINDS:
-            raise RefusedError(f"{kind!r}: is not a kind of entry; the kinds are {', '.join(KINDS)}")
+            raise RefusedError(
+                f"{shortened(str(kind))!r}: is not a kind of entry; the kinds are {', '.join(KINDS)}"
+            )
         return self.root / kind / checked_name(kind, name)
 
     def fresh(self, kind: str, name: object) -> Path:
@@ -169,12 +224,16 @@ class Library:
             wanted = f"a folder, or a file ending in {', '.join(endings)}" if endings else "a folder"
             raise RefusedError(f"path: {source} is a file; give {wanted}")
         with self.lock:
-            path = self.fresh(kind, name)
-            if source.is_file():
-                path.mkdir()
-                (path / source.name).symlink_to(source)
-            else:
-                path.symlink_to(source, target_is_directory=True)
+            path = self.place(kind, name)
+            link = path / source.name if source.is_file() else path
+            if (
+                self.is_within(link) or link.resolve() != source
+            ):  # else the link was made by hand, or elsewhere
+                self.fresh(kind, name)
+                link.parent.mkdir(exist_ok=True)
+                link.symlink_to(source, target_is_directory=source.is_dir())
+            note_adopted(self.root, source)
+            self._adopted.append(source)
         return path
 
     def rename(self, kind: str, name: str, to: object) -> Path:
@@ -211,11 +270,15 @@ class Library:
         """Return what is in the trash, newest first."""
         found = []
         for folder in sorted(self.hidden("trash").iterdir(), reverse=True):
-            for path in folder.iterdir() if folder.name.isdigit() else ():
-                if path.name != "from.txt" and (folder / "from.txt").is_file():
-                    kind = (folder / "from.txt").read_text("utf-8")
-                    removed = int(folder.name) / 1e9
-                    found.append({"id": folder.name, "kind": kind, "name": path.name, "removed": removed})
+            number = whole_of(folder.name.lstrip("0"))
+            if number is None or folder.is_symlink() or not folder.is_dir():
+                continue
+            kind = _removed_from(folder / "from.txt")
+            for path in folder.iterdir() if kind in KINDS else ():
+                if path.name != "from.txt":
+                    found.append(
+                        {"id": folder.name, "kind": kind, "name": path.name, "removed": number / 1e9}
+                    )
         return found
 
     def restore(self, number: str) -> Path:
@@ -232,7 +295,7 @@ class Library:
                     (folder / entry["name"]).rename(target)
                     _delete(folder)
                     return target
-        raise not_found(f"trash/{number}")
+        raise not_found(f"trash/{shortened(number)}")
 
     def empty_trash(self) -> None:
         """Delete what is in the trash; adopted entries lose only their link."""
@@ -242,6 +305,39 @@ class Library:
     def _check_free(self, path: Path) -> None:
         if (why := self.in_use(path)) is not None:
             raise conflict(f"{path.parent.name}/{path.name}: {why}")
+
+
+def check_own_folders(root: Path) -> None:
+    """Check, before anything is written, that the library's own folders are folders in it.
+
+    Args:
+        root: The library's folder; it need not exist.
+
+    Raises:
+        RefusedError: one of them is a link or a file.
+    """
+    for name in (*KINDS, HIDDEN, *(f"{HIDDEN}/{part}" for part in PARTS)):
+        place = root / name
+        if place.is_symlink() or (place.exists() and not place.is_dir()):
+            raise RefusedError(f"FOLDER: {place} is a link or a file, but has to be a folder; move it away")
+
+
+def _removed_from(path: Path) -> str | None:
+    """Return the kind that a file of the trash names; None if it names none."""
+    try:
+        with open_file(path) as file:
+            kind = file.read(40).decode("ascii", errors="replace")
+    except OSError:
+        return None
+    return kind if kind in KINDS and not path.is_symlink() else None
+
+
+def _links(folder: Path) -> list[Path]:
+    """Return the links below a folder, without following them."""
+    found = []
+    for place, folders, files in os.walk(folder):
+        found += [path for name in (*folders, *files) if (path := Path(place, name)).is_symlink()]
+    return found
 
 
 def extent_of(folder: Path) -> Extent:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.jobs.record import State
@@ -15,8 +15,11 @@ from gsplat_edu.studio.library import KINDS
 from gsplat_edu.studio.listing import summary
 from gsplat_edu.studio.pictures import photo_list, thumbnail
 from gsplat_edu.studio.refusal import RefusedError
-from gsplat_edu.studio.replies import act, answered, content_length, entry_of, fields, file_answer
+from gsplat_edu.studio.replies import Json, act, answered, content_length, entry_of, fields, file_answer
 from gsplat_edu.studio.state import Studio
+
+MOST_LINES = 3
+"""Lines of one trouble that the page shows; of more it shows the number."""
 
 
 def routes() -> list[BaseRoute]:
@@ -47,9 +50,21 @@ def _library(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
         "limits": studio.uploads.limits.document(),
         "jobs_at_once": studio.queue.at_once,
         "waiting": sum(job.state is State.QUEUED for job in studio.queue.jobs()),
-        "trouble": [*studio.queue.damaged, *([studio.queue.trouble] if studio.queue.trouble else [])],
+        "trouble": [
+            *_few(
+                list(studio.queue.damaged.values()),
+                "records of jobs are damaged; the page of jobs lists them",
+            ),
+            *_few(library.strange_links(), "entries are links that were not adopted here"),
+            *([studio.queue.trouble] if studio.queue.trouble else []),
+        ],
         **lists,
     }
+
+
+def _few(lines: list[str], summary: str) -> list[str]:
+    """Return lines as they are if they are few, else their number."""
+    return lines if len(lines) <= MOST_LINES else [f"{len(lines)} {summary}"]
 
 
 def _entry(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -103,13 +118,13 @@ async def _upload(request: Request) -> Response:
     kind, name = request.path_params["kind"], request.path_params["name"]
     target = studio.uploads.target(kind, name, request.path_params["path"])
     size = await studio.uploads.receive(request.stream(), _length(request), target)
-    return JSONResponse({"entry": f"{kind}/{name}", "file": target.name, "bytes": size}, 201)
+    return Json({"entry": f"{kind}/{name}", "file": target.name, "bytes": size}, 201)
 
 
 async def _upload_zip(request: Request) -> Response:
     studio: Studio = request.app.state.studio
     kind, name = request.path_params["kind"], request.path_params["name"]
-    return JSONResponse(await studio.uploads.receive_zip(request.stream(), _length(request), kind, name), 201)
+    return Json(await studio.uploads.receive_zip(request.stream(), _length(request), kind, name), 201)
 
 
 def _length(request: Request) -> int | None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
 from gsplat_edu.errors import ArgumentError, SceneFormatError
@@ -21,7 +21,7 @@ from gsplat_edu.files import written_aside
 from gsplat_edu.jobs.record import ACTIVE, Job, State
 from gsplat_edu.reading import parse_json, read_bytes
 from gsplat_edu.studio.refusal import RefusedError, conflict
-from gsplat_edu.studio.replies import act, answered
+from gsplat_edu.studio.replies import Json, act, answered
 from gsplat_edu.studio.scene_routes import BINARY, page_answer
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.viewer.live_folder import LiveFolder, header_of
@@ -85,7 +85,7 @@ def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN
 async def _state(request: Request) -> Response:
     after = request.query_params.get("after", "")
     found = await _waited(request, lambda job, folder: _new_state(job, folder, after))
-    return Response(status_code=204) if found is None else JSONResponse(found)
+    return Response(status_code=204) if found is None else Json(found)
 
 
 def _new_state(job: Job, folder: LiveFolder, after: str) -> dict[str, Any] | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import email.utils
+import json
+import math
 from collections.abc import Awaitable, Callable, Mapping
 from http import HTTPStatus
 from pathlib import Path
@@ -20,13 +22,16 @@ from gsplat_edu.files import described
 from gsplat_edu.reading import parse_json
 from gsplat_edu.studio.refusal import RefusedError, not_found, too_large
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.text import legible
+from gsplat_edu.text import legible, shortened, whole_of
 
 MOST_JSON = 16 << 20
 """Bytes of a JSON body."""
 
 Act = Callable[[Studio, Request, Any], Any]
 """A route: the studio, the request and its JSON body (None without one); returns what is sent as JSON, or an answer."""
+
+LONGEST_ERROR = 600
+"""Characters of an error; paths in it may be long."""
 
 CLOSE = {"Connection": "close"}
 """Header of an answer to a request whose body may not have been read to its end."""
@@ -38,13 +43,35 @@ LONGEST_DRAIN = 5.0
 """Seconds in which they have to come."""
 
 
+class Json(JSONResponse):
+    """An answer as JSON, whatever text and numbers a file has put into it.
+
+    Text that no encoding accepts is escaped; JSON has no NaN and no infinities, so these become null.
+    """
+
+    def render(self, content: Any) -> bytes:  # noqa: ANN401
+        """Return the bytes."""
+        try:
+            return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
+        except ValueError:
+            return json.dumps(_finite(content), allow_nan=False, separators=(",", ":")).encode("ascii")
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def act(path: str, method: str, function: Act) -> Route:
     """Return a route whose function runs in a thread, after the JSON body was read."""
 
     async def endpoint(request: Request) -> Response:
         body = await json_body(request) if method in ("POST", "PUT", "PATCH") else None
         found = await run_in_threadpool(function, request.app.state.studio, request, body)
-        return found if isinstance(found, Response) else JSONResponse(found)
+        return found if isinstance(found, Response) else Json(found)
 
     return Route(path, answered(endpoint), methods=[method])
 
@@ -78,9 +105,9 @@ async def drain(request: Request, status: HTTPStatus) -> None:
         request: The request.
         status: With which it is refused.
     """
-    length = request.headers.get("content-length", "0")
+    length = whole_of(request.headers.get("content-length", "0"))
     for_size = status in (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.INSUFFICIENT_STORAGE)
-    if for_size or not length.isdecimal() or int(length) > MOST_DRAINED:
+    if for_size or length is None or length > MOST_DRAINED:
         return
     size = 0
     # RuntimeError: the body was received already
@@ -94,7 +121,12 @@ async def drain(request: Request, status: HTTPStatus) -> None:
 
 def refusal(line: str, status: HTTPStatus) -> JSONResponse:
     """Return an error as an answer: {"error": the line}."""
-    return JSONResponse({"error": legible(line)}, status, headers=CLOSE)
+    return JSONResponse({"error": bounded(line)}, status, headers=CLOSE)
+
+
+def bounded(line: str) -> str:
+    """Return a line for people as an answer has it, of limited length: its start and its end, which has the advice."""
+    return shortened(legible(line), LONGEST_ERROR)
 
 
 async def json_body(request: Request) -> Any:  # noqa: ANN401
@@ -129,9 +161,10 @@ def content_length(request: Request) -> int | None:
     text = request.headers.get("content-length")
     if text is None:
         return None if "transfer-encoding" in request.headers else 0
-    if not text.isdecimal():
-        raise RefusedError("Content-Length: is not a number")
-    return int(text)
+    length = whole_of(text)
+    if length is None:
+        raise RefusedError("Content-Length: is not a number of bytes")
+    return length
 
 
 def entry_of(studio: Studio, request: Request) -> tuple[str, Path]:
@@ -182,7 +215,7 @@ def fields(body: Any, **wanted: type) -> Mapping[str, Any]:  # noqa: ANN401
         if not isinstance(body.get(name), kind):
             raise RefusedError(f"{name}: is missing, or not of type {kind.__name__}")
     if unknown := sorted(set(body) - set(wanted)):
-        raise RefusedError(f"{unknown[0]}: is not known; see docs/STUDIO.md")
+        raise RefusedError(f"{shortened(unknown[0])}: is not known; see docs/STUDIO.md")
     return body
 
 

@@ -19,6 +19,7 @@ from gsplat_edu.reading import open_file, parse_json
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.studio.pictures import cache_name
 from gsplat_edu.studio.refusal import RefusedError, not_found
+from gsplat_edu.text import whole_of
 
 MOST_READ = 8 << 20
 """Bytes of a log in one answer."""
@@ -56,7 +57,7 @@ def curves(folder: RunFolder, after: str) -> dict[str, Any]:
             facts = folder.log_file.stat()
             known, _, offset = after.partition(".")
             file_id = f"{facts.st_ino:x}"
-            begin = int(offset) if known == file_id and offset.isdecimal() else 0
+            begin = (whole_of(offset) or 0) if known == file_id else 0
             begin = begin if begin <= facts.st_size else 0
             file.seek(begin)
             data = file.read(MOST_READ)
@@ -179,9 +180,10 @@ _making = threading.Lock()
 
 def _picture_file(folder: RunFolder, index: str, what: str) -> Path:
     scores = _scores(folder)
-    if what not in PICTURES or not index.isdecimal() or int(index) >= len(scores):
+    number = whole_of(index)
+    if what not in PICTURES or number is None or number >= len(scores):
         raise not_found(f"{folder.path.name}: view {index[:20]}/{what[:20]}")
-    return folder.renders / "test" / image_file_names([str(score["name"]) for score in scores])[int(index)]
+    return folder.renders / "test" / image_file_names([str(score["name"]) for score in scores])[number]
 
 
 def _size(path: Path) -> dict[str, int | None]:

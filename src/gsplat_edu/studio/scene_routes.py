@@ -23,9 +23,10 @@ from gsplat_edu.jobs.record import State
 from gsplat_edu.reading import read_bytes
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, scene_of
-from gsplat_edu.studio.names import LONGEST_FILE, checked_name
+from gsplat_edu.studio.library import Library
+from gsplat_edu.studio.names import LONGEST_FILE, below, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
-from gsplat_edu.studio.replies import CLOSE, act, content_length, drain, entry_of, file_answer
+from gsplat_edu.studio.replies import CLOSE, act, bounded, content_length, drain, entry_of, file_answer
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
 
@@ -52,23 +53,23 @@ def routes() -> list[BaseRoute]:
     ]
 
 
-def current_scene(entry: Path, kind: str) -> Path:
+def current_scene(library: Library, entry: Path, kind: str) -> Path:
     """Return the file of an entry's scene, the latest one of a run.
 
     Raises:
-        RefusedError: it has none.
+        RefusedError: it has none, or it leads out of the library.
     """
-    if kind != "runs":
-        return scene_of(entry, kind)
     try:
-        return RunFolder(entry).latest_scene()[0]
+        scene = RunFolder(entry).latest_scene()[0] if kind == "runs" else scene_of(entry, kind)
     except CheckpointError as error:
         raise RefusedError(str(error), HTTPStatus.NOT_FOUND) from None
+    library.check_within(scene)
+    return scene
 
 
 def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
     kind, entry = entry_of(studio, request)
-    scene = current_scene(entry, kind)
+    scene = current_scene(studio.library, entry, kind)
     facts = scene.stat()
     editing = request.query_params.get("edit") == "1"
     key = f"{scene} {facts.st_mtime_ns} {facts.st_size} {entry.name} {editing}"
@@ -88,7 +89,7 @@ def _page(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN
 
 def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
     kind, entry = entry_of(studio, request)
-    current_scene(entry, kind)
+    current_scene(studio.library, entry, kind)
     source = str(scene_of(entry, kind))
     data = studio.painter.paint(studio.is_training, source=source, camera=body, live=False)
     return Response(data, media_type="image/jpeg")
@@ -111,7 +112,7 @@ def _prune(folder: Path) -> None:
 
 def _download(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
     kind, entry = entry_of(studio, request)
-    scene = current_scene(entry, kind)
+    scene = current_scene(studio.library, entry, kind)
     if scene.suffix == ".json":
         raise RefusedError(f"{kind}/{entry.name}: is a folder of files; export it to download it")
     return file_answer(request, scene, BINARY, download=f"{entry.name}{scene.suffix}")
@@ -123,8 +124,8 @@ def _exports(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # 
         raise RefusedError(f"{kind}: have no exports; choose a run or a scene")
     folder = entry / EXPORTS
     found = []
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if path.name[0] == "." or not path.is_file():
+    for path in sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else ():
+        if path.name[0] == "." or path.is_symlink() or not path.is_file():
             continue
         form = next((form for form in sorted(FORMATS, key=len)[::-1] if path.name.endswith(f".{form}")), None)
         facts = path.stat()
@@ -156,7 +157,7 @@ def _made_by(studio: Studio, path: Path) -> dict[str, Any]:
 def _export_file(studio: Studio, request: Request) -> Path:
     _, entry = entry_of(studio, request)
     name = checked_name("file", request.path_params["file"], LONGEST_FILE)
-    path = entry / EXPORTS / name
+    path = below(entry, Path(EXPORTS, name), "file")
     if not path.is_file():
         raise not_found(f"{entry.name}/{EXPORTS}/{name}")
     return path
@@ -188,7 +189,7 @@ def _plain(endpoint: Any) -> Any:  # noqa: ANN401
         except OSError as error:
             line, status = described(error), HTTPStatus.INTERNAL_SERVER_ERROR
         await drain(request, status)
-        return PlainTextResponse(f"{legible(line)}\n", status, headers=CLOSE)
+        return PlainTextResponse(f"{bounded(line)}\n", status, headers=CLOSE)
 
     return safe
 
@@ -201,7 +202,7 @@ def _stored(entry: Path) -> bytes | None:
 async def _edits(request: Request) -> Response:
     studio: Studio = request.app.state.studio
     kind, entry = entry_of(studio, request)
-    await run_in_threadpool(current_scene, entry, kind)
+    await run_in_threadpool(current_scene, studio.library, entry, kind)
     data = await run_in_threadpool(_stored, entry)
     headers = {"ETag": f'"{version_of(data)}"'}
     return Response(b"null\n" if data is None else data, media_type="application/json", headers=headers)

@@ -16,7 +16,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gsplat_edu.locks import locked
 from gsplat_edu.studio.app import application
-from gsplat_edu.studio.library import HIDDEN
+from gsplat_edu.studio.library import HIDDEN, check_own_folders
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.uploads import Limits
 from gsplat_edu.viewer.guard import TOKEN_BYTES
@@ -79,7 +79,7 @@ def serve(
     say: Callable[[str], None],
     opened: Callable[[str], None],
 ) -> None:
-    """Serve a library until Ctrl-C; running jobs then end with a checkpoint, and waiting ones stay in the queue.
+    """Serve a library until Ctrl-C; running jobs then end with a checkpoint, and the next start holds waiting ones.
 
     Args:
         folder: The library's folder.
@@ -91,8 +91,9 @@ def serve(
         opened: Called with the page's URL once it can be opened.
 
     Raises:
-        ArgumentError: the address cannot be used, or another server has the folder.
+        ArgumentError: the address cannot be used, another server has the folder, or its own folders are links.
     """
+    check_own_folders(folder)
     with (
         bound_socket(host, port, ("--host", "--port")) as sock,
         locked("FOLDER", folder / HIDDEN, "gsplat-edu studio", say),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from gsplat_edu.jobs.following import last_stage
 from gsplat_edu.jobs.queue import JobQueue
-from gsplat_edu.jobs.record import ACTIVE, Job, State
-from gsplat_edu.studio.commands import work_of
+from gsplat_edu.jobs.record import ACTIVE, Job, Purpose, State, Work
+from gsplat_edu.studio.commands import renamed, work_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.painter import Painter
 from gsplat_edu.studio.refusal import conflict
@@ -36,21 +38,35 @@ class Studio:
         self.stream = Stream()
         self.worker, self.prober = Worker(), Worker()  # a measurement must not hold up a page
         self.painter = Painter()
-        self.queue = JobQueue(self.library.hidden("jobs"), at_once, self.stream.changed, hold=self._hold)
+        jobs = self.library.hidden("jobs")
+        self.queue = JobQueue(jobs, self._work, at_once, self.stream.changed, hold=self._hold)
         self._starting = threading.Lock()
 
-    def start(self, request: dict[str, object]) -> Job:
+    def start(self, request: Mapping[str, Any]) -> Job:
         """Queue the job that a request describes.
 
         Raises:
             RefusedError: it is not allowed, or a job that waits or runs writes to the same place.
         """
         with self._starting:
-            work = work_of(self.library, request)
-            for job in self._pending():
-                if job.argv == work.argv or set(_places(work.argv)) & set(_outputs(job.argv)):
-                    raise conflict(f"job {job.id}: {job.title} works there; wait until it ends, or cancel it")
-            return self.queue.submit(work.argv, work.title, work.subject)
+            return self.queue.submit(self._work(request, Purpose.BEGIN))
+
+    def resume(self, name: str) -> Job:
+        """Continue a paused job, or queue one again; see `JobQueue.resume`.
+
+        Raises:
+            ArgumentError: it cannot be resumed, it is not allowed any more, or another job writes to the same place.
+        """
+        with self._starting:
+            return self.queue.resume(name)
+
+    def _work(self, request: Mapping[str, Any], purpose: Purpose) -> Work:
+        """Turn a request into a command line; see `work_of`."""
+        work = work_of(self.library, request, purpose)
+        for job in () if purpose is Purpose.SHOW else self._pending():
+            if job.argv == work.argv or set(_places(work.argv)) & set(_outputs(job.argv)):
+                raise conflict(f"job {job.id}: {job.title} works there; wait until it ends, or cancel it")
+        return work
 
     def rename(self, kind: str, name: str, to: object) -> Path:
         """Give an entry another name; jobs that made or used it can be resumed there.
@@ -61,12 +77,16 @@ class Studio:
         library = self.library
         with library.lock:
             old, new = library.entry(kind, name), library.fresh(kind, to)
-            subjects = f"{kind}/{old.name}", f"{kind}/{new.name}"
-            self.queue.move(old, new, subjects, lambda: library.rename(kind, name, to))
+            self.queue.move(
+                old,
+                new,
+                lambda request: renamed(request, kind, old.name, new.name),
+                lambda: library.rename(kind, name, to),
+            )
         return new
 
     def close(self) -> None:
-        """End running jobs with a checkpoint; waiting ones wait for the next start."""
+        """End running jobs with a checkpoint; waiting ones are held by the next start."""
         self.worker.close()
         self.prober.close()
         self.painter.close()
@@ -81,6 +101,8 @@ class Studio:
         if job.argv[0] != "train":
             return False
         folder = LiveFolder(Path(job.argv[job.argv.index("--out") + 1]))
+        if not self.library.is_within(folder.pause):
+            return False
         if not wait:
             folder.set_paused(False)
             return False

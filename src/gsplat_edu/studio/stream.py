@@ -15,6 +15,7 @@ from gsplat_edu.jobs.events import Event
 from gsplat_edu.jobs.following import Follower
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job
+from gsplat_edu.text import whole_of
 
 KEPT = 4_000
 """Events that a browser may have missed and still gets; after more it reads the list of jobs again."""
@@ -160,9 +161,10 @@ class Stream:
 
     def _after(self, last_id: str | None) -> int | None:
         """Return the number behind which a watcher wants to go on; None if it has to start anew."""
-        boot, _, number = (last_id or "").partition("-")
-        if boot != self.boot or not number.isdigit():
+        boot, _, text = (last_id or "").partition("-")
+        number = whole_of(text)
+        if boot != self.boot or number is None:
             return None
         with self._lock:
             oldest = self._kept[0][0] if self._kept else self._number + 1
-            return int(number) if oldest - 1 <= int(number) <= self._number else None
+            return number if oldest - 1 <= number <= self._number else None

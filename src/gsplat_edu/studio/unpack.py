@@ -3,6 +3,10 @@
 A few kilobytes can claim petabytes, name files outside of the folder, be links, or list so many entries that reading
 the list takes all memory. So the directory of the file is measured before it is read, every name is checked before
 anything is written, and bytes are counted while they are written.
+
+Readers of zip files find the directory in different ways: from the end, by an offset, past data in front or behind. A
+file in which these ways lead to different places is refused, so that `zipfile` reads the directory that was measured,
+whichever way its version goes. The format: PKWARE, APPNOTE.TXT 6.3.10, sections 4.3.12 to 4.3.16.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.reading import open_file
@@ -23,7 +28,20 @@ from gsplat_edu.studio.refusal import RefusedError, too_large
 
 CHUNK = 1 << 20
 
-TAIL = 22 + 65_535
+END = struct.Struct("<4sHHHHIIH")
+"""End record: signature, two disk numbers, entries on this disk and in all, size and offset of the directory, and the
+length of the comment that follows."""
+
+LOCATOR = struct.Struct("<4sIQI")
+"""zip64, before the end record: signature, a disk number, offset of the zip64 end record, number of disks."""
+
+END64 = struct.Struct("<4sQHHIIQQQQ")
+"""zip64 end record, before the locator: signature, bytes that follow, two versions, and the fields of `END`."""
+
+HEADER = struct.Struct("<4s24xHHH12x")
+"""Entry of the directory: signature, and lengths of the name, the extra field and the comment that follow."""
+
+TAIL = END.size + 65_535
 """Bytes at the end of a zip file in which its end record starts: the record and its comment."""
 
 BYTES_PER_ENTRY = 1_000
@@ -79,6 +97,7 @@ def unpack(
                 room -= _write(archive, entry, into / name, room)
     except (
         zipfile.BadZipFile,
+        LookupError,
         EOFError,
         NotImplementedError,
         RuntimeError,
@@ -98,30 +117,81 @@ def unpack(
 
 
 def _check_directory(path: Path, limits: ZipLimits) -> None:
-    """Measure the directory of a zip file without reading it.
+    """Measure the directory of a zip file, and check that it can be found in one place only.
 
     Raises:
-        RefusedError: there is none, or it lists too much.
+        RefusedError: there is none, it is damaged or ambiguous, or it lists too much.
     """
     size = path.stat().st_size
     with open_file(path) as file:
         file.seek(max(size - TAIL, 0))
         tail = file.read()
         at = tail.rfind(b"PK\x05\x06")
-        if at < 0 or len(tail) < at + 22:
+        if at < 0 or len(tail) < at + END.size:
             raise RefusedError("zip: is not a zip file; pack the photos as zip")
-        count, length = struct.unpack_from("<HI", tail, at + 10)
-        locator = tail[at - 20 : at] if at >= 20 else b""
-        if locator[:4] == b"PK\x06\x07":  # zip64: zipfile believes its record, whatever the other says
-            file.seek(min(struct.unpack_from("<Q", locator, 8)[0], size))
-            record = file.read(56)
-            if len(record) < 56 or record[:4] != b"PK\x06\x06":
-                raise RefusedError("zip: its end is damaged; pack it again")
-            count, length = struct.unpack_from("<QQ", record, 32)
-    if count > limits.entries or length > limits.entries * BYTES_PER_ENTRY:
-        raise too_large(
-            f"zip: lists {count:,} entries in {length:,} bytes; {limits.entries:,} entries may be in it"
-        )
+        _, disk, first, here, count, length, begin, comment = END.unpack_from(tail, at)
+        if at + END.size + comment != len(tail):
+            raise RefusedError("zip: its end is damaged, or something follows it; pack it again")
+        end = size - len(tail) + at
+        if (wide := _wide_end(file, end)) is not None:
+            narrow = ((disk, 16), (first, 16), (here, 16), (count, 16), (length, 32), (begin, 32))
+            if any(
+                value not in (other, (1 << bits) - 1)
+                for (value, bits), other in zip(narrow, wide, strict=True)
+            ):
+                raise RefusedError("zip: has two ends that disagree; pack it again")
+            disk, first, here, count, length, begin = wide
+            end -= LOCATOR.size + END64.size
+        if count > limits.entries or length > limits.entries * BYTES_PER_ENTRY:
+            raise too_large(
+                f"zip: lists {count:,} entries in {length:,} bytes; {limits.entries:,} entries may be in it"
+            )
+        if (disk, first) != (0, 0) or here != count or begin + length != end:
+            raise RefusedError("zip: its directory is not where it claims to be; pack it again, in one part")
+        file.seek(begin)
+        _count_entries(file.read(length), count)
+
+
+def _wide_end(file: BinaryIO, end: int) -> tuple[int, ...] | None:
+    """Return the fields of the zip64 end record, as those of `END` without the comment; None if there is none.
+
+    Args:
+        file: The zip file.
+        end: Where its end record starts.
+
+    Raises:
+        RefusedError: the record is not directly before its locator, where `zipfile` looks for it.
+    """
+    if end < LOCATOR.size:
+        return None
+    file.seek(end - LOCATOR.size)
+    signature, disk, offset, disks = LOCATOR.unpack(file.read(LOCATOR.size))
+    if signature != b"PK\x06\x07":
+        return None
+    at = end - LOCATOR.size - END64.size
+    if at < 0 or offset != at or disk != 0 or disks > 1:
+        raise RefusedError("zip: its end is not where it claims to be; pack it again, in one part")
+    file.seek(at)
+    signature, following, _, _, *fields = END64.unpack(file.read(END64.size))
+    if signature != b"PK\x06\x06" or following != END64.size - 12:  # without signature and this number
+        raise RefusedError("zip: its end is damaged; pack it again")
+    return tuple(fields)
+
+
+def _count_entries(directory: bytes, count: int) -> None:
+    """Check that a directory holds as many entries as it claims, and nothing else.
+
+    Raises:
+        RefusedError: it does not.
+    """
+    at = found = 0
+    while at + HEADER.size <= len(directory) and found < count:
+        signature, *lengths = HEADER.unpack_from(directory, at)
+        if signature != b"PK\x01\x02":
+            break
+        at, found = at + HEADER.size + sum(lengths), found + 1
+    if at != len(directory) or found != count:
+        raise RefusedError("zip: its directory is damaged; pack it again")
 
 
 def _checked(archive: zipfile.ZipFile, packed: int, limits: ZipLimits) -> dict[Path, zipfile.ZipInfo]:
@@ -136,6 +206,8 @@ def _checked(archive: zipfile.ZipFile, packed: int, limits: ZipLimits) -> dict[P
         raise too_large(f"zip: unpacks to {total / packed:,.0f} times its size, which no photos do")
     found: dict[Path, zipfile.ZipInfo] = {}
     for info in infos:
+        if not info.filename:
+            raise RefusedError("zip: an entry has no name; pack it again")
         kind = stat.S_IFMT(info.external_attr >> 16)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
             raise RefusedError(f"zip: {info.filename[:60]!r} is a link or a device; pack the file itself")

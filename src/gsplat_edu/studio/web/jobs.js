@@ -4,6 +4,7 @@ import { at, get, post, remove } from "./api.js";
 import { attempt, button, commandLine, duration, errorLine, h, heading, keyed, link, put } from "./dom.js";
 
 const STATES = {
+  held: "waits for you",
   queued: "waiting",
   running: "running",
   paused: "paused",
@@ -53,6 +54,9 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     h("summary", {}, "Output"),
     output,
   );
+  const ask = h("p", {}, "An earlier start of the studio left this job waiting. It runs this command once you start it:");
+  const label = h("p", { class: "label" });
+  const command = h("div", {});
   const element = h(
     "article",
     { class: "job", "aria-label": view.job.title },
@@ -61,9 +65,10 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     h("div", { class: "row progress" }, bar, left),
     said,
     line,
+    ask,
     h("div", { class: "row" }, pause, resume, stop, forget),
-    h("p", { class: "label" }, "The same as a command"),
-    commandLine(view.job.command),
+    label,
+    command,
     more,
   );
 
@@ -95,7 +100,11 @@ export function jobCard(store, id, { main = false, level = 3 } = {}) {
     if (job.line) put(line, job.line);
     pause.hidden = job.state !== "running" || job.cancelling;
     resume.hidden = !(job.state === "paused" || (job.resumable && !found.active));
-    resume.textContent = job.state === "failed" ? "Try again" : "Resume";
+    resume.textContent = { failed: "Try again", held: "Start" }[job.state] ?? "Resume";
+    ask.hidden = job.state !== "held";
+    if (command.dataset.text !== job.command) command.replaceChildren(commandLine(job.command));
+    command.dataset.text = job.command;
+    label.textContent = job.state === "held" ? "What it will run" : "The same as a command";
     stop.hidden = !found.active || job.cancelling;
     forget.hidden = found.active && job.state !== "queued";
   }
@@ -134,12 +143,18 @@ export function jobPlace(store, subject, commands, options = {}) {
 export function jobs({ main, store }) {
   const cards = new Map();
   const list = h("div", { class: "cards wide" });
+  const broken = h("ul", { class: "damaged", "aria-label": "damaged jobs" });
   const empty = h("p", {}, "No jobs yet. Add photos in the ", link("library", "#/"), ", and start one there.");
-  main.append(heading(1, "Jobs"), empty, list);
+  main.append(heading(1, "Jobs"), broken, empty, list);
   return {
     update() {
       const all = [...store.jobs.values()].sort((a, b) => b.job.id.localeCompare(a.job.id));
-      empty.hidden = all.length > 0;
+      empty.hidden = all.length + store.damaged.size > 0;
+      keyed(broken, [...store.damaged.values()], ({ id }) => id, ({ id, line }) => {
+        const fault = errorLine();
+        const forget = button("Remove from the list", () => attempt(forget, fault, () => remove(at("jobs", id))));
+        return h("li", {}, line, " ", forget, fault);
+      });
       keyed(list, all, ({ job }) => job.id, ({ job }) => {
         cards.set(job.id, jobCard(store, job.id, { level: 2 }));
         return h("div", {}, link(job.subject, `#/${job.subject.split("/").map(encodeURIComponent).join("/")}`), cards.get(job.id).element);

@@ -119,7 +119,7 @@ export function library({ main, store }) {
 
 function stateOf(store, entry) {
   const job = store.jobsOf(entry.entry)[0];
-  if (job && (job.active || ["failed", "interrupted"].includes(job.job.state))) return job.job.state;
+  if (job && (job.active || ["held", "failed", "interrupted"].includes(job.job.state))) return job.job.state;
   if (entry.problem) return "damaged";
   return "";
 }

@@ -48,7 +48,7 @@ function runOf({ subject, created }) {
 export class Store extends EventTarget {
   constructor() {
     super();
-    Object.assign(this, { library: null, jobs: new Map(), heard: new Map(), connected: null, trouble: "", read: false });
+    Object.assign(this, { library: null, jobs: new Map(), damaged: new Map(), heard: new Map(), connected: null, trouble: "", read: false });
   }
 
   // "change": something is different; detail.job is the id of a job, if it is one.
@@ -66,7 +66,7 @@ export class Store extends EventTarget {
     if (kind !== "runs" || !this.library) return found;
     const names = new Set(found.map(({ entry }) => entry));
     const coming = [...this.jobs.values()].filter(({ job, active }) => {
-      return job.subject.startsWith("runs/") && job.argv[0] === "train" && !names.has(job.subject) && (active || job.line);
+      return job.subject.startsWith("runs/") && job.argv[0] === "train" && !names.has(job.subject) && (active || job.line || job.state === "held");
     });
     return [...found, ...new Map(coming.map(({ job }) => [job.subject, runOf(job)])).values()];
   }
@@ -132,7 +132,8 @@ export class Store extends EventTarget {
 
   async readJobs() {
     const heard = new Map(this.heard);
-    const { jobs } = await get("/api/jobs");
+    const { jobs, damaged } = await get("/api/jobs");
+    this.damaged = new Map(damaged.map((found) => [found.id, found]));
     const ids = new Set(jobs.map(({ id }) => id));
     for (const id of this.jobs.keys()) if (!ids.has(id) && this.heard.get(id) === heard.get(id)) this.jobs.delete(id);
     for (const job of jobs) if (!this.jobs.has(job.id)) this.jobs.set(job.id, new JobView(job));
@@ -170,7 +171,9 @@ export class Store extends EventTarget {
       this.changed(event.job);
     });
     source.addEventListener("removed", ({ data }) => {
-      this.jobs.delete(JSON.parse(data).id);
+      const { id } = JSON.parse(data);
+      this.jobs.delete(id);
+      if (this.damaged.delete(id)) this.refreshSoon(); // its line is in the library's list of troubles
       this.changed();
     });
     source.addEventListener("full", () => {
