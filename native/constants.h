@@ -5,7 +5,8 @@
 namespace gsplat {
 
 constexpr int TILE = 16;
-constexpr double DILATION = 0.3;
+constexpr double DILATION_MAX = 1000000.0;
+constexpr double THINNEST = 1e-06;
 constexpr double ALPHA_MIN = 0.00392156862745098;
 constexpr double ALPHA_MAX = 0.99;
 constexpr double T_STOP = 0.0001;

@@ -234,22 +234,22 @@ GSPLAT_INLINE void project_covariance(const Chunk<T> &in, int l, bool raw, Proje
     }
 }
 
-// Sigma2d = (J W M)(J W M)' + 0.3 I, and opacity, of the Gaussians in lanes l and up.
+// Sigma2d = (J W M)(J W M)' + d I with the dilation d, and opacity, of the Gaussians in lanes l and up.
 template <class T>
 GSPLAT_INLINE void project_shape(const Chunk<T> &in, int l, bool raw, const Camera &cam, const Settings &set, Projected &g) {
     project_mean(in, l, cam, set, g);
     project_covariance(in, l, raw, g);
     g.opacity = widened(in.opacity + l);
-    const VD d = splat(DILATION);
+    const VD d = splat(set.dilation);
     g.a = g.a0 + d, g.b = g.b0, g.c = g.c0 + d;
-    const VD det = g.det0 + d * (g.a0 + g.c0) + d * d;
+    const VD det = g.det0 + d * (g.a0 + g.c0) + splat(set.dilation2);
     const VD inverse = splat(1.0) / (g.c * det);  // one division for two
     g.inverse_c = inverse * det, g.inverse_det = inverse * g.c;
     g.compensation = splat(1.0);
     if (set.antialiased) g.compensation = sqrt_(vmax(g.det0, splat(DET_FLOOR)) * g.inverse_det);
     // The mean must be finite in the scene's type, the type of its gradients; so must z², so that weighted depths can be added.
     g.valid &= finite(rounded<T>(g.p[0] + g.p[1] + g.p[2] * g.p[2])) & (g.a + g.c <= splat(SPLAT_LIMIT * SPLAT_LIMIT)) & finite(det) &
-               (det > VD{}) & (g.opacity * g.compensation >= splat(ALPHA_MIN));
+               (det > splat(THINNEST) * (g.a + g.c)) & (g.opacity * g.compensation >= splat(ALPHA_MIN));
 }
 
 // The mean on the screen, u = fx x/z + cx and v, and the nearest point of the image, rounded to the splat's type.

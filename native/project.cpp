@@ -1,6 +1,6 @@
 // project: project Gaussians to ellipses on the screen, one block at a time.
 //
-//     Sigma2d = J W Sigma W' J' + 0.3 I,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
+//     Sigma2d = J W Sigma W' J' + d I, d: dilation,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
 //
 // Half extents of alpha >= 1/255: sqrt(2 ln(255 o) Sigma_xx), sqrt(2 ln(255 o) Sigma_yy).
 //

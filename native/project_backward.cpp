@@ -65,13 +65,13 @@ GSPLAT_INLINE void mean_gradient(const Projected &g, const Camera &cam, const VD
 // N the matrix of moments: dL/dSigma2d = L' N L / 2, dL/dr = L' N w; w is of order 1, however long the ellipse. `lit` is
 // antialiasing's part: the opacity's factor contains det0^(1/2), so dL/dr = sum h Sigma^-1 r, Sigma before the dilation.
 template <class T>
-GSPLAT_INLINE VD raw_gradient(const Projected &g, const Whitened &m, VD lit, int l, Gradients<T> &out, VD *d0, VD *d1) {
+GSPLAT_INLINE VD raw_gradient(const Projected &g, const Whitened &m, VD dilation, VD lit, int l, Gradients<T> &out, VD *d0, VD *d1) {
     VD across0[3], across1[3], dR[9], dr0[3], dr1[3], dq[4], total = VD{};
     cross3(g.r1, g.n, across0), cross3(g.n, g.r0, across1);  // c0 r0 - b0 r1 and a0 r1 - b0 r0
     const VD sx_c = m.sx * g.inverse_c;
     for (int k = 0; k < 3; ++k) {
         // sx r0 + sy r1 = sx (r0 - b/c r1)
-        const VD w0 = sx_c * (splat(DILATION) * g.r0[k] + across0[k]), w1 = m.ty * g.r1[k];
+        const VD w0 = sx_c * (dilation * g.r0[k] + across0[k]), w1 = m.ty * g.r1[k];
         const VD dw0 = m.m00 * w0 + m.m01 * w1, dw1 = m.m01 * w0 + m.m11 * w1;
         const VD extra0 = lit * across0[k], extra1 = lit * across1[k];
         dr0[k] = m.sx * dw0 + extra0, dr1[k] = m.sy * dw0 + m.ty * dw1 + extra1;
@@ -200,7 +200,8 @@ GSPLAT_INLINE void shape_gradient(const ProjectBackwardArgs<T> &args, const Chun
     narrowed(out.means2d_norm + l, sqrt_(nx * nx + ny * ny));
     VD lit = VD{};
     if (args.settings.antialiased) lit = g.det0 > splat(DET_FLOOR) ? slot[H] / g.det0 : VD{};
-    const VD total = raw ? raw_gradient(g, m, lit, l, out, d0, d1) : direct_gradient(g, m, lit, l, out, d0, d1);
+    const VD total =
+        raw ? raw_gradient(g, m, splat(args.settings.dilation), lit, l, out, d0, d1) : direct_gradient(g, m, lit, l, out, d0, d1);
     mean_gradient(g, cam, d0, d1, total, uv, dp);
     dp[2] += slot[DEPTH];
     VD dmean[3];

@@ -36,6 +36,9 @@ inline Settings settings_of(Arguments a) {
     a.numbers("background", set.background, 3);
     set.sh_degree = int32_t(a.whole("sh_degree", 0, 3));
     set.antialiased = a.flag("antialiased");
+    set.dilation = a.number("dilation");
+    if (!(set.dilation >= 0 && set.dilation <= DILATION_MAX)) a.fail("dilation", "has to be 0 to 1e6 px²");
+    set.dilation2 = set.dilation * set.dilation;
     set.alpha_max = a.number("alpha_max");
     if (set.alpha_max < ALPHA_MIN || set.alpha_max >= 1) a.fail("alpha_max", "has to be at least 1/255 and below 1");
     set.log2_alpha_max = std::log2(set.alpha_max);

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from gsplat_edu import Camera, build_cov3d_batch, eval_sh, project_cov3d, quat_to_R_batch, render_gaussians
+from gsplat_edu.constants import DILATION
 from gsplat_edu.gaussian_math import opacity_compensation
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
@@ -38,7 +39,9 @@ class Scene:
             logit_opacities=tensor(self.logits),
         )
 
-    def truth(self, degree: int = 3, antialiased: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def truth(
+        self, degree: int = 3, antialiased: bool = False, dilation: float = DILATION
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return image, transmittance and expected depth of the reference."""
         covs = build_cov3d_batch(np.exp(self.log_scales), quat_to_R_batch(self.quats))
         toward = self.means - self.camera.eye
@@ -48,8 +51,8 @@ class Scene:
         if antialiased:
             front = means_cam[:, 2] > 0.05
             flat = project_cov3d(covs[front], means_cam[front], self.camera)
-            opacities[front] *= opacity_compensation(flat)
-        exact = {"extent": "exact", "stop": "tile"}
+            opacities[front] *= opacity_compensation(flat, dilation)
+        exact = {"extent": "exact", "stop": "tile", "dilation": dilation}
         image, T = render_gaussians(self.camera, self.means, covs, colors, opacities, bg=BACKGROUND, **exact)
         depths = np.repeat(means_cam[:, 2:], 3, axis=1)
         depth, _ = render_gaussians(self.camera, self.means, covs, depths, opacities, **exact)

@@ -17,7 +17,7 @@ SIGNATURES = {
     "project_cov3d": "(cov3d, mean_cam, cam, *, jacobian_limit=None)",
     "render_gaussians": (
         "(cam, means, cov3ds, colors, opacities, bg=(0, 0, 0), z_near=0.05, "
-        "*, extent='box3sigma', stop='box', jacobian_limit=None)"
+        "*, extent='box3sigma', stop='box', jacobian_limit=None, dilation=0.3)"
     ),
     "sphere_shell": "(n=2500, s_t=0.06, s_n=0.01, opacity=0.8, seed=0)",
     "sh_basis": "(dirs)",

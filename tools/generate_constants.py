@@ -14,7 +14,8 @@ from gsplat_edu import constants as c
 
 HEADER = Path(__file__).resolve().parent.parent / "native" / "constants.h"
 NAMES = (
-    "DILATION",
+    "DILATION_MAX",
+    "THINNEST",
     "ALPHA_MIN",
     "ALPHA_MAX",
     "T_STOP",

@@ -22,7 +22,7 @@ SUFFIXES = {".py", ".cpp", ".h", ".js", ".sh"}
 
 EXCEPTIONS = {
     "src/gsplat_edu/render/numpy_reference.py:render_gaussians": (
-        "the chapter's seven parameters stay as they are; extent, stop and jacobian_limit make it the kernels' oracle"
+        "the chapter's seven parameters stay as they are; four more make it the kernels' oracle"
     ),
     "src/gsplat_edu/compat/gsplat.py:rasterization": "gsplat's signature",
     "src/gsplat_edu/compat/projection.py:fully_fused_projection": "gsplat's signature",

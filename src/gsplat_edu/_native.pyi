@@ -26,6 +26,7 @@ class Settings:
         background: Sequence[float],
         sh_degree: int,
         antialiased: bool,
+        dilation: float,
         alpha_max: float,
     ) -> None: ...
 

@@ -13,7 +13,16 @@ from typing import Final
 
 DILATION: Final = 0.3
 """px², added to both diagonal entries of every screen-space covariance, so that every splat is at least about a pixel
-wide and cannot fall between the samples. Source: Kerbl et al. 2023, its code."""
+wide and cannot fall between the samples; `RenderSettings.dilation` replaces it. Source: Kerbl et al. 2023, its code."""
+
+DILATION_MAX: Final = 1e6
+"""px²: largest dilation, a blur of 1,000 px. Its fourth power, which gradients contain, is finite in float32. Source:
+ours."""
+
+THINNEST: Final = 1e-6
+"""px²: a Gaussian whose dilated covariance has det <= THINNEST times its trace is not drawn. Its standard deviation
+along the short axis is then at most 1/1000 px, so that pixel centres are in it by chance only, and float32 could not
+hold the square of its inverse. A dilation of 2e-6 px² or more makes every Gaussian thicker. Source: ours."""
 
 ALPHA_MIN: Final = 1.0 / 255.0
 """Alpha below this is zero: one step of an 8-bit image. This gives a Gaussian a finite extent. Source: Kerbl et al.

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.camera import CameraLike, as_camera
-from gsplat_edu.constants import DET_FLOOR, DILATION
+from gsplat_edu.constants import DET_FLOOR, DILATION, DILATION_MAX
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array
+from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array, in_range
 
 
 def quat_to_R(quat: ArrayLike) -> Float64[np.ndarray, "3 3"]:
@@ -145,29 +145,32 @@ def project_cov3d(
     return cov2d
 
 
-def opacity_compensation(cov2d: ArrayLike) -> Float64[np.ndarray, "*batch"]:
+def opacity_compensation(cov2d: ArrayLike, dilation: float = DILATION) -> Float64[np.ndarray, "*batch"]:
     """Return the factor by which antialiasing lowers an opacity to compensate for the dilation.
 
-    sqrt(max(det Sigma2d, 1e-12) / det(Sigma2d + 0.3 I))
+    sqrt(max(det Sigma2d, 1e-12) / det(Sigma2d + d I))
 
     Args:
         cov2d: (..., 2, 2) screen-space covariances before the dilation, px².
+        dilation: d, px², 0 to 1e6.
 
     Returns:
-        (...) factors in (0, 1).
+        (...) factors in (0, 1]. Those of Gaussians that are too thin to be drawn (`gsplat_edu.constants.THINNEST`) mean
+        nothing.
 
     Raises:
         ShapeError: the last two axes are not (2, 2).
-        ArgumentError: an entry is NaN or infinite.
+        ArgumentError: an entry is NaN or infinite, or the dilation is out of range.
 
     Source: Yu et al. 2024, "Mip-Splatting", eq. 9 with the dilation of Kerbl et al.; the floor is ours.
     """
     cov2d = float64_array("cov2d", cov2d, ("...", 2, 2))
+    dilation = in_range("dilation", dilation, 0.0, DILATION_MAX)
     a, b, c = cov2d[..., 0, 0], cov2d[..., 0, 1], cov2d[..., 1, 1]
     det = np.maximum(a * c - b * b, 0.0)
     # det(Sigma2d + d I) = det Sigma2d + d (a + c) + d²: no term is negative, so there is no further cancellation.
-    dilated = det + DILATION * (a + c) + DILATION * DILATION
-    return np.asarray(np.sqrt(np.maximum(det, DET_FLOOR) / dilated))
+    dilated = det + dilation * (a + c) + dilation * dilation
+    return np.asarray(np.sqrt(np.maximum(det, DET_FLOOR) / np.maximum(dilated, DET_FLOOR)))
 
 
 def _rotations(name: str, quats: Float64[np.ndarray, "*batch 4"]) -> Float64[np.ndarray, "*batch 3 3"]:

@@ -64,7 +64,7 @@ def float64_array(
     check_shape(name, array.shape, shape, {} if sizes is None else sizes)
     finite = np.isfinite(array)
     if not finite.all():
-        where = first_index(~finite)
+        where = first_index(np.asarray(~finite))
         raise ArgumentError(f"{name}{where}: is {array[~finite][0]}, but every entry has to be finite")
     return array
 

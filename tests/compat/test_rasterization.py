@@ -1,6 +1,7 @@
 """`rasterization` against gsplat's own functions, the NumPy reference and finite differences."""
 
 import gc
+import math
 import weakref
 
 import numpy as np
@@ -85,6 +86,36 @@ def test_images_and_gradients_are_gsplats(name):
     assert_close(alphas, wanted[1])
     theirs = assert_same_gradients(tensors, (images, alphas), wanted[:2])
     assert float(theirs["viewmats"].abs().max()) > 1 and float(theirs["Ks"].abs().max()) > 1
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("eps2d", [0.0, 0.1, 0.3, 1.0])
+def test_dilations_of_thin_gaussians_are_gsplats(eps2d, antialiased):
+    """Needles: where eps2d was added as a difference from 0.3, their determinants were negative and clamped."""
+    tensors = gsplat_witness.scene()
+    tensors["colors"] = tensors["colors"][:, 0].detach().requires_grad_()
+    with torch.no_grad():
+        tensors["scales"][:, 1:] *= 0.1
+    mode = "antialiased" if antialiased else "classic"
+    images, alphas, _ = render(tensors, packed=False, eps2d=eps2d, rasterize_mode=mode)
+    wanted = gsplat_witness.rendered(tensors, W, H, antialiased=antialiased, eps2d=eps2d)
+    assert_close(images, wanted[0])
+    assert_close(alphas, wanted[1])
+    assert_same_gradients(tensors, (images, alphas), wanted[:2])
+
+
+@pytest.mark.parametrize(("eps2d", "wanted"), [(0.0, 0.5459), (0.1, 0.5712), (0.3, 0.6126), (1.0, 0.7009)])
+def test_alpha_beside_a_thin_gaussian_is_the_formula(eps2d, wanted):
+    """1.0 x 0.2 px, opacity 0.9: one pixel to the right alpha is 0.9 exp(-1 / (2 (1 + eps2d)))."""
+    one = lambda *values: torch.tensor([values], dtype=torch.float64)  # noqa: E731
+    K = torch.tensor([[[1.0, 0, 5.5], [0, 1, 5.5], [0, 0, 1]]], dtype=torch.float64)
+    view, opacity = torch.eye(4, dtype=torch.float64)[None], one(0.9)[0]
+    thin = (one(0.0, 0, 1), one(1.0, 0, 0, 0), one(1.0, 0.2, 0.1), opacity, one(1.0, 1, 1), view, K)
+    alpha = rasterization(*thin, 11, 11, eps2d=eps2d)[1][0, ..., 0]
+    assert abs(float(alpha[5, 6]) - 0.9 * math.exp(-0.5 / (1 + eps2d))) < 1e-12
+    assert abs(float(alpha[5, 6]) - wanted) < 1e-4
+    down = 0.9 * math.exp(-0.5 / (0.04 + eps2d))
+    assert abs(float(alpha[6, 5]) - (down if down >= 1 / 255 else 0.0)) < 1e-12
 
 
 def test_a_pixel_ends_where_gsplats_does():

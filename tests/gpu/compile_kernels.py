@@ -65,7 +65,7 @@ def main() -> None:
 
 
 def of_gaussians() -> None:
-    shape = {"DEGREE": 3 * MOST, "REST": 15 * MOST, "ANTIALIASED": MOST}
+    shape = {"DEGREE": 3 * MOST, "REST": 15 * MOST, "ANTIALIASED": MOST, "DILATION": 0.3}
     stage(project.project_kernel, **shape, BLOCK=128)
     stage(project.project_backward_kernel, 2, **shape, WITH_CAMERA=MOST, BLOCK=64)
     stage(intersect.count_kernel, BLOCK=128)

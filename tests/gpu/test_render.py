@@ -113,6 +113,26 @@ def test_lower_sh_degrees(device, degree):
         assert np.abs(gradients[key] - truth).max() <= 3e-4 * np.abs(truth).max(), key
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of divisions whose results are not used
+@pytest.mark.parametrize("dilation", [0.0, 0.1, 1.0])
+def test_dilations(device, dilation):
+    """Gaussians of a few pixels, which float32 resolves, and a line, which is not drawn without dilation."""
+    scene = random(20, (17, 33), seed=3)
+    scene.log_scales[7] = (-1.0, -60.0, -60.0)
+    settings = dataclasses.replace(SETTINGS, dilation=dilation)
+    values, gradients, out = images_and_gradients(scene, "cuda", device, settings)
+    truths, expected, oracle = images_and_gradients(scene, "cpu", device, settings)
+    assert set(out.visible.tolist()) == set(oracle.visible.tolist())
+    assert (7 in out.visible) == (dilation > 0)
+    for key, truth in truths.items():
+        assert np.abs(values[key] - truth).max() < 1.1 * max(1.0, np.abs(truth).max()) / 255, key
+    for key, truth in expected.items():
+        parts = 20 if key in POSE else 1  # the camera's is a sum over all Gaussians
+        assert np.abs(gradients[key] - truth).max() <= parts * 4e-3 * np.abs(truth).max(), key
+        if dilation == 0 and len(truth) == 20:
+            assert np.all(gradients[key][7] == 0), key
+
+
 def test_two_runs_give_the_same_bits(device):
     scene = random(20, (17, 33), seed=3)
     first, second = (images_and_gradients(scene, "cuda", device)[:2] for _ in range(2))

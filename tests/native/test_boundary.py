@@ -32,6 +32,7 @@ def settings(**changes):
         "background": [0.0, 0.0, 0.0],
         "sh_degree": 0,
         "antialiased": False,
+        "dilation": 0.3,
         "alpha_max": 0.99,
         "pixel_stop": False,
     }

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsplat_edu.constants import DILATION_MAX
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.gaussians import check_tensor
 from gsplat_edu.kernels import SUFFIXES
@@ -77,7 +78,7 @@ class Arguments:
         near_plane: Gaussians nearer than this are not drawn, world units.
         far_plane: Nor are Gaussians farther away than this.
         radius_clip: Nor are Gaussians whose box has half sizes of at most this, px.
-        eps2d: Added to the diagonal of every screen covariance, px².
+        eps2d: Added to the diagonal of every screen covariance, px², 0 to 1e6.
         sh_degree: Highest degree of the harmonics to use, 0 to 3; None if `colors` are not coefficients.
         packed: Whether `meta` lists the drawn Gaussians only, (nnz, ...), instead of all, (..., C, N, ...). The images
             and the work are the same.
@@ -152,8 +153,9 @@ class Arguments:
         one_of("rasterize_mode", self.rasterize_mode, ("classic", "antialiased"))
         for name in ("width", "height", "tile_size", "channel_chunk"):
             whole_number(name, getattr(self, name), 1)
-        for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
+        for name in ("near_plane", "far_plane", "radius_clip"):
             in_range(name, getattr(self, name), 0.0)
+        in_range("eps2d", self.eps2d, 0.0, DILATION_MAX)
         named = {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities")}
         batch, N = check_scene(named, self.covars is not None)
         if self.covars is not None:

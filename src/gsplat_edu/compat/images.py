@@ -11,6 +11,7 @@ gsplat's pixels are sampled at their centres, (0.5, 0.5) for the first, ours at 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.compat.projection import Lens
-from gsplat_edu.constants import COLOR_LIMIT, DILATION
+from gsplat_edu.constants import COLOR_LIMIT
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.output import MOST_CHANNELS, RenderOutput
@@ -99,8 +100,6 @@ def _render(
     u, v = (splats.means2d - 0.5).unbind(-1)
     means = torch.stack([u, v, torch.ones_like(u)], dim=-1)
     xx, xy, yy = splats.spreads.unbind(-1)
-    if lens.eps2d != DILATION:  # the kernels add DILATION themselves
-        xx, yy = xx + (lens.eps2d - DILATION), yy + (lens.eps2d - DILATION)
     zero = torch.zeros_like(xx)
     cov3ds = torch.stack([xx, xy, zero, xy, yy, zero, zero, zero, zero], dim=-1).view(-1, 3, 3)
     view = render_covariances(
@@ -109,7 +108,7 @@ def _render(
         torch.nn.functional.pad(front, (0, COLOR_CHANNELS - front.shape[1])),
         splats.opacities,
         Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 0.0, 0.0, lens.height, lens.width),
-        SETTINGS,
+        dataclasses.replace(SETTINGS, dilation=lens.eps2d),
         features=features if features.shape[1] else None,
     )
     if absgrad is not None and means.requires_grad:

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from gsplat_edu.compat.checks import check_cameras, check_projection_options, check_scene, expect
-from gsplat_edu.constants import ALPHA_MIN, DET_FLOOR
+from gsplat_edu.constants import ALPHA_MIN, DET_FLOOR, THINNEST
 from gsplat_edu.gaussians import quat_to_R_t
 
 MARGIN = 0.15
@@ -117,12 +117,13 @@ def project(
     a, b, c, det0 = _screen_covariances(solids, *rows)
     variances = torch.stack([a, c], dim=-1) + lens.eps2d
     det = det0 + lens.eps2d * (a + c) + lens.eps2d**2
-    floor = torch.where(det > 0, det, 1.0)
+    thick = det > THINNEST * variances.sum(dim=-1)  # others are not drawn
+    floor = torch.where(thick, det, 1.0)
     compensations = torch.sqrt(det0.clamp(min=DET_FLOOR) / floor)
     means2d = torch.stack(centre, dim=-1)
     bright = None if opacities is None else opacities[:, None] * (compensations if compensated else 1.0)
     return Projected(
-        _radii(means2d, variances, before & (det > 0), bright, lens),
+        _radii(means2d, variances, before & thick, bright, lens),
         means2d,
         depths,
         torch.stack([variances[..., 1] / floor, -b / floor, variances[..., 0] / floor], dim=-1),

@@ -264,6 +264,7 @@ class _Rasterize(torch.autograd.Function):
                 background=background.tolist(),
                 sh_degree=call.sh_degree,
                 antialiased=settings.antialiased,
+                dilation=settings.dilation,
                 alpha_max=settings.alpha_max,
                 pixel_stop=settings.stop == "pixel",
             ),

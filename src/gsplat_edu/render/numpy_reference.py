@@ -13,7 +13,17 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, LAMBDA_FLOOR, T_STOP, TILE, Z_NEAR
+from gsplat_edu.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    DILATION,
+    DILATION_MAX,
+    LAMBDA_FLOOR,
+    T_STOP,
+    THINNEST,
+    TILE,
+    Z_NEAR,
+)
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussian_math import project_cov3d
 from gsplat_edu.validation import ArrayLike, first_index, float64_array, in_range, one_of
@@ -50,6 +60,7 @@ def render_gaussians(
     extent: Extent = "box3sigma",
     stop: Stop = "box",
     jacobian_limit: float | None = None,
+    dilation: float = DILATION,
 ) -> tuple[Float64[np.ndarray, "H W 3"], Float64[np.ndarray, "H W"]]:
     """Render Gaussians from a camera.
 
@@ -64,31 +75,30 @@ def render_gaussians(
         opacities: (N,) 0 to 1.
         bg: (3,) background colour.
         z_near: Means at this camera depth or nearer are culled, world units, >= 0.
-        extent: Which pixels a splat may reach. "box3sigma": the chapter's box of radius ceil(3 sqrt(lambda_max)), which
-            cuts faint tails. "exact": every pixel with alpha >= 1/255.
+        extent: "box3sigma": in a box of radius ceil(3 sqrt(lambda_max)). "exact": wherever alpha >= 1/255.
         stop: When drawing ends. "box": skip a splat if its whole box is below 1e-4 transmittance. "tile": end a 16x16
             tile once all its pixels are. "none": never.
         jacobian_limit: As for `project_cov3d`: the course does not clamp, captures are trained with 1.3.
+        dilation: Added to the diagonal of every screen-space covariance, px²; see `RenderSettings`.
 
     Returns:
-        image (H, W, 3), not clipped, equal to the background if the scene is empty; T_final (H, W), in [0, 1].
+        image (H, W, 3), not clipped, the background if the scene is empty; T_final (H, W), in [0, 1].
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: NaN or infinite values, an opacity outside 0 to 1, an invalid covariance or camera; or a
-            Gaussian, by index, whose ellipse is too large or too thin for float64.
+        ArgumentError: NaN, infinity, an opacity outside 0 to 1, an invalid covariance, camera or option; or a Gaussian,
+            by index, whose ellipse is too large or too thin for float64.
 
     Source: Kerbl et al. 2023, eq. 2-5; Zwicker et al. 2001 for the projection.
     """
     cam = as_camera("cam", cam)
     means, cov3ds, colors, opacities = _checked(means, cov3ds, colors, opacities)
-    bg, z_near = float64_array("bg", bg, (3,)), in_range("z_near", z_near, 0.0)
-    _check_modes(extent, stop)
-    image = np.zeros((cam.H, cam.W, 3))
+    z_near, dilation = _checked_options(extent, stop, z_near, dilation)
+    bg, image = float64_array("bg", bg, (3,)), np.zeros((cam.H, cam.W, 3))
     # Tiles are whole; pixels outside the image have no transmittance and do not keep a tile alive.
     padded = np.pad(np.ones((cam.H, cam.W)), ((0, -cam.H % TILE), (0, -cam.W % TILE)))
     transmittance = padded[: cam.H, : cam.W]
-    for i, mean2d, cov2d in zip(*project(cam, means, cov3ds, z_near, jacobian_limit), strict=True):
+    for i, mean2d, cov2d in zip(*project(cam, means, cov3ds, z_near, jacobian_limit, dilation), strict=True):
         T = transmittance[box := _box(mean2d, cov2d, opacities[i], cam, extent)]
         if T.size == 0 or (stop == "box" and T.max() < T_STOP):
             continue
@@ -133,10 +143,11 @@ def project(
     cov3ds: Float64[np.ndarray, "N 3 3"],
     z_near: float,
     jacobian_limit: float | None,
+    dilation: float = DILATION,
 ) -> Projection:
     """Project Gaussians in front of the camera to screen-space ellipses, sorted near to far.
 
-    Sigma2d = J W Sigma W' J' + 0.3 I
+    Sigma2d = J W Sigma W' J' + d I, with the dilation d
     """
     with np.errstate(over="ignore", invalid="ignore"):  # overflows are reported below
         means_cam = cam.world_to_cam(means)
@@ -146,15 +157,24 @@ def project(
         index = np.flatnonzero(means_cam[:, 2] > z_near)
         index = index[np.argsort(means_cam[index, 2], kind="stable")]
         u, v, _ = cam.project(means_cam[index])
-        cov2d = project_cov3d(
-            cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit
-        ) + DILATION * np.eye(2)
+        flat = project_cov3d(cov3ds[index], means_cam[index], cam, jacobian_limit=jacobian_limit)
+        cov2d = flat + dilation * np.eye(2)
         # As used by _box and _alpha: the determinant, and squared distances.
         fits = np.isfinite(u * u + v * v + np.trace(cov2d, axis1=1, axis2=2) ** 2)
     if not fits.all():
         i = index[np.argmin(fits)]
         raise ArgumentError(f"means[{i}], cov3ds[{i}]: are too large on the screen for float64")
-    return Projection(index, np.stack([u, v], axis=-1), cov2d)
+    drawn = _thick(flat, dilation)
+    return Projection(index[drawn], np.stack([u, v], axis=-1)[drawn], cov2d[drawn])
+
+
+def _thick(flat: Float64[np.ndarray, "M 2 2"], dilation: float) -> Bool[np.ndarray, " M"]:
+    """Return which covariances are thick enough to be drawn after the dilation, det > THINNEST trace."""
+    spread = np.trace(flat, axis1=1, axis2=2)
+    det = np.maximum(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0], 0.0)
+    # det(Sigma2d + d I) = det Sigma2d + d (a + c) + d², without further cancellation
+    thick: Bool[np.ndarray, " M"] = det + dilation * spread + dilation**2 > THINNEST * (spread + 2 * dilation)
+    return thick
 
 
 def _box(
@@ -176,9 +196,10 @@ def _box(
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
-def _check_modes(extent: Extent, stop: Stop) -> None:
+def _checked_options(extent: Extent, stop: Stop, z_near: float, dilation: float) -> tuple[float, float]:
     one_of("extent", extent, ("box3sigma", "exact"))
     one_of("stop", stop, ("box", "tile", "none"))
+    return in_range("z_near", z_near, 0.0), in_range("dilation", dilation, 0.0, DILATION_MAX)
 
 
 def _resolved(i: np.int64, cov2d: Float64[np.ndarray, "2 2"]) -> Float64[np.ndarray, "2 2"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, SH_MAX_DEGREE, Z_NEAR
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, DILATION_MAX, SH_MAX_DEGREE, Z_NEAR
 from gsplat_edu.errors import BackendUnavailableError
 from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
 
@@ -42,6 +42,8 @@ class RenderSettings:
             `gsplat_edu.gaussian_math.opacity_compensation`.
         depth: Also render expected depth. Training without a depth loss is faster without it.
         median_depth: Also render median depth.
+        dilation: Added to both diagonal entries of every screen-space covariance, px², 0 to 1e6. Below 2e-6, Gaussians
+            thinner than 1/1000 px on the screen are not drawn (`gsplat_edu.constants.THINNEST`).
         jacobian_limit: Clamp x/z and y/z inside the projection's Jacobian to this multiple of half the field of view
             (`Camera.jacobian_bounds`); 1.3 for captures, as in Kerbl et al.'s code; None disables clamping.
         alpha_max: Clamp of a splat's alpha in a pixel, 1/255 to 0.9999; gsplat uses 0.999.
@@ -62,6 +64,7 @@ class RenderSettings:
     antialiased: bool = False
     depth: bool = True
     median_depth: bool = False
+    dilation: float = DILATION
     jacobian_limit: float | None = None
     alpha_max: float = ALPHA_MAX
     stop: str = "tile"
@@ -78,6 +81,7 @@ class RenderSettings:
             "antialiased": bool(self.antialiased),
             "depth": bool(self.depth),
             "median_depth": bool(self.median_depth),
+            "dilation": in_range("dilation", self.dilation, 0.0, DILATION_MAX),
             "jacobian_limit": None if limit is None else in_range("jacobian_limit", limit, 1.0),
             "alpha_max": in_range("alpha_max", self.alpha_max, ALPHA_MIN, 0.9999),
             "z_near": in_range("z_near", self.z_near, 0.0),

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, DILATION, SH_OFFSET
+from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, SH_OFFSET, THINNEST
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.gaussians import Gaussians, check_tensor, quat_to_R_t
 from gsplat_edu.render.camera_tensors import CameraTensors
@@ -324,8 +324,12 @@ def _project(
         cov2d = JW @ shapes[visible] @ JW.mT
         det_before = cov2d[:, 0, 0] * cov2d[:, 1, 1] - cov2d[:, 0, 1] ** 2
     a0, b, c0 = cov2d[:, 0, 0], cov2d[:, 0, 1], cov2d[:, 1, 1]
-    a, c = a0 + DILATION, c0 + DILATION
-    det = det_before + DILATION * (a0 + c0) + DILATION * DILATION
+    a, c = a0 + settings.dilation, c0 + settings.dilation
+    det = det_before + settings.dilation * (a0 + c0) + settings.dilation * settings.dilation
+    if bool((thin := det <= THINNEST * (a + c)).any()):  # before the divisions, whose gradients would be NaN
+        kept = torch.nonzero(~thin)[:, 0]
+        rows_of = (each[kept] for each in (means2d, visible, z, a, b, c, det, det_before))
+        means2d, visible, z, a, b, c, det, det_before = rows_of
     ellipses = torch.stack([c / det, b / c, 1 / c], dim=-1)
     compensation = torch.sqrt(det_before.clamp(min=DET_FLOOR) / det)
     return _Screen(means2d, ellipses, visible, z, torch.stack([a, c], dim=-1), compensation)

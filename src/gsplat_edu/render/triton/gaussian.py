@@ -16,7 +16,7 @@ C0 = tl.constexpr(constants.C0)
 C1 = tl.constexpr(constants.C1)
 C2_0, C2_1, C2_2, C2_3, C2_4 = (tl.constexpr(value) for value in constants.C2)
 C3_0, C3_1, C3_2, C3_3, C3_4, C3_5, C3_6 = (tl.constexpr(value) for value in constants.C3)
-DILATION = tl.constexpr(constants.DILATION)
+THINNEST = tl.constexpr(constants.THINNEST)
 DET_FLOOR = tl.constexpr(constants.DET_FLOOR)
 
 # Offsets in a camera's row of values, see `camera_row`.
@@ -131,7 +131,7 @@ def onto_axes(t0, t1, t2, R, s0, s1, s2):
 
 @triton.jit
 @no_type_check
-def shape_on_screen(r, q):
+def shape_on_screen(r, q, DILATION: tl.constexpr):
     """Return a, b, c and the determinant of r r', r q', q q' before dilation, and the dilated determinant."""
     a = dot3(r[0], r[1], r[2], r[0], r[1], r[2])
     b = dot3(r[0], r[1], r[2], q[0], q[1], q[2])

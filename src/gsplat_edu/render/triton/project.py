@@ -1,6 +1,6 @@
 """project: from raw parameters to screen-space ellipses, one packed record per Gaussian; and the backward pass.
 
-    Sigma2d = J W Sigma W' J' + 0.3 I,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
+    Sigma2d = J W Sigma W' J' + d I, d: dilation,   u = fx x/z + cx,   alpha = o exp(-d' Sigma2d^-1 d / 2)
 
 A record holds u, v, sx, sy, ty, log2 o, red, green, blue, depth, half width, half height. Then alpha = 2^(log2 o - (sx
 dx + sy dy)² - (ty dy)²), whose squares cannot cancel for long, thin ellipses. A half width of 0 marks an invisible
@@ -20,12 +20,12 @@ from gsplat_edu.render.camera_tensors import GRADIENT_NUMBERS
 from gsplat_edu.render.triton.gaussian import (
     C0,
     DET_FLOOR,
-    DILATION,
     EYE_AT,
     FOCAL_AT,
     MIDDLE_AT,
     NEAR_AT,
     SIZE_AT,
+    THINNEST,
     dot3,
     harmonic,
     harmonic_slope,
@@ -77,7 +77,7 @@ def _is_finite(x):
 @no_type_check
 def project_kernel(
     means, quats, log_scales, sh0, sh_rest, logits, camera, records, n,
-    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, DILATION: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the records of a block of Gaussians."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
@@ -93,7 +93,7 @@ def project_kernel(
     r = onto_axes(t0, t1, t2, R, s0, s1, s2)
     t0, t1, t2, _ = jacobian_row(camera, 1, y, z)
     q = onto_axes(t0, t1, t2, R, s0, s1, s2)
-    a, b, c, det0, det = shape_on_screen(r, q)
+    a, b, c, det0, det = shape_on_screen(r, q, DILATION)
     a, c = a + DILATION, c + DILATION
     opacity = 1 / (1 + tl.exp(-tl.load(logits + i, mask=mask, other=0.0)))
     if ANTIALIASED:
@@ -107,7 +107,7 @@ def project_kernel(
     fine = _is_finite(a * c + det + x + y + z * z + opacity + length + red + green + blue) & (
         bright <= COLOR_LIMIT
     )
-    seen = mask & front & fine & (det > 0) & (opacity >= ALPHA_MIN)
+    seen = mask & front & fine & (det > THINNEST * (a + c)) & (opacity >= ALPHA_MIN)
     level = 2 * tl.log(tl.where(seen, opacity / ALPHA_MIN, 1.0))
     u = tl.load(camera + FOCAL_AT) * x / z + tl.load(camera + MIDDLE_AT)
     v = tl.load(camera + FOCAL_AT + 1) * y / z + tl.load(camera + MIDDLE_AT + 1)
@@ -280,8 +280,8 @@ def _store_means(
 def project_backward_kernel(
     means, quats, log_scales, sh0, sh_rest, logits, camera, slots, slot_begin, pairs_of,
     grad_means, grad_quats, grad_log_scales, grad_sh0, grad_sh_rest, grad_logits, norms, camera_sums, n,
-    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, WITH_CAMERA: tl.constexpr,
-    BLOCK: tl.constexpr,
+    DEGREE: tl.constexpr, REST: tl.constexpr, ANTIALIASED: tl.constexpr, DILATION: tl.constexpr,
+    WITH_CAMERA: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Add slots and propagate to raw parameters: conic -> Sigma2d -> (J W, M); colour -> (coefficients, direction).
 
@@ -300,7 +300,7 @@ def project_backward_kernel(
     p0, p1, p2, ratio_y = jacobian_row(camera, 1, y, z)
     r = onto_axes(t0, t1, t2, R, s0, s1, s2)
     q = onto_axes(p0, p1, p2, R, s0, s1, s2)
-    a0, b, c0, det0, det = shape_on_screen(r, q)
+    a0, b, c0, det0, det = shape_on_screen(r, q, DILATION)
     a, c = a0 + DILATION, c0 + DILATION
     opacity = 1 / (1 + tl.exp(-tl.load(logits + i, mask=mask, other=0.0)))
     _store_if(grad_logits, 1, 0, i, (1 - opacity) * sums[4], touched, mask)

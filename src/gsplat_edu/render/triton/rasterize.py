@@ -195,7 +195,8 @@ class _Rasterize(torch.autograd.Function):
                 *kept, _camera_row(call, image.device), slots, lists.slot_begin, lists.pairs_of, *outgoing, norms,
                 camera_sums, count,
                 DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
-                WITH_CAMERA=with_camera, BLOCK=BACKWARD_BLOCK, num_warps=PROJECT_BACKWARD_WARPS,
+                DILATION=call.settings.dilation, WITH_CAMERA=with_camera, BLOCK=BACKWARD_BLOCK,
+                num_warps=PROJECT_BACKWARD_WARPS,
             )  # fmt: skip
         call.norms = norms if call.norms is None else call.norms + norms
         wanted = ctx.needs_input_grad[1]
@@ -297,7 +298,8 @@ def _project(call: _Call, kept: list[Tensor]) -> Tensor:
     if count:
         project_kernel[(-(-count // BLOCK),)](
             *kept, _camera_row(call, kept[0].device), records, count,
-            DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased, BLOCK=BLOCK,
+            DEGREE=call.sh_degree, REST=kept[4].shape[1], ANTIALIASED=call.settings.antialiased,
+            DILATION=call.settings.dilation, BLOCK=BLOCK,
         )  # fmt: skip
     return records
 
