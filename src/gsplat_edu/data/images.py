@@ -35,6 +35,9 @@ from gsplat_edu.views import Photo
 AT_ONCE = 64_000_000
 """Pixels to decode at once; decoding takes about 10 bytes per pixel, and 25 more if alpha is resampled."""
 
+LOSSY, LOSSY_THRESHOLD = ("JPEG", HEIF), 128
+"""Formats in which a mask's zeros are noisy near its edges, and the smallest value that counts in them."""
+
 UPRIGHT = 1
 """EXIF orientation of a photo that is stored upright."""
 
@@ -209,7 +212,7 @@ def turned(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.
 
 
 def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """Decode a mask: true for nonzero pixels.
+    """Decode a mask: true for nonzero pixels, or for those of at least `LOSSY_THRESHOLD` in a lossy format.
 
     Raises:
         DatasetError: the file is truncated, corrupt or not an image.
@@ -219,8 +222,9 @@ def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
         with opened_image(path) as file:
             require_room(path, file)
             already = _turned_by_pillow(file)
-            plain = file if file.mode[0] in "IF" else file.convert("L")
-            mask: Bool[np.ndarray, "H W"] = turned(np.asarray(plain) != 0, BACK[already])
+            least = LOSSY_THRESHOLD if file.format in LOSSY else 0
+            plain = np.asarray(file if file.mode[0] in "IF" else file.convert("L"))
+            mask: Bool[np.ndarray, "H W"] = turned(plain >= least if least else plain != 0, BACK[already])
             return mask
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None

@@ -265,7 +265,11 @@ def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
         if entry.photo.mask:
             mask = result / "masks" / f"{entry.name}.png"
             mask.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(entry.photo.mask, mask)
+            given = Path(entry.photo.mask)
+            if given.suffix.lower() == ".png":
+                shutil.copyfile(given, mask)
+            else:
+                turn_mask(given, UPRIGHT, mask)
         return
     counts = Path(entry.photo.mask) if entry.photo.mask else None
     photo = load_photo(
