@@ -1,7 +1,8 @@
 """Find the masks of photos by their names.
 
-In a folder of masks, the mask of the photo left/A.JPG is left/A.JPG (the photo's own name), left/A.png or left/A.JPG.png,
-with any suffix of `MASK_ENDINGS` in any case. Every reader of captures and `gsplat_edu.sfm` use the same rules.
+In a folder of masks, the mask of the photo left/A.JPG is left/A.JPG (the photo's own name), left/A.png or
+left/A.JPG.png, with any suffix of `MASK_ENDINGS` in any case. Every reader of captures and `gsplat_edu.sfm` use these
+rules.
 """
 
 from __future__ import annotations
