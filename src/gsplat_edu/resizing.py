@@ -59,3 +59,11 @@ def smaller_mask(mask: Bool[np.ndarray, "H W"], W: int, H: int) -> Bool[np.ndarr
     shares = cv2.resize(mask.astype(np.float32), (W, H), interpolation=cv2.INTER_AREA)
     counts: Bool[np.ndarray, "h w"] = shares >= ALL_OF_IT
     return counts
+
+
+def eroded(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Return a mask without the pixels that touch one that is not in it; the image's border does not count as one."""
+    import cv2
+
+    kept: Bool[np.ndarray, "H W"] = cv2.erode(mask.view(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
+    return kept

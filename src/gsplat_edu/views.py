@@ -31,44 +31,60 @@ class Photo:
         image: (H, W, 3) RGB: uint8, not copied; or float from 0 to 1, stored as float32.
         alpha: (H, W) uint8, 255 for opaque pixels; None if the photo is opaque.
         mask: (H, W) true for pixels that count; None if all count.
+        outside: (H, W) true for pixels that the capture's mask excludes entirely; None if those are all that do not
+            count. Pixels that undistortion leaves without a source, or that are partly excluded, are neither.
+        lens_only: Whether the capture has no mask for the photo: undistortion alone excludes pixels.
 
     Raises:
         ShapeError: the sizes differ.
-        ArgumentError: a pixel is NaN or outside 0 to 1, or alpha or mask has another dtype.
+        ArgumentError: a pixel is NaN or outside 0 to 1, or alpha, mask or outside has another dtype.
     """
 
     image: Pixels
     alpha: UInt8[np.ndarray, "H W"] | None
     mask: Bool[np.ndarray, "H W"] | None
+    outside: Bool[np.ndarray, "H W"] | None
+    lens_only: bool
 
     def __init__(
         self,
         image: ArrayLike,
         alpha: UInt8[np.ndarray, "H W"] | None = None,
         mask: Bool[np.ndarray, "H W"] | None = None,
+        outside: Bool[np.ndarray, "H W"] | None = None,
+        lens_only: bool = False,
     ) -> None:
         pixels = np.asarray(image)
         if pixels.dtype != np.uint8:
             values = float64_array("image", image, ("H", "W", 3))
-            if np.any(outside := (values < 0) | (values > 1)):
-                where = first_index(outside)
+            if np.any(beyond := (values < 0) | (values > 1)):
+                where = first_index(beyond)
                 raise ArgumentError(
                     f"image{where}: is outside 0 to 1; divide by the largest value or give uint8"
                 )
             pixels = values.astype(np.float32)
         check_shape("image", pixels.shape, ("H", "W", 3), {})
-        for name, plane, dtype in (("alpha", alpha, np.uint8), ("mask", mask, np.bool_)):
+        planes = (("alpha", alpha, np.uint8), ("mask", mask, np.bool_), ("outside", outside, np.bool_))
+        for name, plane, dtype in planes:
             if plane is not None:
                 check_shape(name, plane.shape, pixels.shape[:2], {})
                 if plane.dtype != dtype:
                     raise ArgumentError(f"{name}: is {plane.dtype}, but has to be {np.dtype(dtype)}")
-        for name, value in {"image": pixels, "alpha": alpha, "mask": mask}.items():
+        for name, value in {"image": pixels, "alpha": alpha, "mask": mask, "outside": outside}.items():
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "lens_only", lens_only)
 
     @property
     def nbytes(self) -> int:
         """Size of the pixels in bytes."""
-        return sum(a.nbytes for a in (self.image, self.alpha, self.mask) if a is not None)
+        return sum(a.nbytes for a in (self.image, self.alpha, self.mask, self.outside) if a is not None)
+
+    @property
+    def excluded(self) -> Bool[np.ndarray, "H W"] | None:
+        """Where the capture's mask excludes all of a pixel, (H, W); None if nothing does."""
+        if self.outside is not None or self.mask is None or self.lens_only:
+            return self.outside
+        return ~self.mask
 
     @property
     def opaque(self) -> Bool[np.ndarray, "H W"] | None:
@@ -111,11 +127,13 @@ class Photo:
         if self.image.shape[:2] == (H, W):
             return self
         mask = None if self.mask is None else smaller_mask(self.mask, W, H)
+        outside = None if self.excluded is None else smaller_mask(self.excluded, W, H)
         if self.alpha is None:
-            return Photo(area_mean(self.image, W, H), None, mask)
+            return Photo(area_mean(self.image, W, H), None, mask, outside, self.lens_only)
         bytes_like = self.image if self.image.dtype == np.uint8 else 255.0 * self.image
         weighted = np.asarray(bytes_like, dtype=np.float32)
-        return Photo(*unweighted(area_mean(premultiplied(weighted, self.alpha), W, H)), mask)
+        image, alpha = unweighted(area_mean(premultiplied(weighted, self.alpha), W, H))
+        return Photo(image, alpha, mask, outside, self.lens_only)
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -120,6 +120,7 @@ def test_config_json_has_the_flat_names_of_older_runs(tmp_path):
         "pose_spread",
         "lens_rate",
         "transients",
+        "outside_masks",
     }
     assert {name: value for name, value in found["train"].items() if name not in newer} == older
     folder = RunFolder(tmp_path)

@@ -175,6 +175,7 @@ def _options(config: dict[str, Any]) -> tuple[str, ...]:
         "--strategy": (None if strategy == DEFAULT_STRATEGY else strategy,),
         "--max-gaussians": (train.get("max_gaussians"),),
         "--transients": (None if train.get("transients", "none") == "none" else train["transients"],),
+        "--outside-masks": ("empty" if train.get("outside_masks") == "empty" else None,),
         "--appearance": (
             "vignetting" if appearance_of(config) == "vignetting" else None,
         ),  # never chosen by auto

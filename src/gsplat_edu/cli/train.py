@@ -28,7 +28,8 @@ from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.doctor.remedies import Remedy, remedies_for, transients_for
+from gsplat_edu.doctor.finding import Remedy
+from gsplat_edu.doctor.remedies import CHOICES, remedies_for, transients_for
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.jobs import emitter
@@ -254,10 +255,10 @@ def with_choices(
 
     def take(options: RunOptions, name: str, remedy: Remedy) -> RunOptions:
         if remedy.reason:
-            say(f"--{name} {remedy.value}: {remedy.reason}")
+            say(f"--{name.replace('_', '-')} {remedy.value}: {remedy.reason}")
         return replace(options, config=options.config.changed(**{name: remedy.value}))
 
-    if by_photos := [name for name in names if name in ("appearance", "sky")]:
+    if by_photos := [name for name in names if name in CHOICES]:
         with progress_bar(console, "") as bar:
             remedies = remedies_for(options.data, by_photos, photos_read(bar, lambda: False))
         for name, remedy in remedies.items():

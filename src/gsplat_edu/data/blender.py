@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gsplat_edu.data.capture import Capture, Frame, is_file
+from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, UnusedSplit
 from gsplat_edu.data.points import BLENDER_CUBE
 from gsplat_edu.data.transforms import nothing_found, read_frames, read_json
@@ -42,4 +43,6 @@ def read_blender(folder: Path) -> Capture:
         notes.append(UnusedSplit(val.name, held_out.name))
     notes += [MissingPhotos(len(missing), len(frames) + len(missing), missing[0])] if missing else []
     notes += [FilesOutside(outside[0], len(outside), folder)] if outside else []
+    frames, mask_notes = with_masks(folder, frames)
+    notes += mask_notes
     return Capture("Blender", tuple(frames), None, tuple(notes), cube=BLENDER_CUBE)

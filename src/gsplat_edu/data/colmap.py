@@ -41,7 +41,8 @@ from gsplat_edu.data.colmap_files import (
     points_txt,
 )
 from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
-from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels, UnclearMasks
+from gsplat_edu.data.masks import MASKS, find_named
+from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.gaussian_math import quat_to_R
@@ -199,12 +200,12 @@ def _numbered(folder: Path) -> list[Path]:
 
 def _photo_folders(folder: Path, model: Path) -> tuple[list[Path], list[Path]]:
     """Return the possible folders of photos, and of masks."""
-    photos, masks = [folder / "images", folder], [folder / "masks"]
+    photos, masks = [folder / "images", folder], [folder / MASKS]
     if model == folder or (model.parent == folder and model.name.isdecimal()):
         # The model or its parent folder was given; its photos are where they would be for the capture.
         above = folder.absolute().parents[:2]
         photos += [parent / "images" for parent in above]
-        masks += [parent / "masks" for parent in above]
+        masks += [parent / MASKS for parent in above]
     return photos, masks
 
 
@@ -216,35 +217,28 @@ def _files(
     A file outside the folders of its image's name is used if no other image has the same bare name.
 
     Raises:
-        DatasetError: two images share one file.
+        DatasetError: two images share one file, two masks fit one image, or there are masks and none fits.
     """
     photo_folders, mask_folders = _photo_folders(folder, model)
-    mask_folders = [place for place in mask_folders if is_folder(place)]
     listings = Listings()
     bare = Counter(Path(name).name for name in names)
-    photos, masks, unclear = dict[str, Path](), dict[str, Path](), list[str]()
+    photos = dict[str, Path]()
     for name in names:
         last = Path(name).name
         alone = [last] if bare[last] == 1 else []
         places = [p for p in _candidates(photo_folders, name, alone) if listings.may_hold(str(p))]
         # Photos of full size first, in any folder; then those of images_2, images_4 and images_8.
         photo = next((p for find in (_present, find_photo) for p in map(find, places) if p), None)
-        mask = next((p for p in _masks(mask_folders, [name, *alone]) if is_file(p)), None)
         if photo is not None:
             photos[name] = photo
-        if mask is not None:
-            masks[name] = mask
-        elif not alone and any(is_file(p) for p in _masks(mask_folders, [last])):
-            unclear.append(legible(name))
     _check_single(model, names, photos)
+    masks, mask_notes = find_named(mask_folders, names)
     _check_single(model, names, masks)
     notes = list[Note]()
     outside = [photos[name] for name in names if name in photos and is_outside(folder, name)]
     if outside:
         notes.append(FilesOutside(outside[0], len(outside), folder))
-    if unclear:
-        notes.append(UnclearMasks(len(unclear), len(names), unclear[0]))
-    return photos, masks, notes
+    return photos, masks, [*notes, *mask_notes]
 
 
 def _present(path: Path) -> Path | None:
@@ -271,14 +265,6 @@ def _check_single(model: Path, names: Sequence[str], files: Mapping[str, Path]) 
 def _candidates(folders: Sequence[Path], name: str, alone: Sequence[str]) -> Iterator[Path]:
     yield from (folder / name for folder in folders)
     yield from (folder / last for last in alone for folder in folders if folder.name == "images")
-
-
-def _masks(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Path]:
-    for folder in folders:
-        for name in names:
-            yield folder / f"{name}.png"
-            if Path(name).name:
-                yield (folder / name).with_suffix(".png")
 
 
 def _placed(where: str, pose: Pose) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:

@@ -35,6 +35,9 @@ from gsplat_edu.views import Photo
 AT_ONCE = 64_000_000
 """Pixels to decode at once; decoding takes about 10 bytes per pixel, and 25 more if alpha is resampled."""
 
+LOSSY, LOSSY_THRESHOLD = ("JPEG", HEIF), 128
+"""Formats in which a mask's zeros are noisy near its edges, and the smallest value that counts in them."""
+
 UPRIGHT = 1
 """EXIF orientation of a photo that is stored upright."""
 
@@ -46,6 +49,9 @@ MIRRORED = (2, 4, 5, 7)
 
 BACK = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
 """EXIF orientation that undoes another one."""
+
+
+Plane = Bool[np.ndarray, "H W"] | None
 
 
 @dataclass(frozen=True)
@@ -209,7 +215,7 @@ def turned(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.
 
 
 def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """Decode a mask: true for nonzero pixels.
+    """Decode a mask: true for nonzero pixels, or for those of at least `LOSSY_THRESHOLD` in a lossy format.
 
     Raises:
         DatasetError: the file is truncated, corrupt or not an image.
@@ -219,8 +225,9 @@ def decode_mask(path: Path) -> Bool[np.ndarray, "H W"]:
         with opened_image(path) as file:
             require_room(path, file)
             already = _turned_by_pillow(file)
-            plain = file if file.mode[0] in "IF" else file.convert("L")
-            mask: Bool[np.ndarray, "H W"] = turned(np.asarray(plain) != 0, BACK[already])
+            least = LOSSY_THRESHOLD if file.format in LOSSY else 0
+            plain = np.asarray(file if file.mode[0] in "IF" else file.convert("L"))
+            mask: Bool[np.ndarray, "H W"] = turned(plain >= least if least else plain != 0, BACK[already])
             return mask
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
@@ -245,15 +252,19 @@ def load_photo(source: PhotoFile) -> Photo:
         return Photo(image, alpha, mask)
     if alpha is not None:
         image = premultiplied(image, alpha)
+    outside = None if mask is None else ~mask
     if source.lens.distorts:
         try:
-            image, mask = _undistorted(image, mask, source.lens)
+            image, mask, outside = _undistorted(image, mask, source.lens)
         except DatasetError as error:
             raise DatasetError(f"{source.path}: {error}") from None
     image = area_mean(image, source.W, source.H)
     if alpha is not None:
         image, alpha = unweighted(image)
-    return Photo(image, alpha, None if mask is None else smaller_mask(mask, source.W, source.H))
+    counts, excluded = (
+        None if plane is None else smaller_mask(plane, source.W, source.H) for plane in (mask, outside)
+    )
+    return Photo(image, alpha, counts, excluded, lens_only=source.mask is None)
 
 
 class ImageStore:
@@ -316,28 +327,35 @@ def _turned_by_pillow(file: Image.Image) -> int:
 def _planes(source: PhotoFile) -> int:
     """Return the bytes that a pixel of a photo takes: its colour, its mask and, if it is kept, its alpha."""
     alpha = source.background is None and source.path.suffix.lower() not in (".jpg", ".jpeg")
-    return 3 + (source.mask is not None) + alpha
+    made = source.lens.distorts or (source.W, source.H) != (source.lens.W, source.lens.H)
+    return 3 + (source.mask is not None) * (1 + made) + alpha
 
 
 def _undistorted(
     pixels: UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"],
     mask: Bool[np.ndarray, "H W"] | None,
     lens: Lens,
-) -> tuple[UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"], Bool[np.ndarray, "H W"] | None]:
+) -> tuple[UInt8[np.ndarray, "H W c"] | Float32[np.ndarray, "H W c"], Plane, Plane]:
     """Undistort a photo and its mask band by band. The maps cost less than decoding, so they are not cached.
+
+    Returns:
+        The photo; the pixels that count, None for all; and those that the mask excludes, None without a mask.
 
     Raises:
         DatasetError: as for `undistortion`.
     """
     image, counts = np.empty_like(pixels), np.empty(pixels.shape[:2], dtype=np.bool_)
+    outside = None if mask is None else np.empty_like(mask)
     for band in bands(lens.H):
         columns, rows, counts[band] = undistortion(lens, band)
         image[band] = cv2.remap(pixels, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        if mask is not None:
-            counts[band] &= cv2.remap(mask.view(np.uint8), columns, rows, cv2.INTER_NEAREST) != 0
-    if mask is not None:
-        return image, counts
-    return image, None if counts.all() else counts
+        if mask is not None and outside is not None:
+            inside = cv2.remap(mask.view(np.uint8), columns, rows, cv2.INTER_NEAREST) != 0
+            outside[band] = counts[band] & ~inside
+            counts[band] &= inside
+    if outside is not None:
+        return image, counts, outside
+    return image, None if counts.all() else counts, None
 
 
 def _undecodable(path: Path, error: BaseException) -> SplatError:

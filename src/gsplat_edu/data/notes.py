@@ -70,6 +70,49 @@ class UnclearMasks:
 
 
 @dataclass(frozen=True)
+class PhotosWithoutMask:
+    """Photos without a mask in a capture where others have one.
+
+    Args:
+        photos: Number of such photos.
+        total: Number of photos listed by the capture.
+        first: Name of the first such photo.
+    """
+
+    photos: int
+    total: int
+    first: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.photos} of {self.total} photos have no mask, first {self.first}: all their pixels count"
+        )
+
+
+@dataclass(frozen=True)
+class LossyMasks:
+    """Masks in a lossy format, in which zeros are not exact.
+
+    Args:
+        masks: Number of such masks.
+        total: Number of masks.
+        first: File name of the first such mask.
+    """
+
+    masks: int
+    total: int
+    first: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return (
+            f"{self.masks} of {self.total} masks are stored with losses (JPEG or HEIC), first {self.first}: pixels of "
+            "at least 128 count"
+        )
+
+
+@dataclass(frozen=True)
 class OtherModels:
     """COLMAP models other than the one that is read.
 
@@ -152,4 +195,14 @@ class UnreadColors:
         return f"{self.photos} of {self.total} photos are taken as sRGB, first {self.first}: {self.reason}"
 
 
-Note = MissingPhotos | FilesOutside | UnclearMasks | OtherModels | UnusedSplit | TwoLayouts | UnreadColors
+Note = (
+    MissingPhotos
+    | FilesOutside
+    | UnclearMasks
+    | PhotosWithoutMask
+    | LossyMasks
+    | OtherModels
+    | UnusedSplit
+    | TwoLayouts
+    | UnreadColors
+)

@@ -31,6 +31,7 @@ from gsplat_edu.data.capture import (
 from gsplat_edu.data.colmap import find_model, points_file, read_points
 from gsplat_edu.data.images import image_size
 from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
+from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.errors import DatasetError
@@ -89,6 +90,8 @@ def read_transforms(path: Path) -> Capture:
         outside.append(path.parent / points)
     if outside:
         notes.append(FilesOutside(outside[0], len(outside), path.parent))
+    frames, mask_notes = with_masks(path.parent, frames)
+    notes += mask_notes
     return Capture("transforms.json", tuple(frames), cloud, tuple(notes), no_cloud or Capture.no_cloud)
 
 

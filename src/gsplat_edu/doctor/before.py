@@ -18,6 +18,7 @@ from gsplat_edu.doctor.cameras import (
     check_sizes,
 )
 from gsplat_edu.doctor.cloud import check_cloud
+from gsplat_edu.doctor.cut_out import check_masks
 from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, check_usable
 from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.remedies import check_sky
@@ -43,6 +44,7 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("duplicates", check_duplicates),
     ("cloud", check_cloud),
     ("sky", check_sky),
+    ("masks", check_masks),
 )
 """Checks that compare views; they need at least two."""
 

@@ -55,6 +55,19 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class Remedy:
+    """A choice and its reason.
+
+    Args:
+        value: What to pass to the option.
+        reason: Why, as a clause that follows the option; "" if there is nothing to tell.
+    """
+
+    value: str
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The result of all checks.
 

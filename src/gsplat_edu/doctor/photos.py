@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from gsplat_edu.data.images import PhotoFile, decode, decode_mask
 from gsplat_edu.data.lens import undistortion
@@ -51,28 +51,32 @@ class PhotoStats:
         detail: (8,) natural logarithm of the energy of fine gradients over that of coarse ones, by direction; zero if
             it was not measured.
         transparent: Whether a pixel is not opaque.
-        masked: Whether the photo has a mask.
+        mask: (h, w) true for pixels of which more than half counts; None if the photo has no mask.
     """
 
     thumbnail: UInt8[np.ndarray, "h w 3"]
     detail: Float64[np.ndarray, "8"]
     transparent: bool = False
-    masked: bool = False
+    mask: Bool[np.ndarray, "h w"] | None = None
+
+    @property
+    def masked(self) -> bool:
+        """Whether the photo has a mask."""
+        return self.mask is not None
 
 
 def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
     """Decode a photo and measure it.
 
     Args:
-        source: The photo at its full size. Its mask is decoded only to check that training can read it.
+        source: The photo at its full size. Its mask is measured as stored, without undistortion.
         sharpness: Measure the detail too; without it, JPEGs are decoded at a smaller size.
 
     Raises:
         DatasetError: the photo or its mask cannot be decoded, or the lens cannot be undistorted.
     """
     lens = source.lens
-    if source.mask is not None:
-        decode_mask(source.mask)
+    mask = None if source.mask is None else _shrunk_mask(decode_mask(source.mask))
     decoded, transparent = _decoded(source, WORK_SIDE if sharpness else 2 * THUMBNAIL_SIDE)
     pixels = _shrunk(decoded, WORK_SIDE)
     if face := isinstance(lens, FaceLens):
@@ -83,7 +87,7 @@ def measure_photo(source: PhotoFile, sharpness: bool = True) -> PhotoStats:
         columns, rows, _ = undistortion(lens.scaled(w, h), slice(0, h))
         small = cv2.remap(small, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     detail = detail_of(pixels) if sharpness else np.zeros(len(ANGLES))
-    return PhotoStats(np.asarray(small, dtype=np.uint8), detail, transparent, source.mask is not None)
+    return PhotoStats(np.asarray(small, dtype=np.uint8), detail, transparent, mask)
 
 
 def detail_of(pixels: UInt8[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "8"]:
@@ -122,6 +126,12 @@ def _decoded(source: PhotoFile, side: int) -> tuple[UInt8[np.ndarray, "H W 3"], 
     if alpha is None:
         return image, False
     return np.asarray(Photo(image, alpha).over((0.0, 0.0, 0.0))), bool((alpha < 255).any())
+
+
+def _shrunk_mask(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
+    grey = np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255
+    counts: Bool[np.ndarray, "h w"] = _shrunk(grey, THUMBNAIL_SIDE)[..., 0] >= 128
+    return counts
 
 
 def _shrunk(pixels: UInt8[np.ndarray, "H W 3"], side: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -7,13 +7,13 @@ training should correct all photos, and whether it should start with a sky.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsplat_edu.doctor.appearance import Gains
-from gsplat_edu.doctor.finding import Finding, Severity
+from gsplat_edu.doctor.cut_out import outside_masks_of
+from gsplat_edu.doctor.finding import Finding, Remedy, Severity
 from gsplat_edu.doctor.survey import Progress, Survey, prepare
 from gsplat_edu.sky.find import Sky, find_sky
 
@@ -29,32 +29,19 @@ ENOUGH = 12
 show most places, which is too little to compare a photo with."""
 
 
-@dataclass(frozen=True)
-class Remedy:
-    """A choice and its reason.
-
-    Args:
-        value: What to pass to the option.
-        reason: Why, as a clause that follows the option; "" if there is nothing to tell.
-    """
-
-    value: str
-    reason: str = ""
-
-
 def remedies_for(path: Path, names: Sequence[str], progress: Progress | None = None) -> dict[str, Remedy]:
     """Choose settings for a capture from its photos, which are read once.
 
     Args:
         path: Folder or transforms.json of the capture.
-        names: The settings: "appearance", "sky".
+        names: Of `CHOICES`.
         progress: Called with (photos done, total) in the calling thread.
 
     Raises:
         DatasetError: there is no capture, or its poses cannot be read. Unreadable photos raise no error.
     """
     survey = prepare(path, progress, sharpness=False)
-    return {name: {"appearance": appearance_of, "sky": sky_of}[name](survey) for name in names}
+    return {name: CHOICES[name](survey) for name in names}
 
 
 def appearance_of(survey: Survey) -> Remedy:
@@ -98,6 +85,10 @@ def sky_of(survey: Survey) -> Remedy:
             return Remedy("none", f"photos are {kind}, and a sky may be cut out of them")
     sky = _sky(survey)
     return Remedy("shell", _seen(sky, survey)) if sky.is_certain else Remedy("none")
+
+
+CHOICES = {"appearance": appearance_of, "sky": sky_of, "outside_masks": outside_masks_of}
+"""Functions that choose a setting for a surveyed capture, by the setting's name."""
 
 
 def check_sky(survey: Survey) -> list[Finding]:

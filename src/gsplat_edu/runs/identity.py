@@ -22,7 +22,7 @@ SAME = ("train", "render", "data")
 MAY_DIFFER = {"data": ("path", "points", "scene", "image_memory"), "train": ("iterations",)}
 """Keys of these sections that may differ: files with the same contents may have moved, and a run may be extended."""
 
-ADDED = ("batch", "appearance", "sky", "refine", "pose_spread", "lens_rate", "transients")
+ADDED = ("batch", "appearance", "sky", "refine", "pose_spread", "lens_rate", "transients", "outside_masks")
 """Settings of the training that came after the first version. A run without them was trained with their defaults."""
 
 RETIRED = {"pose_rate": ("poses", "both")}

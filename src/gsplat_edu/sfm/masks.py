@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
-from gsplat_edu.data.capture import PHOTO_ENDINGS, entries, is_file, is_folder
+from gsplat_edu.data.capture import PHOTO_FOLDERS, entries, is_file, is_folder
 from gsplat_edu.data.images import UPRIGHT, decode_mask, image_size, turned, upright_size
+from gsplat_edu.data.masks import MASK_ENDINGS, MASKS, MaskFolder, check_none_unused
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 
@@ -25,21 +26,27 @@ OPAQUE = 128
 def find_masks(files: Sequence[Path]) -> dict[Path, Path]:
     """Find the masks of photos in one folder: zero where a pixel does not count.
 
-    The mask of NAME.jpg is NAME.jpg.mask.png or NAME.mask.png beside it, or NAME.jpg.png or NAME.png in a folder masks/
-    inside the photos' folder or next to it. A mask is ignored if it fits several photos that differ only in their
-    endings.
+    The mask of NAME.jpg is NAME.jpg.mask.png or NAME.mask.png beside it, or NAME.jpg, NAME.png or NAME.jpg.png in a
+    folder masks/ inside the photos' folder or next to it; `gsplat_edu.data.masks` has the rules. A mask is ignored if
+    it fits several photos that differ only in their endings.
 
     Args:
         files: The photos.
 
     Returns:
         The masks, by photo; photos without a mask are missing.
+
+    Raises:
+        DatasetError: two masks in one folder fit a photo.
     """
-    stems = [path.stem for path in files]
+    stems, names = [path.stem for path in files], [path.name for path in files]
+    places = [MaskFolder(folder, names) for path in files[:1] for folder in _folders(path)]
     found = {}
     for path in files:
-        names = [path.name, path.stem] if stems.count(path.stem) == 1 else [path.name]
-        mask = next((place for place in _places(path, names) if is_file(place)), None)
+        spelled = [path.name, path.stem] if stems.count(path.stem) == 1 else [path.name]
+        beside = (path.with_name(name + MASK_ENDING) for name in spelled)
+        mask = next((place for place in beside if is_file(place)), None)
+        mask = mask or next((one for place in places if (one := place.find(path.name))), None)
         if mask is not None:
             found[path] = mask
     return found
@@ -54,11 +61,22 @@ def unused_folders(files: Sequence[Path], masks: Mapping[Path, Path]) -> list[Pa
     """
     used = {mask.parent for mask in masks.values()}
     folders = {folder for path in files[:1] for folder in _folders(path)}
-    return [
-        folder
-        for folder in sorted(folders - used)
-        if is_folder(folder) and any(path.suffix.lower() in PHOTO_ENDINGS for path in entries(folder))
-    ]
+    return [folder for folder in sorted(folders - used) if is_folder(folder) and _direct_images(folder)]
+
+
+def check_some_used(files: Sequence[Path]) -> None:
+    """Refuse photos beside which there are masks, but none is named like a photo.
+
+    Args:
+        files: The photos.
+
+    Raises:
+        DatasetError: names a folder of such masks; or two masks in one folder fit a photo.
+    """
+    masks = find_masks(files)
+    if not masks:
+        unused = unused_folders(files, masks)
+        check_none_unused([MaskFolder(folder, []) for folder in unused], files[0].name)
 
 
 def upright_masks(masks: Mapping[Path, Path], shapes: Mapping[Path, tuple[int, int, int]]) -> set[Path]:
@@ -137,12 +155,17 @@ def write_mask(counts: Bool[np.ndarray, "H W"], target: Path, size: tuple[int, i
         Image.fromarray(small).save(aside, format="PNG")
 
 
-def _places(photo: Path, names: Sequence[str]) -> Iterator[Path]:
-    yield from (photo.with_name(name + MASK_ENDING) for name in names)
-    yield from (folder / f"{name}.png" for folder in _folders(photo) for name in names)
+def _direct_images(folder: Path) -> bool:
+    return any(path.suffix.lower() in MASK_ENDINGS for path in entries(folder))
 
 
 def _folders(photo: Path) -> list[Path]:
-    """List the mask folders of a photo: masks/ inside the photo's folder and next to it."""
-    beside = [photo.parent.with_name("masks")] if photo.parent.name not in ("", "masks") else []
-    return [photo.parent / "masks", *beside]
+    """List the mask folders of a photo: masks/ inside the photo's folder and next to it.
+
+    For photos in images/left these include masks/left, in images/ and next to it.
+    """
+    here = photo.parent
+    beside = [here.with_name(MASKS)] if here.name not in ("", MASKS) else []
+    above = [here.parent.with_name(MASKS)] if here.parent.name in PHOTO_FOLDERS else []
+    below = [place / here.name for place in (*beside, *above)]
+    return [here / MASKS, *beside, *below]

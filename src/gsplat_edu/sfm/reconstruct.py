@@ -22,7 +22,7 @@ from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap
 from gsplat_edu.sfm.mapping import Cameras, attempts, map_photos, no_overlap, rig_attempts, shared_cameras
-from gsplat_edu.sfm.masks import find_masks, unused_folders
+from gsplat_edu.sfm.masks import check_some_used, find_masks, unused_folders
 from gsplat_edu.sfm.options import SfmOptions as SfmOptions
 from gsplat_edu.sfm.panoramas import (
     Panorama,
@@ -146,6 +146,7 @@ class _Run:
             self._stage("frames", wanted, self._take_frames, [self.folder / "frames"])
             source = self.folder / "frames"
             files = photo_files(source)
+        check_some_used(files)
         if are_panoramas(files, options.panorama, self._say):
             files = self._faces(files)
         self.source = source = files[0].parent
@@ -284,9 +285,7 @@ class _Run:
     def _note_masks(self, files: Sequence[Path], photos: Sequence[PhotoFacts]) -> None:
         """Report the masks that are not used, and those whose orientation is ambiguous."""
         for folder in unused_folders(files, find_masks(files)):
-            self._say(
-                f"{folder}: not used, because none of its images is named like a photo (PHOTO.png or PHOTO.jpg.png)"
-            )
+            self._say(f"{folder}: not used, because none of its images is named like a photo")
         stored = stored_mask(self.folder / "photos", "").parent
         unknown = [
             photo.name

@@ -17,7 +17,7 @@ from PIL import Image
 
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.colmap import read_cameras, read_images, read_points
-from gsplat_edu.data.images import AT_ONCE, PhotoFile, load_photo
+from gsplat_edu.data.images import AT_ONCE, UPRIGHT, PhotoFile, load_photo
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.scale import SCALE_FILE, write_scale
 from gsplat_edu.errors import ArgumentError, DatasetError
@@ -26,6 +26,7 @@ from gsplat_edu.gaussian_math import quat_to_R
 from gsplat_edu.intrinsics import Intrinsics
 from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.sfm.colmap import call
+from gsplat_edu.sfm.masks import turn_mask
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts
 from gsplat_edu.sfm.scale import Sight
 from gsplat_edu.sfm.scale import placed as placed_world
@@ -265,7 +266,11 @@ def _write_photo(entry: Undistorted, source: Path, result: Path) -> None:
         if entry.photo.mask:
             mask = result / "masks" / f"{entry.name}.png"
             mask.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(entry.photo.mask, mask)
+            given = Path(entry.photo.mask)
+            if given.suffix.lower() == ".png":
+                shutil.copyfile(given, mask)
+            else:
+                turn_mask(given, UPRIGHT, mask)
         return
     counts = Path(entry.photo.mask) if entry.photo.mask else None
     photo = load_photo(

@@ -16,7 +16,7 @@ from gsplat_edu.studio.names import checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict
 from gsplat_edu.text import shortened
 from gsplat_edu.train.config import APPEARANCES, QUALITIES, REFINEMENTS, SKIES, STRATEGIES
-from gsplat_edu.train.setting import TRANSIENTS
+from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
 
 EXPORTS = "exports"
 """Folder of an entry with the files that were exported from it."""
@@ -117,6 +117,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "sky": _choice("auto", *SKIES),
     "transients": _choice("auto", *TRANSIENTS),
     "refine": _choice("auto", *REFINEMENTS),
+    "outside_masks": _choice("auto", *OUTSIDE_MASKS),
     "panorama": _choice(*PANORAMA),
     "scale": _text,
     "seed": _whole(0, 2**31 - 1),

@@ -15,9 +15,42 @@ from typing import Any, TypeVar
 
 from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.train.setting import TRANSIENTS, Check
+from gsplat_edu.train.checks import (
+    accept_at_least_1 as _at_least_1,
+)
+from gsplat_edu.train.checks import (
+    accept_cap as _cap,
+)
+from gsplat_edu.train.checks import (
+    accept_color as _color,
+)
+from gsplat_edu.train.checks import (
+    accept_flag as _flag,
+)
+from gsplat_edu.train.checks import (
+    accept_fraction as _fraction,
+)
+from gsplat_edu.train.checks import (
+    accept_name_of as _one_of,
+)
+from gsplat_edu.train.checks import (
+    accept_not_negative as _not_negative,
+)
+from gsplat_edu.train.checks import (
+    accept_opacity as _opacity,
+)
+from gsplat_edu.train.checks import (
+    accept_positive as _positive,
+)
+from gsplat_edu.train.checks import (
+    accept_share as _share,
+)
+from gsplat_edu.train.checks import (
+    accept_whole as _whole,
+)
+from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Check
 from gsplat_edu.train.setting import Setting as Setting
-from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
+from gsplat_edu.validation import one_of, whole_number
 
 RECIPE_ITERATIONS = 30_000
 """Length of the run for which the recipe's milestones are defined."""
@@ -67,52 +100,6 @@ def _number(default: Any, check: Check, help: str, source: str = "", *, mileston
     """Declare a setting: default, range, meaning, source, and whether `recipe` scales it with the run's length."""
     metadata = {"check": check, "help": help, "source": source, "milestone": milestone}
     return dataclasses.field(default=default, metadata=metadata)
-
-
-def _whole(low: int, high: int | None = None) -> Check:
-    return lambda name, value: whole_number(name, value, low, high)
-
-
-def _positive(name: str, value: float) -> None:
-    in_range(name, value, 0.0, open_low=True)
-
-
-def _not_negative(name: str, value: float) -> None:
-    in_range(name, value, 0.0)
-
-
-def _fraction(name: str, value: float) -> None:
-    in_range(name, value, 0.0, 1.0)
-
-
-def _share(name: str, value: float) -> None:
-    in_range(name, value, 0.0, 1.0, open_low=True)
-
-
-def _opacity(name: str, value: float) -> None:
-    in_range(name, value, 0.0, 1.0 - 1e-6, open_low=True)
-
-
-def _at_least_1(name: str, value: float | None) -> None:
-    if value is not None:
-        in_range(name, value, 1.0)
-
-
-def _cap(name: str, value: int | None) -> None:
-    if value is not None:
-        whole_number(name, value, 1)
-
-
-def _color(name: str, value: object) -> None:
-    float64_array(name, value, (3,))  # type: ignore[arg-type]
-
-
-def _one_of(names: tuple[str, ...]) -> Check:
-    return lambda name, value: one_of(name, value, names)
-
-
-def _flag(name: str, value: object) -> None:
-    """Accept any value: the option is a flag."""
 
 
 def _documented(kind: Class) -> Class:
@@ -327,6 +314,11 @@ class TrainConfig:
         "none",
         _one_of(TRANSIENTS),
         '"mask": find and mask what only single photos show; "none": use all pixels.',
+    )
+    outside_masks: str = _number(
+        "ignore",
+        _one_of(OUTSIDE_MASKS),
+        'What the scene shows where masks exclude pixels. "ignore": anything; "empty": nothing.',
     )
     pose_spread: float = _number(
         1e-2,

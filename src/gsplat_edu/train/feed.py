@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.resizing import eroded
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
 from gsplat_edu.views import Photo, View
 
@@ -58,16 +59,20 @@ class Target:
         image: (H, W, 3) the photo over the background.
         mask: (H, W) true for pixels that count; None if all do.
         opaque: (H, W) `Photo.opaque`; None if the photo has no alpha.
+        outside: (H, W) `Photo.excluded` of the capture's own mask, without a margin of a pixel, because the edges of
+            masks are not exact; None if the photo has no mask, or nobody asked.
     """
 
     image: UInt8[Tensor, "H W 3"] | Float32[Tensor, "H W 3"]
     mask: Bool[Tensor, "H W"] | None
     opaque: Bool[Tensor, "H W"] | None = None
+    outside: Bool[Tensor, "H W"] | None = None
 
     @property
     def nbytes(self) -> int:
         """Size in bytes."""
-        return sum(tensor.nbytes for tensor in (self.image, self.mask, self.opaque) if tensor is not None)
+        planes = (self.image, self.mask, self.opaque, self.outside)
+        return sum(tensor.nbytes for tensor in planes if tensor is not None)
 
 
 class ViewFeed:
@@ -84,6 +89,7 @@ class ViewFeed:
         background: Colour behind photos that are not opaque; None for a random colour per draw.
         device: Device of the Gaussians.
         room: Bytes of targets to cache on a GPU; `DEVICE_SHARE` of the free memory if None.
+        outside: Whether targets tell what the capture's masks exclude.
     """
 
     def __init__(
@@ -94,11 +100,12 @@ class ViewFeed:
         background: Color | None = (0.0, 0.0, 0.0),
         device: torch.device = CPU,
         room: int | None = None,
+        outside: bool = False,
     ) -> None:
         self.views = self._full = tuple(views)
         self._factor, self._order = 1.0, order
         self._shortest = min(min(view.camera.W, view.camera.H) for view in self._full)
-        self._background, self._device = background, device
+        self._background, self._device, self._outside = background, device, outside
         self._generator = np.random.default_rng(seed)
         self._queue: list[int] = []
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="photo")
@@ -159,7 +166,7 @@ class ViewFeed:
         photo = view.read()
         opaque = photo.opaque
         if photo.alpha is not None and self._background is not None:
-            photo = Photo(photo.over(self._background), mask=photo.mask)
+            photo = Photo(photo.over(self._background), None, photo.mask, photo.outside, photo.lens_only)
             if not view.on_disk:
                 self._flat[view] = photo, opaque
         nbytes = photo.nbytes + (0 if opaque is None else opaque.nbytes)
@@ -178,11 +185,10 @@ class ViewFeed:
         view, photo = draw.view, draw.photo
         if photo is None:
             return self._kept[view]
-        mask, opaque = (
-            None if plane is None else torch.from_numpy(plane).to(self._device)
-            for plane in (photo.mask, draw.opaque)
-        )
-        target = Target(torch.from_numpy(photo.over(background)).to(self._device), mask, opaque)
+        outside = photo.excluded if self._outside else None
+        planes = (photo.mask, draw.opaque, None if outside is None else eroded(outside))
+        moved = [None if plane is None else torch.from_numpy(plane).to(self._device) for plane in planes]
+        target = Target(torch.from_numpy(photo.over(background)).to(self._device), *moved)
         if self._device.type != "cpu" and photo.alpha is None and target.nbytes <= self._room:
             self._kept[view] = target
             self._room -= target.nbytes

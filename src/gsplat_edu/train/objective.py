@@ -29,6 +29,10 @@ LEAST_SHARE = 0.25
 """A view that shows less than this share of the Gaussians weighs the opacity of those only. Views of one subject show
 a third and more of the start's Gaussians, those of an aerial capture of a city a tenth (benchmarks/RESULTS.md)."""
 
+OUTSIDE_WEIGHT = 0.3
+"""Weight of the mean alpha outside the masks of an object. 0.1 leaves twice the alpha outside, 3 costs 0.8 dB inside
+(benchmarks/RESULTS.md)."""
+
 PHOTO = "photo"
 """Name of the term that compares image and photo; logs and progress call it the loss."""
 
@@ -101,7 +105,8 @@ def sum_of_scalars(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
 def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
-    (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale)
+    (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
+    if nothing is outside of masks + weight_e sum_outside(alpha) / (H W)
 
     For fast, the mean is that of the Gaussians that the view shows if they are few. Adam moves a parameter by its full
     rate if all its gradients agree, however small they are: where a view shows a twentieth of the scene, the others
@@ -119,6 +124,8 @@ def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective
         terms["scale"] = MeanScale(config.mcmc.scale_weight, shell)
     if config.strategy == "fast" and config.fast.opacity_weight > 0:
         terms["opacity"] = MeanOpacity(config.fast.opacity_weight, config.fast.stop, LEAST_SHARE)
+    if config.outside_masks == "empty":
+        terms["outside"] = EmptyOutside(OUTSIDE_WEIGHT)
     return Objective(terms)
 
 
@@ -163,6 +170,25 @@ class MeanOpacity:
 
 
 @dataclass(frozen=True)
+class EmptyOutside:
+    """Keeps the scene empty where the capture's masks exclude pixels, as around an object that they cut out.
+
+    Args:
+        weight: lambda_e.
+    """
+
+    weight: float
+
+    def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
+        """Return weight sum_outside(1 - T) / (H W), with the transmittance T; 0 if the photo has no mask."""
+        transmittance, outside = rendered.output.transmittance, rendered.target.outside
+        if outside is None:
+            return transmittance.new_zeros(())
+        value: Tensor = _EmptyOutside.apply(transmittance, self.weight, outside)  # type: ignore[no-untyped-call]
+        return value
+
+
+@dataclass(frozen=True)
 class MeanScale:
     """Keeps scales small.
 
@@ -201,6 +227,24 @@ class _MeanOpacity(torch.autograd.Function):
                 gradient = reusable_tensor(logits.shape, logits).zero_().index_copy_(0, some, gradient)
             ctx.save_for_backward(gradient)
             return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
+        (gradient,) = ctx.saved_tensors
+        return _scaled(gradient, grad), None, None
+
+
+class _EmptyOutside(torch.autograd.Function):
+    """Compute weight sum_outside(1 - T) / (H W), with the gradient -weight / (H W) outside; on one thread, as above."""
+
+    @staticmethod
+    def forward(ctx: Any, transmittance: Tensor, weight: float, outside: Tensor) -> Tensor:  # noqa: ANN401
+        with one_thread():
+            share = weight / max(transmittance.numel(), 1)
+            gradient = reusable_tensor(transmittance.shape, transmittance).copy_(outside).mul_(-share)
+            ctx.save_for_backward(gradient)
+            return (transmittance * gradient).sum() - gradient.sum()
 
     @staticmethod
     @once_differentiable

@@ -12,6 +12,9 @@ Check = Callable[[str, Any], object]
 TRANSIENTS = ("none", "mask")
 """What to do about things that move."""
 
+OUTSIDE_MASKS = ("ignore", "empty")
+"""What the scene shows where the capture's masks exclude pixels: anything, or nothing."""
+
 
 @dataclass(frozen=True)
 class Setting:

@@ -167,7 +167,8 @@ class Trainer:
         self.last_name = ""
         self._render, self._callbacks = render, tuple(callbacks)
         behind, device = None if config.random_background else config.background, gaussians.means.device
-        self._feed = ViewFeed(views, config.view_order, config.seed, behind, device)
+        empty = config.outside_masks == "empty"
+        self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, outside=empty)
         self._parts, self._objective = parts, parts.objective or make_objective(config)
         self._learned = dict(parts.view_model.parameters())
         if taken := sorted(set(self._learned) & set(self.gaussians.tensors())):
@@ -258,7 +259,6 @@ class Trainer:
         return self.density is None or getattr(self.density, "observes_renders_only", False)
 
     def _measured(self) -> dict[str, Tensor]:
-        """Return the view model's tensors that no gradient moves."""
         return {name: tensor for name, tensor in self._learned.items() if name not in self._groups}
 
     def _make_optimizer(self, parameters: Mapping[str, Tensor]) -> Adam:

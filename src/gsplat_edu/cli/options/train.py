@@ -8,8 +8,8 @@ from typing import Any
 
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
+from gsplat_edu.cli.options.several import check_several
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
-from gsplat_edu.cli.ranks import num_processes, restarts_are_allowed
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
@@ -34,7 +34,7 @@ from gsplat_edu.train.config import (
     TrainConfig,
     recipe,
 )
-from gsplat_edu.train.setting import TRANSIENTS
+from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
 from gsplat_edu.validation import one_of
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
@@ -72,10 +72,16 @@ COMMON = (
 AUTO = "auto"
 """The value of an option that stands for a choice by the photos."""
 
-OPEN = {"appearance": APPEARANCES, "sky": SKIES, "transients": TRANSIENTS, "refine": REFINEMENTS}
+OPEN = {
+    "appearance": APPEARANCES,
+    "sky": SKIES,
+    "transients": TRANSIENTS,
+    "refine": REFINEMENTS,
+    "outside_masks": OUTSIDE_MASKS,
+}
 """Settings that can be left open by `AUTO`, and their other values."""
 
-OPEN_FOR_FAST = ("appearance", "sky")
+OPEN_FOR_FAST = ("appearance", "sky", "outside_masks")
 """Those that the strategy fast leaves open unless they are given."""
 
 NAMED = ("iterations", "seed", "strategy", "max_gaussians", "antialiased", "background", *OPEN)
@@ -271,6 +277,12 @@ def _add_photos(group: argparse._ArgumentGroup) -> None:
         " does if there are enough photos (default: none)",
     )
     group.add_argument(
+        "--outside-masks",
+        metavar="NAME",
+        help='"empty" keeps the scene empty where masks exclude pixels, as around an object; "ignore" lets it show'
+        ' anything there; "auto" lets the masks decide (default: auto for the strategy fast, ignore for the others)',
+    )
+    group.add_argument(
         "--refine",
         metavar="NAME",
         help='"poses", "intrinsics" or "both" are learned with the scene; "none" are not; "auto" decides by short'
@@ -332,35 +344,10 @@ def check(arguments: argparse.Namespace) -> None:
         raise DatasetError(
             f"{arguments.data}: does not exist; give the folder of a capture, of photos, or a video"
         )
-    if num_processes() > 1:
-        _check_several(arguments)
+    check_several(arguments)
     for flag, path in (("--points", arguments.points), ("--from", arguments.scene)):
         if path is not None and not path.exists():
             raise ArgumentError(f"{flag}: {path} does not exist; correct the name, or omit the option")
-
-
-def _check_several(arguments: argparse.Namespace) -> None:
-    """Check what only holds for several processes.
-
-    Raises:
-        ArgumentError: an option does not go with them.
-    """
-    size, batch = num_processes(), arguments.batch or 1
-    if batch % size:
-        raise ArgumentError(
-            f"--batch: is {batch}, but has to be a multiple of the {size} processes, so that each renders equally many"
-            " views"
-        )
-    if arguments.view:
-        raise ArgumentError(
-            "--view: shows the training of one process; leave it out, or train without torchrun"
-        )
-    if arguments.time_limit is not None and arguments.iterations is None:
-        raise ArgumentError(
-            "--time-limit: cannot choose the length for several processes; give --iterations too"
-        )
-    if restarts_are_allowed() and not arguments.resume:
-        raise ArgumentError("--resume: is needed with --max-restarts, so that a restart continues; add it")
 
 
 def options_from(arguments: argparse.Namespace) -> RunOptions:
@@ -441,15 +428,15 @@ def strategy_of(arguments: argparse.Namespace) -> str:
 
 
 def _given_or_stored(arguments: argparse.Namespace, name: str) -> str:
-    """Return the value of one of `OPEN`: given, of the run to resume, or "none" (see `left_open`)."""
+    """Return the value of one of `OPEN`: given, of the run to resume, or the first value (see `left_open`)."""
     given = getattr(arguments, name)
     if given is not None:
-        one_of(f"--{name}", given, (*OPEN[name], AUTO))
+        one_of(f"--{name.replace('_', '-')}", given, (*OPEN[name], AUTO))
     if given not in (None, AUTO):
         return str(given)
     folder = RunFolder(arguments.out)
     stored = folder.read_config().get("train") if arguments.resume and folder.exists() else None
-    return str(stored.get(name, "none")) if isinstance(stored, dict) else "none"
+    return str(stored.get(name, OPEN[name][0])) if isinstance(stored, dict) else OPEN[name][0]
 
 
 def left_open(arguments: argparse.Namespace) -> tuple[str, ...]:

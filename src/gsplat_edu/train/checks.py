@@ -1,0 +1,62 @@
+"""Checks of the settings' values: each raises an `ArgumentError` that names the setting, or returns such a check."""
+
+from __future__ import annotations
+
+from gsplat_edu.train.setting import Check
+from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
+
+
+def accept_whole(low: int, high: int | None = None) -> Check:
+    """Return a check for whole numbers within bounds."""
+    return lambda name, value: whole_number(name, value, low, high)
+
+
+def accept_positive(name: str, value: float) -> None:
+    """Accept numbers above 0."""
+    in_range(name, value, 0.0, open_low=True)
+
+
+def accept_not_negative(name: str, value: float) -> None:
+    """Accept numbers of at least 0."""
+    in_range(name, value, 0.0)
+
+
+def accept_fraction(name: str, value: float) -> None:
+    """Accept numbers from 0 to 1."""
+    in_range(name, value, 0.0, 1.0)
+
+
+def accept_share(name: str, value: float) -> None:
+    """Accept numbers above 0 up to 1."""
+    in_range(name, value, 0.0, 1.0, open_low=True)
+
+
+def accept_opacity(name: str, value: float) -> None:
+    """Accept opacities whose logit is finite."""
+    in_range(name, value, 0.0, 1.0 - 1e-6, open_low=True)
+
+
+def accept_at_least_1(name: str, value: float | None) -> None:
+    """Accept None and numbers of at least 1."""
+    if value is not None:
+        in_range(name, value, 1.0)
+
+
+def accept_cap(name: str, value: int | None) -> None:
+    """Accept None and whole numbers of at least 1."""
+    if value is not None:
+        whole_number(name, value, 1)
+
+
+def accept_color(name: str, value: object) -> None:
+    """Accept three numbers."""
+    float64_array(name, value, (3,))  # type: ignore[arg-type]
+
+
+def accept_name_of(names: tuple[str, ...]) -> Check:
+    """Return a check for one of some names."""
+    return lambda name, value: one_of(name, value, names)
+
+
+def accept_flag(name: str, value: object) -> None:
+    """Accept any value: the option is a flag."""
