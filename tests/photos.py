@@ -6,6 +6,8 @@ the programs that `processes.Program` starts, share them in a folder.
 
 import hashlib
 import os
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -34,3 +36,14 @@ def keep() -> None:
             return kept["image"], kept["transmittance"]
 
     synthetic.render_gaussians = procedural.render_gaussians = photographed
+
+
+def blank_png(W: int, H: int) -> bytes:
+    """Return a small gray PNG whose header claims a size; it does not hold as many pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", W, H, 8, 0, 0, 0, 0)
+    body = chunk(b"IDAT", zlib.compress(bytes(1000)))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + body + chunk(b"IEND", b"")

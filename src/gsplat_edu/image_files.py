@@ -6,6 +6,7 @@ photo contains.
 
 from __future__ import annotations
 
+import os
 import struct
 import threading
 import warnings
@@ -33,8 +34,19 @@ SPELLED = "JPEG, PNG, WebP, TIFF, BMP, PPM or HEIC"
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1")
 """Brands of a file's ftyp box that make it HEIF (ISO 23008-12), whatever the file's name."""
 
-MAX_PIXELS = 2**30
-"""Most pixels of a photo; a header that claims more belongs to a corrupt file or not to a photo."""
+MAX_PIXELS = 400_000_000
+"""Most pixels of a photo: cameras have up to 200 million. A header that claims more belongs to a corrupt file, to one
+that was made to fill the memory, or not to a photo."""
+
+MAX_SIDE = 65_535
+"""Longest side of a photo, px: JPEG's limit."""
+
+PLAIN_PIXELS = 64_000_000
+"""A photo of up to this many pixels may be compressed to any size, such as a blank mask."""
+
+PIXELS_PER_BYTE = 200
+"""Most pixels for each byte of a larger photo's file. JPEG's shortest code, six bits for 64 pixels of a blank image, gives
+85; a PNG of one colour has 340 and more."""
 
 BYTES_PER_PIXEL = 10
 """Memory needed for decoding: 4 bytes in Pillow, 4 after a conversion, and the array. Measured: 8 to 11."""
@@ -96,7 +108,7 @@ def opened_image(source: Path | bytes, formats: Sequence[str] = FORMATS) -> Iter
         The image. Call `require_room` before accessing its pixels.
 
     Raises:
-        UNDECODABLE: not an image of these formats, not a regular file, damaged, or larger than `MAX_PIXELS`.
+        UNDECODABLE: not an image of these formats, not a regular file, damaged, or with a size beyond the limits above.
         DatasetError: the file is HEIC, and pillow-heif is not installed; says how to install it.
     """
     with (
@@ -104,9 +116,19 @@ def opened_image(source: Path | bytes, formats: Sequence[str] = FORMATS) -> Iter
         BytesIO(source) if isinstance(source, bytes) else open_file(source) as file,
         _opened(file, source, formats) as image,
     ):
-        if image.width * image.height > MAX_PIXELS:
-            raise ValueError(f"{image.width}x{image.height} px is too large for a photo")
+        file.seek(0, os.SEEK_END)
+        if (reason := _implausible(*image.size, file.tell())) is not None:
+            raise ValueError(reason)
         yield image
+
+
+def _implausible(W: int, H: int, nbytes: int) -> str | None:
+    """Return why a file is not decoded, from the size in its header and that of the file; None if it is a photo's."""
+    if max(W, H) > MAX_SIDE or W * H > MAX_PIXELS:
+        return f"{W}x{H} px is too large for a photo: at most {MAX_SIDE:,} px a side and {MAX_PIXELS // 10**6} megapixels"
+    if W * H > PLAIN_PIXELS and PIXELS_PER_BYTE * nbytes < W * H:
+        return f"{W}x{H} px in {nbytes:,} bytes is too much for a photo; save it as a smaller one"
+    return None
 
 
 def _opened(file: BinaryIO | BytesIO, source: Path | bytes, formats: Sequence[str]) -> Image.Image:

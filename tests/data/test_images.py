@@ -13,7 +13,9 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import decode, decode_mask, image_size
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.errors import DatasetError
+from gsplat_edu.image_files import PIXELS_PER_BYTE
 from gsplat_edu.views import View
+from photos import blank_png
 
 RNG = np.random.default_rng(11)
 NOISE = RNG.integers(0, 256, (12, 16, 3), dtype=np.uint8)
@@ -217,10 +219,30 @@ def test_large_photos_are_read_and_pillows_limit_stays(tmp_path, name, limit, mo
     assert limit == Image.MAX_IMAGE_PIXELS
 
 
-def test_an_absurd_size_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("gsplat_edu.image_files.MAX_PIXELS", 100)
-    with pytest.raises(DatasetError, match=r"a\.png: .*16x12 px is too large for a photo"):
-        image_size(saved(tmp_path, Image.fromarray(NOISE)))
+@pytest.mark.parametrize(
+    ("W", "H", "says"),
+    [
+        (32, 6_094_852, "32x6094852 px is too large for a photo: at most 65,535 px a side"),
+        (30_000, 30_000, "30000x30000 px is too large for a photo: .* 400 megapixels"),
+        (17_290, 17_290, r"17290x17290 px in \d+ bytes is too much for a photo"),
+        (8_001, 8_000, "8001x8000 px in .* is too much for a photo"),
+    ],
+)
+def test_a_size_that_no_photo_has_is_refused_before_decoding(tmp_path, W, H, says):
+    path = tmp_path / "a.png"
+    path.write_bytes(blank_png(W, H))
+    for read in (image_size, decode, decode_mask):
+        with pytest.raises(DatasetError, match=rf"a\.png: .*{says}"):
+            read(path)
+
+
+def test_a_large_photo_may_be_compressed_as_photos_are(tmp_path):
+    path = tmp_path / "a.png"
+    content = blank_png(16_000, 12_500)  # 200 megapixels, the largest of today's cameras
+    path.write_bytes(content + bytes(16_000 * 12_500 // PIXELS_PER_BYTE - len(content)))
+    assert image_size(path) == (16_000, 12_500)
+    path.write_bytes(blank_png(8_000, 8_000))
+    assert image_size(path) == (8_000, 8_000), "a blank mask of 64 megapixels"
 
 
 def test_photos_of_different_sizes(tmp_path):

@@ -1,5 +1,6 @@
 """Entries: listed, adopted, renamed, removed and restored; names of every kind."""
 
+import os
 import re
 import shutil
 import threading
@@ -7,6 +8,7 @@ from importlib.resources import files
 
 import pytest
 
+from photos import blank_png
 from studio.conftest import picture
 
 NAMES = ["toy", "Hütte im Schnee", "写真", "<img src=x onerror=alert(1)>", "a'b`c$(d)", "ا"]  # noqa: RUF001
@@ -190,6 +192,18 @@ def test_thumbnails_are_upright_small_and_cached(page, studio):
     assert again.status_code == 304
     assert page.get("/api/photos/a/thumbs/broken.jpg").status_code == 422
     assert page.get("/api/photos/a/thumbs/a.jpg?side=100000").status_code == 400
+
+
+def test_photos_are_decoded_by_another_process_within_limits(page, studio):
+    """The server's own memory never holds a photo, whatever somebody uploads."""
+    entry(studio, "photos", "a", a__jpg=picture("JPEG", (400, 200)), b__png=blank_png(17_290, 17_290))
+    answer = page.get("/api/photos/a/thumbs/b.png")
+    assert answer.status_code == 422 and "is too much for a photo" in answer.json()["error"]
+    assert page.get("/api/photos/a/thumbs/a.jpg").status_code == 200
+    assert studio.decoder._process is not None and studio.decoder._process.pid != os.getpid()
+    studio.decoder.close()
+    assert page.get("/api/photos/a/thumbs/a.jpg").status_code == 200, "cached"
+    assert page.get("/api/photos/a/thumbs/a.jpg?side=128").status_code == 500, "nobody else decodes it"
 
 
 def test_fifty_clients_get_the_same_list(page, studio, jpeg):

@@ -51,13 +51,13 @@ class PhotoStats:
         detail: (8,) natural logarithm of the energy of fine gradients over that of coarse ones, by direction; zero if
             it was not measured.
         transparent: Whether a pixel is not opaque.
-        mask: (h, w) true for pixels of which more than half counts; None if the photo has no mask.
+        mask: (mh, mw) true for pixels of which more than half counts, as stored; None if the photo has no mask.
     """
 
     thumbnail: UInt8[np.ndarray, "h w 3"]
     detail: Float64[np.ndarray, "8"]
     transparent: bool = False
-    mask: Bool[np.ndarray, "h w"] | None = None
+    mask: Bool[np.ndarray, "mh mw"] | None = None
 
     @property
     def masked(self) -> bool:

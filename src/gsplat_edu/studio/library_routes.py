@@ -109,7 +109,7 @@ def _photos(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
 def _thumb(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
     _, entry = entry_of(studio, request)
     side = request.query_params.get("side", "256")
-    path = thumbnail(studio.library, entry, request.path_params["path"], side)
+    path = thumbnail(studio.decoder, studio.library, entry, request.path_params["path"], side)
     return file_answer(request, path, "image/jpeg")
 
 

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import os
-import threading
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import DatasetError, NotEnoughMemoryError
+from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.studio.library import Library, photo_names
 from gsplat_edu.studio.names import below, checked_path
 from gsplat_edu.studio.refusal import RefusedError, not_found
+from gsplat_edu.studio.workers import Worker
 from gsplat_edu.text import legible
 
 SIDES = (128, 256, 512, 1024)
 """Longest sides of thumbnails, px."""
 
-MOST_PIXELS = 300_000_000
-"""Pixels of a photo that is decoded for a thumbnail."""
-
 QUALITY = 85
-
-_decoding = threading.Semaphore(2)
-"""Photos that are decoded at once: each takes ten bytes per pixel."""
 
 
 def photo_list(entry: Path) -> list[dict[str, Any]]:
@@ -44,10 +38,11 @@ def photo_list(entry: Path) -> list[dict[str, Any]]:
     return found
 
 
-def thumbnail(library: Library, entry: Path, name: str, side: str) -> Path:
+def thumbnail(decoder: Worker, library: Library, entry: Path, name: str, side: str) -> Path:
     """Return the file of a photo's thumbnail, an upright JPEG, made if there is none yet.
 
     Args:
+        decoder: The process that decodes photos, one after the other, so that the server's memory never holds one.
         library: Has the cache.
         entry: The photo's entry.
         name: The photo, as a path below the entry.
@@ -65,9 +60,12 @@ def thumbnail(library: Library, entry: Path, name: str, side: str) -> Path:
         raise not_found(f"{entry.name}/{legible(name)}") from None
     target = library.hidden("cache") / "thumbs" / f"{cache_name(photo, facts)}-{side}.jpg"
     if not target.is_file():
-        with _decoding:
-            if not target.is_file():
-                _make(photo, int(side), target)
+        try:
+            decoder.ask("thumbnail", photo=str(photo), side=int(side), out=str(target))
+        except RefusedError as error:
+            if error.status is not HTTPStatus.BAD_REQUEST:
+                raise
+            raise RefusedError(str(error), HTTPStatus.UNPROCESSABLE_ENTITY) from None
     return target
 
 
@@ -78,20 +76,28 @@ def cache_name(path: Path, facts: os.stat_result) -> str:
     return f"{digest[:2]}/{digest[2:]}"
 
 
-def _make(photo: Path, side: int, target: Path) -> None:
+def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
+    """Write a thumbnail; a task of `gsplat_edu.studio.worker`.
+
+    Args:
+        photo: The photo's file.
+        side: Longest side, px.
+        out: File to write; an existing one is kept, because somebody else may have asked for it.
+
+    Raises:
+        DatasetError: the photo cannot be decoded.
+        NotEnoughMemoryError: it needs more memory than is free.
+    """
     import cv2
     from PIL import Image
 
-    from gsplat_edu.data.images import decode, image_orientation, image_size
+    from gsplat_edu.data.images import decode, image_orientation
     from gsplat_edu.views import Photo
 
-    try:
-        W, H = image_size(photo)
-        if W * H > MOST_PIXELS:
-            raise RefusedError(f"{photo.name}: has {W}x{H} px, too many for a preview")
-        pixels, alpha = decode(photo, image_orientation(photo), smaller=side)
-    except (DatasetError, NotEnoughMemoryError) as error:
-        raise RefusedError(str(error), HTTPStatus.UNPROCESSABLE_ENTITY) from None
+    path, target = Path(photo), Path(out)
+    if target.is_file():
+        return {}
+    pixels, alpha = decode(path, image_orientation(path), smaller=side)
     if alpha is not None:
         pixels = Photo(pixels, alpha).over((0.5, 0.5, 0.5))
     factor = side / max(pixels.shape[:2])
@@ -100,3 +106,4 @@ def _make(photo: Path, side: int, target: Path) -> None:
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
     with written_aside(target) as aside:
         Image.fromarray(pixels).save(aside, format="JPEG", quality=QUALITY)
+    return {}

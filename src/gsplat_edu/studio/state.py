@@ -23,6 +23,10 @@ TRAINING = "training"
 """Stage of `train` in which it looks at the file that lets it wait."""
 
 
+MOST_THUMBNAILS = 24
+"""Thumbnails that wait to be made: those of four tabs. Each holds one of the server's 40 threads."""
+
+
 class Studio:
     """A library with its jobs.
 
@@ -37,6 +41,7 @@ class Studio:
         self.uploads = Uploads(self.library, limits or Limits())
         self.stream = Stream()
         self.worker, self.prober = Worker(), Worker()  # a measurement must not hold up a page
+        self.decoder = Worker(waiting=MOST_THUMBNAILS)
         self.painter = Painter()
         jobs = self.library.hidden("jobs")
         self.queue = JobQueue(jobs, self._work, at_once, self.stream.changed, hold=self._hold)
@@ -89,6 +94,7 @@ class Studio:
         """End running jobs with a checkpoint; waiting ones are held by the next start."""
         self.worker.close()
         self.prober.close()
+        self.decoder.close()
         self.painter.close()
         self.queue.close()
 

@@ -1,4 +1,4 @@
-"""Short work that needs torch, in a process of its own that answers one request after the other.
+"""Short work that needs torch or much memory, in a process of its own that answers one request after the other.
 
     python -m gsplat_edu.studio.worker
 
@@ -208,11 +208,19 @@ def forecast(capture: str, resolution: float | None) -> dict[str, Any]:
     return {name: found[name] for name in QUALITIES}
 
 
+def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
+    """Write a photo's thumbnail; see `gsplat_edu.studio.pictures.make_thumbnail`."""
+    from gsplat_edu.studio.pictures import make_thumbnail
+
+    return make_thumbnail(photo, side, out)
+
+
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {
     "page": make_page,
     "live_page": make_live_page,
     "picture": make_picture,
     "check_edits": check_edits,
+    "thumbnail": make_thumbnail,
     "forecast": forecast,
 }
 

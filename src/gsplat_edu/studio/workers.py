@@ -1,4 +1,4 @@
-"""Processes that do short work with torch for the server, which never imports it."""
+"""Processes that do short work for the server, which never imports torch and never decodes a photo."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ class Worker:
 
     Args:
         nice: Steps by which it gives way to other processes.
+        waiting: Requests that may wait for it; None for `MOST_WAITING`.
     """
 
-    def __init__(self, nice: int = 0) -> None:
+    def __init__(self, nice: int = 0, waiting: int | None = None) -> None:
         self._command = (*COMMAND, str(nice))
         self._lock = threading.Lock()
         self._closed = False
-        self._room = threading.Semaphore(MOST_WAITING)
+        self._room = threading.Semaphore(MOST_WAITING if waiting is None else waiting)
         self._process: subprocess.Popen[bytes] | None = None
 
     def ask(self, task: str, **arguments: Any) -> Any:  # noqa: ANN401
