@@ -45,8 +45,8 @@ PLAIN_PIXELS = 64_000_000
 """A photo of up to this many pixels may be compressed to any size, such as a blank mask."""
 
 PIXELS_PER_BYTE = 200
-"""Most pixels for each byte of a larger photo's file. JPEG's shortest code, six bits for 64 pixels of a blank image, gives
-85; a PNG of one colour has 340 and more."""
+"""Most pixels for each byte of a larger photo's file. JPEG's shortest code, six bits for 64 pixels of a blank image,
+gives 85; a PNG of one colour has 340 and more."""
 
 BYTES_PER_PIXEL = 10
 """Memory needed for decoding: 4 bytes in Pillow, 4 after a conversion, and the array. Measured: 8 to 11."""
@@ -125,7 +125,8 @@ def opened_image(source: Path | bytes, formats: Sequence[str] = FORMATS) -> Iter
 def _implausible(W: int, H: int, nbytes: int) -> str | None:
     """Return why a file is not decoded, from the size in its header and that of the file; None if it is a photo's."""
     if max(W, H) > MAX_SIDE or W * H > MAX_PIXELS:
-        return f"{W}x{H} px is too large for a photo: at most {MAX_SIDE:,} px a side and {MAX_PIXELS // 10**6} megapixels"
+        limits = f"at most {MAX_SIDE:,} px a side and {MAX_PIXELS // 10**6} megapixels"
+        return f"{W}x{H} px is too large for a photo: {limits}"
     if W * H > PLAIN_PIXELS and PIXELS_PER_BYTE * nbytes < W * H:
         return f"{W}x{H} px in {nbytes:,} bytes is too much for a photo; save it as a smaller one"
     return None
