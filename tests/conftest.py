@@ -22,11 +22,14 @@ if "GSPLAT_TEST_NATIVE" in os.environ:  # another build of the native module: to
     sys.modules["gsplat_edu._native"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(sys.modules["gsplat_edu._native"])
 
+import outside
 import photos
 import slices
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch
 from shape_checker import pytest_runtest_setup  # noqa: F401
 from slices import pytest_collection_modifyitems, pytest_report_header, pytest_runtest_makereport  # noqa: F401
+
+outside.forbid()
 
 # Programs started in the background of a shell ignore Ctrl-C, and every tested program would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

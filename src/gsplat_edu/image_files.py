@@ -21,6 +21,7 @@ from PIL import Image
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.headroom import require_memory
 from gsplat_edu.reading import open_file
+from gsplat_edu.text import install_command
 
 HEIF = "HEIF"
 """Pillow's name for HEIC and HEIF, which pillow-heif decodes (extra `heic`)."""
@@ -146,7 +147,7 @@ def _opened(file: BinaryIO | BytesIO, source: Path | bytes, formats: Sequence[st
     try:
         from pillow_heif import HeifImageFile  # not registered with Pillow: that would be global
     except ImportError:
-        reason = 'HEIC needs pillow-heif: pip install -c constraints.txt ".[heic]", or export it as JPEG'
+        reason = f"HEIC needs pillow-heif: {install_command('heic')}, or export it as JPEG"
         name = "the image" if isinstance(source, bytes) else source
         raise DatasetError(f"{name}: cannot be decoded; {reason}", reason) from None
     image: Image.Image = HeifImageFile(file)  # type: ignore[no-untyped-call]

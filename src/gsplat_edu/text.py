@@ -125,3 +125,8 @@ def as_file_name(name: str) -> str:
         return decode_file_name(name.encode("utf-8", "surrogateescape"))
     except UnicodeError:  # an unpaired surrogate: no file has this name
         return name
+
+
+def install_command(extra: str) -> str:
+    """Return the command that adds an extra, in a clone of the repository; there is no published package yet."""
+    return f'pip install -c constraints.txt ".[{extra}]"'

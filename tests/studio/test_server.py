@@ -276,5 +276,5 @@ def test_the_server_imports_no_torch():
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     assert main(["studio", str(tmp_path / "library")]) == 2
-    line = "gsplat-edu studio: studio: uvicorn is not installed; pip install -c constraints.txt 'gsplat-edu[studio]'\n"
+    line = 'gsplat-edu studio: studio: uvicorn is not installed; pip install -c constraints.txt ".[studio]"\n'
     assert capsys.readouterr().err == line and not (tmp_path / "library").exists()

@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 from gsplat_edu.errors import ArgumentError, CheckpointError, SplatError
 from gsplat_edu.files import described
 from gsplat_edu.headroom import shortage
+from gsplat_edu.text import install_command
 
 LOOPBACK = "127.0.0.1"
 
@@ -137,7 +138,7 @@ def _distributed() -> Any:  # noqa: ANN401
     try:
         return importlib.import_module("distributed")
     except ModuleNotFoundError as error:
-        how = "pip install -c constraints.txt 'gsplat-edu[cluster]'"
+        how = install_command("cluster")
         raise ArgumentError(
             f"--workers, --scheduler: {error.name} is not installed; {how}, or omit them"
         ) from None

@@ -10,6 +10,7 @@ from dataclasses import replace
 from gsplat_edu.cli.printing import say
 from gsplat_edu.cli.screen import has_screen, open_in_browser
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.text import install_command
 from gsplat_edu.viewer.serve import exposure
 
 NEEDED = ("starlette", "uvicorn", "h11")
@@ -28,7 +29,7 @@ def run(arguments: argparse.Namespace) -> None:
         try:
             importlib.import_module(name)
         except ModuleNotFoundError:
-            how = "pip install -c constraints.txt 'gsplat-edu[studio]'"
+            how = install_command("studio")
             raise ArgumentError(f"studio: {name} is not installed; {how}") from None
     from gsplat_edu.studio.server import serve
     from gsplat_edu.studio.uploads import Limits

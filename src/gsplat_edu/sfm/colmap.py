@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.text import install_command
 
 POLL = 0.25
 """Seconds between two queries of a job's progress."""
@@ -38,9 +39,7 @@ def require_colmap() -> None:
         ArgumentError: it is missing; says how to install it.
     """
     if importlib.util.find_spec("pycolmap") is None:
-        raise ArgumentError(
-            'sfm: needs pycolmap, which is not installed: pip install -c constraints.txt ".[sfm]"'
-        )
+        raise ArgumentError(f"sfm: needs pycolmap, which is not installed: {install_command('sfm')}")
 
 
 def call(

@@ -56,7 +56,7 @@ def add_blocks(parser: argparse.ArgumentParser, default: str | None = None) -> N
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where blocks are trained."""
-    group = parser.add_argument_group("cluster (pip install 'gsplat-edu[cluster]')")
+    group = parser.add_argument_group("cluster (extra cluster)")
     group.add_argument(
         "--workers",
         type=whole_number_text,

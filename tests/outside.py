@@ -1,0 +1,34 @@
+"""Forbids the process of the tests to contact other computers, so that every test shows that a command does not."""
+
+import ipaddress
+import sys
+
+EVENTS = ("socket.connect", "socket.sendto")
+"""Python's audit events with an address."""
+
+
+class OutsideError(AssertionError):
+    """A test contacted another computer."""
+
+
+def is_here(address: object) -> bool:
+    """Return whether a socket's address is on this computer: a path, or a loopback address."""
+    if not isinstance(address, tuple):
+        return True
+    host = address[0]
+    if isinstance(host, bytes):
+        host = host.decode("ascii", "replace")
+    try:
+        return host in ("", "localhost") or ipaddress.ip_address(host.partition("%")[0]).is_loopback
+    except ValueError:
+        return False
+
+
+def forbid() -> None:
+    """Raise an error at every connection to another computer from now on; it cannot be undone."""
+
+    def heard(event: str, arguments: tuple[object, ...]) -> None:
+        if event in EVENTS and not is_here(arguments[1]):
+            raise OutsideError(f"{event} to {arguments[1]}: a test contacts another computer")
+
+    sys.addaudithook(heard)
