@@ -15,6 +15,14 @@ _SURROGATES = re.compile("[\ud800-\udfff]")
 _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
 """Characters that move the cursor, change colours, break a line or reverse the direction of text."""
 
+LONGEST_WORD = 300
+"""Characters of a word in a line for people: most paths are shorter."""
+
+LONGEST_LINE = 1_000
+"""Characters of a line for people."""
+
+_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
+
 _WHOLE = re.compile("[0-9]{1,20}")
 
 MOST_SPELLED = 1e12
@@ -78,6 +86,15 @@ def shortened(text: str, most: int = 80) -> str:
         return text
     end = (most - 3) // 3
     return f"{text[: most - 3 - end]}...{text[len(text) - end :]}"
+
+
+def bounded(line: str) -> str:
+    """Return a line for people of limited length; values that it quotes may be of any length, and are shortened.
+
+    The start and the end remain: they say what is wrong, and what to do.
+    """
+    words = _LONG_WORD.sub(lambda match: shortened(match[0], LONGEST_WORD), line)
+    return shortened(words, LONGEST_LINE)
 
 
 def whole_of(text: str) -> int | None:

@@ -49,14 +49,15 @@ DROP = """([files, place]) => {
 
 
 @contextlib.contextmanager
-def served(folder, worker):
+def served(folder, worker, limits=None):
     """Serve a library from a thread of this process; yields the studio and the URL with its token.
 
     Args:
         folder: The library's folder.
         worker: Does what needs torch.
+        limits: How much may be taken in.
     """
-    studio = Studio(folder)
+    studio = Studio(folder, limits=limits)
     studio.worker.close()
     studio.worker = studio.painter.worker = worker
     with socket.create_server(("127.0.0.1", 0)) as sock:

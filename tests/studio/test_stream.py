@@ -8,6 +8,9 @@ from gsplat_edu.jobs.record import Work
 from gsplat_edu.studio import stream as stream_module
 from gsplat_edu.studio.stream import Stream
 
+ODD = ("\u00b2", "\u0663", "+6", "-6", " 6", "6_0", "6.0", "9" * 5_000)
+"""What `str.isdigit`, `str.isdecimal` or `int` take for numbers."""
+
 
 def collected(stream, last_id, count):
     """Return the next events as (id, kind, data)."""
@@ -42,7 +45,8 @@ def test_unknown_ids_start_anew(monkeypatch):
     stream = Stream()
     for number in range(6):
         stream.publish("job", {"number": number})
-    for last_id in (None, "", "other-3", f"{stream.boot}-x", f"{stream.boot}-99", f"{stream.boot}-2"):
+    odd = [f"{stream.boot}-{number}" for number in ODD]
+    for last_id in (None, "", "other-3", f"{stream.boot}-x", f"{stream.boot}-99", f"{stream.boot}-2", *odd):
         ((found_id, kind, _),) = collected(stream, last_id, 1)
         assert kind == "reset" and found_id == f"{stream.boot}-6", last_id
     assert [data["number"] for _, _, data in collected(stream, f"{stream.boot}-3", 3)] == [3, 4, 5]

@@ -24,7 +24,7 @@ from gsplat_edu.headroom import shortage
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Failed, Interrupted
 from gsplat_edu.render.settings import BACKENDS
-from gsplat_edu.text import printable
+from gsplat_edu.text import bounded, printable
 from gsplat_edu.viewer.serve import LOOPBACK
 
 EXIT_BUG = 1
@@ -105,7 +105,7 @@ class OneLineParser(argparse.ArgumentParser):
         if speaks_for_all():
             line = f"{self.prog}: {message}{end} see {self.prog} --help"
             complain(line)
-            emitter.emit(Failed(line, EXIT_BAD_INPUT))
+            emitter.emit(Failed(bounded(printable(line)), EXIT_BAD_INPUT))
         self.exit(EXIT_BAD_INPUT)
 
 
@@ -225,7 +225,7 @@ def run_command(program: str, command: Callable[[], None], debug: bool) -> int:
             traceback.print_exc()
         if speaks_for_all():
             complain(f"{program}: {line}")
-            emitter.emit(Failed(f"{program}: {printable(line)}", EXIT_BAD_INPUT))
+            emitter.emit(Failed(bounded(printable(f"{program}: {line}")), EXIT_BAD_INPUT))
         return EXIT_BAD_INPUT
     emitter.finish()
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from gsplat_edu.text import printable
+from gsplat_edu.text import bounded, printable
 
 
 def say(sentence: str) -> None:
@@ -13,8 +13,8 @@ def say(sentence: str) -> None:
 
 
 def complain(sentence: str) -> None:
-    """Print a line to standard error."""
-    print(printable(sentence), file=sys.stderr)
+    """Print a line to standard error; values in it may be of any length, and are shortened."""
+    print(bounded(printable(sentence)), file=sys.stderr)
 
 
 def escape_unencodable_characters() -> None:

@@ -17,6 +17,7 @@ from starlette.routing import BaseRoute
 
 from gsplat_edu.studio import job_routes, library_routes, live_routes, run_routes, scene_routes
 from gsplat_edu.studio.guard import Guard
+from gsplat_edu.studio.patience import Patience
 from gsplat_edu.studio.refusal import not_found
 from gsplat_edu.studio.replies import act, file_answer
 from gsplat_edu.studio.state import Studio
@@ -65,7 +66,8 @@ def application(
         *library_routes.routes(),
     ]
     guard = Middleware(Guard, token=token, host=host, cookie=cookie)
-    app = Starlette(routes=routes, middleware=[guard], lifespan=lifespan)
+    patience = Middleware(Patience, seconds=studio.uploads.limits.stall)
+    app = Starlette(routes=routes, middleware=[guard, patience], lifespan=lifespan)
     app.state.studio = studio
     return app
 

@@ -214,8 +214,12 @@ class Library:
         """
         if not source.is_absolute():
             raise RefusedError(f"path: {source} is relative; give the whole path, from the root")
-        source = source.resolve()
-        if not source.exists():
+        try:
+            source = source.resolve()
+            exists = source.exists()
+        except (OSError, ValueError, RuntimeError):  # too long, with a NUL, a circle of links
+            exists = False
+        if not exists:
             raise RefusedError(f"path: {source} does not exist; correct it")
         if source.is_relative_to(self.root) or self.root.is_relative_to(source):
             raise RefusedError(f"path: {source} overlaps the library; give a place outside of it")

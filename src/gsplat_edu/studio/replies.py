@@ -22,16 +22,13 @@ from gsplat_edu.files import described
 from gsplat_edu.reading import parse_json
 from gsplat_edu.studio.refusal import RefusedError, not_found, too_large
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.text import legible, shortened, whole_of
+from gsplat_edu.text import bounded, legible, shortened, whole_of
 
 MOST_JSON = 16 << 20
 """Bytes of a JSON body."""
 
 Act = Callable[[Studio, Request, Any], Any]
 """A route: the studio, the request and its JSON body (None without one); returns what is sent as JSON, or an answer."""
-
-LONGEST_ERROR = 600
-"""Characters of an error; paths in it may be long."""
 
 CLOSE = {"Connection": "close"}
 """Header of an answer to a request whose body may not have been read to its end."""
@@ -99,19 +96,24 @@ def answered(endpoint: Callable[[Request], Awaitable[Response]]) -> Callable[[Re
 async def drain(request: Request, status: HTTPStatus) -> None:
     """Receive the rest of a body that is refused: a browser that is still sending would lose the answer.
 
-    A body that is refused for its size, or announced to be larger than `MOST_DRAINED`, is not received.
+    A body that is refused for its size or because it stalls, or announced to be larger than `MOST_DRAINED`, is not
+    received.
 
     Args:
         request: The request.
         status: With which it is refused.
     """
     length = whole_of(request.headers.get("content-length", "0"))
-    for_size = status in (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.INSUFFICIENT_STORAGE)
-    if for_size or length is None or length > MOST_DRAINED:
+    given_up = (
+        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+        HTTPStatus.INSUFFICIENT_STORAGE,
+        HTTPStatus.REQUEST_TIMEOUT,
+    )
+    if status in given_up or length is None or length > MOST_DRAINED:
         return
     size = 0
-    # RuntimeError: the body was received already
-    with contextlib.suppress(ClientDisconnect, RuntimeError, TimeoutError):
+    # RuntimeError: the body was received already; RefusedError: it stalls
+    with contextlib.suppress(ClientDisconnect, RuntimeError, TimeoutError, RefusedError):
         async with asyncio.timeout(LONGEST_DRAIN):
             async for piece in request.stream():
                 size += len(piece)
@@ -121,12 +123,7 @@ async def drain(request: Request, status: HTTPStatus) -> None:
 
 def refusal(line: str, status: HTTPStatus) -> JSONResponse:
     """Return an error as an answer: {"error": the line}."""
-    return JSONResponse({"error": bounded(line)}, status, headers=CLOSE)
-
-
-def bounded(line: str) -> str:
-    """Return a line for people as an answer has it, of limited length: its start and its end, which has the advice."""
-    return shortened(legible(line), LONGEST_ERROR)
+    return JSONResponse({"error": bounded(legible(line))}, status, headers=CLOSE)
 
 
 async def json_body(request: Request) -> Any:  # noqa: ANN401

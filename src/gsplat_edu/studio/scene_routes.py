@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import threading
 from http import HTTPStatus
@@ -26,9 +25,9 @@ from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, scene_of
 from gsplat_edu.studio.library import Library
 from gsplat_edu.studio.names import LONGEST_FILE, below, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
-from gsplat_edu.studio.replies import CLOSE, act, bounded, content_length, drain, entry_of, file_answer
+from gsplat_edu.studio.replies import CLOSE, act, content_length, drain, entry_of, file_answer
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.text import legible
+from gsplat_edu.text import bounded, legible
 
 KEPT_PAGES = 12
 """Pages in the cache."""
@@ -189,7 +188,7 @@ def _plain(endpoint: Any) -> Any:  # noqa: ANN401
         except OSError as error:
             line, status = described(error), HTTPStatus.INTERNAL_SERVER_ERROR
         await drain(request, status)
-        return PlainTextResponse(f"{bounded(line)}\n", status, headers=CLOSE)
+        return PlainTextResponse(f"{bounded(legible(line))}\n", status, headers=CLOSE)
 
     return safe
 
@@ -214,11 +213,10 @@ async def _store_edits(request: Request) -> Response:
     if (content_length(request) or 0) > MOST_BYTES:
         raise too_large(f"{EDITS}: may have {MOST_BYTES:,} bytes")
     received = bytearray()
-    async with asyncio.timeout(60):
-        async for piece in request.stream():
-            received += piece
-            if len(received) > MOST_BYTES:
-                raise too_large(f"{EDITS}: may have {MOST_BYTES:,} bytes")
+    async for piece in request.stream():
+        received += piece
+        if len(received) > MOST_BYTES:
+            raise too_large(f"{EDITS}: may have {MOST_BYTES:,} bytes")
     data = bytes(received)
     expected = request.headers.get("if-match", "").strip('"')
     version = await run_in_threadpool(_store, studio, kind, entry, data, expected)

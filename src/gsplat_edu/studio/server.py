@@ -56,6 +56,12 @@ class PatientProtocol(H11Protocol):
         else:
             self._heard()
 
+    def on_response_complete(self) -> None:
+        """Close a connection whose request was answered although its body has not come: nothing waits for the rest."""
+        super().on_response_complete()
+        if self.conn.their_state is h11.SEND_BODY and not self.transport.is_closing():
+            self.transport.close()
+
     def _wait(self) -> None:
         if self._late is None:
             self._late = self.loop.call_later(REQUEST_SECONDS, self._close)

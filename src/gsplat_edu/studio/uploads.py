@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import shutil
 import threading
@@ -23,9 +22,6 @@ from gsplat_edu.studio.names import below, checked_path
 from gsplat_edu.studio.refusal import RefusedError, conflict, too_large
 from gsplat_edu.studio.unpack import ZipLimits, unpack
 
-STALL = 30.0
-"""Seconds without a byte after which an upload is given up."""
-
 AT_ONCE = 16
 """Uploads that are received at the same time."""
 
@@ -40,6 +36,8 @@ class Limits:
         spare: Bytes of the disk that stay free.
         entry_files: Files of one entry.
         zipped: What a zip file may hold.
+        stall: Seconds of waiting after which a body of a request that does not go on is given up
+            (`gsplat_edu.studio.patience`).
     """
 
     file: int = 4 << 30
@@ -47,6 +45,7 @@ class Limits:
     spare: int = 1 << 30
     entry_files: int = 20_000
     zipped: ZipLimits = field(default_factory=ZipLimits)
+    stall: float = 30.0
 
     def document(self) -> dict[str, int]:
         """Return the limits for the page."""
@@ -133,7 +132,7 @@ class Uploads:
             Its size.
 
         Raises:
-            RefusedError: it is too large, stalls, is shorter than announced, or is no photo although its name says so.
+            RefusedError: it is too large, is shorter than announced, or is no photo although its name says so.
         """
         part = self.library.part(target.suffix.lower())
         try:
@@ -190,7 +189,7 @@ class Uploads:
         await run_in_threadpool(self._reserve, reserved, begins=True)
         try:
             with part.open("xb") as file:
-                while (chunk := await asyncio.wait_for(anext(chunks, None), STALL)) is not None:
+                async for chunk in chunks:
                     size += len(chunk)
                     if size > min(self.limits.file, length or size):
                         raise too_large(
@@ -200,10 +199,6 @@ class Uploads:
                         await run_in_threadpool(self._reserve, len(chunk))
                         reserved += len(chunk)
                     await run_in_threadpool(file.write, chunk)
-        except TimeoutError:
-            raise RefusedError(
-                f"file: no byte came for {STALL:.0f} s; send it again", HTTPStatus.REQUEST_TIMEOUT
-            ) from None
         finally:
             with self._lock:
                 self._running -= 1

@@ -1,0 +1,63 @@
+"""How long the server waits for the body of a request, and for the loop between parts of an answer."""
+
+from __future__ import annotations
+
+import asyncio
+from http import HTTPStatus
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from gsplat_edu.studio.refusal import RefusedError
+
+STEP = 4096
+"""Bytes of a body that count as progress: one byte now and then does not keep a connection."""
+
+
+class Patience:
+    """Gives up bodies that stall, whichever route reads them, and stops to write to connections that are gone.
+
+    Only the time in which a route waits for bytes counts, not that in which it writes them to a disk.
+
+    Args:
+        app: What answers the requests.
+        seconds: Waiting within which `STEP` more bytes of a body, or its end, have to come.
+    """
+
+    def __init__(self, app: ASGIApp, seconds: float) -> None:
+        self.app, self.seconds = app, seconds
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        left, new, is_whole = self.seconds, 0, False
+        loop = asyncio.get_running_loop()
+
+        async def patient() -> Message:
+            nonlocal left, new, is_whole
+            if is_whole:  # further messages say that the browser is gone
+                return await receive()
+            began = loop.time()
+            try:
+                message = await asyncio.wait_for(receive(), left)
+            except TimeoutError:
+                raise RefusedError(
+                    f"body: fewer than {STEP:,} bytes of it came in {self.seconds:g} s; send it again",
+                    HTTPStatus.REQUEST_TIMEOUT,
+                ) from None
+            left -= loop.time() - began
+            new += len(message.get("body", b""))
+            if new >= STEP:
+                left, new = self.seconds, 0
+            is_whole = message["type"] != "http.request" or not message.get("more_body", False)
+            return message
+
+        async def yielding(message: Message) -> None:
+            await send(message)
+            if message.get("more_body", False):
+                # else many parts are written before the loop can tell that the connection is gone, and asyncio
+                # complains about each of them
+                await asyncio.sleep(0)
+
+        await self.app(scope, patient, yielding)
