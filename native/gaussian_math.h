@@ -112,7 +112,7 @@ struct Chunk {
     int count, padded;
     alignas(64) T mean[3][CHUNK];
     T quat[4][CHUNK], scale[3][CHUNK];  // raw parameters; scales after exp
-    T cov3d[9][CHUNK];                  // covariances given directly
+    double cov3d[9][CHUNK];             // covariances given directly
     T opacity[CHUNK];                   // after the sigmoid
 };
 
@@ -224,7 +224,7 @@ GSPLAT_INLINE void project_covariance(const Chunk<T> &in, int l, bool raw, Proje
         g.det0 = dot3(g.n, g.n);
     } else {
         VD S[9];
-        for (int k = 0; k < 9; ++k) S[k] = widened(in.cov3d[k] + l);
+        for (int k = 0; k < 9; ++k) S[k] = load<VD>(in.cov3d[k] + l);
         for (int k = 0; k < 3; ++k) {  // r = t S here
             g.r0[k] = g.t0[0] * S[k] + g.t0[1] * S[3 + k] + g.t0[2] * S[6 + k];
             g.r1[k] = g.t1[0] * S[k] + g.t1[1] * S[3 + k] + g.t1[2] * S[6 + k];

@@ -53,13 +53,16 @@ struct Scene {
     const T *quats, *log_scales;                       // N 4, N 3
     const T *sh0, *sh_rest, *logit_opacities;          // N 3, N rest 3, N
     int32_t rest;                                      // coefficients per channel in sh_rest
-    const T *cov3ds, *colors, *opacities;              // N 3 3, N 3, N
+    const double *cov3ds;                              // N 3 3; in float the determinants of thin ones would lose their digits
+    const T *colors, *opacities;                       // N 3, N
 };
 
 // Gradients of the scene; every entry of a range is written, including zeros.
 template <class T>
 struct SceneGrads {
-    T *means, *quats, *log_scales, *sh0, *sh_rest, *logit_opacities, *cov3ds, *colors, *opacities;
+    T *means, *quats, *log_scales, *sh0, *sh_rest, *logit_opacities;
+    double *cov3ds;
+    T *colors, *opacities;
     T *features;                                       // N channels; null if there are none
     T *means2d_norm;                                   // N, |(gu W/2, gv H/2)|
     int64_t first;                                     // Gaussian in the first row of the arrays except means2d_norm

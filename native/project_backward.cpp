@@ -16,7 +16,8 @@ constexpr uint32_t MOST_FETCHED = 32;  // slots of a Gaussian, in advance
 template <class T>
 struct Gradients {
     alignas(64) T mean[3][CHUNK], quat[4][CHUNK], log_scale[3][CHUNK], opacity[CHUNK];  // opacity: raw or direct
-    T cov3d[9][CHUNK], color[3][CHUNK], means2d_norm[CHUNK];
+    double cov3d[9][CHUNK];
+    T color[3][CHUNK], means2d_norm[CHUNK];
     Shade<T> shades;
     T drawn[CHUNK];  // 0 where all gradients are 0
 };
@@ -103,8 +104,8 @@ GSPLAT_INLINE VD direct_gradient(const Projected &g, const Whitened &m, VD lit, 
         d1[k] = (c + c) * g.r1[k] + b * g.r0[k];
         total += d0[k] * g.t0[k] + d1[k] * g.t1[k];
         for (int j = 0; j < 3; ++j)
-            narrowed(out.cov3d[3 * k + j] + l,
-                     a * g.t0[k] * g.t0[j] + c * g.t1[k] * g.t1[j] + half * b * (g.t0[k] * g.t1[j] + g.t1[k] * g.t0[j]));
+            store(out.cov3d[3 * k + j] + l,
+                  a * g.t0[k] * g.t0[j] + c * g.t1[k] * g.t1[j] + half * b * (g.t0[k] * g.t1[j] + g.t1[k] * g.t0[j]));
     }
     return total;
 }
@@ -259,7 +260,7 @@ GSPLAT_INLINE void zero(const ProjectBackwardArgs<T> &args, int64_t i) {
             memset(grads.sh_rest + 3 * int64_t(args.scene.rest) * i, 0, 3 * size_t(args.scene.rest) * sizeof(T));
         grads.logit_opacities[i] = 0;
     } else {
-        memset(grads.cov3ds + 9 * i, 0, 9 * sizeof(T));
+        memset(grads.cov3ds + 9 * i, 0, 9 * sizeof(double));
         memset(grads.colors + 3 * i, 0, 3 * sizeof(T));
         grads.opacities[i] = 0;
     }

@@ -58,7 +58,7 @@ struct PerGaussian {
         const Kind kind = means.is(Kind::F32) ? Kind::F32 : Kind::F64;
         n = means.shape[0];
         if (direct) {
-            cov3ds = a.array("cov3ds", {kind}, {n, 3, 3}, written);
+            cov3ds = a.array("cov3ds", {Kind::F64}, {n, 3, 3}, written);
             colors = a.array("colors", {kind}, {n, 3}, written);
             opacities = a.array("opacities", {kind}, {n}, written);
             return;
@@ -86,7 +86,7 @@ struct SceneArrays : PerGaussian {
                 sh_rest.as<T>(),
                 logit_opacities.as<T>(),
                 int32_t(rest),
-                cov3ds.as<T>(),
+                cov3ds.as<double>(),
                 colors.as<T>(),
                 opacities.as<T>()};
     }
@@ -106,8 +106,8 @@ struct GradientArrays : PerGaussian {
 
     template <class T>
     SceneGrads<T> as() const {
-        return {means.as<T>(),  quats.as<T>(),  log_scales.as<T>(), sh0.as<T>(),      sh_rest.as<T>(),      logit_opacities.as<T>(),
-                cov3ds.as<T>(), colors.as<T>(), opacities.as<T>(),  features.as<T>(), means2d_norm.as<T>(), 0};
+        return {means.as<T>(),       quats.as<T>(),  log_scales.as<T>(), sh0.as<T>(),      sh_rest.as<T>(),      logit_opacities.as<T>(),
+                cov3ds.as<double>(), colors.as<T>(), opacities.as<T>(),  features.as<T>(), means2d_norm.as<T>(), 0};
     }
 };
 

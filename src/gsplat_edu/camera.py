@@ -290,7 +290,10 @@ def as_camera(name: str, camera: CameraLike) -> Camera:
     if isinstance(camera, Camera):
         return camera
     members = ("R", "eye", "fx", "fy", "cx", "cy", "H", "W")
-    missing = [member for member in members if not hasattr(camera, member)]
+    try:
+        missing = [member for member in members if not hasattr(camera, member)]
+    except RuntimeError:  # a tensor has an H, but refuses to give that of five axes
+        missing = list(members)
     if missing:
         raise ArgumentError(
             f"{name}: is not a camera, a {type(camera).__name__} has no {', '.join(missing)}; "

@@ -201,8 +201,13 @@ def check_tensor(name: str, value: Tensor, shape: Shape, sizes: dict[str, int]) 
 
     Raises:
         ShapeError: the shape differs; see `gsplat_edu.validation.check_shape`.
-        ArgumentError: an entry is NaN or infinite.
+        ArgumentError: it is not a tensor of real numbers, or an entry is NaN or infinite.
     """
+    if not isinstance(value, Tensor):
+        raise ArgumentError(f"{name}: is of type {type(value).__name__}, but has to be a tensor")
+    if value.is_complex() or value.is_meta:
+        kind = "complex" if value.is_complex() else "without data"
+        raise ArgumentError(f"{name}: is {kind}, but has to hold real numbers")
     check_shape(name, value.shape, shape, sizes)
     if not is_finite(value):
         raise ArgumentError(
@@ -212,7 +217,7 @@ def check_tensor(name: str, value: Tensor, shape: Shape, sizes: dict[str, int]) 
 
 def is_finite(value: Tensor) -> bool:
     """Return whether all entries are finite, without a tensor of answers: a scene may fill half the memory."""
-    if not value.numel():
+    if not value.numel() or not value.is_floating_point():
         return True
     low, high = value.detach().aminmax()  # NaN if there is one
     return bool(torch.isfinite(low) & torch.isfinite(high))

@@ -123,18 +123,45 @@ def whole_number(name: str, value: object, low: int, high: int | None = None) ->
         number = None
     if number is None or number < low or (high is not None and number > high):
         bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
-        raise ArgumentError(f"{name}: is {value!r}, but has to be a whole number {bounds}")
+        raise ArgumentError(f"{name}: is {shown(value)}, but has to be a whole number {bounds}")
     return number
 
 
-def one_of(name: str, value: str, choices: Sequence[str]) -> None:
+def flag(name: str, value: object) -> bool:
+    """Check that a value is a boolean, Python's or NumPy's; 0 and 1 are taken as well.
+
+    Raises:
+        ArgumentError: it is not.
+    """
+    if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
+        raise ArgumentError(f"{name}: is {shown(value)}, but has to be True or False")
+    return bool(value)
+
+
+def of_type(name: str, value: object, kind: type) -> None:
+    """Check that a value is an instance of a class.
+
+    Raises:
+        ArgumentError: it is not.
+    """
+    if not isinstance(value, kind):
+        raise ArgumentError(f"{name}: is {shown(value)}, but has to be of type {kind.__name__}")
+
+
+def shown(value: object) -> str:
+    """Return a scalar or a short word as Python writes it, of other values the type: a message is one line."""
+    text = repr(value) if isinstance(value, bool | int | float | str | bytes | None) else ""
+    return text if 0 < len(text) <= 40 else f"of type {type(value).__name__}"
+
+
+def one_of(name: str, value: object, choices: Sequence[str]) -> None:
     """Check that a word is one of the allowed choices.
 
     Raises:
         ArgumentError: it is not; the message lists the choices.
     """
-    if value not in choices:
-        raise ArgumentError(f"{name}: is {value!r}, but has to be one of {', '.join(choices)}")
+    if not isinstance(value, str) or value not in choices:
+        raise ArgumentError(f"{name}: is {shown(value)}, but has to be one of {', '.join(choices)}")
 
 
 def _spelled(shape: Shape, sizes: Mapping[str, int]) -> str:

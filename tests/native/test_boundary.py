@@ -383,7 +383,9 @@ def test_a_step_in_the_backward_pass_needs_a_composited_frame_of_raw_parameters(
     with pytest.raises(ValueError, match="call composite first"):
         frame().adam(**fields)
     arrays = {"means": (N, 3), "cov3ds": (N, 3, 3), "colors": (N, 3), "opacities": (N,)}
-    direct = frame(scene=_native.Scene(**{name: torch.zeros(shape) for name, shape in arrays.items()}))
+    tensors = {name: torch.zeros(shape) for name, shape in arrays.items()}
+    tensors["cov3ds"] = tensors["cov3ds"].double()
+    direct = frame(scene=_native.Scene(**tensors))
     direct.composite(images=fields["images"], features=None)
     with pytest.raises(ValueError, match="Adam moves raw parameters"):
         direct.adam(**fields)

@@ -1,6 +1,7 @@
 """No crashes, hangs or leaks, and no bad Gaussian that spoils the others."""
 
 import dataclasses
+import math
 import os
 import subprocess
 import sys
@@ -183,14 +184,32 @@ def test_parameters_need_not_be_contiguous():
 def test_other_dtypes_are_refused():
     with pytest.raises(ArgumentError, match="all float32 or all float64"):
         render(random(3).gaussians(torch.float16), camera(9, 9), backend="cpu")
+    zeros, ball, view = torch.zeros(1, 3), torch.eye(3)[None], camera(9, 9)
     with pytest.raises(ArgumentError, match="all float32 or all float64"):
-        render_covariances(
-            torch.zeros(1, 3),
-            torch.eye(3)[None].double(),
-            torch.zeros(1, 3),
-            torch.zeros(1),
-            camera(9, 9),
-        )
+        render_covariances(zeros, ball, zeros.double(), torch.zeros(1), view)
+    with pytest.raises(ArgumentError, match="^cov3ds: are torch.float32"):
+        render_covariances(zeros.double(), ball, zeros.double(), torch.zeros(1).double(), view)
+
+
+def test_float64_covariances_keep_the_digits_of_needles():
+    """A needle of 1,000 x 0.2 px at 45 degrees: in float32 the determinant would keep 1 digit at most."""
+    half = math.sqrt(0.5)
+    axes = torch.tensor([[half, -half, 0.0], [half, half, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    axes = axes * torch.tensor([1000.0, 0.2, 0.0], dtype=torch.float64)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        given = (torch.tensor([[4.125, 4.0, 1.0]]), torch.ones(1, 3), torch.full((1,), 0.9))
+        means, colors, opacities = (t.to(dtype) for t in given)
+        view = Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 0.0, 0.0, 9, 9)
+        settings = RenderSettings(dilation=0.0)
+        covs = (axes @ axes.mT)[None].requires_grad_()
+        out = render_covariances(means, covs, colors, opacities, view, settings)
+        out.image.sum().backward()
+        found.append((out.image.detach().double(), covs.grad))
+    # alpha <= 1 and |d log alpha| is below 20 roundings of eps = 6e-8
+    assert float((found[0][0] - found[1][0]).abs().max()) < 20 * 6e-8
+    assert float(found[1][0][0, 0].max()) > 0.01 and float(found[1][0][0, 8].max()) == 0.0
+    assert float((found[0][1] - found[1][1]).abs().max()) < 1e-4 * float(found[1][1].abs().max())
 
 
 def test_several_cameras_give_stacked_views():

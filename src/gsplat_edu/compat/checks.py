@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_edu.constants import DILATION_MAX
+from gsplat_edu.constants import DILATION_MAX, SPLAT_LIMIT
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.gaussians import check_tensor
 from gsplat_edu.kernels import SUFFIXES
-from gsplat_edu.sh import num_coefficients
-from gsplat_edu.validation import in_range, one_of, whole_number
+from gsplat_edu.validation import flag, in_range, one_of, whole_number
 
 
 class RollingShutterType(Enum):
@@ -28,6 +28,9 @@ class RollingShutterType(Enum):
     ROLLING_RIGHT_TO_LEFT = 3
     GLOBAL = 4
 
+
+MOST_PIXELS = 2**31 - 1
+"""Largest width and height, px: the kernels count in 32 bits."""
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 """Values of `render_mode`."""
@@ -79,7 +82,7 @@ class Arguments:
         far_plane: Nor are Gaussians farther away than this.
         radius_clip: Nor are Gaussians whose box has half sizes of at most this, px.
         eps2d: Added to the diagonal of every screen covariance, px², 0 to 1e6.
-        sh_degree: Highest degree of the harmonics to use, 0 to 3; None if `colors` are not coefficients.
+        sh_degree: Highest degree of the harmonics to use, 0 to 4; None if `colors` are not coefficients.
         packed: Whether `meta` lists the drawn Gaussians only, (nnz, ...), instead of all, (..., C, N, ...). The images
             and the work are the same.
         tile_size: Only sets tile_width and tile_height in `meta`; the kernels have tiles of 16 px.
@@ -88,7 +91,7 @@ class Arguments:
         sparse_grad: False.
         absgrad: Whether the backward pass sets `meta["means2d"].absgrad`.
         rasterize_mode: "classic", or "antialiased": opacities times sqrt(det0 / det).
-        channel_chunk: No effect: any number of channels is composited, 34 at a time.
+        channel_chunk: No effect: any number of channels is composited, 32 beside the first three at a time.
         distributed: False.
         camera_model: "pinhole".
         segmented: No effect: it selects a sort in gsplat.
@@ -151,11 +154,12 @@ class Arguments:
             _check_only(name, getattr(self, name), only)
         one_of("render_mode", self.render_mode, RENDER_MODES)
         one_of("rasterize_mode", self.rasterize_mode, ("classic", "antialiased"))
-        for name in ("width", "height", "tile_size", "channel_chunk"):
+        for name in ("packed", "absgrad", "segmented"):
+            flag(name, getattr(self, name))
+        check_size(self.width, self.height)
+        for name in ("tile_size", "channel_chunk"):
             whole_number(name, getattr(self, name), 1)
-        for name in ("near_plane", "far_plane", "radius_clip"):
-            in_range(name, getattr(self, name), 0.0)
-        in_range("eps2d", self.eps2d, 0.0, DILATION_MAX)
+        check_limits(self.near_plane, self.far_plane, self.radius_clip, self.eps2d)
         named = {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities")}
         batch, N = check_scene(named, self.covars is not None)
         if self.covars is not None:
@@ -167,12 +171,11 @@ class Arguments:
 
     def _check_colors(self) -> None:
         """Check colours or coefficients, and backgrounds."""
+        check_tensor("colors", self.colors, ("...",), {})
         channels = self.colors.shape[-1] if self.colors.ndim else 0
         tail: tuple[int, ...] = (channels,)
         if self.sh_degree is not None:
-            K = max(
-                num_coefficients(whole_number("sh_degree", self.sh_degree, 0, 3)), *self.colors.shape[-2:-1]
-            )
+            K = max((whole_number("sh_degree", self.sh_degree, 0, 4) + 1) ** 2, *self.colors.shape[-2:-1])
             channels, tail = 3, (K, 3)
         per_camera = self.colors.ndim == len(self.batch) + 2 + len(tail)
         expect(
@@ -196,11 +199,26 @@ def _check_only(name: str, value: object, only: object) -> None:
     """Check an argument of which one value is supported."""
     if name == "rolling_shutter":
         value, only = getattr(value, "name", value), RollingShutterType.GLOBAL.name
-    if isinstance(value, Tensor) or value != only:
-        shown = "a tensor" if isinstance(value, Tensor) else repr(value)
+    if type(value) is not type(only) or value != only:
+        plain = isinstance(value, bool | int | float | str | Enum)
+        shown = repr(value) if plain else f"of type {type(value).__name__}"
         raise ArgumentError(
             f"{name}: is {shown}, but only {only!r} is supported; {REMEDIES.get(name, UNDISTORT)}"
         )
+
+
+def check_size(width: int, height: int) -> None:
+    """Check the size of the images."""
+    for name, size in (("width", width), ("height", height)):
+        whole_number(name, size, 1, MOST_PIXELS)
+
+
+def check_limits(near_plane: float, far_plane: float, radius_clip: float, eps2d: float) -> None:
+    """Check the numbers that decide which Gaussians count."""
+    named = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip}
+    for name, value in named.items():
+        in_range(name, value, 0.0)
+    in_range("eps2d", eps2d, 0.0, DILATION_MAX)
 
 
 def check_projection_options(sparse_grad: bool, camera_model: str) -> None:
@@ -230,10 +248,31 @@ def check_scene(named: Mapping[str, Tensor | None], from_covars: bool) -> tuple[
 
 def check_cameras(viewmats: Tensor, Ks: Tensor, batch: tuple[int, ...], means: Tensor) -> int:
     """Check the matrices of the cameras; return their number, which is the same in each batch."""
+    check_tensor("viewmats", viewmats, ("...",), {})
     C = max(viewmats.shape[-3] if viewmats.ndim >= 3 else 1, 1)
     expect("viewmats", viewmats, (*batch, C, 4, 4), means)
     expect("Ks", Ks, (*batch, C, 3, 3), means)
     return C
+
+
+def check_spreads(name: str, spreads: Tensor, positions: Tensor, batch: tuple[int, ...]) -> None:
+    """Check that no drawn Gaussian is larger on the screen than the kernels can hold; `name` made the covariances.
+
+    Args:
+        name: The argument to name.
+        spreads: (B, C, N, 3) xx, xy and yy of the screen covariances, px².
+        positions: Positions of the drawn ones in (B, C, N).
+        batch: Leading axes of the argument.
+    """
+    C, N = spreads.shape[1:3]
+    wide = spreads.detach().reshape(-1, 3)[positions][:, [0, 2]].sum(dim=-1) > 0.5 * SPLAT_LIMIT**2
+    if bool(wide.any()):
+        at = int(positions[wide.nonzero()[0, 0]])
+        where = (*np.unravel_index(at // (C * N), batch), at % N) if batch else (at % N,)
+        raise ArgumentError(
+            f"{name}[{', '.join(map(str, where))}]: makes a Gaussian of more than {SPLAT_LIMIT:g} px on the screen, "
+            "which the kernels cannot draw; make it smaller or remove it"
+        )
 
 
 def expect(name: str, tensor: Any, shape: tuple[int, ...], like: Tensor) -> None:  # noqa: ANN401

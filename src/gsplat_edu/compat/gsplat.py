@@ -28,11 +28,13 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.compat.checks import Arguments, RollingShutterType
+from gsplat_edu.compat.checks import Arguments, RollingShutterType, check_spreads
 from gsplat_edu.compat.harmonics import spherical_harmonics
 from gsplat_edu.compat.images import Splats, composite
 from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
 from gsplat_edu.constants import SH_OFFSET
+from gsplat_edu.headroom import require_memory
+from gsplat_edu.render.api import BYTES_PER_PIXEL
 
 __all__ = ["RollingShutterType", "fully_fused_projection", "rasterization", "spherical_harmonics"]
 
@@ -102,6 +104,11 @@ class _Drawn(NamedTuple):
 
 
 def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    require_memory(
+        f"{a.batches * a.C} images of {a.width}x{a.height} px",
+        BYTES_PER_PIXEL * a.batches * a.C * a.width * a.height,
+        "render fewer images, or fewer pixels (width, height)",
+    )
     lens = Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
     triangle = None if a.covars is None else a.covars[..., TRIANGLE[0], TRIANGLE[1]]
     viewmats, Ks = a.viewmats.reshape(-1, a.C, 4, 4), a.Ks.reshape(-1, a.C, 3, 3)
@@ -109,6 +116,7 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     solids = solids_of(a.means, triangle, a.quats, a.scales)
     found = project(solids, viewmats, Ks, lens, flat, antialiased)
     positions = (found.radii > 0).all(dim=-1).flatten().nonzero()[:, 0]
+    check_spreads("scales" if a.covars is None else "covars", found.spreads, positions, a.batch)
     images = positions // max(a.N, 1)
     drawn = _Drawn(positions, images // a.C, images, positions % max(a.N, 1))
     opacities = flat[:, None].expand(-1, a.C, -1)

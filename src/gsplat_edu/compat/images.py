@@ -25,7 +25,7 @@ from gsplat_edu.compat.projection import Lens
 from gsplat_edu.constants import COLOR_LIMIT
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.render.cpu import render_covariances
-from gsplat_edu.render.output import MOST_CHANNELS, RenderOutput
+from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 
 SETTINGS = RenderSettings(alpha_max=0.999, z_near=0.0, depth=False, stop="pixel")
@@ -41,7 +41,7 @@ class Splats(NamedTuple):
     means2d: Float[Tensor, "M 2"]
     """px, gsplat's pixel centres."""
     spreads: Float[Tensor, "M 3"]
-    """xx, xy, yy of the screen covariance before eps2d, px²."""
+    """xx, xy, yy of the screen covariance before eps2d, px², always float64."""
     opacities: Float[Tensor, " M"]
     colors: Float[Tensor, "M D"] | None
     depths: Float[Tensor, " M"] | None
@@ -63,24 +63,14 @@ def composite(
     """
     M = len(splats.opacities)
     colors = splats.means2d.new_zeros(M, 0) if splats.colors is None else splats.colors
-    parts: list[Tensor] = []
-    transmittance: Tensor | None = None
+    front, features = colors[:, :COLOR_CHANNELS], colors[:, COLOR_CHANNELS:]
     # The depth is a feature, never a colour, because the kernels skip Gaussians whose colours exceed COLOR_LIMIT.
-    pieces = torch.split(colors, COLOR_CHANNELS + MOST_CHANNELS - 1, dim=1)
-    for k, piece in enumerate(pieces):
-        front, features = piece[:, :COLOR_CHANNELS], piece[:, COLOR_CHANNELS:]
-        if k == 0 and splats.depths is not None:
-            features = torch.cat([features, splats.depths[:, None]], dim=1)
-        view = _render(splats, front, features, lens, absgrad)
-        parts.append(view.image[..., : front.shape[1]])
-        if view.features is not None:
-            parts.append(view.features)
-        transmittance = view.transmittance if transmittance is None else transmittance
-    assert transmittance is not None
-    if splats.depths is not None:  # behind the colours of the first piece
-        parts.append(parts[1][..., -1:])
-        parts[1] = parts[1][..., :-1]
-    image = torch.cat(parts, dim=-1)
+    if splats.depths is not None:
+        features = torch.cat([features, splats.depths[:, None]], dim=1)
+    view = _render(splats, front, features, lens, absgrad)
+    transmittance, image = view.transmittance, view.image[..., : front.shape[1]]
+    if view.features is not None:
+        image = torch.cat([image, view.features], dim=-1)
     if splats.background is not None:
         behind = transmittance[..., None] * splats.background
         image = image + (behind if splats.depths is None else torch.nn.functional.pad(behind, (0, 1)))

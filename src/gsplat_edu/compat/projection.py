@@ -16,9 +16,17 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-from gsplat_edu.compat.checks import check_cameras, check_projection_options, check_scene, expect
+from gsplat_edu.compat.checks import (
+    check_cameras,
+    check_limits,
+    check_projection_options,
+    check_scene,
+    check_size,
+    expect,
+)
 from gsplat_edu.constants import ALPHA_MIN, DET_FLOOR, THINNEST
 from gsplat_edu.gaussians import quat_to_R_t
+from gsplat_edu.validation import flag
 
 MARGIN = 0.15
 """gsplat clamps x/z and y/z inside the Jacobian at the edge of the image, moved outwards by this fraction of its size.
@@ -60,7 +68,7 @@ class Projected(NamedTuple):
     conics: Float[Tensor, "B C N 3"]
     compensations: Float[Tensor, "B C N"]
     spreads: Float[Tensor, "B C N 3"]
-    """xx, xy and yy of the covariance before eps2d, px²."""
+    """xx, xy and yy of the covariance before eps2d, px², always float64."""
 
 
 def solids_of(means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None) -> Solids:
@@ -77,7 +85,7 @@ def solids_of(means: Tensor, covars: Tensor | None, quats: Tensor | None, scales
         return Solids(means.reshape(*shape, 3), covars.reshape(*shape, 6))
     assert quats is not None
     assert scales is not None
-    rotations = quat_to_R_t(quats.reshape(-1, 4)).view(*shape, 3, 3)
+    rotations = quat_to_R_t(quats.reshape(-1, 4).double()).view(*shape, 3, 3)
     return Solids(means.reshape(*shape, 3), None, rotations, scales.reshape(*shape, 3))
 
 
@@ -99,8 +107,15 @@ def project(
         opacities: Make the radii tighter; None for radii that suit every opacity.
         compensated: Whether the compensations will multiply the opacities, for the radii.
 
+    Everything is computed in float64 and returned in the dtype of the means. Only the spreads stay float64, because the
+    determinants of thin Gaussians would lose their digits in float32.
+
     Differentiable in: solids, viewmats, Ks.
     """
+    dtype = solids.means.dtype
+    solids = Solids(solids.means.double(), *(None if each is None else each.double() for each in solids[1:]))
+    viewmats, Ks = viewmats.double(), Ks.double()
+    opacities = None if opacities is None else opacities.double()
     R = viewmats[..., None, :3, :3]
     points = solids.means[:, None] @ viewmats[..., :3, :3].mT + viewmats[..., None, :3, 3]
     depths = points[..., 2]
@@ -124,10 +139,10 @@ def project(
     bright = None if opacities is None else opacities[:, None] * (compensations if compensated else 1.0)
     return Projected(
         _radii(means2d, variances, before & thick, bright, lens),
-        means2d,
-        depths,
-        torch.stack([variances[..., 1] / floor, -b / floor, variances[..., 0] / floor], dim=-1),
-        compensations,
+        means2d.to(dtype),
+        depths.to(dtype),
+        torch.stack([variances[..., 1] / floor, -b / floor, variances[..., 0] / floor], dim=-1).to(dtype),
+        compensations.to(dtype),
         torch.stack([a, b, c], dim=-1),
     )
 
@@ -210,6 +225,10 @@ def fully_fused_projection(
     Differentiable in: means, covars, quats, scales, viewmats, Ks.
     """
     check_projection_options(sparse_grad, camera_model)
+    check_size(width, height)
+    for name, value in (("packed", packed), ("calc_compensations", calc_compensations)):
+        flag(name, value)
+    check_limits(near_plane, far_plane, radius_clip, eps2d)
     batch, N = check_scene(
         {"means": means, "quats": quats, "scales": scales, "opacities": opacities}, covars is not None
     )

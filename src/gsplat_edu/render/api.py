@@ -18,6 +18,7 @@ from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput, RenderStack, check_features
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_dense
+from gsplat_edu.validation import of_type
 
 BYTES_PER_PIXEL = 40
 """Memory for creating and using an image: 20 bytes as float32 with transmittance and depth, and as much again for its
@@ -68,8 +69,8 @@ def render(
             its pose and intrinsics; or a sequence of cameras of equal image size.
         settings: Background, SH degree, antialiasing, depths; None uses the defaults.
         background: (3,) background as a tensor, for differentiation; None uses the settings' background.
-        features: (N, C) numbers to composite beside the colours, of the Gaussians' dtype and device, 1 <= C <= 32;
-            None for none.
+        features: (N, C) numbers to composite beside the colours, of the Gaussians' dtype and device; None for none.
+            The backend cpu composites 32 at a time: every further 32 take another projection, sort and two passes.
         backend: "auto" for the fastest one on the Gaussians' device, or a backend by name (see
             `gsplat_edu.render.backends`).
 
@@ -80,12 +81,14 @@ def render(
         BackendUnavailableError: the backend cannot run here.
         ShapeError: the background is not of shape (3,), features have another shape, or cameras have different sizes.
         NotEnoughMemoryError: the image alone needs more memory than is free.
-        ArgumentError: a feature is NaN or infinite; or on the backend torch, a parameter is, or a quaternion has zero
-            length. The kernels skip such a Gaussian, with zero gradient and no effect on others.
+        ArgumentError: an argument has another type, or a feature is NaN or infinite; or on torch, a parameter is, or a
+            quaternion has zero length. The kernels skip such a Gaussian; it has zero gradient and no effect on others.
 
     Differentiable in: every raw parameter of the Gaussians, the background, the features, and a camera of tensors.
     """
-    settings = settings or RenderSettings()
+    of_type("gaussians", gaussians, Gaussians)
+    settings = RenderSettings() if settings is None else settings
+    of_type("settings", settings, RenderSettings)
     name = resolve_backend(backend, gaussians.means.device)
     if background is None:
         background = _background(settings.background, gaussians.means.dtype, gaussians.means.device)
@@ -93,7 +96,7 @@ def render(
         check_tensor("background", background, (3,), {})
         background = background.to(gaussians.means)
     if features is not None:
-        check_features(features, len(gaussians))
+        check_features(features, gaussians.means)
     extra = Extra(background, features)
     if not isinstance(camera, Sequence):
         return _render_one(name, gaussians, _checked("camera", camera), settings, extra)
@@ -102,7 +105,10 @@ def render(
         raise ArgumentError(
             "camera: is an empty sequence or has different image sizes; render the cameras one by one"
         )
-    views = tuple(_render_one(name, gaussians, c, settings, extra) for c in cameras)
+    return _stack(tuple(_render_one(name, gaussians, c, settings, extra) for c in cameras))
+
+
+def _stack(views: tuple[RenderOutput, ...]) -> RenderStack:
     return RenderStack(
         torch.stack([view.image for view in views]),
         torch.stack([view.transmittance for view in views]),

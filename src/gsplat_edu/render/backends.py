@@ -34,13 +34,13 @@ def resolve_backend(name: str, device: torch.device | None = None) -> str:
     Warns:
         BackendWarning: "auto" selects cpu although there is a GPU, because its kernels fail the check.
     """
+    check_backend(name)
     if name == "auto":
         on_gpu = torch.cuda.is_available() if device is None else device.type == "cuda"
         name = "cuda" if on_gpu and not interpreted() else "cpu"
         if name == "cuda" and device is None and (reason := unavailable("cuda")):
             _warn_once(f"the GPU is not used: {reason}")
             name = "cpu"
-    check_backend(name)
     reason = unavailable(name, device)
     if reason:
         raise BackendUnavailableError(f"backend {name!r}: {reason}")

@@ -10,6 +10,7 @@ Chapters: 11_tiles, 12_the_backward_pass.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +34,7 @@ from gsplat_edu.render.camera_tensors import (
     camera_gradients,
     split_camera,
 )
-from gsplat_edu.render.output import STATISTICS, Extra, RenderOutput, check_features
+from gsplat_edu.render.output import MOST_CHANNELS, STATISTICS, Extra, RenderOutput, check_features
 from gsplat_edu.render.settings import RenderSettings
 
 
@@ -63,6 +64,11 @@ class _Call:
     collecting: bool = False
     errors: Tensor | None = None
     statistics: Tensor | None = None
+
+    def for_features(self) -> _Call:
+        """Return a call that composites further features of the same view."""
+        settings = dataclasses.replace(self.settings, depth=False, median_depth=False)
+        return _Call(self.camera, settings, self.sh_degree, self.direct)
 
 
 def render_cpu(
@@ -99,21 +105,22 @@ def render_covariances(
 
     Args:
         means: (N, 3) centres, world units.
-        cov3ds: (N, 3, 3) covariances, world units squared; symmetry is not checked.
+        cov3ds: (N, 3, 3) covariances, world units squared; symmetry is not checked. Float64 beside float32 means keeps
+            the digits of thin ones.
         colors: (N, 3) any range.
         opacities: (N,) 0 to 1.
         camera: A `Camera` or any object with its members; `CameraTensors` for gradients of its pose and intrinsics.
         settings: Background, antialiasing and depth; None uses the defaults.
         background: (3,) background as a tensor, for differentiation; None uses the settings' background.
-        features: (N, C) features to composite beside the colours, 1 <= C <= 32; None for none.
+        features: (N, C) features to composite beside the colours, 32 in a pass; None for none.
 
     Returns:
         The view.
 
     Raises:
         ShapeError: a shape differs, or the arguments have different N.
-        ArgumentError: a value is NaN or infinite, the dtypes are not all float32 or all float64, or `camera` is
-            invalid.
+        ArgumentError: a value is NaN or infinite, the dtypes other than that of `cov3ds` are not all float32 or all
+            float64, or `camera` is invalid.
 
     Differentiable in: means, cov3ds, colors, opacities, background, features, and a camera of tensors.
     """
@@ -121,16 +128,18 @@ def render_covariances(
     sizes: dict[str, int] = {}
     check_tensor("means", means, ("N", 3), sizes)
     check_tensor("cov3ds", cov3ds, ("N", 3, 3), sizes)
+    if cov3ds.dtype not in (means.dtype, torch.float64):
+        raise ArgumentError(f"cov3ds: are {cov3ds.dtype}, but have to be {means.dtype}, as means, or float64")
     check_tensor("colors", colors, ("N", 3), sizes)
     check_tensor("opacities", opacities, ("N",), sizes)
     if background is None:
         background = torch.tensor(settings.background, dtype=means.dtype)
     check_tensor("background", background, (3,), {})
     if features is not None:
-        check_features(features, len(means))
+        check_features(features, means)
     value, pose = split_camera(camera if isinstance(camera, CameraTensors) else as_camera("camera", camera))
     call = _Call(value, settings, 0, direct=True)
-    return _output(call, Extra(background, features), pose, means, cov3ds, colors, opacities)
+    return _output(call, Extra(background, features), pose, means, cov3ds.double(), colors, opacities)
 
 
 RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
@@ -142,17 +151,28 @@ DIRECT = ("means", "cov3ds", "colors", "opacities")
 
 def _output(call: _Call, extra: Extra, pose: Pose, *parameters: Tensor) -> RenderOutput:
     dtype, features = parameters[0].dtype, extra.features
-    tensors = parameters if features is None else (*parameters, features)
+    tensors = [p for k, p in enumerate(parameters) if not call.direct or k != DIRECT.index("cov3ds")]
+    tensors += [] if features is None else [features]
     if dtype not in SUFFIXES or any(p.dtype != dtype or p.device.type != "cpu" for p in tensors):
         raise ArgumentError("means: the backend cpu needs tensors on the CPU, all float32 or all float64")
-    image, transmittance, depth, mixed, median = _Rasterize.apply(  # type: ignore[no-untyped-call]
-        call, extra.background, *pose, features, *parameters
+    calls, groups = (
+        [call],
+        [features] if features is None else list(torch.split(features, MOST_CHANNELS, dim=1)),
     )
+    image, transmittance, depth, mixed, median = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        call, extra.background, *pose, groups[0], *parameters
+    )
+    for group in groups[1:]:
+        calls.append(call.for_features())
+        further = _Rasterize.apply(calls[-1], extra.background, *pose, group, *parameters)  # type: ignore[no-untyped-call]
+        mixed = torch.cat([mixed, further[3]], dim=-1)
 
     def norms() -> Tensor:
-        if call.norms is None:
+        found = [each.norms for each in calls if each.norms is not None]
+        if not found:
             raise ArgumentError("means2d: has no gradient; call backward on a loss of this image first")
-        return call.norms.index_select(0, call.visible)  # in half the time of [call.visible]
+        total = functools.reduce(torch.add, found)
+        return total.index_select(0, call.visible)  # in half the time of [call.visible]
 
     needs_more = any(tensor is not None and tensor.requires_grad for tensor in (*pose, features))
     return RenderOutput(
@@ -166,21 +186,26 @@ def _output(call: _Call, extra: Extra, pose: Pose, *parameters: Tensor) -> Rende
         defer=None if needs_more or features is not None else _defer(call, extra.background, parameters),
         features=None if features is None else mixed,
         median_depth=median if call.settings.median_depth else None,
-        collector=functools.partial(_collect, call, parameters[0]),
+        collector=functools.partial(_collect, calls, parameters[0]),
     )
 
 
-def _collect(call: _Call, means: Tensor, errors: Tensor | None) -> Callable[[], Tensor]:
+def _collect(calls: Sequence[_Call], means: Tensor, errors: Tensor | None) -> Callable[[], Tensor]:
     """Ask for statistics of the next backward pass; return a function that gives those of the visible Gaussians."""
     if errors is not None:
-        check_tensor("errors", errors, (call.camera.H, call.camera.W), {})
+        check_tensor("errors", errors, (calls[0].camera.H, calls[0].camera.W), {})
         errors = errors.detach().to(means).contiguous()
-    call.collecting, call.errors = True, errors
+    for call in calls:
+        call.collecting, call.errors = True, errors
 
     def found() -> Tensor:
-        if call.statistics is None:
+        tables = [call.statistics for call in calls if call.statistics is not None]
+        if not tables:
             raise ArgumentError("collect: there is nothing yet; call backward on a loss of this image first")
-        return call.statistics.index_select(0, call.visible)
+        total = tables[0].index_select(0, calls[0].visible)
+        for table in tables[1:]:  # absgrad adds up; what weights and errors give is the same in every pass
+            total[:, :2] += table.index_select(0, calls[0].visible)[:, :2]
+        return total
 
     return found
 

@@ -14,7 +14,7 @@ from gsplat_edu.gaussians import check_tensor
 from gsplat_edu.moments import AdamInBackward
 
 MOST_CHANNELS = 32
-"""Largest number of channels of features in one render."""
+"""Largest number of channels of features in one pass of the native kernels."""
 
 STATISTICS = ("abs_u", "abs_v", "weight_sum", "pixels", "error_sum", "weight_max")
 """Columns of the kernels' statistics, in order."""
@@ -34,24 +34,27 @@ class Extra(NamedTuple):
 
     Args:
         background: (3,) colour behind everything, of the Gaussians' dtype.
-        features: (N, C) features to composite, 1 to 32 channels, or None.
+        features: (N, C) features to composite, or None.
     """
 
     background: Tensor
     features: Tensor | None = None
 
 
-def check_features(features: Tensor, count: int) -> int:
-    """Check features of `count` Gaussians; return their number of channels.
+def check_features(features: Tensor, means: Tensor) -> int:
+    """Check features of the Gaussians with these means; return their number of channels.
 
     Raises:
-        ShapeError: the features are not of shape (count, 1 to 32).
-        ArgumentError: a value is NaN or infinite.
+        ShapeError: the features are not of shape (N, 1 or more).
+        ArgumentError: they are not a tensor, of another dtype or device than the means, or a value is NaN or infinite.
     """
-    sizes = {"N": count}
+    sizes = {"N": len(means)}
     check_tensor("features", features, ("N", "C"), sizes)
-    if not 1 <= sizes["C"] <= MOST_CHANNELS:
-        raise ShapeError(f"features: have {sizes['C']} channels, but need 1 to {MOST_CHANNELS}")
+    if not sizes["C"]:
+        raise ShapeError("features: have no channels, but need one or more; None stands for no features")
+    if (features.dtype, features.device) != (means.dtype, means.device):
+        wanted = f"{means.dtype} on {means.device}"
+        raise ArgumentError(f"features: are {features.dtype} on {features.device}, but means are {wanted}")
     return sizes["C"]
 
 
@@ -111,7 +114,8 @@ class RenderOutput:
         """Ask the backward pass for statistics of the visible Gaussians. Call it before that pass.
 
         Each statistic is a sum or maximum over the pixels of this image, with w = T alpha. They have the same bits for
-        any number of threads. After several passes they are those of the last one.
+        any number of threads. After several passes they are those of the last one. With more than 32 features,
+        "absgrad" is the sum over groups of 32 of them: at least the sum of the absolute values.
 
         Args:
             names: "absgrad": (M, 2) sums of |d loss / d mean in the image|, each pixel's by itself (AbsGS); per px.
@@ -146,7 +150,7 @@ class RenderOutput:
 
         The factors convert pixels to normalised device coordinates, so that one threshold suits every image size. The
         value is zero for Gaussians that the loss does not reach. A second backward pass through the same image
-        accumulates, as for gradients.
+        accumulates, as for gradients; so do the passes of more than 32 features on the backend cpu.
 
         Raises:
             ArgumentError: backward has not been called on a loss of this image.

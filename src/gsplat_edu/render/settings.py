@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, DILATION_MAX, SH_MAX_DEGREE, Z_NEAR
 from gsplat_edu.errors import BackendUnavailableError
-from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
+from gsplat_edu.validation import flag, float64_array, in_range, one_of, shown, whole_number
 
 BACKENDS = ("cuda", "cpu", "torch")
 """All backends, fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, which evaluates every
@@ -25,9 +25,10 @@ def check_backend(name: str) -> None:
     Raises:
         BackendUnavailableError: the backend does not exist.
     """
-    if name not in ("auto", *BACKENDS):
+    known: tuple[object, ...] = ("auto", *BACKENDS)
+    if type(name) not in map(type, known) or name not in known:
         raise BackendUnavailableError(
-            f"backend {name!r}: not in this version of gsplat_edu; use auto or one of: {', '.join(BACKENDS)}"
+            f"backend {shown(name)}: not in this version of gsplat_edu; use auto or one of: {', '.join(BACKENDS)}"
         )
 
 
@@ -78,9 +79,9 @@ class RenderSettings:
         plain = {
             "background": tuple(float64_array("background", self.background, (3,)).tolist()),
             "sh_degree": whole_number("sh_degree", self.sh_degree, 0, SH_MAX_DEGREE),
-            "antialiased": bool(self.antialiased),
-            "depth": bool(self.depth),
-            "median_depth": bool(self.median_depth),
+            "antialiased": flag("antialiased", self.antialiased),
+            "depth": flag("depth", self.depth),
+            "median_depth": flag("median_depth", self.median_depth),
             "dilation": in_range("dilation", self.dilation, 0.0, DILATION_MAX),
             "jacobian_limit": None if limit is None else in_range("jacobian_limit", limit, 1.0),
             "alpha_max": in_range("alpha_max", self.alpha_max, ALPHA_MIN, 0.9999),

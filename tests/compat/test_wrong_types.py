@@ -1,0 +1,109 @@
+"""Every public function of compat, and `render`, with values of wrong types for each argument: our errors only.
+
+The message begins with the argument's name, or with that of one that was given together with it.
+"""
+
+import inspect
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_calls import arguments
+from gsplat_edu.compat import gsplat as compat
+from gsplat_edu.errors import ArgumentError, SplatError
+from gsplat_edu.render.api import render
+from gsplat_edu.render.settings import RenderSettings
+from native_scenes import smooth_scene
+
+pytestmark = pytest.mark.usefixtures("as_shipped")
+
+WRONG = {
+    "a word": "x",
+    "bytes": b"x",
+    "an object": object(),
+    "an array": np.zeros((2, 3)),
+    "a list": [1.0, "x"],
+    "a dictionary": {"a": 1},
+    "a class": dict,
+    "a complex number": 1j,
+    "a large number": 2**70,
+    "NaN": float("nan"),
+    "a complex tensor": torch.zeros(6, 3, dtype=torch.complex64),
+    "a tensor of another shape": torch.zeros(7, 7, 7, 7, 7),
+    "an empty tensor": torch.zeros(0),
+    "booleans": torch.ones(2, 2, dtype=torch.bool),
+    "a tensor without data": torch.zeros(6, 3, device="meta"),
+}
+
+GIVEN = arguments()
+PROJECTION = ("means", "quats", "scales", "viewmats", "Ks", "width", "height")
+CALLS = {
+    "render": (
+        render,
+        {
+            "gaussians": smooth_scene(0).gaussians(),
+            "camera": smooth_scene(0).camera,
+            "settings": RenderSettings(),
+            "background": torch.zeros(3, dtype=torch.float64),
+            "features": torch.zeros(5, 2, dtype=torch.float64),
+            "backend": "cpu",
+        },
+    ),
+    "RenderSettings": (RenderSettings, {}),
+    "rasterization": (compat.rasterization, GIVEN),
+    "fully_fused_projection": (
+        compat.fully_fused_projection,
+        {name: GIVEN[name] for name in PROJECTION} | {"covars": None},
+    ),
+    "spherical_harmonics": (
+        compat.spherical_harmonics,
+        {"degrees_to_use": 1, "dirs": torch.ones(6, 3), "coeffs": torch.ones(6, 4, 3)},
+    ),
+}
+CASES = [
+    (function, name) for function, (call, _) in CALLS.items() for name in inspect.signature(call).parameters
+]
+TAKEN = {
+    # A number of any size is a limit, and a list of cameras has no length limit.
+    "near_plane": {"a large number"},
+    "far_plane": {"a large number"},
+    "radius_clip": {"a large number"},
+    "z_near": {"a large number"},
+    "jacobian_limit": {"a large number"},
+    # Whole numbers without an upper limit that have no effect on the image.
+    "tile_size": {"a large number"},
+    "channel_chunk": {"a large number"},
+    "dense_chunk": {"a large number"},
+}
+"""Values that are no errors."""
+
+
+@pytest.mark.parametrize(("function", "name"), CASES)
+def test_only_our_errors_come_out(function, name):
+    call, given = CALLS[function]
+    call(**given)
+    for what, value in WRONG.items():
+        if what in TAKEN.get(name, ()):
+            continue
+        with pytest.raises(SplatError) as found:
+            call(**given | {name: value})
+            pytest.fail(f"{name}: {what} was taken")
+        message = str(found.value)
+        assert re.match(rf"(backend|{name})\b", message), (what, message)
+        assert "\n" not in message and len(message) < 300, (what, message)
+
+
+def test_a_gaussian_too_large_to_draw_is_named_as_the_caller_gave_it():
+    scales = torch.full((6, 3), 0.2)
+    scales[4] = 1e20
+    means = torch.zeros(6, 3)
+    for name, wide in (
+        ("scales", {"scales": scales}),
+        ("covars", {"covars": torch.diag_embed(scales * scales)}),
+    ):
+        if name == "covars":
+            wide["covars"] = torch.diag_embed(scales.clamp(max=1e19) ** 2)
+        with pytest.raises(ArgumentError, match=rf"^{name}\[4\]: makes a Gaussian of more than 1e\+15 px"):
+            compat.rasterization(**arguments(means=means) | wide)
