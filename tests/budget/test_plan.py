@@ -87,7 +87,7 @@ def chosen(*arguments, **options):
 def peak(found):
     """The model's peak memory for a plan with all the Gaussians it allows."""
     facts, config = FACTS.smaller(found.resolution or 1.0), found.options.config
-    process = MEASURED.process + reduced_bytes(config, facts.photo_bytes)
+    process = MEASURED.process + reduced_bytes(config, facts)
     footprint = Footprint(facts, process, MEASURED.pairs, config.sh_degree)
     return footprint.peak(found.max_gaussians, found.image_memory)
 

@@ -126,7 +126,9 @@ def test_few_photos_and_unknown_names_are_refused(tmp_path, capsys):
 @pytest.mark.sliced(1, group="reports on photos that differ")
 def test_doctor_names_the_photos_and_the_option(struck, run, tmp_path, capsys):
     folder = finished(struck[0], tmp_path / "plain")
-    capsys.readouterr()
+    ended = " ".join(capsys.readouterr().out.split())
+    assert "show things or shadows that the others do not, most of all" in ended
+    assert f"gsplat-edu doctor {folder}; --transients mask leaves them out" in ended
     assert main(["doctor", str(folder)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "warning moved:" in said and "train with --transients mask" in said

@@ -375,3 +375,23 @@ def test_photos_that_show_what_others_do_not_are_named_with_the_option(scene):
     found = warnings(trained(*scene, moved=(("b.png", 0.123), ("a.png", 0.02))))["moved"]
     assert found.labels == ("b.png (12.3 %)", "a.png (2.0 %)") and "2 photos" in found.sentence
     assert "--transients mask" in found.advice
+
+
+def test_a_photo_below_the_others_is_suspicious_only_if_the_scene_fits_the_others(scene):
+    """`fern`: the scene was too small for all photos, and the worst of them was right."""
+    gaussians, views = scene
+    run = trained(gaussians, views)
+
+    def advice(usual, split="train"):
+        level = {"train": [], "test": []}
+        for name, found in (("train", run.train), ("test", run.test)):
+            level[name] = [replace(view, psnr=usual + 0.1 * i) for i, view in enumerate(found)]
+        level[split][0] = replace(level[split][0], psnr=usual - 8.0)
+        changed = replace(run, train=level["train"], test=level["test"])
+        (found,) = [finding for finding in examine_run(changed).findings if finding.name == "unexplained"]
+        return found.advice
+
+    assert advice(31.0).endswith("has a wrong pose, train without it")
+    badly = advice(25.0)
+    assert "train without it" not in badly and "--max-gaussians" in badly and "median 25" in badly
+    assert len(run.test) < 4 or "it was held out" in advice(31.0, "test")

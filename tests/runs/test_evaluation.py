@@ -57,10 +57,10 @@ def test_a_run_is_evaluated_and_everything_is_written(capture, folder):
     assert min(by_hand) > 10, "the start points already look a little like the scene"
 
     picture = np.array(Image.open(folder.renders / "test" / "view_000.png"))
-    assert picture.shape == (24, 32 + 4 + 32, 3)
-    np.testing.assert_array_equal(picture[:, 36:], views[0].image)
+    assert picture.shape == (13 + 24, 32 + 4 + 32, 3)
+    np.testing.assert_array_equal(picture[13:, :32], views[0].image)
     np.testing.assert_array_equal(
-        picture[:, :32], np.floor(255 * images[0].clamp(0, 1).double().numpy() + 0.5)
+        picture[13:, 36:], np.floor(255 * images[0].clamp(0, 1).double().numpy() + 0.5)
     )
     assert sorted(p.name for p in (folder.renders / "test").iterdir()) == ["view_000.png", "view_001.png"]
     page = folder.report.read_text()

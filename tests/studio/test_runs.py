@@ -127,7 +127,7 @@ def test_previews_are_small_and_made_once(page, run, studio, monkeypatch):
             assert np.abs(np.asarray(image, int) - color).max() <= 3  # of 8-bit levels, by JPEG's rounding
         etag = answer.headers["etag"]
         assert page.get(answer.request.url, headers={"If-None-Match": etag}).status_code == 304
-    monkeypatch.setattr(runs, "opened_image", None)  # nothing is decoded again
+    monkeypatch.setattr(runs, "read_comparison", None)  # nothing is decoded again
     assert page.get(f"/api/runs/r/views/{index}/photo.jpg").status_code == 200
     path.unlink()
     assert page.get(f"/api/runs/r/views/{index}/photo.jpg").status_code == 404

@@ -213,14 +213,21 @@ def pixel_share(config: TrainConfig) -> float:
     return float(np.mean([photo_factor(config, iteration) ** -2 for iteration in some]))
 
 
-def reduced_bytes(config: TrainConfig, photo_bytes: int) -> int:
-    """Return the memory that photos of reduced size take besides those of full size: at most half of it.
+def reduced_bytes(config: TrainConfig, facts: Facts) -> int:
+    """Return by how much photos of reduced size raise the peak of memory.
+
+    Only training photos are reduced, to at most half of their pixels, and their copies are freed before a photo has its
+    full size again. So they do not add to what the evaluation takes for images, but to half of it.
 
     Args:
         config: The run.
-        photo_bytes: Bytes of all photos at full size.
+        facts: The capture at training size.
     """
-    return min(REDUCED_ROOM, photo_bytes // 2) if photo_factor(config, 0) > 1.0 else 0
+    if photo_factor(config, 0) <= 1.0:
+        return 0
+    share = facts.train / max(facts.train + facts.test, 1)
+    copies = min(REDUCED_ROOM, int(share * facts.photo_bytes) // 2)
+    return max(copies - int(PER_PIXEL * facts.largest) // 2, 0)
 
 
 def wanted_gaussians(config: TrainConfig, points: int, pixels: float, views: int = PLANNED_VIEWS) -> int:

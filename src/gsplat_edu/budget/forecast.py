@@ -116,7 +116,7 @@ def predict(
         pixels = facts.pixels / photo_factor(config, iteration) ** 2
         return speed.seconds(float(counts[iteration]), pixels) + reading_again
 
-    process = measured.process + reduced_bytes(config, facts.photo_bytes)
+    process = measured.process + reduced_bytes(config, facts)
     footprint = Footprint(facts, process, measured.pairs, config.sh_degree, config.batch)
     evaluations, saved = (last // every if every else 0 for every in (eval_every, save_every))
     saving = saving_seconds(float(counts.mean()), config.sh_degree)

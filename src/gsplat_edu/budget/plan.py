@@ -279,7 +279,7 @@ def choose(request: Request, measured: Measurements, spent: float) -> Plan:
     facts = request.facts.smaller(choice.factor)
     found = Plan(options, request.by_time, _predicted(request, measured, choice, config))
     at_cap = Footprint(
-        facts, process + reduced_bytes(config, facts.photo_bytes), pairs, config.sh_degree, config.batch
+        facts, process + reduced_bytes(config, facts), pairs, config.sh_degree, config.batch
     ).peak(found.max_gaussians or 0, found.image_memory)
     return dataclasses.replace(found, sentences=_sentences(request, found, at_cap))
 
@@ -294,7 +294,7 @@ def _within_memory(
     aim, least = int(MEMORY_SHARE * limit), 0
     for factor in factors:
         facts = request.facts.smaller(factor)
-        reduced = reduced_bytes(request.options.config, facts.photo_bytes)
+        reduced = reduced_bytes(request.options.config, facts)
         config = request.config(iterations, factor, None)
         footprint = Footprint(facts, process + reduced, pairs, config.sh_degree, config.batch)
         wanted = wanted_gaussians(config, facts.points, facts.pixels, facts.train)

@@ -35,6 +35,7 @@ from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.surgery import split_children
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.schedule import photo_factor
 from gsplat_edu.train.trainer import StepParts, Trainer
 from gsplat_edu.views import View
 
@@ -123,8 +124,7 @@ def probe(
     if min(min(view.camera.W, view.camera.H) for view in small) >= SMALL:
         trials.append(trial(start, small))
     score, picture = judging_seconds(grown, photos[:2], config, backend)
-    # scaled to the whole start scene, with a margin for views that were not measured
-    pairs = math.ceil(SPREAD * trials[0].pairs * len(usual) / len(start))
+    pairs = _pairs_at_first(config, trials[0].pairs * len(usual) / len(start), len(usual))
     del start, usual, grown, small, photos
     give_back()
     return Measurements(
@@ -138,6 +138,20 @@ def probe(
         settled=resident_bytes(),
         noise=math.sqrt(max(trials[0].seconds) / min(trials[0].seconds)),
     )
+
+
+def _pairs_at_first(config: TrainConfig, pairs: float, gaussians: int) -> int:
+    """Return the pairs of the start scene in photos of the size with which the run starts.
+
+    Large Gaussians of a random start cover fewer tiles there, and have shrunk before photos have their full size.
+
+    Args:
+        config: The run.
+        pairs: Most pairs in one of the measured photos, at full size.
+        gaussians: Number of Gaussians of the start scene; a small one still has a pair.
+    """
+    most = SPREAD * pairs
+    return math.ceil(max(most / photo_factor(config, 0) ** 2, min(most, gaussians)))
 
 
 @dataclass(frozen=True)

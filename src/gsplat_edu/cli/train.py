@@ -29,12 +29,14 @@ from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.finding import Remedy
-from gsplat_edu.doctor.remedies import CHOICES, remedies_for, transients_for
+from gsplat_edu.doctor.moving import moved_line
+from gsplat_edu.doctor.remedies import CHOICES, ENOUGH, remedies_for, transients_for
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Metric
 from gsplat_edu.locks import locked
+from gsplat_edu.render.api import render
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation
 from gsplat_edu.runs.pilot import ORDER, PILOT_STEPS, refinement_for
@@ -290,6 +292,11 @@ def _report(capture: CaptureRun, result: Evaluation, say: Callable[[str], None])
         emitter.emit(Metric(name, result.metrics["test"][name], unit, "test"))
     emitter.report_output(capture.folder.path)
     say(f"wrote {capture.folder.scene(trainer.iteration)}, {capture.folder.report}")
+    if trainer.transients is None and len(capture.dataset.train) >= ENOUGH:
+        features = functools.partial(render, backend=capture.options.backend)
+        settings = capture.options.render_settings
+        if line := moved_line(capture.folder.path, trainer.gaussians, capture.dataset, features, settings):
+            say(line)
     if (planned := trainer.config.iterations) > trainer.iteration:
         folder = capture.folder.path
         say(f"the time limit ended training before iteration {planned}; --resume continues it: {folder}")

@@ -30,7 +30,7 @@ from gsplat_edu.data.capture import (
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.images import UPRIGHT, ImageHeader, ImageStore, PhotoFile, image_header
 from gsplat_edu.data.lens import CROPPED_ANGLE, MAX_ANGLE
-from gsplat_edu.data.notes import TwoLayouts, UnreadColors
+from gsplat_edu.data.notes import Background, TwoLayouts, UnreadColors
 from gsplat_edu.data.orientation import oriented
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
@@ -147,7 +147,7 @@ def load_dataset(
         for frame, (source, camera, _) in zip(frames, made, strict=True)
     ]
     notes += _lens_notes(frames, [rescaled for _, _, rescaled in made])
-    notes += _file_notes(frames, sources, header_of)
+    notes += _file_notes(frames, sources, header_of) + _alpha_notes(capture, sources, settings, header_of)
     if store.needed > store.budget:
         notes.append(
             f"the photos take {_spelled(store.needed)} of memory, but only {_spelled(store.budget)} are kept: the "
@@ -290,6 +290,21 @@ def _lens_notes(frames: Sequence[Frame], rescaled: Sequence[bool]) -> list[str]:
             f"{lens.fy:.4g} px: the calibration may be wrong"
         )
     return notes
+
+
+def _alpha_notes(
+    capture: Capture,
+    sources: Sequence[PhotoFile],
+    settings: DataSettings,
+    header_of: Callable[[Path], ImageHeader],
+) -> list[str]:
+    """Report what lies behind transparent photos."""
+    count = sum(header_of(source.path).alpha for source in sources)
+    return (
+        [str(Background(count, len(sources), settings.background, capture.layout == "Blender"))]
+        if count
+        else []
+    )
 
 
 def _file_notes(

@@ -85,11 +85,13 @@ class ImageHeader:
         size: Width and height as stored, px. A HEIC's are upright, because its container turns it.
         problem: Why the colours are taken as sRGB although the file declares others; empty if they are not.
         decoding: Bytes per pixel that decoding takes.
+        alpha: Whether pixels may be transparent.
     """
 
     size: tuple[int, int]
     problem: str
     decoding: int = BYTES_PER_PIXEL
+    alpha: bool = False
 
 
 def image_header(path: Path) -> ImageHeader:
@@ -101,7 +103,8 @@ def image_header(path: Path) -> ImageHeader:
     try:
         with opened_image(path) as file:
             decoding = DEEP_BYTES_PER_PIXEL if is_deep(file) else bytes_per_pixel(file)
-            return ImageHeader(stored_size(file), conversion_of(file.info).problem, decoding)
+            problem = conversion_of(file.info).problem
+            return ImageHeader(stored_size(file), problem, decoding, file.has_transparency_data)
     except UNDECODABLE as error:
         raise _undecodable(path, error) from None
 

@@ -195,8 +195,37 @@ class UnreadColors:
         return f"{self.photos} of {self.total} photos are taken as sRGB, first {self.first}: {self.reason}"
 
 
+@dataclass(frozen=True)
+class Background:
+    """What lies behind transparent photos.
+
+    Args:
+        photos: Number of photos with an alpha channel.
+        total: Number of photos.
+        color: (r, g, b), 0 to 1; None if it may differ from iteration to iteration.
+        usually_white: Whether scores of such captures are usually given on white.
+    """
+
+    photos: int
+    total: int
+    color: tuple[float, float, float] | None
+    usually_white: bool
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        names = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
+        color = self.color or (0.0, 0.0, 0.0)
+        spelled = names.get(color, "RGB " + " ".join(f"{value:g}" for value in color))
+        behind = "the background of the training" if self.color is None else spelled
+        said = f"{self.photos} of {self.total} photos have an alpha channel: behind them is {behind}"
+        if not self.usually_white or self.color in (None, (1.0, 1.0, 1.0)):
+            return said
+        return f"{said}; published scores of Blender scenes are on white, as with --white-background"
+
+
 Note = (
-    MissingPhotos
+    Background
+    | MissingPhotos
     | FilesOutside
     | UnclearMasks
     | PhotosWithoutMask

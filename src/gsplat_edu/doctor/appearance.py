@@ -132,6 +132,8 @@ def check_duplicates(survey: Survey) -> list[Finding]:
     """Find duplicate photos, and different photos with the same pose."""
     duplicates, poses = _duplicates(survey), _same_poses(survey)
     names = survey.names
+    if survey.layout == "Blender":
+        return _rendered_alike(names, duplicates)
     found = []
     if moved := [(i, j) for i, j in duplicates if _motion(survey, i, j) > DUPLICATE_MOTION]:
         named = tuple(f"{names[i]} and {names[j]}" for i, j in moved)
@@ -151,6 +153,18 @@ def check_duplicates(survey: Survey) -> list[Finding]:
         advice = "check the photos that share a pose: something moved between them, or a pose is wrong"
         found.append(Finding("same pose", Severity.WARNING, what, advice, named))
     return found
+
+
+def _rendered_alike(names: Sequence[str], duplicates: Sequence[tuple[int, int]]) -> list[Finding]:
+    """Return a note: rendered photos have exact poses and a split by which scenes are compared."""
+    if not duplicates:
+        return []
+    named = tuple(f"{names[i]} and {names[j]}" for i, j in duplicates)
+    what = (
+        f"{counted(len(duplicates), 'pair')} of nearly identical photos, which rendered captures often have"
+    )
+    advice = "keep all photos if you compare with published scores: the split is part of the benchmark"
+    return [Finding("duplicates", Severity.NOTE, what, advice, named)]
 
 
 def _duplicates(survey: Survey) -> list[tuple[int, int]]:

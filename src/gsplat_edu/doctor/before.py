@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from gsplat_edu.data.notes import MissingPhotos
+from gsplat_edu.data.notes import Background, MissingPhotos
 from gsplat_edu.doctor.appearance import check_blur, check_duplicates, check_exposure
 from gsplat_edu.doctor.cameras import (
     check_away,
@@ -24,6 +24,7 @@ from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.remedies import check_sky
 from gsplat_edu.doctor.survey import Survey
 from gsplat_edu.text import short_number
+from gsplat_edu.train.config import TrainConfig
 
 Check = Callable[[Survey], list[Finding]]
 
@@ -84,6 +85,8 @@ def _facts(survey: Survey) -> tuple[tuple[str, str], ...]:
     facts = [("capture", str(survey.path)), ("holds", f"{survey.layout}: {photos}; {cloud}")]
     if len(survey.shots) > 1:
         facts.append(("cameras", _arrangement(survey)))
+    if survey.layout == "Blender" and (clear := sum(shot.stats.transparent for shot in survey.shots)):
+        facts.append(("", str(Background(clear, len(survey.shots), TrainConfig.background, True))))
     # `check_missing` reports the photos that have no file
     return (*facts, *(("", str(note)) for note in survey.notes if not isinstance(note, MissingPhotos)))
 

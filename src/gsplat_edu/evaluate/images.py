@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from gsplat_edu.errors import ArgumentError
+from gsplat_edu.evaluate.comparison import SEPARATOR_GREY, SEPARATOR_WIDTH
 from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.evaluate.video import encode_video
 from gsplat_edu.files import remove_leftovers, written_aside
@@ -20,11 +21,6 @@ PICTURE_SIDE = 640
 """Pictures of a report are shrunk until their longer side has this many px."""
 
 JPEG_QUALITY = 88
-
-SEPARATOR_WIDTH = 4
-"""Width of the line between two images side by side, px."""
-
-SEPARATOR_GREY = 128
 
 VIDEO_SUFFIX = ".mp4"
 

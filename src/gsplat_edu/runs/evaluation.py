@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from gsplat_edu.evaluate.images import save_png, side_by_side
+from gsplat_edu.evaluate.comparison import save_comparison
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.gaussians import Gaussians
@@ -70,7 +70,7 @@ def evaluate_run(
     progress: Progress | None = None,
     into: RunFolder | None = None,
 ) -> Evaluation:
-    """Score a scene and write metrics.json, renders/test/NAME.png (render | photo) and report.html.
+    """Score a scene and write metrics.json, renders/test/NAME.png (photo | render) and report.html.
 
     Other keys of an existing metrics.json are kept.
 
@@ -151,7 +151,7 @@ class _Gallery:
             path.unlink(missing_ok=True)
 
     def add(self, view: View, score: ImageScore, image: Image, truth: Image) -> None:
-        save_png(self._files[id(view)], side_by_side([image, truth]))
+        save_comparison(self._files[id(view)], truth, image)
         self.pictures.append(Picture.of(view.name, image, truth))
         if self._progress is not None:
             self._progress("test", score)

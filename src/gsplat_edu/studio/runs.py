@@ -13,8 +13,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from gsplat_edu.errors import CheckpointError
+from gsplat_edu.evaluate.comparison import comparison_size, read_comparison
 from gsplat_edu.files import written_aside
-from gsplat_edu.image_files import UNDECODABLE, opened_image
+from gsplat_edu.image_files import UNDECODABLE
 from gsplat_edu.reading import open_file, parse_json
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.studio.pictures import cache_name
@@ -23,9 +24,6 @@ from gsplat_edu.text import whole_of
 
 MOST_READ = 8 << 20
 """Bytes of a log in one answer."""
-
-SEPARATOR = 4
-"""Width of the line between render and photo in renders/test, px (`gsplat_edu.evaluate.images.side_by_side`)."""
 
 GAIN = 4
 """Factor of a difference picture."""
@@ -188,23 +186,21 @@ def _picture_file(folder: RunFolder, index: str, what: str) -> Path:
 
 def _size(path: Path) -> dict[str, int | None]:
     try:
-        with opened_image(path, ("PNG",)) as file:
-            return {"W": (file.width - SEPARATOR) // 2, "H": file.height}
+        W, H = comparison_size(path)
     except UNDECODABLE:
         return {"W": None, "H": None}
+    return {"W": W, "H": H}
 
 
 def _parts(path: Path) -> Mapping[str, UInt8[np.ndarray, "H W 3"]]:
-    """Split a render beside a photo into the pictures."""
+    """Split a photo beside its render into the pictures."""
     try:
-        with opened_image(path, ("PNG",)) as file:
-            both = np.asarray(file.convert("RGB"))
-    except UNDECODABLE:
+        found = read_comparison(path)
+    except FileNotFoundError:
         raise not_found(f"picture {path.name}") from None
-    W = (both.shape[1] - SEPARATOR) // 2
-    if both.shape[1] != 2 * W + SEPARATOR:
-        raise RefusedError(f"{path.name}: is not a render beside a photo; evaluate the run again")
-    render, photo = (np.ascontiguousarray(half) for half in (both[:, :W], both[:, W + SEPARATOR :]))
+    except UNDECODABLE:
+        raise RefusedError(f"{path.name}: is not a photo beside its render; evaluate the run again") from None
+    render, photo = found["render"], found["photo"]
     apart = np.abs(render.astype(np.int16) - photo)
     return {"render": render, "photo": photo, "difference": np.minimum(GAIN * apart, 255).astype(np.uint8)}
 

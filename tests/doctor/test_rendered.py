@@ -1,0 +1,60 @@
+"""A rendered RGBA benchmark: its background is named, and its split is not questioned."""
+
+import numpy as np
+import pytest
+
+from gsplat_edu.data.dataset import DataSettings, load_dataset
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_blender, write_colmap
+from gsplat_edu.doctor.before import examine
+from gsplat_edu.doctor.finding import Severity
+from gsplat_edu.doctor.survey import prepare
+from gsplat_edu.views import View
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def cut_out():
+    """Views whose black is transparent; the last one is the first one's photo."""
+    views, points, colors = procedural_capture(24, 6, splats=60)
+    images = [view.image for view in views[:-1]] + [views[0].image]
+    clear = [
+        View(
+            view.camera,
+            image,
+            alpha=np.where(image.max(axis=2) > 20, 255, 0).astype(np.uint8),
+            name=view.name,
+        )
+        for view, image in zip(views, images, strict=True)
+    ]
+    return clear, points, colors
+
+
+def test_the_background_is_named_and_the_usual_one(tmp_path, cut_out):
+    views, points, colors = cut_out
+    write_blender(tmp_path / "blender", views[:4], views[4:])
+    write_colmap(tmp_path / "colmap", views, points, colors)
+
+    def said(layout, color):
+        notes = load_dataset(tmp_path / layout, DataSettings(background=color)).notes
+        return next(note for note in notes if "alpha channel" in note)
+
+    black = said("blender", (0.0, 0.0, 0.0))
+    assert black.startswith("6 of 6 photos have an alpha channel: behind them is black")
+    assert "on white, as with --white-background" in black
+    assert said("blender", WHITE).endswith("behind them is white")
+    assert said("colmap", (0.0, 0.0, 0.0)).endswith("behind them is black")
+    facts = dict.fromkeys(value for _, value in examine(prepare(tmp_path / "blender")).facts)
+    assert black in facts
+
+
+def test_photos_alike_are_a_note_for_rendered_captures(tmp_path, cut_out):
+    views, points, colors = cut_out
+    write_blender(tmp_path / "blender", views[:4], views[4:])
+    write_colmap(tmp_path / "colmap", views, points, colors)
+    found = examine(prepare(tmp_path / "blender"))
+    alike = [finding for finding in found.findings if finding.name in ("duplicates", "same photo")]
+    assert [finding.severity for finding in alike] == [Severity.NOTE]
+    assert not any("remove one photo" in advice for advice in found.advice)
+    assert any("remove one photo" in advice for advice in examine(prepare(tmp_path / "colmap")).advice)
