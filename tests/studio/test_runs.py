@@ -15,7 +15,6 @@ from gsplat_edu.jobs import events
 from gsplat_edu.jobs.record import Work
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import open_source
-from gsplat_edu.studio import runs
 from gsplat_edu.studio.runs import GAIN
 from processes import Program
 
@@ -112,7 +111,7 @@ def test_held_out_views_are_sorted_and_have_pictures(page, run):
         assert page.get(f"/api/runs/r/views/{path}").status_code == 404
 
 
-def test_previews_are_small_and_made_once(page, run, studio, monkeypatch):
+def test_previews_are_small_and_made_once(page, run, studio):
     (index, view) = next(enumerate(run.read_metrics()["test_views"]))
     (path,) = (run.path / "renders" / "test").glob(f"{view['name'].removesuffix('.png')}*")
     both = np.zeros((600, 2 * 900 + 4, 3), np.uint8)
@@ -127,7 +126,7 @@ def test_previews_are_small_and_made_once(page, run, studio, monkeypatch):
             assert np.abs(np.asarray(image, int) - color).max() <= 3  # of 8-bit levels, by JPEG's rounding
         etag = answer.headers["etag"]
         assert page.get(answer.request.url, headers={"If-None-Match": etag}).status_code == 304
-    monkeypatch.setattr(runs, "read_comparison", None)  # nothing is decoded again
+    studio.decoder.close()  # nothing is decoded again
     assert page.get(f"/api/runs/r/views/{index}/photo.jpg").status_code == 200
     path.unlink()
     assert page.get(f"/api/runs/r/views/{index}/photo.jpg").status_code == 404

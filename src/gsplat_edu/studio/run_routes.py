@@ -17,7 +17,7 @@ from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.library import photo_names
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, entry_of, file_answer
-from gsplat_edu.studio.runs import compared, curves, held_out_views, view_picture, view_preview
+from gsplat_edu.studio.runs import compared, curves, held_out_views, view_picture
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.text import legible
 
@@ -54,18 +54,16 @@ def _curves(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # n
 
 
 def _picture(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
-    params = request.path_params
-    data, version = view_picture(_run(studio, request), params["index"], params["what"])
-    headers = {"ETag": f'"{version}"', "Cache-Control": "no-cache"}
-    if request.headers.get("if-none-match") == headers["ETag"]:
-        return Response(status_code=304, headers=headers)
-    return Response(data, media_type="image/png", headers=headers)
+    return file_answer(request, _view_file(studio, request, small=False), "image/png")
 
 
 def _preview(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401
+    return file_answer(request, _view_file(studio, request, small=True), "image/jpeg")
+
+
+def _view_file(studio: Studio, request: Request, small: bool) -> Path:
     params, cache = request.path_params, studio.library.hidden("cache") / "views"
-    path = view_preview(cache, _run(studio, request), params["index"], params["what"])
-    return file_answer(request, path, "image/jpeg")
+    return view_picture(studio.decoder, cache, _run(studio, request), params["index"], params["what"], small)
 
 
 def _report(studio: Studio, request: Request, body: Any) -> Response:  # noqa: ANN401

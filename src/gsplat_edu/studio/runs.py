@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ from gsplat_edu.reading import open_file, parse_json
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.studio.pictures import cache_name
 from gsplat_edu.studio.refusal import RefusedError, not_found
+from gsplat_edu.studio.workers import Worker
 from gsplat_edu.text import whole_of
 
 MOST_READ = 8 << 20
@@ -125,55 +124,61 @@ def compared(a: RunFolder, b: RunFolder) -> dict[str, Any]:
     }
 
 
-def view_picture(folder: RunFolder, index: str, what: str) -> tuple[bytes, str]:
-    """Return a picture of a held-out view as PNG, and a version of it.
+def view_picture(
+    decoder: Worker, cache: Path, folder: RunFolder, index: str, what: str, small: bool = False
+) -> Path:
+    """Return the file of a picture of a held-out view, made if there is none yet.
 
     Args:
+        decoder: The process that decodes pictures, so that the server's memory never holds one.
+        cache: Folder of such files.
         folder: The run.
         index: The view, as `views` numbers it.
         what: render, photo, or difference: their absolute difference times `GAIN`.
-
-    Raises:
-        RefusedError: there is no such view or picture.
-    """
-    path = _picture_file(folder, index, what)
-    version = f"{path.stat().st_mtime_ns:x}-{what}" if path.is_file() else ""
-    data = io.BytesIO()
-    Image.fromarray(_parts(path)[what]).save(data, format="PNG", compress_level=1)
-    return data.getvalue(), version
-
-
-def view_preview(cache: Path, folder: RunFolder, index: str, what: str) -> Path:
-    """Return the file of a smaller picture of a held-out view, a JPEG, made if there is none yet.
-
-    Args:
-        cache: Folder of such files.
-        folder: The run.
-        index: See `view_picture`.
-        what: See `view_picture`.
+        small: Whether to make a JPEG of at most `PREVIEW_SIDE` px instead of a PNG of the whole picture.
 
     Raises:
         RefusedError: there is no such view or picture.
     """
     path = _picture_file(folder, index, what)
     try:
-        facts = path.stat()
+        made = cache_name(path, path.stat())
     except OSError:
         raise not_found(f"picture {path.name}") from None
-    made = cache_name(path, facts)
-    targets = {name: cache / f"{made}-{name}.jpg" for name in PICTURES}
-    with _making:  # a page asks for all three at once
-        if not targets[what].is_file():
-            for name, pixels in _parts(path).items():
-                image = Image.fromarray(pixels)
-                image.thumbnail((PREVIEW_SIDE, PREVIEW_SIDE))
-                with written_aside(targets[name]) as aside:
-                    image.save(aside, format="JPEG", quality=PREVIEW_QUALITY)
+    names = PICTURES if small else (what,)  # a page asks for all three previews at once
+    targets = {name: cache / f"{made}-{name}.{'jpg' if small else 'png'}" for name in names}
+    if not targets[what].is_file():
+        outs = {name: str(target) for name, target in targets.items()}
+        decoder.ask("view_pictures", comparison=str(path), outs=outs, small=small)
     return targets[what]
 
 
-_making = threading.Lock()
-"""Previews are made one after the other: decoding takes a core and ten bytes per pixel."""
+def make_view_pictures(comparison: str, outs: Mapping[str, str], small: bool) -> dict[str, Any]:
+    """Write pictures of a held-out view; a task of `gsplat_edu.studio.worker`.
+
+    Args:
+        comparison: File of the photo beside its render.
+        outs: File to write by picture; nothing is done if all exist, because somebody else may have asked for them.
+        small: See `view_picture`.
+
+    Raises:
+        RefusedError: the file is damaged.
+    """
+    if all(Path(out).is_file() for out in outs.values()):
+        return {}
+    parts = _parts(Path(comparison))
+    for name, out in outs.items():
+        image = Image.fromarray(parts[name])
+        if small:
+            image.thumbnail((PREVIEW_SIDE, PREVIEW_SIDE))
+        how: dict[str, Any] = (
+            {"format": "JPEG", "quality": PREVIEW_QUALITY}
+            if small
+            else {"format": "PNG", "compress_level": 1}
+        )
+        with written_aside(Path(out)) as aside:
+            image.save(aside, **how)
+    return {}
 
 
 def _picture_file(folder: RunFolder, index: str, what: str) -> Path:

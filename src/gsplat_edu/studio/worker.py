@@ -215,12 +215,20 @@ def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
     return make_thumbnail(photo, side, out)
 
 
+def make_view_pictures(comparison: str, outs: dict[str, str], small: bool) -> dict[str, Any]:
+    """Write pictures of a run's held-out view; see `gsplat_edu.studio.runs.make_view_pictures`."""
+    from gsplat_edu.studio.runs import make_view_pictures
+
+    return make_view_pictures(comparison, outs, small)
+
+
 TASKS: dict[str, Callable[..., dict[str, Any]]] = {
     "page": make_page,
     "live_page": make_live_page,
     "picture": make_picture,
     "check_edits": check_edits,
     "thumbnail": make_thumbnail,
+    "view_pictures": make_view_pictures,
     "forecast": forecast,
 }
 
