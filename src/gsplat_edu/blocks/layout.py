@@ -17,7 +17,6 @@ import dataclasses
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.json_fields import checked_text, checked_whole, number_within
@@ -134,13 +133,15 @@ class Done:
     version: str
 
     @classmethod
-    def checked(cls, entry: dict[str, Any]) -> Done:
+    def checked(cls, entry: object) -> Done:
         """Return the record in a JSON object.
 
         Raises:
             ArgumentError: a field is of another type or out of range.
-            TypeError: a field is missing or unknown.
+            TypeError: a field is missing or unknown, or the value is no object.
         """
+        if not isinstance(entry, dict):
+            raise TypeError("is not an object")
         for name in ("block", "gaussians", "iterations", "peak_memory"):
             checked_whole(name, entry.get(name), 0, LARGEST)
         for name in ("plan", "sha256", "host", "instructions", "version"):

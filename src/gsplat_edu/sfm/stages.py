@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,6 +11,9 @@ from typing import Any
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.reading import parse_json, read_text
+
+LARGEST = 1e300
+"""No number in a record is as large; a whole number may have more digits than a float can hold."""
 
 
 def _text(value: object) -> bool:
@@ -23,7 +25,7 @@ def _whole(value: object) -> bool:
 
 
 def _number(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+    return type(value) in (int, float) and abs(value) < LARGEST  # type: ignore[arg-type]
 
 
 def _texts(value: object) -> bool:

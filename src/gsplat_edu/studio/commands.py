@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,7 +59,7 @@ def _whole(least: int, most: int) -> Option:
 
 def _number(least: float, most: float) -> Option:
     def words(name: str, value: Any) -> Words:  # noqa: ANN401
-        if type(value) not in (int, float) or not math.isfinite(value) or not least <= value <= most:
+        if type(value) not in (int, float) or not least <= value <= most:  # NaN is not either
             raise RefusedError(
                 f"{name}: is {str(value)[:40]}, but has to be a number from {least:g} to {most:g}"
             )
