@@ -153,3 +153,25 @@ def test_a_browser_plays_it_in_the_right_colours(tmp_path, height, width):
     for i, shown in enumerate(played["shown"]):
         # One step of limited-range YUV is up to 2.3 in RGB, and quantization adds a few; a wrong matrix is off by 30.
         assert np.abs(np.array(shown) - np.array(expected[i])).max() <= 8
+
+
+@pytest.mark.parametrize("fps", [30.0, 23.976, 8.0])
+def test_a_video_takes_half_a_bit_per_pixel_at_its_frame_rate(tmp_path, fps):
+    """A texture that moves, with grain; without a limit it takes more than a bit per pixel."""
+    rng = np.random.default_rng(0)
+    large = cv2.GaussianBlur(rng.uniform(0, 255, (500, 700)).astype(np.float32), (0, 0), 1.5)
+    large = np.clip(128 + 4 * (large - 128), 0, 255).astype(np.uint8)
+    grain = rng.normal(0, 5, (12, 480, 640))
+    moved = [large[i : i + 480, 2 * i : 2 * i + 640] for i in range(12)]
+    frames = [
+        np.repeat(np.clip(one + noise, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        for one, noise in zip(moved, grain, strict=True)
+    ]
+    (path,) = write_frames(tmp_path / "a.mp4", frames, fps=fps)
+    assert path.stat().st_size < 1.5 * 0.5 / 8 * 12 * 480 * 640  # the first frame has none before it
+    video = cv2.VideoCapture(str(path))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=1e-3)
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 12
+    decoded = [video.read()[1][..., ::-1] for _ in frames]
+    errors = [np.mean((one.astype(float) - other) ** 2) for one, other in zip(decoded, frames, strict=True)]
+    assert 10 * np.log10(255**2 / np.mean(errors)) > 25

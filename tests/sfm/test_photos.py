@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.errors import DatasetError
-from gsplat_edu.sfm.photos import copy_photos, fingerprint, photo_files
+from gsplat_edu.sfm.photos import PhotoFacts, camera_kinds, copy_photos, fingerprint, photo_files
 from systems import needs_posix
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (30, 40, 3)).astype(np.uint8)
@@ -198,3 +198,19 @@ def test_broken_links_and_pipes_are_not_photos(tmp_path, monkeypatch):
     os.mkfifo(tmp_path / "pipe")
     monkeypatch.setattr("gsplat_edu.sfm.photos.is_photo", lambda path: asked.append(path) or True)
     assert photo_files(tmp_path) == asked == [wanted], "opening a pipe would block for ever"
+
+
+def test_a_camera_that_was_turned_counts_once():
+    """EXIF's orientation turns photos before they are compared; without it, sides and kind tell."""
+
+    def kinds(*cameras):
+        return camera_kinds([PhotoFacts("a", "b", 4, 3, 0, None, camera) for camera in cameras])
+
+    assert kinds("4000x3000 Phone 5.4 26", "4000x3000 Phone 5.4 26") == "one camera"
+    assert kinds("4000x3000 Phone 5.4 26", "3000x4000 Phone 5.4 26").startswith(
+        "one camera, some photos upright"
+    )
+    assert kinds("4000x3000 Phone 5.4 26", "3000x4000 Phone 2.2 13") == "2 kinds of camera or zoom"
+    assert kinds("4000x3000", "3000x4000") == "2 kinds of camera or zoom", (
+        "nothing says that it is one camera"
+    )

@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.image_files import BYTES_PER_PIXEL
+from gsplat_edu.train.capacity import PLANNED, PLANNED_PIXELS, PLANNED_VIEWS
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
 from gsplat_edu.train.schedule import photo_factor, planned_counts
@@ -27,13 +28,6 @@ GROWTH = (0.005, 0.08)
 snowmiku97 and 3,000 at half size; whole trainings added 3,100 (3,000 iterations), 4,100 (7,000), 5,500 (7,000, not
 rescaled) and 3,900 (1,200, half size). For fox it gives 5,000; 3,500 were added. Scenes with much fine detail need
 several times as many."""
-
-PLANNED = 100_000
-"""fast: planned Gaussians for `PLANNED_VIEWS` training views of `PLANNED_PIXELS`. The number grows with the square root
-of the views, but only with the cube root of the pixels, since small photos are sharper: at a third of its width,
-`snowmiku97` gains 1.4 dB from 50,000 Gaussians instead of 25,000. It is at most one per pixel of a photo."""
-
-PLANNED_PIXELS, PLANNED_VIEWS = 734_580, 85
 
 LEAST_PLANNED = 1_000
 """fast: smallest planned number, for thumbnails."""

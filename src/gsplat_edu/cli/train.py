@@ -19,7 +19,7 @@ from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
 from gsplat_edu.cli.eval import score_lines
 from gsplat_edu.cli.exporting import export_all
-from gsplat_edu.cli.options.train import left_open, options_from
+from gsplat_edu.cli.options.train import AUTO, left_open, options_from
 from gsplat_edu.cli.process import process_age
 from gsplat_edu.cli.ranks import num_processes
 from gsplat_edu.cli.sfm import stage_bars
@@ -44,6 +44,7 @@ from gsplat_edu.runs.processes import Member, joined
 from gsplat_edu.runs.training import CaptureRun, Clean, RunOptions, is_finished
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.source import needs_poses
+from gsplat_edu.train.capacity import advised_side
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.schedule import milestone
@@ -240,6 +241,8 @@ def _planned(
 ) -> Plan:
     """Find poses if necessary, and choose the options that the limits leave open."""
     options = with_poses(options_from(arguments), arguments, console, say)
+    if arguments.resolution == AUTO and not (arguments.resume and options.folder.exists()):
+        options = _with_resolution(options, say)
     options = with_choices(options, left_open(arguments), console, say)
     limits = Limits(arguments.max_memory, deadline)
     given = [name for name in PLANNED if getattr(arguments, name) is not None]
@@ -248,6 +251,19 @@ def _planned(
     for sentence in chosen.sentences:
         say(sentence)
     return chosen
+
+
+def _with_resolution(options: RunOptions, say: Callable[[str], None]) -> RunOptions:
+    """Choose the size of the photos that the planned Gaussians resolve, and say so."""
+    dataset = load_dataset(options.data, options.data_settings)
+    sizes = [(view.camera.W, view.camera.H) for view in (*dataset.train, *dataset.test)]
+    W, H = max(sizes, key=max)
+    side = advised_side(sizes, len(dataset.train))
+    if side is None:
+        say(f"--resolution auto: photos of up to {W}x{H} keep their size")
+        return options
+    say(f"--resolution {side}: the planned Gaussians do not resolve more of photos of up to {W}x{H}")
+    return replace(options, data_settings=replace(options.data_settings, resolution=float(side)))
 
 
 def with_choices(

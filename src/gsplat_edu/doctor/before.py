@@ -15,6 +15,7 @@ from gsplat_edu.doctor.cameras import (
     check_coverage,
     check_intrinsics,
     check_parallax,
+    check_resolution,
     check_sizes,
 )
 from gsplat_edu.doctor.cloud import check_cloud
@@ -46,6 +47,7 @@ OF_VIEWS: tuple[tuple[str, Check], ...] = (
     ("cloud", check_cloud),
     ("sky", check_sky),
     ("masks", check_masks),
+    ("resolution", check_resolution),
 )
 """Checks that compare views; they need at least two."""
 

@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 
+from gsplat_edu.data.dataset import TEST_EVERY
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.evaluate.paths import common_up
 from gsplat_edu.text import short_number
+from gsplat_edu.train.capacity import advised_side
 
 OFF_CENTRE = 0.1
 """Warn when the principal point is farther than this from the image centre, as a fraction of the image's side. Lenses
@@ -159,6 +161,18 @@ def check_sizes(survey: Survey) -> list[Finding]:
     advice = "if the photos were cropped, not resized, calibrate again: intrinsics are only rescaled"
     names = tuple(shot.name for shot in other) if len(other) < len(survey.shots) else ()
     return [Finding("sizes", Severity.NOTE, what, advice, names)]
+
+
+def check_resolution(survey: Survey) -> list[Finding]:
+    """Find photos that show more than the planned Gaussians resolve."""
+    sizes = [shot.size for shot in survey.shots]
+    side = advised_side(sizes, len(sizes) - len(sizes) // TEST_EVERY)
+    if side is None:
+        return []
+    W, H = max(sizes, key=max)
+    what = f"photos of {1e-6 * W * H:.1f} megapixels cost time, but the planned Gaussians do not resolve them"
+    advice = f"train with --resolution auto, which reduces the photos to {side} px"
+    return [Finding("resolution", Severity.NOTE, what, advice)]
 
 
 def check_parallax(survey: Survey) -> list[Finding]:

@@ -23,7 +23,20 @@ BT709, BT601 = 1, 6
 """Codes of ISO/IEC 23091-2 for colour primaries, transfer function and matrix. sRGB has the primaries of BT.709;
 swscale, which OpenCV uses to convert to YUV, has the matrix of BT.601."""
 
-CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+MOST_BITS = (2**31 - 1) // 2
+"""Bits per second that OpenCV asks of the encoder at most; it asks for 64 per pixel and frame, up to this."""
+
+BITS_PER_PIXEL = 0.5
+"""Bits that a pixel of a frame may take on average. Frames of traced boxes have 37.0 dB then, 38.8 dB at 4.5 times the
+size without a limit (docs/decisions/0009-vp9-in-mp4.md)."""
+
+FASTEST = 7_000
+"""Largest frame rate for the encoder: frames of less than 640 x 480 px get as many bits as those."""
+
+TICKS = 1_000
+"""Duration of a frame in the track's units."""
+
+CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts")
 """Container boxes that lead to the tables in an MP4 file's index."""
 
 VISUAL_ENTRY = 8 + 8 + 78
@@ -48,7 +61,7 @@ def encode_video(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: floa
     """
     with named_in_utf8(path) as plain:
         _encode(plain, shown, frames, fps)
-    path.write_bytes(streamable(path.read_bytes()))
+    path.write_bytes(streamable(path.read_bytes(), fps))
 
 
 def _encode(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: float) -> None:
@@ -77,7 +90,9 @@ def _encode(path: Path, shown: Path, frames: Iterable[ArrayLike], fps: float) ->
 
 def _writer(path: Path, shown: Path, size: tuple[int, int], fps: float) -> cv2.VideoWriter:
     height, width = (side + side % 2 for side in size)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), fps, (width, height))
+    # OpenCV has no option for the quality. A fast video gets few bits per frame; `streamable` slows it down.
+    fast = max(min(round(MOST_BITS / (BITS_PER_PIXEL * width * height)), FASTEST), 1)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), fast, (width, height))
     if not writer.isOpened():
         raise ArgumentError(
             f"{shown}: OpenCV cannot encode VP9 at {width}x{height}, {fps:g} fps here; write a folder of PNGs"
@@ -85,14 +100,15 @@ def _writer(path: Path, shown: Path, size: tuple[int, int], fps: float) -> cv2.V
     return writer
 
 
-def streamable(data: bytes) -> bytes:
-    """Move an MP4 file's index before its frames, and set the colour codes of its VP9 track.
+def streamable(data: bytes, fps: float | None = None) -> bytes:
+    """Move an MP4 file's index before its frames, and set the colour codes of its VP9 track and its frame rate.
 
     With the index at the end, a player has to fetch the whole file first. Without colour codes, browsers assume the
     matrix of BT.709, which turns (30, 220, 30) into (15, 190, 23).
 
     Args:
         data: The file.
+        fps: Frames per second; None keeps those of the file.
 
     Returns:
         The file, with its length unchanged.
@@ -108,6 +124,8 @@ def streamable(data: bytes) -> bytes:
     (_, front), (start, end) = boxes[b"ftyp"], boxes[b"moov"]
     index = bytearray(data[start:end])
     _name_colours(index)
+    if fps is not None:
+        _set_rate(index, fps)
     if start > boxes[b"mdat"][0]:
         _shift_offsets(index, end - start)
     return data[:front] + index + data[front:start] + data[end:]
@@ -147,6 +165,24 @@ def _shift_offsets(index: bytearray, shift: int) -> None:
             if kind == b"stco" and max(offsets, default=0) >= 2**32:
                 raise ArgumentError("video: is larger than 4 GiB; write a folder, or fewer or smaller frames")
             struct.pack_into(form, index, content + 8, *offsets)
+
+
+def _set_rate(index: bytearray, fps: float) -> None:
+    """Give every frame the duration 1 / fps, and the headers of movie, track, edit and media the sum of them."""
+    tables = {kind: content for kind, content, _ in _tables(index, 0, len(index))}
+    times = tables[b"stts"]
+    (entries,) = struct.unpack_from(">I", index, times + 4)
+    frames = 0
+    for number in range(entries):
+        (count,) = struct.unpack_from(">I", index, times + 8 + 8 * number)
+        struct.pack_into(">I", index, times + 12 + 8 * number, TICKS)
+        frames += count
+    struct.pack_into(">II", index, tables[b"mdhd"] + 12, max(round(TICKS * fps), 1), TICKS * frames)
+    (units,) = struct.unpack_from(">I", index, tables[b"mvhd"] + 12)
+    whole = round(units * frames / fps)
+    for kind, at in ((b"mvhd", 16), (b"tkhd", 20), (b"elst", 8)):
+        if kind in tables:
+            struct.pack_into(">I", index, tables[kind] + at, whole)
 
 
 def _name_colours(index: bytearray) -> None:

@@ -274,6 +274,27 @@ def photo_facts(files: Sequence[Path], source: Path, folder: Path) -> list[Photo
     return [photo for _, photo in _headers(files, source, folder)[0]]
 
 
+def camera_kinds(photos: Sequence[PhotoFacts]) -> str:
+    """Describe from how many kinds of camera photos are.
+
+    A camera that was turned, and whose photos some program stored upright without noting it in EXIF, counts once. Its
+    portraits and landscapes are still calibrated apart: nothing tells whether it was turned left or right, and the
+    principal point and the tangential distortion depend on that.
+    """
+    keys = {photo.camera for photo in photos}
+    turned = set[str]()
+    for key in keys:
+        size, named, kind = key.partition(" ")
+        W, _, H = size.partition("x")
+        if named and int(W) < int(H) and f"{H}x{W} {kind}" in keys:
+            turned.add(key)
+    count = len(keys) - len(turned)
+    said = "one camera" if count == 1 else f"{count} kinds of camera or zoom"
+    if turned:
+        said += ", some photos upright without EXIF's orientation, which are calibrated apart"
+    return said
+
+
 def _headers(
     files: Sequence[Path], source: Path, folder: Path
 ) -> tuple[list[tuple[Path, PhotoFacts]], dict[Path, tuple[Path, int]], list[str]]:

@@ -35,6 +35,7 @@ from gsplat_edu.sfm.panoramas import (
 )
 from gsplat_edu.sfm.photos import (
     PhotoFacts,
+    camera_kinds,
     copy_photos,
     fingerprint,
     mask_folder,
@@ -269,10 +270,8 @@ class _Run:
             self._say(f"left out, cannot be decoded: {listed(unreadable)}")
         if len(photos) < FEWEST:
             raise DatasetError(too_few(self.source, len(photos), unreadable))
-        lenses = len({photo.camera for photo in photos})
         known = sum(photo.focal is not None for photo in photos)
-        kinds = "one camera" if lenses == 1 else f"{lenses} kinds of camera or zoom"
-        summary = f"{len(photos)} from {kinds}; {known} with a focal length in EXIF"
+        summary = f"{len(photos)} from {camera_kinds(photos)}; {known} with a focal length in EXIF"
         if self.panoramas is not None:
             summary = f"{len(photos)} faces of {len(self.panoramas)} panoramas"
         if masked := sum(bool(photo.mask) for photo in photos):

@@ -248,9 +248,10 @@ def _add_view(group: argparse._ArgumentGroup) -> None:
 def _add_photos(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--resolution",
-        type=float,
+        type=_number_or_auto,
         metavar="R",
-        help="below 32: divide the photos' size by this; from 32 on: their longest side in px (default: full size)",
+        help="below 32: divide the photos' size by this; from 32 on: their longest side in px; auto: what the planned"
+        " Gaussians resolve, if the photos are much larger (default: full size)",
     )
     _add_number(
         group,
@@ -321,6 +322,10 @@ def _number_or_none(text: str) -> float | str:
     return text if text == "none" else _number(text)
 
 
+def _number_or_auto(text: str) -> float | str:
+    return text if text == AUTO else _number(text)
+
+
 def _number(text: str) -> float:
     try:
         return float(text)
@@ -366,7 +371,7 @@ def options_from(arguments: argparse.Namespace) -> RunOptions:
 def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
     config = _config(arguments)
     settings = DataSettings(
-        resolution=arguments.resolution,
+        resolution=_resolution(arguments),
         test_every=arguments.test_every,
         background=None if config.random_background else config.background,
         image_memory=DataSettings.image_memory if arguments.image_memory is None else arguments.image_memory,
@@ -383,6 +388,18 @@ def _options(arguments: argparse.Namespace, backend: str) -> RunOptions:
         save_every=arguments.save_every,
         resume=arguments.resume,
     )
+
+
+def _resolution(arguments: argparse.Namespace) -> float | None:
+    """Return the resolution: given, or for auto that of the run to resume, or none yet."""
+    if arguments.resolution != AUTO:
+        return None if arguments.resolution is None else float(arguments.resolution)
+    if arguments.blocks is not None:
+        raise ArgumentError("--resolution auto: is for trainings in one piece; give a number with --blocks")
+    folder = RunFolder(arguments.out)
+    stored = folder.read_config().get("data") if arguments.resume and folder.exists() else None
+    found = stored.get("resolution") if isinstance(stored, dict) else None
+    return float(found) if isinstance(found, int | float) else None
 
 
 def _config(arguments: argparse.Namespace) -> TrainConfig:
