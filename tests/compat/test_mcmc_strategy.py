@@ -13,15 +13,15 @@ STEPS, N = 24, 40
 @pytest.fixture
 def on_the_cpu(monkeypatch):
     """Its two CUDA kernels, replaced as docs/GSPLAT.md says; relocations are counted by what comes in."""
-    ratios = []
+    seen = []
 
-    def counted(opacities, scales, given, binoms):
-        ratios.append(given.clone())
-        return compute_relocation(opacities, scales, given, binoms)
+    def counted(opacities, scales, ratios, binoms):
+        seen.append(ratios.clone())
+        return compute_relocation(opacities, scales, ratios, binoms)
 
     monkeypatch.setattr(ops, "compute_relocation", counted)
     monkeypatch.setattr(ops, "quat_scale_to_covar_preci", quat_scale_to_covar_preci)
-    return ratios
+    return seen
 
 
 def draw(params):
