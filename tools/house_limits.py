@@ -25,6 +25,8 @@ EXCEPTIONS = {
         "the chapter's seven parameters stay as they are; four more make it the kernels' oracle"
     ),
     "src/gsplat_edu/compat/gsplat.py:rasterization": "gsplat's signature",
+    "src/gsplat_edu/compat/tiles.py:isect_tiles": "gsplat's signature",
+    "src/gsplat_edu/compat/tiles.py:rasterize_to_pixels": "gsplat's signature",
     "src/gsplat_edu/compat/projection.py:fully_fused_projection": "gsplat's signature",
 }
 """Functions that may have more parameters, with the reason."""

@@ -207,9 +207,16 @@ def _check_only(name: str, value: object, only: object) -> None:
         )
 
 
-def check_size(width: int, height: int) -> None:
-    """Check the size of the images."""
-    for name, size in (("width", width), ("height", height)):
+def real_tensor(name: str, tensor: Any) -> Tensor:  # noqa: ANN401
+    """Check that a tensor is one of the dtypes and on the device that the kernels take."""
+    if not isinstance(tensor, Tensor) or tensor.dtype not in SUFFIXES or tensor.device.type != "cpu":
+        raise ArgumentError(f"{name}: has to be a tensor of float32 or float64 on the CPU")
+    return tensor
+
+
+def check_size(width: int, height: int, *names: str) -> None:
+    """Check the size of the images; `names` are those of the two arguments, if they are others."""
+    for name, size in zip(names or ("width", "height"), (width, height), strict=True):
         whole_number(name, size, 1, MOST_PIXELS)
 
 
@@ -229,9 +236,7 @@ def check_projection_options(sparse_grad: bool, camera_model: str) -> None:
 
 def check_scene(named: Mapping[str, Tensor | None], from_covars: bool) -> tuple[tuple[int, ...], int]:
     """Check means, and quats, scales and opacities as far as they are needed; return the leading axes and N."""
-    means = named["means"]
-    if not isinstance(means, Tensor) or means.dtype not in SUFFIXES or means.device.type != "cpu":
-        raise ArgumentError("means: has to be a tensor of float32 or float64 on the CPU")
+    means = real_tensor("means", named["means"])
     batch, N = tuple(means.shape[:-2]), means.shape[-2] if means.ndim >= 2 else 0
     expect("means", means, (*batch, N, 3), means)
     for name, tail in (("quats", (4,)), ("scales", (3,)), ("opacities", ())):
@@ -275,11 +280,11 @@ def check_spreads(name: str, spreads: Tensor, positions: Tensor, batch: tuple[in
         )
 
 
-def expect(name: str, tensor: Any, shape: tuple[int, ...], like: Tensor) -> None:  # noqa: ANN401
-    """Check a tensor's shape, dtype and device, and that it is finite."""
+def expect(name: str, tensor: Any, shape: tuple[int, ...], like: Tensor, named: str = "means") -> None:  # noqa: ANN401
+    """Check a tensor's shape and that it is finite, and that dtype and device are those of another, `named`."""
     if not isinstance(tensor, Tensor) or (tensor.dtype, tensor.device) != (like.dtype, like.device):
         given = f"{tensor.dtype} on {tensor.device}" if isinstance(tensor, Tensor) else type(tensor).__name__
-        raise ArgumentError(f"{name}: is {given}, but has to be {like.dtype} on {like.device}, as means")
+        raise ArgumentError(f"{name}: is {given}, but has to be {like.dtype} on {like.device}, as {named}")
     if tuple(tensor.shape) != shape:
         raise ShapeError(f"{name}: has shape {tuple(tensor.shape)}, but has to be {shape}")
     with torch.no_grad():

@@ -1,9 +1,10 @@
-"""A drop-in for gsplat 1.5.3: its `rasterization`, `fully_fused_projection` and `spherical_harmonics` on any CPU.
+"""A drop-in for gsplat 1.5.3: its `rasterization`, and the steps it is made of, on any CPU.
 
     from gsplat_edu.compat.gsplat import rasterization      # instead of: from gsplat import rasterization
 
-gsplat's `DefaultStrategy` runs on it as it is; its `MCMCStrategy` calls CUDA kernels of its own. docs/GSPLAT.md
-compares the arguments one by one and lists the differences.
+gsplat's `DefaultStrategy` runs on it as it is, its `MCMCStrategy` with `compute_relocation` and
+`quat_scale_to_covar_preci` in place of its own, which are CUDA kernels. docs/GSPLAT.md compares the arguments one by
+one and lists the differences.
 
 Design. gsplat has three stages, each differentiable: projection and harmonics, then compositing of what they return.
 Its strategies call `meta["means2d"].retain_grad()` before the backward pass and read `.grad` and `.absgrad` after it.
@@ -21,7 +22,6 @@ graph could pass through. Training with `gsplat_edu.render.api.render` is faster
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -30,13 +30,29 @@ from torch import Tensor
 
 from gsplat_edu.compat.checks import Arguments, RollingShutterType, check_spreads
 from gsplat_edu.compat.harmonics import spherical_harmonics
-from gsplat_edu.compat.images import Splats, composite
+from gsplat_edu.compat.images import Splats, absgrad_store, composite
+from gsplat_edu.compat.parts import compute_relocation, proj, quat_scale_to_covar_preci, world_to_cam
 from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
+from gsplat_edu.compat.skipping import skipping_bad_gaussians, without_bad_gaussians
+from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles, rasterize_to_pixels
 from gsplat_edu.constants import SH_OFFSET
 from gsplat_edu.headroom import require_memory
 from gsplat_edu.render.api import BYTES_PER_PIXEL
 
-__all__ = ["RollingShutterType", "fully_fused_projection", "rasterization", "spherical_harmonics"]
+__all__ = [
+    "RollingShutterType",
+    "compute_relocation",
+    "fully_fused_projection",
+    "isect_offset_encode",
+    "isect_tiles",
+    "proj",
+    "quat_scale_to_covar_preci",
+    "rasterization",
+    "rasterize_to_pixels",
+    "skipping_bad_gaussians",
+    "spherical_harmonics",
+    "world_to_cam",
+]
 
 ALPHA_FLOOR = 1e-10
 """gsplat's lower bound of alpha where it divides the depth by it, for ED."""
@@ -91,7 +107,7 @@ def rasterization(
 
     Differentiable in: means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds.
     """
-    return _rasterize(Arguments(**locals()))
+    return _rasterize(Arguments(**without_bad_gaussians(dict(locals()))))
 
 
 class _Drawn(NamedTuple):
@@ -182,7 +198,7 @@ def _draw(
             depths.index_select(0, own) if with_depth else None,
             None if backgrounds is None else backgrounds[k],
         )
-        store = _absgrad_store(meta["means2d"], own) if a.absgrad else None
+        store = absgrad_store(meta["means2d"], own) if a.absgrad else None
         image, transmittance = composite(splats, lens, store)
         images.append(image)
         transmittances.append(transmittance)
@@ -199,14 +215,3 @@ def _colors(a: Arguments, drawn: _Drawn) -> Float[Tensor, "nnz D"]:
     means = _rows(a.means, a.means.ndim - 1).index_select(0, drawn.scenes * a.N + drawn.gaussians)
     colors = spherical_harmonics(a.sh_degree, means - eyes.index_select(0, drawn.images), coefficients)
     return torch.clamp_min(colors + SH_OFFSET, 0.0)
-
-
-def _absgrad_store(means2d: Tensor, rows: Int64[Tensor, " M"]) -> Callable[[Tensor, Tensor], None]:
-    """Return a function that adds sums of absolute gradients to `means2d.absgrad`, given indices into `rows`."""
-
-    def store(visible: Tensor, sums: Tensor) -> None:
-        if not hasattr(means2d, "absgrad"):
-            means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
-        means2d.absgrad.view(-1, 2).index_add_(0, rows[visible], sums)  # type: ignore[attr-defined]
-
-    return store

@@ -107,3 +107,14 @@ def _render(
         # the image: that would be a circle of references through the graph.
         means.register_hook(lambda _: absgrad(visible, found()["absgrad"]))  # type: ignore[no-untyped-call]
     return view
+
+
+def absgrad_store(means2d: Tensor, rows: Int64[Tensor, " M"]) -> Callable[[Tensor, Tensor], None]:
+    """Return a function that adds sums of absolute gradients to `means2d.absgrad`, given indices into `rows`."""
+
+    def store(visible: Tensor, sums: Tensor) -> None:
+        if not hasattr(means2d, "absgrad"):
+            means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
+        means2d.absgrad.view(-1, 2).index_add_(0, rows[visible], sums)  # type: ignore[attr-defined]
+
+    return store

@@ -16,6 +16,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import write_points_ply
+from gsplat_edu.data.tracks import Seen, seen_by, tracks_of
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.validation import ArrayLike, float64_array
 from gsplat_edu.views import Photo, View
@@ -27,7 +28,7 @@ PINHOLE = 1
 def write_colmap(
     folder: Path, views: Sequence[View], points: ArrayLike, colors: ArrayLike, *, binary: bool = True
 ) -> None:
-    """Write images/NAME, masks/NAME.png for views with a mask, and a model in sparse/0.
+    """Write images/NAME, masks/NAME.png for views with a mask, and a model in sparse/0 with tracks.
 
     Args:
         folder: The capture; created if missing.
@@ -56,6 +57,8 @@ def write_model(
 ) -> None:
     """Write a COLMAP model in sparse/0, without photos.
 
+    Tracks say which photos see a point (`gsplat_edu.data.tracks`); programs that supervise depth read them.
+
     Args:
         folder: The capture; created if missing.
         cameras: Name and camera of each photo in images/.
@@ -77,10 +80,11 @@ def write_model(
         for i, (name, camera) in enumerate(cameras, 1)
     ]
     rgb = np.round(255.0 * np.clip(cloud.colors, 0.0, 1.0)).astype(int)
+    seen = [seen_by(camera, cloud.points) for _, camera in cameras]
     if binary:
-        _write_bin(model, lenses, poses, cloud.points, rgb)
+        _write_bin(model, lenses, poses, seen, (cloud.points, rgb))
     else:
-        _write_txt(model, lenses, poses, cloud.points, rgb)
+        _write_txt(model, lenses, poses, seen, (cloud.points, rgb))
 
 
 def write_transforms(
@@ -210,32 +214,34 @@ def _write_bin(
     model: Path,
     cameras: dict[tuple[float, ...], int],
     poses: Sequence[_Pose],
-    points: np.ndarray,
-    rgb: np.ndarray,
+    seen: Sequence[Seen],
+    cloud: tuple[np.ndarray, np.ndarray],
 ) -> None:
     data = struct.pack("<Q", len(cameras))
     for (W, H, *values), camera in cameras.items():
         data += struct.pack("<IiQQ4d", camera, PINHOLE, int(W), int(H), *values)
     (model / "cameras.bin").write_bytes(data)
     data = struct.pack("<Q", len(poses))
-    for image, quat, shift, camera, name in poses:
-        data += (
-            struct.pack("<I7dI", image, *quat, *shift, camera) + name.encode() + b"\0" + struct.pack("<Q", 0)
-        )
+    for (image, quat, shift, camera, name), shown in zip(poses, seen, strict=True):
+        data += struct.pack("<I7dI", image, *quat, *shift, camera) + name.encode() + b"\0"
+        marks = np.empty(len(shown.points), [("pixel", "<f8", 2), ("point", "<i8")])
+        marks["pixel"], marks["point"] = shown.pixels, shown.points + 1
+        data += struct.pack("<Q", len(marks)) + marks.tobytes()
     (model / "images.bin").write_bytes(data)
-    rows = [
-        struct.pack("<Q3d3BdQ", i, *point, *color, 0.0, 0)
-        for i, (point, color) in enumerate(zip(points, rgb, strict=True), 1)
-    ]
-    (model / "points3D.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
+    rows = []
+    tracks = tracks_of(seen, len(cloud[0]))
+    for i, (point, color, track) in enumerate(zip(*cloud, tracks, strict=True), 1):
+        rows.append(struct.pack("<Q3d3BdQ", i, *point, *color, 0.0, len(track.images)))
+        rows.append(np.stack([track.images + 1, track.places], axis=1).astype("<u4").tobytes())
+    (model / "points3D.bin").write_bytes(struct.pack("<Q", len(tracks)) + b"".join(rows))
 
 
 def _write_txt(
     model: Path,
     cameras: dict[tuple[float, ...], int],
     poses: Sequence[_Pose],
-    points: np.ndarray,
-    rgb: np.ndarray,
+    seen: Sequence[Seen],
+    cloud: tuple[np.ndarray, np.ndarray],
 ) -> None:
     def line(*values: Any) -> str:  # noqa: ANN401
         return " ".join(v if isinstance(v, str) else repr(v) for v in values) + "\n"
@@ -245,13 +251,17 @@ def _write_txt(
         text += line(camera, "PINHOLE", int(values[0]), int(values[1]), *(float(v) for v in values[2:]))
     (model / "cameras.txt").write_text(text, encoding="utf-8")
     text = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points\n"
-    for image, quat, shift, camera, name in poses:
-        text += line(image, *quat, *shift.tolist(), camera, name) + "\n"
+    for (image, quat, shift, camera, name), shown in zip(poses, seen, strict=True):
+        text += line(image, *quat, *shift.tolist(), camera, name)
+        marks = zip(shown.pixels.tolist(), (shown.points + 1).tolist(), strict=True)
+        text += line(*(number for pixel, point in marks for number in (*pixel, point)))
     (model / "images.txt").write_text(text, encoding="utf-8")
-    rows = zip(points.tolist(), rgb.tolist(), strict=True)
-    text = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n"
-    text += "".join(line(i, *point, *color, 0.0) for i, (point, color) in enumerate(rows, 1))
-    (model / "points3D.txt").write_text(text, encoding="utf-8")
+    points, rgb = (each.tolist() for each in cloud)
+    lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n"]
+    for i, (point, color, track) in enumerate(zip(points, rgb, tracks_of(seen, len(points)), strict=True), 1):
+        pairs = np.stack([track.images + 1, track.places], axis=1).ravel().tolist()
+        lines.append(line(i, *point, *color, 0.0, *pairs))
+    (model / "points3D.txt").write_text("".join(lines), encoding="utf-8")
 
 
 def _save_photo(path: Path, photo: Photo) -> None:

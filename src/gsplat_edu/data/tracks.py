@@ -1,0 +1,73 @@
+"""Which points which photos see, for the tracks of a COLMAP model that was not made from matches.
+
+A photo sees a point if the point is before its camera, inside the image, and not hidden: points hide what is behind
+them in their cell of the image. Cells are so large that a surface of evenly spread points has some in each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from gsplat_edu.camera import Camera
+
+MOST_SEEN = 2_000
+"""Points that a photo sees at most, taken evenly from the order of the points: about as many as matching finds. A cloud
+of a million points in hundreds of photos would make gigabytes of tracks."""
+
+PER_CELL = 4
+"""Points of a cell on average."""
+
+DEPTH_SLACK = 0.05
+"""A point is hidden if it is farther away than the nearest one of its cell by more than this fraction. Surfaces that
+are seen at a grazing angle lose points by it, which is harmless."""
+
+
+class Seen(NamedTuple):
+    """What a photo sees."""
+
+    points: Int64[np.ndarray, " M"]
+    """Rows of the points, increasing."""
+    pixels: Float64[np.ndarray, "M 2"]
+    """Where, px; the centre of the first pixel is at (0.5, 0.5), as in COLMAP's files."""
+
+
+class Track(NamedTuple):
+    """The observations of a point."""
+
+    images: Int64[np.ndarray, " L"]
+    """Indices of the cameras."""
+    places: Int64[np.ndarray, " L"]
+    """Rows in what those cameras see."""
+
+
+def seen_by(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> Seen:
+    """Return the points that a camera sees, as far as the points themselves tell."""
+    at = camera.world_to_cam(points)
+    before = np.flatnonzero(at[:, 2] > 0)
+    u, v, depth = camera.project(at[before])
+    inside = (u >= -0.5) & (u < camera.W - 0.5) & (v >= -0.5) & (v < camera.H - 0.5)
+    rows, u, v, depth = before[inside], u[inside], v[inside], depth[inside]
+    edge = max(1.0, float(np.sqrt(PER_CELL * camera.W * camera.H / max(len(rows), 1))))
+    columns = int(camera.W // edge) + 1
+    cells = ((v + 0.5) // edge).astype(np.int64) * columns + ((u + 0.5) // edge).astype(np.int64)
+    nearest = np.full(cells.max(initial=0) + 1, np.inf)
+    np.minimum.at(nearest, cells, depth)
+    shown = np.flatnonzero(depth <= (1 + DEPTH_SLACK) * nearest[cells])
+    if len(shown) > MOST_SEEN:
+        shown = shown[np.linspace(0, len(shown) - 1, MOST_SEEN).round().astype(np.int64)]
+    return Seen(rows[shown], np.stack([u, v], axis=-1)[shown] + 0.5)
+
+
+def tracks_of(seen: Sequence[Seen], count: int) -> list[Track]:
+    """Return the track of each of `count` points: by image, then by place."""
+    points = np.concatenate([each.points for each in seen] or [np.empty(0, np.int64)])
+    images = np.repeat(np.arange(len(seen)), [len(each.points) for each in seen])
+    places = np.concatenate([np.arange(len(each.points)) for each in seen] or [np.empty(0, np.int64)])
+    order = np.argsort(points, kind="stable")
+    ends = np.bincount(points, minlength=count).cumsum()[:-1]
+    split = zip(np.split(images[order], ends), np.split(places[order], ends), strict=True)
+    return [Track(*each) for each in split][:count]
