@@ -157,6 +157,14 @@ def test_every_option_is_one_of_the_command_line(library, command, options):
     assert {f"--{name.replace('_', '-')}" for name in options} <= known
 
 
+def test_the_resolution_may_be_chosen_by_the_command(library):
+    options = {"resolution": "auto", "outside_masks": "empty"}
+    found = parsed(work_of(library, {"command": "train", "subject": "captures/a", "options": options}))
+    assert found.resolution == "auto" and found.outside_masks == "empty"
+    with pytest.raises(RefusedError, match="resolution: is big, but has to be a number"):
+        work_of(library, {"command": "train", "subject": "captures/a", "options": {"resolution": "big"}})
+
+
 @pytest.mark.parametrize("command", SAMPLES)
 def test_values_reach_the_command(library, command):
     options = SAMPLES[command]

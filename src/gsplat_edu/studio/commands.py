@@ -68,6 +68,13 @@ def _number(least: float, most: float) -> Option:
     return words
 
 
+def _word_or(word: str, number: Option) -> Option:
+    def words(name: str, value: Any) -> Words:  # noqa: ANN401
+        return [_flag(name), word] if value == word else number(name, value)
+
+    return words
+
+
 def _switch(name: str, value: Any) -> Words:  # noqa: ANN401
     if not isinstance(value, bool):
         raise RefusedError(f"{name}: is {str(value)[:40]}, but has to be true or false")
@@ -103,6 +110,9 @@ SFM_OPTIONS: Mapping[str, Option] = {
     "threads": _whole(0, 1_024),
 }
 
+AUTO = "auto"
+"""The resolution that the planned Gaussians resolve."""
+
 TRAIN_OPTIONS: Mapping[str, Option] = {
     "quality": _choice(*QUALITIES),
     "iterations": _whole(1, 1_000_000),
@@ -110,7 +120,7 @@ TRAIN_OPTIONS: Mapping[str, Option] = {
     "max_memory": _text,
     "max_gaussians": _whole(1, 100_000_000),
     "strategy": _choice(*STRATEGIES),
-    "resolution": _number(0.1, 100_000.0),
+    "resolution": _word_or(AUTO, _number(0.1, 100_000.0)),
     "test_every": _whole(0, 100_000),
     "appearance": _choice("auto", *APPEARANCES),
     "sky": _choice("auto", *SKIES),

@@ -14,6 +14,7 @@ from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.studio.commands import AUTO
 from gsplat_edu.studio.library import photo_names
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, entry_of, file_answer
@@ -81,9 +82,9 @@ def _forecast(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  #
     entry = studio.library.entry("captures", request.path_params["name"])
     text = request.query_params.get("resolution")
     try:
-        resolution = None if text is None else float(text)
+        resolution = text if text in (None, AUTO) else float(text)
     except ValueError:
-        raise RefusedError(f"resolution: is {text[:20]!r}, but has to be a number") from None  # type: ignore[index]
+        raise RefusedError(f"resolution: is {str(text)[:20]!r}, but has to be a number or auto") from None
     return {"qualities": studio.prober.ask("forecast", capture=str(entry), resolution=resolution)}
 
 

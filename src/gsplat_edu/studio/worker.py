@@ -170,12 +170,12 @@ _identities: dict[str, Any] = {}
 """The identity of the scene that was checked last."""
 
 
-def forecast(capture: str, resolution: float | None) -> dict[str, Any]:
+def forecast(capture: str, resolution: float | str | None) -> dict[str, Any]:
     """Forecast time and memory of a training of each quality, measured now on this machine.
 
     Args:
         capture: Folder of the capture.
-        resolution: As for `train --resolution`.
+        resolution: As for `train --resolution`: a number or "auto".
     """
     from dataclasses import replace
 
@@ -185,8 +185,14 @@ def forecast(capture: str, resolution: float | None) -> dict[str, Any]:
     from gsplat_edu.data.dataset import load_dataset
     from gsplat_edu.data.settings import DataSettings
     from gsplat_edu.render.backends import resolve_backend
+    from gsplat_edu.train.capacity import advised_side
     from gsplat_edu.train.config import DEFAULT_STRATEGY, QUALITIES, recipe
 
+    if isinstance(resolution, str):
+        whole = load_dataset(Path(capture))
+        sizes = [(view.camera.W, view.camera.H) for view in (*whole.train, *whole.test)]
+        side = advised_side(sizes, len(whole.train))
+        resolution = None if side is None else float(side)
     dataset = load_dataset(Path(capture), DataSettings(resolution=resolution))
     facts = Facts.of(dataset, load_dataset(dataset.path))
     measured, found = None, {}

@@ -14,6 +14,14 @@ const QUALITIES = [
   ["high", "High", "fine detail, several times as long"],
 ];
 
+const OUTSIDE = [
+  ["", "decide from the masks"],
+  ["empty", "empty: the masks cut out an object"],
+  ["ignore", "ignore: the masks hide something in front"],
+];
+
+const NUMBER_OR_AUTO = "auto|[0-9]+([.][0-9]+)?";
+
 export function capture(given) {
   const { main, store } = given;
   return withEntry(given, (entry) => {
@@ -61,17 +69,19 @@ function startForm(store, entry) {
   });
   const fields = {
     iterations: h("input", { id: "iterations", type: "number", min: 1, max: 1000000, inputmode: "numeric" }),
-    resolution: h("input", { id: "resolution", type: "number", min: 0.1, step: "any", inputmode: "decimal" }),
+    resolution: h("input", { id: "resolution", type: "text", placeholder: "full size", autocomplete: "off", pattern: NUMBER_OR_AUTO }),
     time_limit: h("input", { id: "time-limit", type: "text", placeholder: "30m", autocomplete: "off" }),
     max_memory: h("input", { id: "max-memory", type: "text", placeholder: "8G", autocomplete: "off" }),
     max_gaussians: h("input", { id: "max-gaussians", type: "number", min: 1, inputmode: "numeric" }),
+    outside_masks: h("select", { id: "outside-masks" }, OUTSIDE.map(([value, text]) => h("option", { value }, text))),
   };
   const labels = {
     iterations: "Iterations instead of a quality",
-    resolution: "Size of the photos: 2 for half, or longest side in px",
+    resolution: "Size of the photos: 2 for half, longest side in px, or auto",
     time_limit: "Time instead of a quality",
     max_memory: "Memory limit",
     max_gaussians: "Splats at most",
+    outside_masks: "Outside of the photos' masks",
   };
   const name = h("input", { id: "run-name", type: "text", autocomplete: "off" });
   const go = h("button", { class: "primary" }, "Start training");
@@ -81,7 +91,7 @@ function startForm(store, entry) {
     measure.hidden = true;
     for (const facts of said.values()) facts.textContent = "measuring ...";
     try {
-      const resolution = fields.resolution.value ? `?resolution=${Number(fields.resolution.value)}` : "";
+      const resolution = fields.resolution.value ? `?resolution=${encodeURIComponent(fields.resolution.value)}` : "";
       const { qualities } = await get(at(entry.entry, "forecast") + resolution);
       for (const [value, facts] of said) {
         const { seconds, bytes: memory, gaussians, iterations } = qualities[value];
@@ -108,7 +118,9 @@ function startForm(store, entry) {
             const own = fields.iterations.value || fields.time_limit.value; // takes the place of a quality
             const options = own ? {} : { quality: new FormData(event.target).get("quality") };
             for (const [key, field] of Object.entries(fields)) {
-              if (field.value) options[key] = field.type === "number" ? Number(field.value) : field.value;
+              if (!field.value) continue;
+              const number = field.type === "number" || (key === "resolution" && field.value !== "auto");
+              options[key] = number ? Number(field.value) : field.value;
             }
             const to = name.value || freeName(store, "runs", entry.name);
             const { job } = await startJob(store, { command: "train", subject: entry.entry, to, options });
