@@ -123,7 +123,7 @@ def whole_number(name: str, value: object, low: int, high: int | None = None) ->
         number = None
     if number is None or number < low or (high is not None and number > high):
         bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
-        raise ArgumentError(f"{name}: is {shown(value)}, but has to be a whole number {bounds}")
+        raise ArgumentError(f"{name}: is {quoted(value)}, but has to be a whole number {bounds}")
     return number
 
 
@@ -134,7 +134,7 @@ def flag(name: str, value: object) -> bool:
         ArgumentError: it is not.
     """
     if not isinstance(value, bool | np.bool_ | int | np.integer) or value not in (0, 1):
-        raise ArgumentError(f"{name}: is {shown(value)}, but has to be True or False")
+        raise ArgumentError(f"{name}: is {quoted(value)}, but has to be True or False")
     return bool(value)
 
 
@@ -145,10 +145,10 @@ def of_type(name: str, value: object, kind: type) -> None:
         ArgumentError: it is not.
     """
     if not isinstance(value, kind):
-        raise ArgumentError(f"{name}: is {shown(value)}, but has to be of type {kind.__name__}")
+        raise ArgumentError(f"{name}: is {quoted(value)}, but has to be of type {kind.__name__}")
 
 
-def shown(value: object) -> str:
+def quoted(value: object) -> str:
     """Return a scalar or a short word as Python writes it, of other values the type: a message is one line."""
     text = repr(value) if isinstance(value, bool | int | float | str | bytes | None) else ""
     return text if 0 < len(text) <= 40 else f"of type {type(value).__name__}"
@@ -161,7 +161,7 @@ def one_of(name: str, value: object, choices: Sequence[str]) -> None:
         ArgumentError: it is not; the message lists the choices.
     """
     if not isinstance(value, str) or value not in choices:
-        raise ArgumentError(f"{name}: is {shown(value)}, but has to be one of {', '.join(choices)}")
+        raise ArgumentError(f"{name}: is {quoted(value)}, but has to be one of {', '.join(choices)}")
 
 
 def _spelled(shape: Shape, sizes: Mapping[str, int]) -> str:

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.studio.patience import STEP, Patience
+from gsplat_edu.studio.patience import LEAST_GAIN, Patience
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.uploads import Limits
 from gsplat_edu.text import LONGEST_LINE, LONGEST_WORD, bounded
@@ -41,8 +41,8 @@ def read(piece, wait, count, seconds):
 
 
 def test_a_body_has_to_go_on():
-    assert read(STEP, 0.0, 100, 30.0) == 100 * STEP and read(1, 0.0, 10, 30.0) == 10
-    for piece, wait in ((1, 0.01), (STEP // 1000, 0.01), (STEP, 60.0)):  # trickles, and stops
+    assert read(LEAST_GAIN, 0.0, 100, 30.0) == 100 * LEAST_GAIN and read(1, 0.0, 10, 30.0) == 10
+    for piece, wait in ((1, 0.01), (LEAST_GAIN // 1000, 0.01), (LEAST_GAIN, 60.0)):  # trickles, and stops
         with pytest.raises(RefusedError, match=r"fewer than 4,096 bytes of it came in 0.1 s"):
             read(piece, wait, 1_000, 0.1)
 

@@ -33,7 +33,7 @@ MOST_BLOCKS = 256
 LONGEST_TEXT = 1_000
 """Characters of a text in a record."""
 
-LARGEST = 2**53
+LARGEST_NUMBER = 2**53
 """Largest number in a record; JSON's readers keep whole numbers up to it exactly."""
 
 
@@ -143,10 +143,10 @@ class Done:
         if not isinstance(entry, dict):
             raise TypeError("is not an object")
         for name in ("block", "gaussians", "iterations", "peak_memory"):
-            checked_whole(name, entry.get(name), 0, LARGEST)
+            checked_whole(name, entry.get(name), 0, LARGEST_NUMBER)
         for name in ("plan", "sha256", "host", "instructions", "version"):
             checked_text(name, entry.get(name), LONGEST_TEXT)
-        number_within("seconds", entry.get("seconds"), 0, LARGEST)
+        number_within("seconds", entry.get("seconds"), 0, LARGEST_NUMBER)
         return cls(**entry)
 
     def write(self, folder: BlocksFolder) -> None:

@@ -19,7 +19,7 @@ EVENTS = "GSPLAT_EDU_EVENTS"
 """Environment variable that names the file of events."""
 
 
-LARGEST = 1e300
+LARGEST_NUMBER = 1e300
 """Largest magnitude of a number in a line."""
 
 
@@ -210,7 +210,7 @@ def parse_line(line: str | bytes) -> tuple[float, Event]:
 
 
 def _is_number(value: Any) -> bool:  # noqa: ANN401
-    return type(value) in (int, float) and abs(value) <= LARGEST  # not NaN either
+    return type(value) in (int, float) and abs(value) <= LARGEST_NUMBER  # not NaN either
 
 
 def _is_texts(value: Any) -> bool:  # noqa: ANN401
@@ -218,7 +218,7 @@ def _is_texts(value: Any) -> bool:  # noqa: ANN401
 
 
 TYPES: Mapping[str, Callable[[Any], bool]] = {
-    "int": lambda value: type(value) is int and abs(value) <= LARGEST,
+    "int": lambda value: type(value) is int and abs(value) <= LARGEST_NUMBER,
     "float": _is_number,
     "float | None": lambda value: value is None or _is_number(value),
     "str": lambda value: isinstance(value, str),

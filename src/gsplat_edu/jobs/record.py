@@ -160,7 +160,7 @@ class Job:
 
     def document(self) -> dict[str, Any]:
         """Return the record as JSON has it: the request, and no command line."""
-        facts = {name: getattr(self, name) for name in FIELDS}
+        facts = {name: getattr(self, name) for name in RECORD_FIELDS}
         return {"version": VERSION, "id": self.id, "request": dict(self.work.request), **facts}
 
 
@@ -180,7 +180,7 @@ def _or_none(check: Callable[[Any], bool]) -> Callable[[Any], bool]:
     return lambda value: value is None or check(value)
 
 
-FIELDS: Mapping[str, Callable[[Any], bool]] = {
+RECORD_FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, str) and value in tuple(State),
     "created": _time,
     "started": _or_none(_time),
@@ -252,11 +252,11 @@ class JobFolder:
             entry = parse_json(data) if len(data) <= MOST_BYTES else None
             if not isinstance(entry, dict) or entry.get("version") != VERSION:
                 raise ValueError("it is no record of this version")
-            if set(entry) != {"version", "id", "request", *FIELDS}:
+            if set(entry) != {"version", "id", "request", *RECORD_FIELDS}:
                 raise ValueError("it has other fields")
             if entry["id"] != self.path.name:
                 raise ValueError("it belongs to another job")
-            for name, is_allowed in FIELDS.items():
+            for name, is_allowed in RECORD_FIELDS.items():
                 if not is_allowed(entry[name]):
                     raise ValueError(f"{name} has an impossible value")
             if not isinstance(entry["request"], dict):
@@ -267,7 +267,7 @@ class JobFolder:
         except ValueError as error:
             why = shortened(printable(str(error)))
             raise ArgumentError(f"job {self.path.name}: is damaged ({why}); remove it") from None
-        facts = {name: entry[name] for name in FIELDS}
+        facts = {name: entry[name] for name in RECORD_FIELDS}
         facts |= {"state": State(entry["state"]), "outputs": tuple(entry["outputs"])}
         return Job(self.path.name, work, **facts)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, DILATION_MAX, SH_MAX_DEGREE, Z_NEAR
 from gsplat_edu.errors import BackendUnavailableError
-from gsplat_edu.validation import flag, float64_array, in_range, one_of, shown, whole_number
+from gsplat_edu.validation import flag, float64_array, in_range, one_of, quoted, whole_number
 
 BACKENDS = ("cuda", "cpu", "torch")
 """All backends, fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, which evaluates every
@@ -28,7 +28,7 @@ def check_backend(name: str) -> None:
     known: tuple[object, ...] = ("auto", *BACKENDS)
     if type(name) not in map(type, known) or name not in known:
         raise BackendUnavailableError(
-            f"backend {shown(name)}: not in this version of gsplat_edu; use auto or one of: {', '.join(BACKENDS)}"
+            f"backend {quoted(name)}: not in this version of gsplat_edu; use auto or one of: {', '.join(BACKENDS)}"
         )
 
 

@@ -12,7 +12,7 @@ from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
 from gsplat_edu.reading import parse_json, read_text
 
-LARGEST = 1e300
+LARGEST_NUMBER = 1e300
 """No number in a record is as large; a whole number may have more digits than a float can hold."""
 
 
@@ -25,7 +25,7 @@ def _whole(value: object) -> bool:
 
 
 def _number(value: object) -> bool:
-    return type(value) in (int, float) and abs(value) < LARGEST  # type: ignore[arg-type]
+    return type(value) in (int, float) and abs(value) < LARGEST_NUMBER  # type: ignore[arg-type]
 
 
 def _texts(value: object) -> bool:

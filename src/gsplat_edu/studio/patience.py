@@ -9,7 +9,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from gsplat_edu.studio.refusal import RefusedError
 
-STEP = 4096
+LEAST_GAIN = 4096
 """Bytes of a body that count as progress: one byte now and then does not keep a connection."""
 
 
@@ -20,7 +20,7 @@ class Patience:
 
     Args:
         app: What answers the requests.
-        seconds: Waiting within which `STEP` more bytes of a body, or its end, have to come.
+        seconds: Waiting within which `LEAST_GAIN` more bytes of a body, or its end, have to come.
     """
 
     def __init__(self, app: ASGIApp, seconds: float) -> None:
@@ -43,12 +43,12 @@ class Patience:
                 message = await asyncio.wait_for(receive(), left)
             except TimeoutError:
                 raise RefusedError(
-                    f"body: fewer than {STEP:,} bytes of it came in {self.seconds:g} s; send it again",
+                    f"body: fewer than {LEAST_GAIN:,} bytes of it came in {self.seconds:g} s; send it again",
                     HTTPStatus.REQUEST_TIMEOUT,
                 ) from None
             left -= loop.time() - began
             new += len(message.get("body", b""))
-            if new >= STEP:
+            if new >= LEAST_GAIN:
                 left, new = self.seconds, 0
             is_whole = message["type"] != "http.request" or not message.get("more_body", False)
             return message
