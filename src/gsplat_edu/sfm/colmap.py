@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
@@ -21,6 +22,9 @@ from gsplat_edu.text import install_command
 
 POLL = 0.25
 """Seconds between two queries of a job's progress."""
+
+BEAT = 10.0
+"""Seconds after which the progress of a job that reports nothing is repeated, so that its time can be shown."""
 
 COUNTS = {
     "features": "SELECT COUNT(*) FROM descriptors",
@@ -67,6 +71,7 @@ def call(
     listener = threading.Thread(target=_listen, args=(process, answers), daemon=True)
     count = COUNTS.get(job)
     result: dict[str, Any] | None = None
+    done, told = 0, time.monotonic()
     assert process.stdin is not None and process.stdout is not None
     try:
         with suppress(BrokenPipeError), process.stdin as stdin:  # broken if the process failed at once
@@ -78,9 +83,13 @@ def call(
             except queue.Empty:
                 if count is not None:
                     progress(_rows(Path(str(arguments["database"])), count))
+                elif time.monotonic() - told >= BEAT:
+                    told = time.monotonic()
+                    progress(done)
                 continue
             if "done" in answer:
-                progress(answer["done"])
+                done, told = answer["done"], time.monotonic()
+                progress(done)
             elif "result" in answer:
                 result = answer["result"]
             else:
