@@ -1,7 +1,8 @@
-"""Progress where output is redirected: lines with the elapsed and remaining time; on a terminal, 80 columns are enough."""
+"""Lines of progress where output is redirected; on a terminal of 80 columns, the time left is visible."""
 
 import io
 import re
+from queue import SimpleQueue
 
 import pytest
 from rich.console import Console
@@ -10,6 +11,7 @@ from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import LINE_SECONDS, Bar, clock
 from gsplat_edu.cli.train import progress_bar
+from gsplat_edu.sfm.colmap import _await_result
 
 
 class Time:
@@ -103,3 +105,21 @@ def test_the_time_left_survives_80_columns():
     drawn = console.file.getvalue()
     assert re.search(r"200000/300000.*0:01:40", drawn), "it is in the visible part of the line"
     assert "loss 0.123" in drawn
+
+
+def test_a_mapper_that_reports_nothing_for_long_is_followed(monkeypatch):
+    """COLMAP's mapper adjusts all poses for minutes between two photos, and after the last one."""
+    monkeypatch.setattr("gsplat_edu.sfm.colmap.POLL", 0.001)
+    monkeypatch.setattr("gsplat_edu.sfm.colmap.BEAT", 0.0)
+    answers, seen = SimpleQueue(), []
+
+    def progress(done):
+        seen.append(done)
+        if len(seen) == 5:
+            answers.put({"result": {"models": []}})
+
+    answers.put({"done": 7})
+    assert _await_result(answers, progress, None) == {"models": []}
+    assert seen == [7, 7, 7, 7, 7]
+    answers.put({"ended": True})
+    assert _await_result(answers, progress, None) is None
