@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def stage_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a progress bar per stage, on a terminal.
+    """Show a progress bar per stage; without a terminal, lines about long stages.
 
     Args:
         console: Console to draw on.

@@ -5,12 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress, Task, TaskID, TextColumn
+from rich.progress import Progress, ProgressColumn, Task, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Column
 from rich.text import Text
 
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Message
 from gsplat_edu.text import printable
+
+LINE_SECONDS = 30.0
+"""Least seconds between two lines about one task, if there is no terminal for a progress bar."""
+
+LINE_SHARE = 0.05
+"""Least fraction of a task's time between two lines, so that a long task does not fill a log."""
+
+SPEED_SECONDS = 300.0
+"""Seconds over which a task's speed is averaged: some tasks take a minute per step."""
 
 
 class Terminal(Console):
@@ -36,7 +46,17 @@ class Terminal(Console):
 
 
 class Bar(Progress):
-    """Progress bars that a job also reports as events."""
+    """Progress bars that a job also reports as events. Without a terminal, lines show the progress of long tasks.
+
+    Args:
+        columns: As for rich.
+        options: As for rich.
+    """
+
+    def __init__(self, *columns: ProgressColumn | str, **options: Any) -> None:  # noqa: ANN401
+        self._told: dict[TaskID, float] = {}
+        """Seconds of each task at its last line."""
+        super().__init__(*columns, speed_estimate_period=SPEED_SECONDS, **options)
 
     def update(self, task_id: TaskID, **changes: Any) -> None:  # noqa: ANN401
         """Update a task like rich."""
@@ -48,24 +68,54 @@ class Bar(Progress):
         super().advance(task_id, advance)
         self._report(task_id)
 
+    def due(self, task_id: TaskID) -> bool:
+        """Return whether a task's last line was long ago: `LINE_SECONDS`, or `LINE_SHARE` of the task's time.
+
+        Args:
+            task_id: The task. A field "lines" that is false keeps this class from printing lines for it.
+        """
+        elapsed = self._tasks[task_id].elapsed or 0.0
+        return elapsed - self._told.get(task_id, 0.0) >= max(LINE_SECONDS, LINE_SHARE * elapsed)
+
+    def times(self, task_id: TaskID) -> str:
+        """Return for how long a task has run, and how long it will, unless no column of the bars forecasts that."""
+        task = self._tasks[task_id]
+        self._told[task_id] = task.elapsed or 0.0
+        said = f"{clock(task.elapsed or 0.0)} elapsed"
+        if any(isinstance(column, TimeRemainingColumn) for column in self.columns):
+            remaining = task.time_remaining
+            said += "" if remaining is None else f", {clock(remaining)} left"
+        return said
+
     def _report(self, task_id: TaskID) -> None:
         task = self._tasks[task_id]
-        if task.visible:
-            emitter.progress(
-                printable(task.description), task.completed, task.total, lambda: task.time_remaining
-            )
+        if not task.visible:
+            return
+        emitter.progress(printable(task.description), task.completed, task.total, lambda: task.time_remaining)
+        if not self.console.is_terminal and task.fields.get("lines", True) and self.due(task_id):
+            total = "" if task.total is None else f" of {task.total:,.0f}"
+            line = f"{task.description}: {task.completed:,.0f}{total}, {self.times(task_id)}"
+            # not Terminal.print: a job has reported this as progress, and needs no message
+            Console.print(self.console, printable(line), markup=False, emoji=False, soft_wrap=True)
+
+
+def clock(seconds: float) -> str:
+    """Return a time as minutes and seconds, or hours, minutes and seconds: "3:05", "1:03:05"."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
 class Field(TextColumn):
-    """A progress bar column whose text may quote names from files.
+    """A progress bar column whose text may quote names from files. Where the line is too narrow, it is cut first.
 
     Args:
         text: As for rich's `TextColumn`: "{task.description}", for example.
     """
 
     def __init__(self, text: str) -> None:
-        super().__init__(text, markup=False)
+        super().__init__(text, markup=False, table_column=Column())  # rich's own does not give way
 
     def render(self, task: Task) -> Text:
         """Return a task's text, escaped."""
-        return Text(printable(self.text_format.format(task=task)))
+        return Text(printable(self.text_format.format(task=task)), no_wrap=True, overflow="ellipsis")

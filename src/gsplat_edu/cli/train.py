@@ -327,7 +327,7 @@ def _check_view(arguments: argparse.Namespace) -> None:
 
 def train_with_bar(
     capture: CaptureRun,
-    bar: Progress,
+    bar: Bar,
     ends: Callable[[], bool],
     callbacks: Sequence[Callback],
 ) -> bool:
@@ -343,7 +343,7 @@ def train_with_bar(
         Whether `ends`, in any of the processes that share the training, ended it.
     """
     iterations, start = capture.options.config.iterations, capture.trainer.iteration
-    task = bar.add_task("training", total=iterations, completed=start, state="")
+    task = bar.add_task("training", total=iterations, completed=start, state="", lines=False)
 
     def show(trainer: Trainer, event: Event) -> None:
         if not isinstance(event, StepEvent):
@@ -355,8 +355,11 @@ def train_with_bar(
             state = f"loss {event.loss:.3f}  PSNR {_psnr(trainer):.1f} of {_short(trainer.last_name)}"
             bar.update(task, state=f"{state}  {event.num_gaussians} Gaussians  {speed:.0f} it/s")
         bar.update(task, completed=trainer.iteration, total=iterations)
-        if bar.disable and milestone(trainer.iteration, max(iterations // LINES, 1), batch) is not None:
-            figures = f"loss {event.loss:.4f}, PSNR {_psnr(trainer):.2f} dB of {trainer.last_name}"
+        if not bar.disable:
+            return
+        if milestone(trainer.iteration, max(iterations // LINES, 1), batch) is not None or bar.due(task):
+            figures = f"{bar.times(task)}, loss {event.loss:.4f}"
+            figures += f", PSNR {_psnr(trainer):.2f} dB of {trainer.last_name}"
             figures += f", {event.num_gaussians} Gaussians"
             bar.console.print(f"iteration {trainer.iteration}/{iterations}: {figures}", soft_wrap=True)
 
@@ -386,21 +389,21 @@ def _psnr(trainer: Trainer) -> float:
     return psnr(*trainer.last)
 
 
-def progress_bar(console: Console, state: str) -> Progress:
+def progress_bar(console: Console, state: str) -> Bar:
     """Make a progress bar; one that shows a state stays on the screen.
 
     Args:
-        console: The terminal; without one, nothing is drawn.
+        console: The terminal; without one, lines show the progress of long tasks.
         state: Template of the text behind the bar.
     """
     columns = (
         Field("{task.description}"),
         BarColumn(bar_width=16),
         MofNCompleteColumn(),
+        TimeRemainingColumn(),  # before the state, which is cut where the terminal is narrow
         Field(state),
     )
-    quiet = not console.is_terminal
-    return Bar(*columns, TimeRemainingColumn(), console=console, transient=not state, disable=quiet)
+    return Bar(*columns, console=console, transient=not state, disable=not console.is_terminal)
 
 
 @contextmanager

@@ -9,8 +9,10 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,9 @@ from gsplat_edu.text import install_command
 
 POLL = 0.25
 """Seconds between two queries of a job's progress."""
+
+BEAT = 10.0
+"""Seconds after which the progress of a job that reports nothing is repeated, so that its time can be shown."""
 
 COUNTS = {
     "features": "SELECT COUNT(*) FROM descriptors",
@@ -72,22 +77,11 @@ def call(
         with suppress(BrokenPipeError), process.stdin as stdin:  # broken if the process failed at once
             stdin.write(json.dumps({"job": job, **arguments}).encode())
         listener.start()
-        while result is None:
-            try:
-                answer = answers.get(timeout=POLL)
-            except queue.Empty:
-                if count is not None:
-                    progress(_rows(Path(str(arguments["database"])), count))
-                continue
-            if "done" in answer:
-                progress(answer["done"])
-            elif "result" in answer:
-                result = answer["result"]
-            else:
-                break
+        rows = None if count is None else partial(_rows, Path(str(arguments["database"])), count)
+        result = _await_result(answers, progress, rows)
         code = process.wait()
-        if result is not None and count is not None:
-            progress(_rows(Path(str(arguments["database"])), count))
+        if result is not None and rows is not None:
+            progress(rows())
     finally:
         if process.poll() is None:
             process.kill()
@@ -102,6 +96,35 @@ def call(
             "--max-image-size, or run the command again"
         )
     return result
+
+
+def _await_result(
+    answers: queue.SimpleQueue[dict[str, Any]],
+    progress: Callable[[int], None],
+    rows: Callable[[], int] | None,
+) -> dict[str, Any] | None:
+    """Forward a job's progress until it ends; return its result, or None if it has none.
+
+    Args:
+        answers: The job's messages.
+        progress: Called with the amount done; also, now and then, while the job reports nothing.
+        rows: Measures the amount done of a job that does not report it.
+    """
+    done, told = 0, time.monotonic()
+    while True:
+        try:
+            answer = answers.get(timeout=POLL)
+        except queue.Empty:
+            if rows is not None:
+                progress(rows())
+            elif time.monotonic() - told >= BEAT:
+                told = time.monotonic()
+                progress(done)
+            continue
+        if "done" not in answer:
+            return answer.get("result")
+        done, told = answer["done"], time.monotonic()
+        progress(done)
 
 
 def forget_matches(database: Path) -> None:

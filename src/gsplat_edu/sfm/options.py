@@ -35,7 +35,8 @@ class SfmOptions:
         out: Folder of the capture. Intermediate results are kept in its subfolder sfm/.
         frames: Most frames to take from a video.
         matcher: "exhaustive": all pairs. "sequential": each photo with the following ones. "nearest": these, similar
-            photos, and photos taken nearby. "auto": exhaustive up to 150 photos, else nearest; nearest for videos.
+            photos, and photos taken nearby. "auto": for photos in sequence, from 60 on, the pairs of a video; otherwise
+            exhaustive up to 150 photos, else nearest; nearest for videos.
         mapper: "incremental", "global", or "auto": incremental, then global if its result is insufficient.
         camera_model: COLMAP's name of the lens model; "auto": SIMPLE_RADIAL, or a model with more parameters if the
             photos support it.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import warnings
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -108,7 +109,9 @@ def photo_descriptors(database: Path, names: Sequence[str], seed: int) -> Float3
     learnt = np.concatenate(sample)
     if len(learnt) < WORDS:
         return np.zeros((len(names), 1), np.float32)
-    words, _ = vq.kmeans2(learnt, WORDS, iter=10, minit="points", rng=rng)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about words that no descriptor is nearest to, which are harmless
+        words, _ = vq.kmeans2(learnt, WORDS, iter=10, minit="points", rng=rng)
     words = np.ascontiguousarray(words, dtype=np.float32)
     rows = [_vlad(descriptors, words) for descriptors in _descriptors(database, names)]
     return np.stack(rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -74,6 +75,7 @@ class PhotoFacts:
         sensor: EXIF orientation that makes the sensor's picture of the decoded pixels: 2 for a mirrored photo, and for
             HEIC, which is decoded upright, the one that turns it back. Photos of one camera then share a lens.
         problem: `gsplat_edu.data.images.ImageHeader.problem`.
+        taken: When it was taken, from EXIF, as a text that sorts by time; empty if unknown.
         final: Whether the file is an upright pinhole image made here, which the capture takes as it is.
     """
 
@@ -88,6 +90,7 @@ class PhotoFacts:
     mask: str = ""
     sensor: int = UPRIGHT
     problem: str = ""
+    taken: str = ""
     final: bool = False
 
     def copy_size(self, longest: int) -> tuple[int, int]:
@@ -363,7 +366,19 @@ def _facts(path: Path, name: str, copy: str) -> tuple[PhotoFacts, tuple[int, int
     said += [details.get(tag) for tag in (ExifTags.Base.LensModel, ExifTags.Base.FocalLength)]
     said += [details.get(ExifTags.Base.FocalLengthIn35mmFilm), details.get(ExifTags.Base.DigitalZoomRatio)]
     camera = " ".join([f"{W}x{H}", *(str(value).strip("\0 ") for value in said if value is not None)])
-    return PhotoFacts(name, copy, W, H, turns, focal, camera, place, sensor=sensor, problem=problem), decoded
+    photo = PhotoFacts(name, copy, W, H, turns, focal, camera, place, sensor=sensor, problem=problem)
+    return replace(photo, taken=_taken(details)), decoded
+
+
+def _taken(details: dict[int, object]) -> str:
+    """Read the time: "2024:02:12 00:39:19", and the digits of the fraction of a second; empty if it is invalid."""
+    said, fraction = (
+        str(details.get(tag, "")).strip("\0 ")
+        for tag in (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal)
+    )
+    if not re.fullmatch(r"[0-9]{4}:[0-9]{2}:[0-9]{2} [0-9]{2}:[0-9]{2}:[0-9]{2}", said) or said[:4] == "0000":
+        return ""
+    return f"{said}.{fraction}" if re.fullmatch("[0-9]+", fraction) else said
 
 
 def _number(value: object) -> float:

@@ -5,6 +5,7 @@ Chapter: 13_photos_to_scene.
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ from gsplat_edu.data.scale import Scale
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
+from gsplat_edu.sfm.candidates import Candidates
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap
 from gsplat_edu.sfm.mapping import Cameras, attempts, map_photos, no_overlap, rig_attempts, shared_cameras
 from gsplat_edu.sfm.masks import check_some_used, find_masks, unused_folders
@@ -48,18 +50,6 @@ from gsplat_edu.sfm.scale_text import AUTO
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
-
-EXHAUSTIVE = 150
-"""Largest number of photos for which every pair is matched: 11,175 pairs, ten minutes on two cores."""
-
-OVERLAP = {"video": 10, "photos": 4}
-"""Each photo is matched with this many that follow it; photos, too, are usually taken in sequence."""
-
-ALIKE = {"video": 5, "photos": 25}
-"""Each photo is matched with this many of similar appearance; in a video, these close loops."""
-
-CLOSE_BY = 15
-"""Each photo is matched with this many taken nearby, if EXIF gives the positions of all photos."""
 
 INLIERS = 15
 """Smallest number of matches with one geometry that connects two photos: COLMAP's own bound."""
@@ -318,16 +308,21 @@ class _Run:
         return {"summary": f"{sum(found.values()):,} in {total - len(names)} photos"}
 
     def _match(self) -> dict[str, Any]:
-        count = len(self.photos)
-        kind = self.options.matcher
+        count, kind = len(self.photos), self.options.matcher
+        candidates = Candidates(self.photos, self.folder / "database.db", self.video, self.unit)
         if kind == "auto":
-            kind = "exhaustive" if count <= EXHAUSTIVE and not self.video else "nearest"
-        chosen = self._pairs(kind, 1)
+            kind = candidates.automatic()
+        chosen = candidates.of(kind)
+        if kind == "sequence":
+            self._say(
+                f"{candidates.sequence}; {len(chosen):,} pairs are matched instead of all {math.comb(count, 2):,}; "
+                "for all, run gsplat-edu sfm with --matcher exhaustive"
+            )
         verified = self._match_pairs(chosen)
         part = self._connected(verified)
-        if len(part) < count and self.options.matcher == "auto" and kind == "nearest":
+        if len(part) < count and self.options.matcher == "auto" and kind != "exhaustive":
             # Neighbours in the sequence and similar photos did not connect all photos: try more pairs.
-            chosen |= self._pairs("exhaustive" if count <= EXHAUSTIVE else kind, 3)
+            chosen |= candidates.farther(kind)
             verified = self._match_pairs(chosen)
             part = self._connected(verified)
         if not verified:
@@ -351,33 +346,6 @@ class _Run:
         units = [(a // unit, b // unit) for a, b in verified]
         part = pairs.largest_part(len(self.photos) // unit, units)
         return [unit * one + face for one in part for face in range(unit)]
-
-    def _pairs(self, kind: str, farther: int) -> set[pairs.Pair]:
-        """Choose pairs; never two faces of one panorama, which show no depth."""
-        chosen = self._candidates(kind, farther)
-        return chosen if self.unit == 1 else {(a, b) for a, b in chosen if a // self.unit != b // self.unit}
-
-    def _candidates(self, kind: str, farther: int) -> set[pairs.Pair]:
-        count, origin = len(self.photos), "video" if self.video else "photos"
-        if kind == "exhaustive":
-            return pairs.all_pairs(count)
-        overlap, unit = OVERLAP["video"] if kind == "sequential" else OVERLAP[origin], range(self.unit)
-        chosen = {
-            (self.unit * a + i, self.unit * b + j)
-            for a, b in pairs.sequential_pairs(count // self.unit, overlap)
-            for i in unit
-            for j in unit
-        }
-        if kind == "sequential":
-            return chosen
-        described = pairs.photo_descriptors(
-            self.folder / "database.db", [photo.copy for photo in self.photos], COLMAP_SEED
-        )
-        chosen |= pairs.nearest_pairs(described, farther * ALIKE[origin], overlap + 1)
-        places = [photo.place for photo in self.photos if photo.place is not None]
-        if len(places) == count:
-            chosen |= pairs.nearest_pairs(pairs.on_the_ground(places), farther * CLOSE_BY)
-        return chosen
 
     def _match_pairs(self, chosen: set[pairs.Pair]) -> list[pairs.Pair]:
         """Match the pairs that are not matched yet; return all pairs that are connected."""

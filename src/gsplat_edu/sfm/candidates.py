@@ -1,0 +1,109 @@
+"""The pairs of photos that a matcher tries: all, those in sequence, and those that look alike or were taken nearby."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from gsplat_edu.sfm import pairs
+from gsplat_edu.sfm.colmap import COLMAP_SEED
+from gsplat_edu.sfm.photos import PhotoFacts
+from gsplat_edu.sfm.sequence import PhotoSequence, find_sequence, natural_order
+
+EXHAUSTIVE = 150
+"""Largest number of photos for which every pair is matched: 11,175 pairs, ten minutes on two cores."""
+
+SEQUENCE = 60
+"""Number of photos from which a sequence is sought: all 1,770 pairs take minutes on two cores, finding it seconds."""
+
+OVERLAP = {"video": 10, "photos": 4}
+"""Each photo is matched with this many that follow it; photos found to be in sequence are matched like a video."""
+
+ALIKE = {"video": 5, "photos": 25}
+"""Each photo is matched with this many of similar appearance; in a video, these close loops."""
+
+CLOSE_BY = 15
+"""Each photo is matched with this many taken nearby, if EXIF gives the positions of all photos."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Chooses the pairs to match.
+
+    Args:
+        photos: The photos, in the order of their indices.
+        database: COLMAP's database, with their descriptors.
+        video: Whether they are the frames of a video.
+        unit: Photos with one pose: a panorama's faces, which follow one another in the list.
+    """
+
+    photos: Sequence[PhotoFacts]
+    database: Path
+    video: bool = False
+    unit: int = 1
+
+    @cached_property
+    def sequence(self) -> PhotoSequence | None:
+        """How the photos were taken in sequence, or None; not asked for frames, panoramas, and few photos."""
+        if self.video or self.unit > 1 or len(self.photos) < SEQUENCE:
+            return None
+        names, times = [photo.name for photo in self.photos], [photo.taken for photo in self.photos]
+        return find_sequence(names, times, self._described)
+
+    def automatic(self) -> str:
+        """Return the matcher that fits the photos."""
+        if self.sequence is not None:
+            return "sequence"
+        return "exhaustive" if len(self.photos) <= EXHAUSTIVE and not self.video else "nearest"
+
+    def farther(self, kind: str) -> set[pairs.Pair]:
+        """Return more pairs, for photos that those of the automatic matcher `kind` did not connect."""
+        return self.of("exhaustive") if len(self.photos) <= EXHAUSTIVE else self.of(kind, 3)
+
+    def of(self, kind: str, farther: int = 1) -> set[pairs.Pair]:
+        """Return the pairs; never two faces of one panorama, which show no depth.
+
+        Args:
+            kind: "exhaustive"; "sequential"; "nearest": also similar photos and those taken nearby; or "sequence":
+                also these, but as few as for a video.
+            farther: Factor for the number of similar photos and those taken nearby.
+        """
+        chosen = self._pairs(kind, farther)
+        return chosen if self.unit == 1 else {(a, b) for a, b in chosen if a // self.unit != b // self.unit}
+
+    def _pairs(self, kind: str, farther: int) -> set[pairs.Pair]:
+        count = len(self.photos)
+        if kind == "exhaustive":
+            return pairs.all_pairs(count)
+        like = "video" if self.video or kind == "sequence" else "photos"
+        overlap, unit = OVERLAP["video"] if kind == "sequential" else OVERLAP[like], range(self.unit)
+        chosen = {
+            (self.unit * a + i, self.unit * b + j)
+            for a, b in pairs.sequential_pairs(count // self.unit, overlap)
+            for i in unit
+            for j in unit
+        }
+        order = self._order
+        if kind != "sequential":
+            chosen |= pairs.nearest_pairs(self._described[order], farther * ALIKE[like], overlap + 1)
+            places = [photo.place for photo in (self.photos[i] for i in order) if photo.place is not None]
+            if len(places) == count:
+                chosen |= pairs.nearest_pairs(pairs.on_the_ground(places), farther * CLOSE_BY)
+        return {(min(order[a], order[b]), max(order[a], order[b])) for a, b in chosen}
+
+    @cached_property
+    def _order(self) -> list[int]:
+        """The photos in sequence: as found, or else by name."""
+        if self.sequence is not None:
+            return self.sequence.order
+        groups = natural_order([photo.name for photo in self.photos[:: self.unit]])
+        return [self.unit * group + face for group in groups for face in range(self.unit)]
+
+    @cached_property
+    def _described(self) -> Float32[np.ndarray, "n d"]:
+        return pairs.photo_descriptors(self.database, [photo.copy for photo in self.photos], COLMAP_SEED)

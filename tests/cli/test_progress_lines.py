@@ -1,0 +1,125 @@
+"""Lines of progress where output is redirected; on a terminal of 80 columns, the time left is visible."""
+
+import io
+import re
+from queue import SimpleQueue
+
+import pytest
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, TimeRemainingColumn
+
+from gsplat_edu.cli.sfm import stage_bars
+from gsplat_edu.cli.terminal import LINE_SECONDS, Bar, clock
+from gsplat_edu.cli.train import progress_bar
+from gsplat_edu.sfm.colmap import _await_result
+
+
+class Time:
+    """A clock that a test sets."""
+
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def log():
+    return Console(file=io.StringIO(), width=80)
+
+
+def lines(console):
+    return console.file.getvalue().splitlines()
+
+
+def test_times_are_short():
+    assert [clock(s) for s in (0.4, 65, 600, 3785)] == ["0:00", "1:05", "10:00", "1:03:05"]
+
+
+def test_a_long_task_prints_lines_with_its_times(log):
+    time = Time()
+    with Bar(MofNCompleteColumn(), TimeRemainingColumn(), console=log, disable=True, get_time=time) as bar:
+        task = bar.add_task("evaluating", total=100)
+        for _ in range(100):
+            time.now += 2.0
+            bar.advance(task)
+    assert lines(log)[0] == "evaluating: 15 of 100, 0:30 elapsed, 2:50 left"
+    assert len(lines(log)) == 200 // LINE_SECONDS
+    assert all(
+        re.fullmatch(r"evaluating: \d+ of 100, \d:\d\d elapsed, \d:\d\d left", line) for line in lines(log)
+    )
+
+
+def test_the_log_of_a_task_of_hours_stays_short(log):
+    time = Time()
+    with Bar(TimeRemainingColumn(), console=log, disable=True, get_time=time) as bar:
+        task = bar.add_task("rendering\x1b[2J", total=36_000)
+        for _ in range(3600):
+            time.now += 10.0
+            bar.advance(task, 10)
+    assert 50 < len(lines(log)) < 120
+    assert lines(log)[-1].startswith("rendering\\x1b[2J: 3") and " left" in lines(log)[-1]
+
+
+def test_a_short_task_prints_nothing_and_neither_does_one_with_lines_of_its_own(log):
+    time = Time()
+    with Bar(console=log, disable=True, get_time=time) as bar:
+        short, own = bar.add_task("photos", total=None), bar.add_task("training", total=5, lines=False)
+        time.now = LINE_SECONDS - 1.0
+        bar.update(short, completed=3)
+        time.now = 1000.0
+        bar.advance(own)
+    assert lines(log) == []
+
+
+def test_stages_of_unknown_speed_show_the_elapsed_time_only():
+    time = Time()
+    log = Console(file=io.StringIO(), width=80, get_time=time)
+    with stage_bars(log) as progress:
+        progress("mapping", 0, 120)
+        for time.now in (40.0, 50.0, 75.0):
+            progress("mapping", 7, 120)
+    assert lines(log) == ["mapping: 7 of 120, 0:40 elapsed", "mapping: 7 of 120, 1:15 elapsed"]
+
+
+def test_a_terminal_gets_no_lines():
+    time = Time()
+    console = Console(file=io.StringIO(), width=80, force_terminal=True)
+    with Bar(MofNCompleteColumn(), console=console, get_time=time) as bar:
+        task = bar.add_task("evaluating", total=100)
+        time.now = 100.0
+        bar.advance(task)
+    assert "elapsed" not in console.file.getvalue()
+
+
+def test_the_time_left_survives_80_columns():
+    time = Time()
+    console = Console(file=io.StringIO(), width=80, force_terminal=True, get_time=time)
+    with progress_bar(console, "{task.fields[state]}") as bar:
+        state = "loss 0.123  PSNR 22.2 of ...long_name_000123.jpg  1234567 Gaussians  123 it/s"
+        task = bar.add_task("training", total=300_000, state=state)
+        bar.update(task, completed=100_000)
+        time.now = 100.0
+        bar.update(task, completed=200_000)
+        bar.refresh()
+    drawn = console.file.getvalue()
+    assert re.search(r"200000/300000.*0:01:40", drawn), "it is in the visible part of the line"
+    assert "loss 0.123" in drawn
+
+
+def test_a_mapper_that_reports_nothing_for_long_is_followed(monkeypatch):
+    """COLMAP's mapper adjusts all poses for minutes between two photos, and after the last one."""
+    monkeypatch.setattr("gsplat_edu.sfm.colmap.POLL", 0.001)
+    monkeypatch.setattr("gsplat_edu.sfm.colmap.BEAT", 0.0)
+    answers, seen = SimpleQueue(), []
+
+    def progress(done):
+        seen.append(done)
+        if len(seen) == 5:
+            answers.put({"result": {"models": []}})
+
+    answers.put({"done": 7})
+    assert _await_result(answers, progress, None) == {"models": []}
+    assert seen == [7, 7, 7, 7, 7]
+    answers.put({"ended": True})
+    assert _await_result(answers, progress, None) is None

@@ -1,0 +1,193 @@
+"""Photos taken in sequence are recognised, and photos in any other order are not."""
+
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from gsplat_edu.sfm.candidates import EXHAUSTIVE, SEQUENCE, Candidates
+from gsplat_edu.sfm.pairs import all_pairs
+from gsplat_edu.sfm.photos import PhotoFacts
+from gsplat_edu.sfm.sequence import CHANCE, FIRST, by_chance, find_sequence, natural_order, successors_alike
+
+
+def described(turns):
+    """Descriptors of photos of a circle: each shares with the others what lies in both fields of view, as VLAD does."""
+    rng = np.random.default_rng(1)
+    around = np.radians(np.arange(0.0, 360.0, 2.0))
+    seen = np.exp(-0.5 * (np.angle(np.exp(1j * (turns[:, None] - around))) / 0.25) ** 2)
+    vectors = seen @ rng.normal(size=(len(around), 400)) + rng.normal(scale=0.3, size=(len(turns), 400))
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
+def laps(count, number):
+    """Angles of photos on a circle that is walked so often, with uneven steps."""
+    steps = np.random.default_rng(2).uniform(0.5, 1.5, count)
+    return 2.0 * np.pi * number * np.cumsum(steps) / steps.sum()
+
+
+def names(count):
+    return [f"IMG_{i}.jpg" for i in range(count)]
+
+
+def test_numbers_in_names_are_compared_as_numbers():
+    files = ["IMG_10.jpg", "img_9.jpg", "IMG_100.jpg", "a2b10.png", "a2b9.png", "7.jpg"]
+    assert [files[i] for i in natural_order(files)] == [
+        "7.jpg",
+        "a2b9.png",
+        "a2b10.png",
+        "img_9.jpg",
+        "IMG_10.jpg",
+        "IMG_100.jpg",
+    ]
+    padded = [f"{i:04}.jpg" for i in range(1, 40)]
+    assert natural_order(padded) == list(range(39))
+
+
+@pytest.mark.parametrize(("count", "number"), [(SEQUENCE, 1), (SEQUENCE, 2), (120, 1), (120, 2), (400, 3)])
+def test_one_or_more_laps_are_a_sequence(count, number):
+    files = sorted(names(count))  # as the photos are listed: IMG_1, IMG_10, IMG_100, ...
+    turns = laps(count, number)[[int(name[4:-4]) for name in files]]
+    found = find_sequence(files, [""] * count, described(turns))
+    assert found is not None and [files[i] for i in found.order] == names(count)
+    assert found.by == "name" and found.alike > max(found.by_chance, count / 2)
+
+
+def test_shuffled_photos_are_no_sequence():
+    rng = np.random.default_rng(3)
+    vectors = described(laps(120, 2))
+    most = 0
+    for _ in range(10):
+        order = rng.permutation(120)
+        assert find_sequence(names(120), [""] * 120, vectors[order]) is None
+        most = max(most, successors_alike(vectors[order]))
+    assert 0 < most <= by_chance(120)
+
+
+def test_times_give_the_order_where_names_do_not():
+    vectors = described(laps(90, 1))
+    shuffled = np.random.default_rng(4).permutation(90)
+    times = [f"2024:02:12 00:{i // 60:02}:{i % 60:02}" for i in range(90)]
+    found = find_sequence(names(90), [times[i] for i in shuffled], vectors[shuffled])
+    assert found is not None and found.by == "EXIF time"
+    np.testing.assert_array_equal(shuffled[found.order], np.arange(90))
+    both = find_sequence(names(90), times, vectors)
+    assert both is not None and both.by == "name, as by EXIF time"
+    one_unknown = [times[i] if i else "" for i in shuffled]
+    assert find_sequence(names(90), one_unknown, vectors[shuffled]) is None
+    assert find_sequence(names(90), [times[0]] * 90, vectors[shuffled]) is None
+
+
+def test_photos_without_features_or_all_alike_prove_nothing():
+    assert successors_alike(np.zeros((100, 8), np.float32)) == 0
+    alike = np.zeros((100, 8), np.float32)
+    alike[:, 0] = 1.0
+    assert successors_alike(alike) == 0
+    assert find_sequence(names(100), [""] * 100, alike) is None
+
+
+def test_similarities_are_counted_as_by_hand():
+    vectors = described(laps(300, 1))  # more than one block
+    similarity = vectors @ vectors.T
+    expected = 0
+    for i in range(299):
+        others = np.delete(np.arange(300), i)
+        expected += int(np.sum(similarity[i, others] >= similarity[i, i + 1]) <= FIRST)
+    assert successors_alike(vectors) == expected
+
+
+def test_the_bound_on_chance_covers_random_orders():
+    """The bound's distribution lies above the simulated one, whose tail it is meant to bound, at several quantiles."""
+    count, rounds = 60, 4000
+    rng = np.random.default_rng(5)
+    vectors = described(laps(count, 1))
+    similarity = vectors @ vectors.T
+    np.fill_diagonal(similarity, -np.inf)
+    near = np.argsort(np.argsort(-similarity, axis=1), axis=1) < FIRST
+    orders = [rng.permutation(count) for _ in range(rounds)]
+    hits = np.array([near[order[:-1], order[1:]].sum() for order in orders])
+    assert hits[0] == successors_alike(vectors[orders[0]])
+    law = np.ones(1)
+    for left in range(1, count):
+        p = min(1.0, FIRST / left)
+        law = np.convolve(law, (1.0 - p, p))
+    bound = np.cumsum(law[::-1])[::-1]
+    for least in range(1, count):
+        # three standard deviations of the simulated frequency
+        q = bound[least]
+        assert np.mean(hits >= least) <= q + 3.0 * np.sqrt(q * (1.0 - q) / rounds) + 1.0 / rounds
+    assert bound[by_chance(count)] > CHANCE >= bound[by_chance(count) + 1]
+    assert by_chance(6) == 5, "so few prove nothing"
+    assert [by_chance(n) for n in (60, 120, 1000)] == sorted(by_chance(n) for n in (60, 120, 1000))
+
+
+@pytest.fixture
+def lap_of(tmp_path):
+    """Return what makes the candidates for photos of a circle, with a database like COLMAP's."""
+
+    def make(turns, places=None, **changes):
+        rng = np.random.default_rng(6)
+        world = rng.integers(0, 256, (400, 128)).astype(np.uint8)
+        where = rng.uniform(0.0, 2.0 * np.pi, len(world))
+        path = tmp_path / "database.db"
+        with closing(sqlite3.connect(path)) as writer, writer:
+            writer.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
+            writer.execute("CREATE TABLE descriptors (image_id INTEGER, data BLOB)")
+            for i, turn in enumerate(turns):
+                seen = np.abs(np.angle(np.exp(1j * (where - turn)))) < 0.4
+                writer.execute("INSERT INTO images VALUES (?, ?)", (i, f"{i:06}.jpg"))
+                writer.execute("INSERT INTO descriptors VALUES (?, ?)", (i, world[seen].tobytes()))
+        files = sorted(names(len(turns)))
+        photos = [
+            PhotoFacts(name, f"{i:06}.jpg", 8, 8, place=None if places is None else places[i])
+            for i, name in enumerate(files)
+        ]
+        return Candidates(photos, path, **changes)
+
+    return make
+
+
+def turns_by_name(count, number):
+    return laps(count, number)[[int(name[4:-4]) for name in sorted(names(count))]]
+
+
+def test_photos_in_sequence_get_the_pairs_of_a_video_and_closed_loops(lap_of):
+    found = lap_of(turns_by_name(90, 1))
+    assert found.automatic() == "sequence"
+    chosen, order = found.of("sequence"), natural_order(sorted(names(90)))
+    assert all(a < b for a, b in chosen)
+    for step in (*range(1, 11), 16, 32, 64):
+        assert {(min(p), max(p)) for p in zip(order, order[step:], strict=False)} <= chosen
+    first, last = order[0], order[89]
+    assert (min(first, last), max(first, last)) in chosen, "the loop is closed"
+    assert len(chosen) < len(all_pairs(90)) / 2
+    assert found.farther("sequence") == all_pairs(90), "where photos do not connect, all pairs are tried"
+    assert str(found.sequence).startswith("the photos were taken in sequence: sorted by name, 8")
+
+
+def test_shuffled_photos_keep_all_pairs(lap_of):
+    shuffled = np.random.default_rng(7).permutation(laps(90, 1))
+    assert lap_of(shuffled).automatic() == "exhaustive"
+
+
+def test_few_photos_keep_all_pairs(lap_of):
+    few = lap_of(turns_by_name(SEQUENCE - 1, 1))
+    assert few.automatic() == "exhaustive" and few.of("exhaustive") == all_pairs(SEQUENCE - 1)
+
+
+def test_many_photos_without_an_order_get_those_nearby(lap_of):
+    count = EXHAUSTIVE + 1
+    places = [(47.0 + 0.001 * i, 8.0, 0.0) for i in range(count)]
+    found = lap_of(np.random.default_rng(8).permutation(laps(count, 1)), places)
+    assert found.automatic() == "nearest"
+    assert {(i, i + 1) for i in range(count - 1)} <= found.of("nearest"), (
+        "EXIF positions count in their own order"
+    )
+
+
+def test_a_chosen_matcher_follows_natural_order(lap_of):
+    order = natural_order(sorted(names(20)))
+    pairs = lap_of(turns_by_name(20, 1)).of("sequential")
+    assert (min(order[8:10]), max(order[8:10])) in pairs
+    assert len(pairs) == sum(20 - step for step in (*range(1, 11), 16))
