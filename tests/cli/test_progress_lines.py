@@ -8,9 +8,12 @@ import pytest
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
+from gsplat_edu.cli.main import main
 from gsplat_edu.cli.sfm import stage_bars
 from gsplat_edu.cli.terminal import LINE_SECONDS, Bar, clock
 from gsplat_edu.cli.train import progress_bar
+from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.sfm.colmap import _await_result
 
 
@@ -123,3 +126,15 @@ def test_a_mapper_that_reports_nothing_for_long_is_followed(monkeypatch):
     assert seen == [7, 7, 7, 7, 7]
     answers.put({"ended": True})
     assert _await_result(answers, progress, None) is None
+
+
+def test_a_training_without_a_terminal_prints_the_time_left(tmp_path, capsys):
+    write_colmap(tmp_path / "egg", *procedural_capture(12, 4, splats=30))
+    words = ["train", str(tmp_path / "egg"), "--out", str(tmp_path / "run")]
+    assert main([*words, "--iterations", "40", "--strategy", "none"]) == 0
+    found = re.findall(
+        r"^iteration (\d+)/40: (.*), loss \d\.\d{4}, PSNR ", capsys.readouterr().out, re.MULTILINE
+    )
+    assert [int(iteration) for iteration, _ in found][-1] == 40 and len(found) >= 10
+    assert all(re.fullmatch(r"\d:\d\d elapsed(, \d:\d\d left)?", times) for _, times in found)
+    assert found[-1][1].endswith("0:00 left")
