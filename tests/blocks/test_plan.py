@@ -79,7 +79,7 @@ def test_a_plan_is_read_as_it_was_written(tmp_path):
     area = measured_area(cameras, under(cameras, np.random.default_rng(2)))
     block = Block(Cell((-math.inf, 0.1), (1 / 3, math.inf)), ("a.png", "b.png"), ("c.png",), "digest", 7)
     plan = BlockPlan(
-        "capture", (1.0, 2.0, 3.0), area, (block,), {"train": {"iterations": 5}, "save_every": 10}
+        "capture", (1.0, 2.0, 3.0), area, (block,), {"train": {"iterations": 5}, "data": {}, "save_every": 10}
     )
     plan.write(tmp_path)
     assert BlockPlan.read(tmp_path) == plan

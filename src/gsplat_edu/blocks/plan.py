@@ -223,9 +223,11 @@ class BlockPlan:
                 for entry in found["blocks"]
             )
             recipe = dict(found["recipe"])
+            if not all(isinstance(recipe.get(section), dict) for section in ("train", "data")):
+                raise ValueError("recipe: lacks a section")
             capture = str(found["capture"])
             views = {str(name): str(digest) for name, digest in dict(found["views"]).items()}
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise CheckpointError(f"{path}: is damaged ({error}); restore it, or split again") from None
         return cls(capture, (x, y, z), Area(ground, low, high, heights), blocks, recipe, views)
 
