@@ -27,6 +27,9 @@ SUPERSAMPLING = 2
 """Rays per pixel along each side."""
 
 RADIUS, TARGET = 4.0, (0.0, 0.0, 0.0)
+SHININESS = 30.0
+"""Phong's exponent of the highlights."""
+
 HELD_OUT = 8
 """Every n-th view is a test view."""
 
@@ -71,6 +74,19 @@ class Shape:
         return _unit(self.axes.T @ local)
 
 
+@dataclass(frozen=True)
+class Scene:
+    """Shapes under `LIGHT`.
+
+    Args:
+        shapes: What is drawn.
+        shininess: Phong's exponent of the highlights.
+    """
+
+    shapes: tuple[Shape, ...]
+    shininess: float
+
+
 def traced_capture(size: int, count: int) -> tuple[list[View], list[View]]:
     """Photograph the object from a spiral of views around it.
 
@@ -81,15 +97,25 @@ def traced_capture(size: int, count: int) -> tuple[list[View], list[View]]:
     Returns:
         Training views and test views, with alpha.
     """
-    views = [_photographed(f"view_{i:03d}.png", _camera(i, count, size)) for i in range(count)]
+    scene = Scene(SHAPES, SHININESS)
+    views = [photographed(scene, f"view_{i:03d}.png", _camera(i, count, size)) for i in range(count)]
     test = views[::HELD_OUT]
     return [view for view in views if view not in test], test
 
 
 def _camera(i: int, count: int, size: int) -> Camera:
     """Return a camera of the spiral, which winds from above the object to somewhat below its equator."""
-    height = 0.9 - 1.2 * (i + 0.5) / count
-    azimuth = i * math.pi * (3 - math.sqrt(5))
+    return camera_at(0.9 - 1.2 * (i + 0.5) / count, i * math.pi * (3 - math.sqrt(5)), size)
+
+
+def camera_at(height: float, azimuth: float, size: int) -> Camera:
+    """Return a camera that looks at the object.
+
+    Args:
+        height: Sine of its elevation.
+        azimuth: Its angle around the vertical axis, radians.
+        size: Width and height of the photo, px.
+    """
     ring = math.sqrt(1 - height * height)
     eye = RADIUS * np.array([ring * math.sin(azimuth), -height, ring * math.cos(azimuth)])
     return Camera(
@@ -97,20 +123,22 @@ def _camera(i: int, count: int, size: int) -> Camera:
     )
 
 
-def _photographed(name: str, camera: Camera) -> View:
-    """Trace a photo, a row of pixels at a time: that many rays fit in cache."""
-    rows = [_row(camera, y) for y in range(camera.H)]
+def photographed(scene: Scene, name: str, camera: Camera) -> View:
+    """Trace a photo with alpha, a row of pixels at a time: that many rays fit in cache."""
+    rows = [_row(scene, camera, y) for y in range(camera.H)]
     color, alpha = (np.stack(part) for part in zip(*rows, strict=True))
     return View(camera, _bytes(color), alpha=_bytes(alpha), name=name)
 
 
-def _row(camera: Camera, y: int) -> tuple[Float64[np.ndarray, "W 3"], Float64[np.ndarray, " W"]]:
+def _row(
+    scene: Scene, camera: Camera, y: int
+) -> tuple[Float64[np.ndarray, "W 3"], Float64[np.ndarray, " W"]]:
     """Return straight colour and alpha of a row of pixels: means over the rays of each."""
     inside = (np.arange(SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
     across = (np.arange(camera.W)[:, None] + inside).ravel()
     x, v = np.meshgrid((across - camera.cx) / camera.fx, (y + inside - camera.cy) / camera.fy)
     directions = _unit(camera.R.T @ np.stack([x.ravel(), v.ravel(), np.ones(x.size)]))
-    traced = _traced(np.asarray(camera.eye, float)[:, None], directions)
+    traced = _traced(scene, np.asarray(camera.eye, float)[:, None], directions)
     means = traced.reshape(4, SUPERSAMPLING, camera.W, SUPERSAMPLING).mean(axis=(1, 3))
     return (means[:3] / np.maximum(means[3], 1e-12)).T, means[3]
 
@@ -124,32 +152,34 @@ def _bytes(values: Float64[np.ndarray, "..."]) -> np.ndarray:
     return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
 
 
-def _traced(eye: Float64[np.ndarray, "3 1"], directions: Points) -> Float64[np.ndarray, "4 N"]:
+def _traced(scene: Scene, eye: Float64[np.ndarray, "3 1"], directions: Points) -> Float64[np.ndarray, "4 N"]:
     """Return colour times alpha, and alpha, of each ray."""
     result = np.zeros((4, directions.shape[1]))
-    distances = np.stack([shape.hit(eye, directions) for shape in SHAPES])
+    distances = np.stack([shape.hit(eye, directions) for shape in scene.shapes])
     nearest = distances.argmin(axis=0)
-    for k, shape in enumerate(SHAPES):
+    for k, shape in enumerate(scene.shapes):
         rays = np.flatnonzero((nearest == k) & np.isfinite(distances[k]))
         points = eye + distances[k, rays] * directions[:, rays]
-        result[:3, rays], result[3, rays] = _shaded(shape, points, directions[:, rays]), 1.0
+        result[:3, rays], result[3, rays] = _shaded(scene, shape, points, directions[:, rays]), 1.0
     return result
 
 
-def _shaded(shape: Shape, points: Points, directions: Points) -> Points:
+def _shaded(scene: Scene, shape: Shape, points: Points, directions: Points) -> Points:
     """Return the colours of points on a shape: ambient and diffuse light, a highlight, hard shadows."""
     normals = shape.normals(points)
     diffuse = (LIGHT * normals).sum(axis=0)
     above = points + 1e-3 * normals
-    lit = np.all([np.isinf(other.hit(above, LIGHT)) for other in SHAPES], axis=0)
+    lit = np.all([np.isinf(other.hit(above, LIGHT)) for other in scene.shapes], axis=0)
     mirrored = 2 * diffuse * normals - LIGHT
-    highlight = np.maximum(-(mirrored * directions).sum(axis=0), 0) ** 30 * lit
+    highlight = np.maximum(-(mirrored * directions).sum(axis=0), 0) ** scene.shininess * lit
     return np.clip(
         shape.texture(points) * (0.3 + 0.7 * np.maximum(diffuse, 0) * lit) + shape.gloss * highlight, 0, 1
     )
 
 
-def _checks(scale: float, dark: tuple[float, ...], bright: tuple[float, ...]) -> Texture:
+def checks(scale: float, dark: tuple[float, ...], bright: tuple[float, ...]) -> Texture:
+    """Return cubes of two colours, `scale` of them in a unit of length."""
+
     def texture(points: Points) -> Points:
         even = np.floor(scale * points).sum(axis=0) % 2 == 0
         return np.where(even, _column(dark), _column(bright))
@@ -176,7 +206,7 @@ def _column(color: tuple[float, ...]) -> Float64[np.ndarray, "3 1"]:
     return np.array(color)[:, None]
 
 
-def _placed(
+def placed(
     center: tuple[float, ...], halves: tuple[float, ...], turn: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return centre and axes of a shape that is turned about the vertical axis, radians."""
@@ -188,10 +218,10 @@ RED, YELLOW, GREEN, LIME = (0.7, 0.1, 0.1), (0.95, 0.8, 0.3), (0.1, 0.4, 0.2), (
 BLACK, STONE = (0.2, 0.2, 0.22), (0.8, 0.75, 0.7)
 
 SHAPES = (
-    Shape(*_placed((0, 0.75, 0), (1.1, 0.12, 1.1), 0.3), True, _checks(5, BLACK, STONE), 0.1),
-    Shape(*_placed((0, 0.1, 0), (0.52, 0.52, 0.52)), False, _waves, 0.6),
-    Shape(*_placed((0.62, 0.33, 0.45), (0.3, 0.3, 0.3)), False, _stripes, 0.2),
-    Shape(*_placed((-0.55, 0.23, 0.5), (0.2, 0.4, 0.2), 0.7), True, _checks(13, RED, YELLOW), 0.0),
-    Shape(*_placed((-0.4, -0.45, -0.3), (0.45, 0.12, 0.22), 0.5), False, _checks(9, GREEN, LIME), 0.4),
-    Shape(*_placed((0.5, -0.15, -0.55), (0.05, 0.78, 0.05)), True, _stripes, 0.0),
+    Shape(*placed((0, 0.75, 0), (1.1, 0.12, 1.1), 0.3), True, checks(5, BLACK, STONE), 0.1),
+    Shape(*placed((0, 0.1, 0), (0.52, 0.52, 0.52)), False, _waves, 0.6),
+    Shape(*placed((0.62, 0.33, 0.45), (0.3, 0.3, 0.3)), False, _stripes, 0.2),
+    Shape(*placed((-0.55, 0.23, 0.5), (0.2, 0.4, 0.2), 0.7), True, checks(13, RED, YELLOW), 0.0),
+    Shape(*placed((-0.4, -0.45, -0.3), (0.45, 0.12, 0.22), 0.5), False, checks(9, GREEN, LIME), 0.4),
+    Shape(*placed((0.5, -0.15, -0.55), (0.05, 0.78, 0.05)), True, _stripes, 0.0),
 )

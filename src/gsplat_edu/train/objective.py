@@ -30,8 +30,8 @@ LEAST_SHARE = 0.25
 a third and more of the start's Gaussians, those of an aerial capture of a city a tenth (benchmarks/RESULTS.md)."""
 
 OUTSIDE_WEIGHT = 0.3
-"""Weight of the mean alpha outside the masks of an object. 0.1 leaves twice the alpha outside, 3 costs 0.8 dB inside
-(benchmarks/RESULTS.md)."""
+"""Weight of the mean alpha outside the masks of an object. 0.1 leaves 1.4 times the alpha outside, 3 costs 1.3 dB
+inside (benchmarks/RESULTS.md)."""
 
 PHOTO = "photo"
 """Name of the term that compares image and photo; logs and progress call it the loss."""
