@@ -18,10 +18,13 @@ def is_here(address: object) -> bool:
     host = address[0]
     if isinstance(host, bytes):
         host = host.decode("ascii", "replace")
+    if host in ("", "localhost"):
+        return True
     try:
-        return host in ("", "localhost") or ipaddress.ip_address(host.partition("%")[0]).is_loopback
+        found = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
         return False
+    return found.is_loopback or found.is_unspecified  # 0.0.0.0 as a target is this computer
 
 
 def forbid() -> None:

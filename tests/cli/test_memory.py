@@ -51,7 +51,12 @@ def png(path: Path, W: int, H: int) -> Path:
     data = b"".join(squeeze.compress(row * 1000) for _ in range(-(-H // 1000))) + squeeze.flush()
     header = struct.pack(">IIBBBBB", W, H, 1, 0, 0, 0, 0)
     path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", data)
+        + chunk(b"IEND", b"")
+        # as many bytes as a photo of that size has
+        + bytes(W * H // 200)
     )
     return path
 
@@ -73,12 +78,12 @@ def screens(path: Path, count: int) -> Path:
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc/self/statm")
 @pytest.mark.own_process
 def test_a_process_with_little_memory_left(tmp_path):
-    """A 24,000 x 18,000 PNG, an image 200,000 px wide and screen-filling splats, with 640 MiB left.
+    """A 20,000 x 15,000 PNG, an image 200,000 px wide and screen-filling splats, with 640 MiB left.
 
     20,000 splats in 64 x 64 tiles are 82 million pairs of at least 8 bytes. Buffers grow by a quarter, which makes
-    that more than 640 MiB. The photo takes 4 GiB, and the image 600 GiB.
+    that more than 640 MiB. The photo takes 2.8 GiB, and the image 600 GiB.
     """
-    photo, scene = png(tmp_path / "large.png", 24_000, 18_000), screens(tmp_path / "screens.ply", 20_000)
+    photo, scene = png(tmp_path / "large.png", 20_000, 15_000), screens(tmp_path / "screens.ply", 20_000)
     out = tmp_path / "out"
     words = [sys.executable, "-c", CHILD, photo, scene, tmp_path, out]
     ended = subprocess.run(words, capture_output=True, text=True, timeout=600, check=False)
@@ -89,7 +94,7 @@ def test_a_process_with_little_memory_left(tmp_path):
     assert codes == ["2", "2", "2"], ended.stderr
     first, second, third = ended.stderr.splitlines()
     assert re.fullmatch(
-        r"photo: .*large\.png: 24000x18000 px: needs 4\.02 GiB of memory, but only 0\.\d\d GiB are free; "
+        r"photo: .*large\.png: 20000x15000 px: needs 2\.79 GiB of memory, but only 0\.\d\d GiB are free; "
         r"close other programs, or make the photo smaller",
         first,
     )

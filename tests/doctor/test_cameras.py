@@ -12,6 +12,7 @@ import pytest
 from doctor.rooms import replaced, room, turned, with_camera
 from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import read_capture
+from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.cameras import check_away
 from gsplat_edu.doctor.finding import Severity
 from gsplat_edu.doctor.photos import PhotoStats
@@ -179,6 +180,12 @@ def with_tracks(folder, counts):
         at = end + 8 + 24 * points
     assert number == len(counts) and at == len(data)
     path.write_bytes(b"".join(written))
+    cloud = path.with_name("points3D.bin")
+    measured = bytearray(cloud.read_bytes())
+    struct.pack_into(
+        "<d", measured, 8 + struct.calcsize("<Q3d3B"), 0.7
+    )  # the first point's error, as a mapper has it
+    cloud.write_bytes(measured)
 
 
 COUNTS = [200] * 24
@@ -257,6 +264,15 @@ def test_no_pose_of_a_clean_capture_is_doubted(capture):
         shots.append(Shot(frame.name, frame.lens, (camera.W, camera.H), camera, stats))
     points = np.zeros((0, 3)) if read.cloud is None else read.cloud.points
     assert check_away(Survey(folder, read.layout, tuple(shots), (), (), points, ())) == []
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_tracks_computed_from_poses_are_no_evidence_for_them(tmp_path, orbit, kind):
+    views, points = orbit
+    write_colmap(tmp_path, views[:4], points, np.full(points.shape, 0.5), binary=kind == "bin")
+    assert observed_points(tmp_path) == {}
+    (tmp_path / "sparse" / "0" / f"points3D.{kind}").unlink()
+    assert min(observed_points(tmp_path).values()) > 0, "they are there"
 
 
 def test_observed_points_are_read_from_text_too(tmp_path):

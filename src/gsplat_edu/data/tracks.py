@@ -21,6 +21,10 @@ of a million points in hundreds of photos would make gigabytes of tracks."""
 PER_CELL = 4
 """Points of a cell on average."""
 
+UNMEASURED = -1.0
+"""Reprojection error of points whose tracks come from here: COLMAP's value for an error that was not computed. It says
+that the tracks are no evidence for the poses, which they were computed from."""
+
 DEPTH_SLACK = 0.05
 """A point is hidden if it is farther away than the nearest one of its cell by more than this fraction. Surfaces that
 are seen at a grazing angle lose points by it, which is harmless."""

@@ -16,7 +16,7 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import write_points_ply
-from gsplat_edu.data.tracks import Seen, seen_by, tracks_of
+from gsplat_edu.data.tracks import UNMEASURED, Seen, seen_by, tracks_of
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.validation import ArrayLike, float64_array
 from gsplat_edu.views import Photo, View
@@ -231,7 +231,7 @@ def _write_bin(
     rows = []
     tracks = tracks_of(seen, len(cloud[0]))
     for i, (point, color, track) in enumerate(zip(*cloud, tracks, strict=True), 1):
-        rows.append(struct.pack("<Q3d3BdQ", i, *point, *color, 0.0, len(track.images)))
+        rows.append(struct.pack("<Q3d3BdQ", i, *point, *color, UNMEASURED, len(track.images)))
         rows.append(np.stack([track.images + 1, track.places], axis=1).astype("<u4").tobytes())
     (model / "points3D.bin").write_bytes(struct.pack("<Q", len(tracks)) + b"".join(rows))
 
@@ -260,7 +260,7 @@ def _write_txt(
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n"]
     for i, (point, color, track) in enumerate(zip(points, rgb, tracks_of(seen, len(points)), strict=True), 1):
         pairs = np.stack([track.images + 1, track.places], axis=1).ravel().tolist()
-        lines.append(line(i, *point, *color, 0.0, *pairs))
+        lines.append(line(i, *point, *color, UNMEASURED, *pairs))
     (model / "points3D.txt").write_text("".join(lines), encoding="utf-8")
 
 

@@ -10,10 +10,11 @@ import numpy as np
 
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.errors import DatasetError
-from gsplat_edu.reading import read_bytes
+from gsplat_edu.reading import open_file, read_bytes
 from gsplat_edu.text import decode_file_name, legible
 
 _IMAGE = struct.Struct("<I7dI")
+_POINT = struct.Struct("<Q3d3Bd")
 _COUNT = struct.Struct("<Q")
 _OBSERVED = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 
@@ -25,17 +26,34 @@ def observed_points(capture: Path) -> dict[str, int]:
         capture: Folder with a COLMAP model.
 
     Returns:
-        Counts by frame name; empty if there is no model or it cannot be read.
+        Counts by frame name; empty if there is no model, it cannot be read, or its tracks were computed from the poses
+        (`gsplat_edu.data.tracks`), so that they are no evidence for them.
     """
     model = find_model(capture)
     if model is None:
         return {}
     try:
+        if not _is_measured(model):
+            return {}
         if (model / "images.bin").is_file():
             return dict(_binary(read_bytes(model / "images.bin")))
         return dict(_text(read_bytes(model / "images.txt")))
     except (OSError, ValueError, IndexError, struct.error, DatasetError):
         return {}  # the reader of the poses reports the problem
+
+
+def _is_measured(model: Path) -> bool:
+    """Return whether the model's first point has a reprojection error; a mapper gives all points one, or none."""
+    if (points := model / "points3D.bin").is_file():
+        with open_file(points) as file:
+            data = file.read(_COUNT.size + _POINT.size)
+        return len(data) < _COUNT.size + _POINT.size or _POINT.unpack_from(data, _COUNT.size)[-1] >= 0
+    if (points := model / "points3D.txt").is_file():
+        with open_file(points) as file:
+            first = next((line for line in file if line.strip() and not line.startswith(b"#")), b"")
+        fields = first.split(maxsplit=8)
+        return len(fields) < 8 or float(fields[7]) >= 0
+    return True
 
 
 def _binary(data: bytes) -> Iterator[tuple[str, int]]:
