@@ -47,5 +47,10 @@ def test_train_chooses_and_says_so_and_doctor_advises_it(tmp_path, capsys, monke
     assert main([*words, str(tmp_path / "small"), "--resume"]) == 0
     (found,) = [one for one in examine(prepare(tmp_path / "capture")).findings if one.name == "resolution"]
     assert "--resolution auto" in found.advice
+    assert "--resolution auto --out" in examine(prepare(tmp_path / "capture")).otherwise[0], (
+        "the next command"
+    )
+    given = examine(prepare(tmp_path / "capture"), ("--resolution", "2")).otherwise[0]
+    assert "--resolution 2 --out" in given and "auto" not in given
     assert main([*words, str(tmp_path / "blocks"), "--blocks", "2"]) == 2
     assert "--resolution auto: is for trainings in one piece" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.appearance import check_exposure
 from gsplat_edu.doctor.before import examine
+from gsplat_edu.doctor.cameras import side_for_training
 from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosis_lines, table_lines
 from gsplat_edu.doctor.moving import moved_parts
 from gsplat_edu.doctor.residuals import residuals
@@ -85,6 +86,8 @@ def _before(arguments: argparse.Namespace, console: Console) -> tuple[Diagnosis,
     from gsplat_edu.budget.costs import Facts, wanted_gaussians
     from gsplat_edu.budget.forecast import forecast  # it measures this machine, which takes a moment
 
+    if arguments.resolution is None and (side := side_for_training(survey)) is not None:
+        settings = DataSettings(resolution=float(side))  # as the command in the advice trains
     try:
         dataset = load_dataset(arguments.path, settings)
         facts = Facts.of(dataset)

@@ -63,7 +63,8 @@ def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
 
     Args:
         survey: The capture, prepared.
-        options: The user's training options, as command-line words; the recommended command repeats them.
+        options: The user's training options, as command-line words; the recommended command repeats them, and adds
+            --resolution auto where the photos are much larger than the scene resolves.
     """
     checks = [*OF_FILES, *(OF_VIEWS if len(survey.shots) > 1 else ()), *OF_LISTS]
     findings, fine = list[Finding](), list[str]()
@@ -72,6 +73,8 @@ def examine(survey: Survey, options: Sequence[str] = ()) -> Diagnosis:
         findings += found
         if not found:
             fine.append(name)
+    if "--resolution" not in options and any(finding.name == "resolution" for finding in findings):
+        options = (*options, "--resolution", "auto")
     return Diagnosis(_facts(survey), tuple(findings), tuple(fine), _otherwise(survey, options))
 
 

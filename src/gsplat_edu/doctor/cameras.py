@@ -163,13 +163,17 @@ def check_sizes(survey: Survey) -> list[Finding]:
     return [Finding("sizes", Severity.NOTE, what, advice, names)]
 
 
+def side_for_training(survey: Survey) -> int | None:
+    """Return the longest side to which photos should be reduced, px; None to keep their size."""
+    sizes = [shot.size for shot in survey.shots]
+    return advised_side(sizes, len(sizes) - len(sizes) // TEST_EVERY) if sizes else None
+
+
 def check_resolution(survey: Survey) -> list[Finding]:
     """Find photos that show more than the planned Gaussians resolve."""
-    sizes = [shot.size for shot in survey.shots]
-    side = advised_side(sizes, len(sizes) - len(sizes) // TEST_EVERY)
-    if side is None:
+    if (side := side_for_training(survey)) is None:
         return []
-    W, H = max(sizes, key=max)
+    W, H = max((shot.size for shot in survey.shots), key=max)
     what = f"photos of {1e-6 * W * H:.1f} megapixels cost time, but the planned Gaussians do not resolve them"
     advice = f"train with --resolution auto, which reduces the photos to {side} px"
     return [Finding("resolution", Severity.NOTE, what, advice)]
