@@ -36,6 +36,11 @@ def picture_of(tab, camera):
     return np.frombuffer(base64.b64decode(encoded), "<f4").reshape(camera.H, camera.W, 3)
 
 
+READING = "GPU stall due to ReadPixels"
+"""What Chromium's driver says, now and then, of tests that read the page's pixels. A page that watches a training must
+not give it a reason: `test_live_browser.py` hears everything."""
+
+
 class Visit:
     """An open page. It records the console messages, errors and requests."""
 
@@ -125,7 +130,7 @@ def visit(browser, tabs):
             one.leave()
             free.append(one.tab)
     for one, _ in visits:
-        assert one.complaints == []
+        assert [text for text in one.complaints if READING not in text] == []
         assert [url for url in one.requests if not url.startswith(("file:", "blob:", "data:"))] == []
 
 
