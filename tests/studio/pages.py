@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from playwright.sync_api import Error
 
 from gsplat_edu.studio.app import application
 from gsplat_edu.studio.server import _config, _Server
@@ -116,9 +117,19 @@ class Visitor:
 def until(tab, frame, condition, patience=60):
     """Wait until an expression is true in a frame; Playwright's own way needs eval, which our policies forbid."""
     end = time.monotonic() + patience
-    while not frame.evaluate(condition):
+    while not _holds(frame, condition):
         assert time.monotonic() < end, condition
         tab.wait_for_timeout(50)
+
+
+def _holds(frame, condition):
+    """Evaluate the expression; a frame that is just navigating has none yet."""
+    try:
+        return frame.evaluate(condition)
+    except Error as error:
+        if "navigation" not in str(error):
+            raise
+        return False
 
 
 def encoded(data):
