@@ -13,14 +13,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from gsplat_edu.json_fields import LARGEST_NUMBER
 from gsplat_edu.reading import parse_json
 
 EVENTS = "GSPLAT_EDU_EVENTS"
 """Environment variable that names the file of events."""
-
-
-LARGEST_NUMBER = 1e300
-"""Largest magnitude of a number in a line."""
 
 
 @dataclass(frozen=True)

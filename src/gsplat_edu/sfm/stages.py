@@ -10,10 +10,8 @@ from typing import Any
 
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.files import written_aside
+from gsplat_edu.json_fields import LARGEST_NUMBER
 from gsplat_edu.reading import parse_json, read_text
-
-LARGEST_NUMBER = 1e300
-"""No number in a record is as large; a whole number may have more digits than a float can hold."""
 
 
 def _text(value: object) -> bool:
