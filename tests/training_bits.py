@@ -24,12 +24,12 @@ import torch
 from gsplat_edu import kernels
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.synthetic import sphere_capture
-from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.course import EXTENT, course_config
-from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent, StepEvent
-from gsplat_edu.train.initialize import from_points, make_strategy, random_ball
+from gsplat_edu.train.initialize import from_points, random_ball
 from gsplat_edu.train.trainer import Trainer, TrainResult
 
 RECORDS = Path(__file__).parent / "golden" / "training_bits.json"
@@ -37,7 +37,6 @@ RECORDS = Path(__file__).parent / "golden" / "training_bits.json"
 CAPABILITIES = {"v2": "default", "v3": "avx2", "v4": "avx512"}
 """Torch's capability on a machine whose best instruction set is this one of ours."""
 
-RENDER = functools.partial(render, backend="cpu")
 SCHEDULE = {"densify_start": 5, "densify_every": 10, "densify_stop": 100, "mcmc_stop": 100, "sh_every": 20}
 
 
@@ -47,9 +46,8 @@ CAPTURE, SPHERE = functools.cache(procedural_capture), functools.cache(sphere_ca
 def train_capture(config, events, size=40) -> tuple[Trainer, TrainResult]:
     views, points, colors = CAPTURE(size, 6, splats=120)
     start = from_points(points, colors, config)
-    density = make_strategy(config, 2.0, start)
     watch = [lambda _, event: events.append(event)]
-    trainer = Trainer(start, views, config, render=RENDER, extent=2.0, density=density, callbacks=watch)
+    trainer = training(config, Views(views), load_backend("cpu"), Start(start, extent=2.0), callbacks=watch)
     return trainer, trainer.run()
 
 
@@ -76,11 +74,9 @@ def train_sphere(events):
     config = course_config(iterations=120, max_gaussians=400)
     config = config.changed(densify_every=20, densify_stop=100)
     generator = torch.Generator().manual_seed(9)
-    start = random_ball(150, generator)
-    control = AdaptiveDensityControl(config, EXTENT, generator, start)
+    start = Start(random_ball(150, generator), extent=EXTENT, generator=generator)
     watch = [lambda _, event: events.append(event)]
-    views = SPHERE(40).train
-    trainer = Trainer(start, views, config, render=RENDER, extent=EXTENT, density=control, callbacks=watch)
+    trainer = training(config, Views(SPHERE(40).train), load_backend("cpu"), start, callbacks=watch)
     return trainer, trainer.run()
 
 

@@ -29,6 +29,9 @@ PARALLEL = 1e-3
 """Smallest eigenvalue of mean(I - d d') at which the intersection of the optical axes d is well defined. Below it
 (about 1.8 degrees between axes) the intersection is noise."""
 
+EXTENT_MARGIN = 1.1
+"""Factor between the cameras' spread and the extent (the code of Kerbl et al. 2023)."""
+
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Float64[np.ndarray, "3 3"]:
     """Return the rotation of a camera that looks at a point.
@@ -348,3 +351,27 @@ def point_nearest_axes(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"] | 
         return None
     b = (across @ (eyes - mean)[:, :, None]).mean(axis=0)[:, 0]
     return np.asarray(mean + np.linalg.solve(A, b))
+
+
+def scene_extent(cameras: Sequence[Camera]) -> float:
+    """Measure the scale of a scene by the spread of its cameras.
+
+    1.1 max_i |e_i - mean e|,  e_i: centre of camera i
+
+    Args:
+        cameras: At least one.
+
+    Returns:
+        World units; 1 if all cameras are at the same place, which says nothing about the scene.
+
+    Raises:
+        ArgumentError: there is no camera.
+
+    Source: the code of Kerbl et al. 2023.
+    """
+    if not cameras:
+        raise ArgumentError("cameras: is empty; the extent of a scene needs at least one camera")
+    eyes = np.stack([camera.eye for camera in cameras])
+    spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
+    # Differences within rounding count as the same place.
+    return EXTENT_MARGIN * spread if spread > 1e-9 * max(1.0, float(np.abs(eyes).max())) else 1.0

@@ -1,7 +1,8 @@
-"""Training losses."""
+"""Training losses: L1 and SSIM, natively or in torch; `gsplat_edu.render.backends` says which backend uses which."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,17 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsplat_edu.buffers import reusable_tensor
+from gsplat_edu.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA
 from gsplat_edu.errors import ArgumentError
-from gsplat_edu.kernels import REASON, SUFFIXES, kernel, native_array
-from gsplat_edu.render.backends import unavailable
+from gsplat_edu.kernels import SUFFIXES, kernel, native_array
+from gsplat_edu.threads import one_thread
 from gsplat_edu.validation import check_shape, in_range
+
+SSIM_RADIUS = 5
+"""Taps of SSIM's window on either side of its middle, px. (Wang et al. 2004: a window of 11)"""
+
+LossKernel = Callable[[Tensor, Tensor, float], Tensor]
+"""Computes (1 - k) L1 + k (1 - SSIM) of an image, its target and k, differentiably in the image."""
 
 
 def photo_loss(
@@ -22,8 +30,9 @@ def photo_loss(
     target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
     mask: Bool[np.ndarray, "H W"] | Bool[Tensor, "H W"] | None = None,
     ssim_weight: float = 0.2,
+    kernel: LossKernel | None = None,
 ) -> Float[Tensor, ""]:
-    """Return the photometric loss of the unmasked pixels: `l1_ssim`, or `l1` if SSIM has no weight.
+    """Return the photometric loss of the unmasked pixels: (1 - k) L1 + k (1 - SSIM).
 
     Masked pixels are black in both image and photo; the mean covers all pixels.
 
@@ -32,6 +41,7 @@ def photo_loss(
         target: (H, W, 3) photo, uint8 or float from 0 to 1.
         mask: (H, W) true for pixels that count; None if all count.
         ssim_weight: k, 0 to 1.
+        kernel: Computes the loss; `Backend.loss` of the image's backend. `l1_ssim` if None.
 
     Returns:
         () scalar, differentiable in the image.
@@ -47,21 +57,14 @@ def photo_loss(
         check_shape("mask", counts.shape, (*image.shape[:2], 1), {})
         image = _Masked.apply(image, counts)  # type: ignore[no-untyped-call]
         target = torch.mul(target.detach(), counts, out=reusable_tensor(target.shape, target))
-    if image.device.type == "cuda" and image.dtype == torch.float32 and unavailable("cuda") is None:
-        from gsplat_edu.render.triton.loss import l1_ssim_triton
-
-        with torch.cuda.device_of(image):  # type: ignore[no-untyped-call]
-            return l1_ssim_triton(image, target, ssim_weight)
-    return l1_ssim(image, target, ssim_weight) if ssim_weight else l1(image, target)
+    return (kernel or l1_ssim)(image, target, ssim_weight)
 
 
+@one_thread()  # the rounding of torch's sum depends on the number of threads
 def l1(
     image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"]
 ) -> Float[Tensor, ""]:
     """Return the mean absolute difference of two images: mean |image - target|.
-
-    On the CPU this is one native pass (if the native module is available): torch would wake its own threads for it,
-    which would compete with the native ones.
 
     Args:
         image: (H, W, 3) render.
@@ -74,12 +77,7 @@ def l1(
         ShapeError: the sizes differ.
     """
     check_shape("target", target.shape, image.shape, {})
-    native = REASON is None and image.device.type == "cpu" and image.dtype in SUFFIXES
-    if native and target.dtype in (image.dtype, torch.uint8):
-        return l1_ssim(image, target, ssim_weight=0.0)
-    if target.dtype == torch.uint8:
-        target = target.to(image.dtype) / 255.0
-    return torch.mean(torch.abs(image - target.detach()))
+    return torch.mean(torch.abs(image - _as_floats(target, image)))
 
 
 def l1_ssim(
@@ -119,6 +117,55 @@ def l1_ssim(
     weight = in_range("ssim_weight", ssim_weight, 0.0, 1.0)
     loss: Tensor = _L1Ssim.apply(image, target, weight)  # type: ignore[no-untyped-call]
     return loss
+
+
+@one_thread()
+def l1_ssim_in_torch(
+    image: Float[Tensor, "H W 3"],
+    target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
+    ssim_weight: float = 0.2,
+) -> Float[Tensor, ""]:
+    """Return the loss of `l1_ssim` from its definition, by torch's convolution, on any device.
+
+    SSIM = mean (2 mx my + C1) (2 c + C2) / ((mx² + my² + C1) (vx + vy + C2)),
+    with means m, variances v and covariance c under the Gaussian window.
+
+    Args:
+        image: (H, W, 3) render.
+        target: (H, W, 3) photo, 0 to 1, or uint8, 0 to 255; receives no gradient.
+        ssim_weight: k, 0 to 1.
+
+    Raises:
+        ShapeError: the sizes differ.
+        ArgumentError: the weight is outside 0 to 1.
+
+    Source: Kerbl et al. 2023, eq. 7; Wang et al. 2004.
+    """
+    weight = in_range("ssim_weight", ssim_weight, 0.0, 1.0)
+    mean = l1(image, target)
+    if weight == 0.0:
+        return mean
+    x, y = image, _as_floats(target, image)
+    mx, my = _blurred(x), _blurred(y)
+    vx, vy, c = _blurred(x * x) - mx * mx, _blurred(y * y) - my * my, _blurred(x * y) - mx * my
+    ratio = (2 * mx * my + SSIM_C1) * (2 * c + SSIM_C2)
+    ssim = torch.mean(ratio / ((mx * mx + my * my + SSIM_C1) * (vx + vy + SSIM_C2)))
+    return (1.0 - weight) * mean + weight * (1.0 - ssim)
+
+
+def _as_floats(target: Tensor, image: Tensor) -> Tensor:
+    """Return a target as numbers of the image's dtype, 0 to 1, without a gradient."""
+    return (target.to(image.dtype) / 255.0 if target.dtype == torch.uint8 else target).detach()
+
+
+def _blurred(image: Tensor) -> Tensor:
+    """Convolve (H, W, 3) with the window of SSIM; zero outside the image."""
+    steps = torch.arange(2 * SSIM_RADIUS + 1, dtype=image.dtype, device=image.device) - SSIM_RADIUS
+    taps = torch.exp(-(steps**2) / (2 * SSIM_SIGMA**2))
+    window = (torch.outer(taps, taps) / taps.sum() ** 2)[None, None].repeat(3, 1, 1, 1)
+    planes = image.permute(2, 0, 1)[None]
+    blurred = torch.nn.functional.conv2d(planes, window, padding=SSIM_RADIUS, groups=3)
+    return blurred[0].permute(1, 2, 0)
 
 
 class _Masked(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""Random steps of Gaussians along their covariances, by the kernel that takes them: the native one, or torch.
+"""Random steps of Gaussians along their covariances, natively or in torch.
 
 The numbers come from a generator without a state: Philox maps a seed and the index of a Gaussian to four 32-bit words.
 Every Gaussian's draw is independent of the others', so any thread or device may compute it.
@@ -9,6 +9,7 @@ Source: Salmon et al. 2011, "Parallel Random Numbers: As Easy as 1, 2, 3"; Box a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -45,24 +46,49 @@ class NoiseNumbers(NamedTuple):
 
 
 @torch.no_grad()
-def add_noise(gaussians: Gaussians, numbers: NoiseNumbers) -> None:
+def add_noise_natively(gaussians: Gaussians, numbers: NoiseNumbers) -> None:
     """Move the means, in place: means += amount sigmoid(k (t - opacity)) Sigma n,  n ~ N(0, I).
 
-    On the CPU this is one native pass, the same to the bit on any number of threads. Torch steps where it does not
-    take the tensors: without the native module, on a GPU, or if a tensor is strided or of another dtype. Both draw the
-    same words; the steps differ by rounding, in float32 by up to 1e-5 of the largest step that Sigma allows.
+    One native pass, the same to the bit on any number of threads.
 
     Args:
-        gaussians: The Gaussians; only their means change. A parameter that is not finite makes its mean NaN or
-            infinite.
+        gaussians: The Gaussians, contiguous, float32 or float64 on the CPU; only their means change. A parameter that
+            is not finite makes its mean NaN or infinite.
         numbers: Seed, amount and gate.
+
+    Raises:
+        BackendUnavailableError: the native module is missing.
     """
-    needed = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
-    here = gaussians.means.device.type == "cpu" and gaussians.means.dtype in kernels.SUFFIXES
-    if here and kernels.REASON is None and all(tensor.is_contiguous() for tensor in needed):
-        _add_natively(gaussians, numbers)
-    else:
-        _add_in_torch(gaussians, numbers)
+    means = gaussians.means
+    kernels.kernel("noise_f", means.dtype)(
+        means=kernels.native_array(means.detach()),
+        quats=kernels.native_array(gaussians.quats.detach()),
+        log_scales=kernels.native_array(gaussians.log_scales.detach()),
+        logit_opacities=kernels.native_array(gaussians.logit_opacities.detach()),
+        **numbers._asdict(),
+        threads=native_threads(),
+    )
+    torch.autograd.graph.increment_version(means)  # so that autograd knows of the change
+
+
+@torch.no_grad()
+def add_noise_in_torch(gaussians: Gaussians, numbers: NoiseNumbers) -> None:
+    """Move the means as `add_noise_natively` does, by torch's operations, on any device.
+
+    Both draw the same words; the steps differ by rounding, in float32 by up to 1e-5 of the largest step that Sigma
+    allows.
+    """
+    means = gaussians.means
+    draw = standard_normals(numbers.seed, len(means), means.detach())
+    R, scales = unchecked_rotations(gaussians.quats.detach()), gaussians.scales
+    wander = (R @ (scales.square() * (R.mT @ draw[..., None])[..., 0])[..., None])[..., 0]
+    x = numbers.sharpness * (gaussians.opacities - numbers.threshold)
+    gate = torch.where(x > SHUT, 0.0, torch.sigmoid(-x))
+    means += numbers.amount * gate[:, None] * wander
+
+
+NoiseKernel = Callable[[Gaussians, NoiseNumbers], None]
+"""Moves the means of Gaussians, in place."""
 
 
 def standard_normals(seed: int, count: int, like: Tensor) -> Float[Tensor, "count 3"]:
@@ -104,26 +130,3 @@ def philox(counter: Words, key: tuple[int, int]) -> Words:
         c2, c3 = ((a >> 32) & WORD) ^ c3 ^ k1, a & WORD
         k0, k1 = (k0 + 0x9E3779B9) & WORD, (k1 + 0xBB67AE85) & WORD
     return c0, c1, c2, c3
-
-
-def _add_natively(gaussians: Gaussians, numbers: NoiseNumbers) -> None:
-    means = gaussians.means
-    kernels.kernel("noise_f", means.dtype)(
-        means=kernels.native_array(means.detach()),
-        quats=kernels.native_array(gaussians.quats.detach()),
-        log_scales=kernels.native_array(gaussians.log_scales.detach()),
-        logit_opacities=kernels.native_array(gaussians.logit_opacities.detach()),
-        **numbers._asdict(),
-        threads=native_threads(),
-    )
-    torch.autograd.graph.increment_version(means)  # so that autograd knows of the change
-
-
-def _add_in_torch(gaussians: Gaussians, numbers: NoiseNumbers) -> None:
-    means = gaussians.means
-    draw = standard_normals(numbers.seed, len(means), means.detach())
-    R, scales = unchecked_rotations(gaussians.quats.detach()), gaussians.scales
-    wander = (R @ (scales.square() * (R.mT @ draw[..., None])[..., 0])[..., None])[..., 0]
-    x = numbers.sharpness * (gaussians.opacities - numbers.threshold)
-    gate = torch.where(x > SHUT, 0.0, torch.sigmoid(-x))
-    means += numbers.amount * gate[:, None] * wander

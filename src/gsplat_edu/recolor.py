@@ -12,7 +12,7 @@ the sRGB curve, or v (y - T c + (1 - T) o) - (1 - T) o + T c before a background
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -51,8 +51,7 @@ def recolored(
 ) -> Float[Tensor, "H W 3"]:
     """Return the image with the colours A x + b, or its object with them.
 
-    On the CPU this is one native pass, the same to the bit on any number of threads; torch computes it on a GPU and
-    without the native module.
+    Natively where the native module takes the image, else in torch. A training takes `Backend.recolored`.
 
     Args:
         image: (H, W, 3) any range.
@@ -71,6 +70,49 @@ def recolored(
         ShapeError: a shape differs.
         ArgumentError: matrix, transmittance or falloff has another dtype or device than the image.
     """
+    native = kernels.REASON is None and image.device.type == "cpu" and image.dtype in kernels.SUFFIXES
+    return (recolored_natively if native else recolored_in_torch)(image, matrix, photo, behind, falloff)
+
+
+def recolored_natively(
+    image: Float[Tensor, "H W 3"],
+    matrix: Float[Tensor, "3 4"],
+    photo: UInt8[Tensor, "H W 3"] | None = None,
+    behind: Behind | None = None,
+    falloff: Float[Tensor, "H W"] | None = None,
+) -> Float[Tensor, "H W 3"]:
+    """Compute `recolored` in one native pass, for images on the CPU; the same bits on any number of threads."""
+    through, background = _checked(image, matrix, photo, behind, falloff)
+    constants = _Constants(photo, falloff, background)
+    found: Tensor = _Recolored.apply(image, matrix, through, constants)  # type: ignore[no-untyped-call]
+    return found
+
+
+def recolored_in_torch(
+    image: Float[Tensor, "H W 3"],
+    matrix: Float[Tensor, "3 4"],
+    photo: UInt8[Tensor, "H W 3"] | None = None,
+    behind: Behind | None = None,
+    falloff: Float[Tensor, "H W"] | None = None,
+) -> Float[Tensor, "H W 3"]:
+    """Compute `recolored` by torch's operations, on any device."""
+    through, background = _checked(image, matrix, photo, behind, falloff)
+    corrected = image @ matrix[:, :3].T + matrix[:, 3]
+    color = image.new_tensor(background)
+    if through is not None:
+        corrected = corrected + through[..., None] * (color - matrix[:, :3] @ color - matrix[:, 3])
+    if falloff is not None:
+        offset = SRGB_OFFSET if through is None else SRGB_OFFSET - through[..., None] * (SRGB_OFFSET + color)
+        corrected = falloff[..., None] * (corrected + offset) - offset
+    if photo is None:
+        return corrected
+    return torch.where((photo == 255) & (corrected > 1), torch.ones_like(corrected), corrected)
+
+
+def _checked(
+    image: Tensor, matrix: Tensor, photo: Tensor | None, behind: Behind | None, falloff: Tensor | None
+) -> tuple[Tensor | None, Color]:
+    """Check the arguments of `recolored`; return the transmittance, None for an opaque image, and the background."""
     check_shape("image", image.shape, ("H", "W", 3), {})
     check_shape("matrix", matrix.shape, (3, 4), {})
     if photo is not None:
@@ -84,20 +126,11 @@ def recolored(
             raise ArgumentError(
                 f"{name}: is {tensor.dtype} on {tensor.device}, but has to be {image.dtype} on {image.device}"
             )
-    if kernels.REASON is None and image.device.type == "cpu" and image.dtype in kernels.SUFFIXES:
-        constants = _Constants(photo, falloff, background)
-        found: Tensor = _Recolored.apply(image, matrix, through, constants)  # type: ignore[no-untyped-call]
-        return found
-    corrected = image @ matrix[:, :3].T + matrix[:, 3]
-    color = image.new_tensor(background)
-    if through is not None:
-        corrected = corrected + through[..., None] * (color - matrix[:, :3] @ color - matrix[:, 3])
-    if falloff is not None:
-        offset = SRGB_OFFSET if through is None else SRGB_OFFSET - through[..., None] * (SRGB_OFFSET + color)
-        corrected = falloff[..., None] * (corrected + offset) - offset
-    if photo is None:
-        return corrected
-    return torch.where((photo == 255) & (corrected > 1), torch.ones_like(corrected), corrected)
+    return through, background
+
+
+RecolorKernel = Callable[..., Tensor]
+"""Computes `recolored`, from the same arguments."""
 
 
 class _Constants(NamedTuple):

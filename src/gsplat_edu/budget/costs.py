@@ -18,7 +18,7 @@ from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.image_files import BYTES_PER_PIXEL
-from gsplat_edu.train.capacity import PLANNED, PLANNED_PIXELS, PLANNED_VIEWS
+from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM
 from gsplat_edu.train.schedule import photo_factor, planned_counts
@@ -28,9 +28,6 @@ GROWTH = (0.005, 0.08)
 snowmiku97 and 3,000 at half size; whole trainings added 3,100 (3,000 iterations), 4,100 (7,000), 5,500 (7,000, not
 rescaled) and 3,900 (1,200, half size). For fox it gives 5,000; 3,500 were added. Scenes with much fine detail need
 several times as many."""
-
-LEAST_PLANNED = 1_000
-"""fast: smallest planned number, for thumbnails."""
 
 FEW_POINTS = 30_000
 """Start points beyond this number do not increase the growth."""
@@ -234,8 +231,7 @@ def wanted_gaussians(config: TrainConfig, points: int, pixels: float, views: int
         views: Number of training views.
     """
     if config.strategy == "fast":
-        share = math.cbrt(pixels / PLANNED_PIXELS) * math.sqrt(views / PLANNED_VIEWS)
-        return max(round(min(PLANNED * share, pixels)), LEAST_PLANNED)
+        return planned_gaussians(pixels, views)
     window = min(config.adc.densify_stop, config.iterations) - config.densify_start
     return points + _added(points, pixels) * max(window // config.densify_every, 0)
 

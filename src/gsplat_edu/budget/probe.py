@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import dataclasses
 import functools
 import math
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,16 +26,17 @@ from gsplat_edu.evaluate.metrics import ImageScore, score_views
 from gsplat_edu.evaluate.report import Picture
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import device_of
+from gsplat_edu.render.backends import device_of, load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.surgery import split_children
 from gsplat_edu.train.events import Event, StepEvent
-from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.schedule import photo_factor
-from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import View
 
 Bytes = UInt8[np.ndarray, "H W 3"]
@@ -108,7 +108,7 @@ def probe(
         photo = view.read()
         reading.append(time.perf_counter() - began)
         photos.append(View(view.camera, photo.image, alpha=photo.alpha, mask=photo.mask, name=view.name))
-    plain = dataclasses.replace(config, strategy="none")  # mcmc starts fainter and smaller than it stays
+    plain = replace(config, strategy="none")  # mcmc starts fainter and smaller than it stays
     start, usual = (
         scene or from_points(dataset.points, dataset.colors, settings) for settings in (config, plain)
     )
@@ -116,9 +116,8 @@ def probe(
     grown = _grown(usual, int(expected_counts(config, len(start), pixels)[-1]))
     if len(grown) == len(start) > 1:
         start = start.map(lambda tensor: tensor[::2])
-    trial = functools.partial(
-        _trial, extent=scene_extent([view.camera for view in dataset.train]), config=config, backend=backend
-    )
+    extent = scene_extent([view.camera for view in dataset.train])
+    trial = functools.partial(_trial, config=config, extent=extent, name=backend)
     small = [_halved(view) for view in photos]
     trials = [trial(start, photos), trial(grown, photos)]
     if min(min(view.camera.W, view.camera.H) for view in small) >= SMALL:
@@ -176,20 +175,20 @@ def _grown(start: Gaussians, wanted: int) -> Gaussians:
 
 
 def _trial(
-    gaussians: Gaussians, views: Sequence[View], extent: float, config: TrainConfig, backend: str
+    gaussians: Gaussians, views: Sequence[View], config: TrainConfig, extent: float, name: str
 ) -> _Trial:
-    pairs, moments = [0], list[float]()
+    pairs, moments, backend = [0], list[float](), load_backend(name)
 
     def counting(
-        gaussians: Gaussians, camera: Camera | CameraTensors, *, settings: RenderSettings
+        gaussians: Gaussians, camera: Camera | CameraTensors, settings: RenderSettings, extra: Extra
     ) -> RenderOutput:
-        output = render(gaussians, camera, settings=settings, backend=backend)
+        output = backend.rasterize(gaussians, camera, settings, extra)
         pairs.append(output.num_pairs or 0)
         return output
 
     def note(trainer: Trainer, event: Event) -> None:
         if isinstance(event, StepEvent):
-            if backend == "cuda" and torch.cuda.is_available():
+            if backend.device.type == "cuda":
                 torch.cuda.synchronize()
             moments.append(time.perf_counter())
 
@@ -203,18 +202,15 @@ def _trial(
         fast_start_factor=1.0,
         fast_stop=PROBE_STEPS + 1,
         max_gaussians=max(len(gaussians), config.max_gaussians or 0),
+        **dict.fromkeys(("refine", "appearance", "transients", "sky"), "none"),
     )
-    placed = gaussians.to(device_of(backend))
-    density = make_strategy(plain, extent, placed)
-    trainer = Trainer(
-        placed,
-        views,
+    trainer = training(
         plain,
-        render=counting,
-        extent=extent,
-        density=density,
+        Views(views),
+        replace(backend, rasterize=counting),
+        Start(gaussians, extent=extent),
         callbacks=[note],
-        parts=StepParts(fused=config.batch == 1),  # a batch stores its gradients
+        fused=config.batch == 1,  # a batch stores its gradients
     )
     trainer.run(_until(moments))
     pixels = float(np.mean([view.camera.W * view.camera.H for view in views]))

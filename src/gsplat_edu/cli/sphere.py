@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,13 +25,14 @@ from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import device_of, resolve_backend
+from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backends import load_backend, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.course import EXTENT, course_config
-from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import random_ball
-from gsplat_edu.train.trainer import Callback, Renderer, Trainer, TrainResult
+from gsplat_edu.train.trainer import Callback, Trainer, TrainResult
 from gsplat_edu.validation import whole_number
 
 MAX_SEED = 2**63 - 1
@@ -129,13 +129,15 @@ def run_sphere(
         say: Prints the closing lines.
     """
     capture = sphere_capture(options.budget.size)
-    renderer = functools.partial(render, backend=options.backend)
+    backend = load_backend(options.backend)
     settings, iters = RenderSettings(depth=False), options.budget.iters
     middle = 3 * iters // 8  # the chapter shows 300 of its 800
 
     def held_out(gaussians: Gaussians) -> Float32[np.ndarray, "H W 3"]:
         with torch.no_grad():
-            return renderer(gaussians, capture.held_out.camera, settings=settings).image.numpy(force=True)
+            return render(gaussians, capture.held_out.camera, settings=settings, backend=backend).image.numpy(
+                force=True
+            )
 
     snapshots = {}
 
@@ -145,7 +147,7 @@ def run_sphere(
         ):  # called after the step and again after its densification, which is kept
             snapshots["middle"] = held_out(trainer.gaussians)
 
-    trainer = _trainer(options, capture, renderer, (take_snapshot, *callbacks))
+    trainer = _trainer(options, capture, backend, (take_snapshot, *callbacks))
     start = held_out(trainer.gaussians)
     result = trainer.run()
     final, truth = held_out(trainer.gaussians), capture.held_out.image
@@ -164,15 +166,12 @@ def run_sphere(
 
 
 def _trainer(
-    options: SphereOptions, capture: SphereCapture, renderer: Renderer, callbacks: Sequence[Callback]
+    options: SphereOptions, capture: SphereCapture, backend: Backend, callbacks: Sequence[Callback]
 ) -> Trainer:
     config = course_config(options.budget.iters, options.seed, options.budget.cap)
     generator = torch.Generator().manual_seed(options.seed)
-    gaussians = random_ball(options.k0, generator).to(device_of(options.backend))
-    control = AdaptiveDensityControl(config, EXTENT, generator, gaussians)
-    return Trainer(
-        gaussians, capture.train, config, render=renderer, extent=EXTENT, density=control, callbacks=callbacks
-    )
+    start = Start(random_ball(options.k0, generator), extent=EXTENT, generator=generator)
+    return training(config, Views(capture.train), backend, start, callbacks=callbacks)
 
 
 def _l1(image: Float32[np.ndarray, "H W 3"], truth: Float32[np.ndarray, "H W 3"]) -> float:

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from gsplat_edu.camera import Camera, point_nearest_axes
+from gsplat_edu.camera import scene_extent as scene_extent
 from gsplat_edu.data.blender import TRAIN_FILE, read_blender
 from gsplat_edu.data.capture import (
     PHOTO_ENDINGS,
@@ -37,7 +38,7 @@ from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.scale import Scale, read_scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
-from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.errors import DatasetError
 from gsplat_edu.views import View
 
 TEST_EVERY = 8
@@ -48,9 +49,6 @@ ONE_PLACE = 1e-5
 
 FAR = 1e4
 """Camera coordinates beyond which the origin is moved, world units; float32 would resolve them only to 1e-3."""
-
-EXTENT_MARGIN = 1.1
-"""Factor between the cameras' spread and the extent (the code of Kerbl et al. 2023)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,30 +169,6 @@ def load_dataset(
         capture.scale,
         cloud is not None,
     )
-
-
-def scene_extent(cameras: Sequence[Camera]) -> float:
-    """Measure the scale of a scene by the spread of its cameras.
-
-    1.1 max_i |e_i - mean e|,  e_i: centre of camera i
-
-    Args:
-        cameras: At least one.
-
-    Returns:
-        World units; 1 if all cameras are at the same place, which says nothing about the scene.
-
-    Raises:
-        ArgumentError: there is no camera.
-
-    Source: the code of Kerbl et al. 2023.
-    """
-    if not cameras:
-        raise ArgumentError("cameras: is empty; the extent of a scene needs at least one camera")
-    eyes = np.stack([camera.eye for camera in cameras])
-    spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max())
-    # Differences within rounding count as the same place.
-    return EXTENT_MARGIN * spread if spread > 1e-9 * max(1.0, float(np.abs(eyes).max())) else 1.0
 
 
 def read_capture(path: Path) -> Capture:

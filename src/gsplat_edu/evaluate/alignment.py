@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gsplat_edu.adam import adam_step
+from gsplat_edu.adam import adam_in_torch
 from gsplat_edu.camera import Camera
 from gsplat_edu.evaluate.metrics import at_exposure_of, psnr, seen_through
 from gsplat_edu.gaussians import Gaussians
@@ -95,7 +95,7 @@ def aligned_psnr(
         leaf = twist.clone().requires_grad_()
         image = shown(start.moved(leaf * units))
         (gradient,) = torch.autograd.grad(photo_loss(image, target, mask), leaf)
-        adam_step(twist, first, second, gradient, _numbers(step))
+        adam_in_torch(twist, first, second, gradient, _numbers(step))
     with torch.no_grad():
         return psnr(shown(start.moved(twist * units).value()), truth, scored)
 

@@ -13,11 +13,11 @@ from gsplat_edu.camera import Camera, CameraLike, as_camera
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians, check_tensor
 from gsplat_edu.headroom import require_memory
-from gsplat_edu.render.backends import resolve_backend
+from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput, RenderStack, check_features
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.render.torch_reference import render_dense
 from gsplat_edu.validation import of_type
 
 BYTES_PER_PIXEL = 40
@@ -36,7 +36,7 @@ def render(
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
     features: Tensor | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> RenderOutput: ...
 
 
@@ -48,7 +48,7 @@ def render(
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
     features: Tensor | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> RenderStack: ...
 
 
@@ -59,7 +59,7 @@ def render(
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
     features: Tensor | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> RenderOutput | RenderStack:
     """Render Gaussians from one camera, or from several of equal image size.
 
@@ -72,7 +72,7 @@ def render(
         features: (N, C) numbers to composite beside the colours, of the Gaussians' dtype and device; None for none.
             The backend cpu composites 32 at a time: every further 32 take another projection, sort and two passes.
         backend: "auto" for the fastest one on the Gaussians' device, or a backend by name (see
-            `gsplat_edu.render.backends`).
+            `gsplat_edu.render.backends`), or a backend that is loaded already.
 
     Returns:
         The view, including the data for density control; for several cameras, a stack of views.
@@ -89,7 +89,7 @@ def render(
     of_type("gaussians", gaussians, Gaussians)
     settings = RenderSettings() if settings is None else settings
     of_type("settings", settings, RenderSettings)
-    name = resolve_backend(backend, gaussians.means.device)
+    chosen = backend if isinstance(backend, Backend) else load_backend(backend, gaussians.means.device)
     if background is None:
         background = _background(settings.background, gaussians.means.dtype, gaussians.means.device)
     else:
@@ -99,13 +99,13 @@ def render(
         check_features(features, gaussians.means)
     extra = Extra(background, features)
     if not isinstance(camera, Sequence):
-        return _render_one(name, gaussians, _checked("camera", camera), settings, extra)
+        return _render_one(chosen, gaussians, _checked("camera", camera), settings, extra)
     cameras = [_checked(f"camera[{k}]", one) for k, one in enumerate(camera)]
     if len({(c.H, c.W) for c in cameras}) != 1:
         raise ArgumentError(
             "camera: is an empty sequence or has different image sizes; render the cameras one by one"
         )
-    return _stack(tuple(_render_one(name, gaussians, c, settings, extra) for c in cameras))
+    return _stack(tuple(_render_one(chosen, gaussians, c, settings, extra) for c in cameras))
 
 
 def _stack(views: tuple[RenderOutput, ...]) -> RenderStack:
@@ -142,7 +142,7 @@ def _sent(color: tuple[float, float, float], dtype: torch.dtype, device: torch.d
 
 
 def _render_one(
-    name: str,
+    backend: Backend,
     gaussians: Gaussians,
     camera: Camera | CameraTensors,
     settings: RenderSettings,
@@ -155,14 +155,6 @@ def _render_one(
             (BYTES_PER_PIXEL + BYTES_PER_CHANNEL * channels) * int(camera.W) * int(camera.H),
             "close other programs, or render fewer pixels (--size)",
         )
-    if name == "cpu":
-        from gsplat_edu.render.cpu import render_cpu  # backends.py has checked the native module
-
-        return render_cpu(gaussians, camera, settings, extra)
     if settings.stop != "tile":
-        raise ArgumentError(f"stop: is {settings.stop!r}, which only the backend cpu offers, not {name}")
-    if name == "cuda":
-        from gsplat_edu.render.triton.rasterize import render_triton  # and Triton
-
-        return render_triton(gaussians, camera, settings, extra)
-    return render_dense(gaussians, camera, settings, extra)
+        backend.require("stop", f"stop: {settings.stop!r}")
+    return backend.rasterize(gaussians, camera, settings, extra)

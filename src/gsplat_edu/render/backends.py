@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib.util
 import os
 import warnings
 
 import torch
+from torch import Tensor
 
 from gsplat_edu import kernels
+from gsplat_edu.adam import adam_in_torch, adam_natively
 from gsplat_edu.errors import BackendUnavailableError, BackendWarning
+from gsplat_edu.losses import l1_ssim, l1_ssim_in_torch
+from gsplat_edu.moments import AdamNumbers
+from gsplat_edu.noise import add_noise_in_torch, add_noise_natively
+from gsplat_edu.recolor import recolored_in_torch, recolored_natively
+from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.self_check import cuda_failure
 from gsplat_edu.render.settings import BACKENDS as BACKENDS
 from gsplat_edu.render.settings import check_backend
+
+CUDA_LACKS = frozenset({"stop", "processes"})
+"""What the Triton kernels do not offer."""
 
 
 def resolve_backend(name: str, device: torch.device | None = None) -> str:
@@ -81,3 +92,84 @@ def interpreted() -> bool:
 def device_of(backend: str) -> torch.device:
     """Return the device on which a backend needs its tensors."""
     return torch.device("cuda" if backend == "cuda" and torch.cuda.is_available() else "cpu")
+
+
+def load_backend(name: str = "auto", device: torch.device | None = None) -> Backend:
+    """Return a backend's kernels.
+
+    Args:
+        name: "auto", or a backend by name; see `resolve_backend`.
+        device: The device of the tensors, if they exist already.
+
+    Raises:
+        BackendUnavailableError: the backend does not exist or cannot run here; the message says why.
+    """
+    return _LOADERS[resolve_backend(name, device)]()
+
+
+@functools.cache
+def _cpu() -> Backend:
+    from gsplat_edu.render.cpu import render_cpu  # it needs the native module
+
+    return Backend(
+        "cpu",
+        device_of("cpu"),
+        render_cpu,
+        l1_ssim,
+        adam_natively,
+        add_noise_natively,
+        recolored_natively,
+    )
+
+
+@functools.cache
+def _dense() -> Backend:
+    from gsplat_edu.render.torch_reference import render_dense
+
+    return Backend(
+        "torch",
+        device_of("torch"),
+        render_dense,
+        l1_ssim_in_torch,
+        adam_in_torch,
+        add_noise_in_torch,
+        recolored_in_torch,
+        frozenset({"stop", "processes", "forecast"}),
+    )
+
+
+@functools.cache
+def _cuda() -> Backend:
+    from gsplat_edu.render.triton.adam import adam_triton
+    from gsplat_edu.render.triton.loss import l1_ssim_triton
+    from gsplat_edu.render.triton.rasterize import render_triton
+
+    if interpreted():  # on tensors of the CPU, where the other kernels are faster
+        return dataclasses.replace(_cpu(), name="cuda", rasterize=render_triton, lacks=CUDA_LACKS)
+
+    def loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+        with torch.cuda.device_of(image):  # type: ignore[no-untyped-call]
+            return l1_ssim_triton(image, target, ssim_weight)
+
+    def adam(
+        parameter: Tensor, first: Tensor, second: Tensor, gradient: Tensor, numbers: AdamNumbers
+    ) -> None:
+        if parameter.dtype != torch.float32:  # what is not per Gaussian, as the lenses of a capture
+            adam_in_torch(parameter, first, second, gradient, numbers)
+            return
+        with torch.no_grad(), torch.cuda.device_of(parameter):  # type: ignore[no-untyped-call]
+            adam_triton(parameter, first, second, gradient, tuple(numbers))
+
+    return Backend(
+        "cuda",
+        device_of("cuda"),
+        render_triton,
+        loss,
+        adam,
+        add_noise_in_torch,
+        recolored_in_torch,
+        CUDA_LACKS,
+    )
+
+
+_LOADERS = {"cpu": _cpu, "torch": _dense, "cuda": _cuda}

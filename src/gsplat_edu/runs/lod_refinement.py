@@ -18,20 +18,19 @@ import numpy as np
 import torch
 
 from gsplat_edu.camera import Camera
-from gsplat_edu.data.dataset import scene_extent
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.paths import resized
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.lod.levels import Node, leaves_of, level_of, with_levels
 from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import device_of
+from gsplat_edu.render.backends import device_of, load_backend
 from gsplat_edu.runs.dataset import data_settings, run_dataset
 from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.refined import with_camera
 from gsplat_edu.runs.source import Source, run_of
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import FROM_SCENE, recipe
-from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import View
 
 MOST_JUDGED = 8
@@ -79,7 +78,7 @@ class LevelScore:
         return f"level {self.level}, {self.count:,} splats, against {size}: {found}"
 
 
-Views = tuple[Sequence[View], Sequence[View]]
+Split = tuple[Sequence[View], Sequence[View]]
 """Views to train on and views to score on."""
 
 
@@ -132,7 +131,7 @@ def _split(gaussians: Gaussians, sizes: Sequence[int]) -> list[Gaussians]:
     ]
 
 
-def _photos(source: Source, run: RunFolder, factor: float, backend: str) -> Views:
+def _photos(source: Source, run: RunFolder, factor: float, backend: str) -> Split:
     """Return the run's photos, reduced, at the cameras and the exposure of its scene."""
     config = run.read_config()
     settings = data_settings(config)
@@ -170,7 +169,7 @@ def _spread(views: Sequence[View]) -> tuple[View, ...]:
     return tuple(views[i * len(views) // count] for i in range(count))
 
 
-def _renders(source: Source, factor: float, backend: str) -> Views:
+def _renders(source: Source, factor: float, backend: str) -> Split:
     """Return renders of the scene from an orbit, reduced from full size."""
     shown = source.scene.gaussians.to(device_of(backend))
     views = []
@@ -192,6 +191,7 @@ def _trained(
     changes: dict[str, Any] = {**FROM_SCENE}
     config = recipe(
         steps,
+        strategy="none",
         **changes,
         sh_degree=gaussians.sh_degree,
         max_gaussians=None,
@@ -199,13 +199,7 @@ def _trained(
         antialiased=settings.antialiased,
         jacobian_limit=settings.jacobian_limit,
     )
-    trainer = Trainer(
-        gaussians.to(device_of(backend)),
-        views,
-        config,
-        render=functools.partial(render, backend=backend),
-        extent=scene_extent([view.camera for view in views]),
-    )
+    trainer = training(config, Views(views), load_backend(backend), Start(gaussians))
     trainer.run()
     return trainer.gaussians.map(lambda tensor: tensor.detach().cpu())
 

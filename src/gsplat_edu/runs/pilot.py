@@ -7,22 +7,20 @@ helps clearly.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import replace
 
-from gsplat_edu.data.dataset import Dataset, load_dataset, scene_extent
+from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
-from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import device_of
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.refined import with_refined_cameras
+from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import TrainConfig, recipe
-from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event, StepEvent
-from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
-from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.train.poses import refinement_of
+from gsplat_edu.train.trainer import Trainer
 
 SIDE = 240
 """Longest side of the photos of a pilot, px."""
@@ -77,20 +75,8 @@ def _choice(scores: dict[str, float]) -> tuple[str, str]:
 def _pilot(dataset: Dataset, options: RunOptions, refine: str, progress: Callable[[], None]) -> float | None:
     """Train a pilot and return its score, dB; None if no pixel counts."""
     config = _config(options.config, refine)
-    cameras = [view.camera for view in dataset.train]
-    extent = scene_extent(cameras)
-    start = sorted_in_space(from_points(dataset.points, dataset.colors, config))
-    gaussians = start.to(device_of(options.backend))
-    model, refinement = make_view_model(config, cameras, extent, gaussians)
-    trainer = Trainer(
-        gaussians,
-        dataset.train,
-        config,
-        render=functools.partial(render, backend=options.backend),
-        extent=extent,
-        density=make_strategy(config, extent, gaussians),
-        parts=StepParts(view_model=model),
-    )
+    trainer = training(config, dataset, load_backend(options.backend))
+    refinement = refinement_of(trainer.view_model)
 
     def step(trainer: Trainer, event: Event) -> None:
         if isinstance(event, StepEvent):
@@ -101,7 +87,7 @@ def _pilot(dataset: Dataset, options: RunOptions, refine: str, progress: Callabl
     renderer = replace(options, config=config).renderer
     colors = config.appearance != "none"
     scores = [
-        aligned_psnr(trainer.gaussians, view, renderer, config.background, extent, colors=colors)
+        aligned_psnr(trainer.gaussians, view, renderer, config.background, trainer.extent, colors=colors)
         for view in shown.test
     ]
     return mean_aligned_psnr(scores)

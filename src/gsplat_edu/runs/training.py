@@ -8,7 +8,6 @@ Chapter: 13_photos_to_scene.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.data.dataset import Dataset, load_dataset, scene_extent
+from gsplat_edu.data.dataset import Dataset, load_dataset
 from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
@@ -24,8 +23,7 @@ from gsplat_edu.files import check_folder, remove_leftovers
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.reading import stored_path
-from gsplat_edu.render.api import render
-from gsplat_edu.render.backends import device_of
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
 from gsplat_edu.runs.identity import check_capture, check_options, fingerprint, photo_digests
@@ -44,13 +42,14 @@ from gsplat_edu.train.checkpoint import (
     read_seconds,
     save_checkpoint,
 )
+from gsplat_edu.train.compose import Start, training
 from gsplat_edu.train.density.surgery import sorted_in_space
 from gsplat_edu.train.events import Event
-from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
-from gsplat_edu.train.objective import make_objective
+from gsplat_edu.train.initialize import from_points
+from gsplat_edu.train.poses import refinement_of
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.team import ALONE
-from gsplat_edu.train.trainer import Callback, StepParts, Trainer
+from gsplat_edu.train.trainer import Callback, Trainer
 from gsplat_edu.train.transients import check_enough
 
 
@@ -249,26 +248,13 @@ class CaptureRun:
         return sorted_in_space(gaussians)
 
     def _trainer(self, gaussians: Gaussians) -> Trainer:
-        options, dataset = self.options, self.dataset
-        extent = scene_extent([view.camera for view in dataset.train])
-        gaussians = gaussians.to(device_of(options.backend))
-        cameras = [view.camera for view in dataset.train]
-        model, self._refinement = make_view_model(options.config, cameras, extent, gaussians)
-        renderer = functools.partial(render, backend=options.backend)
-        return Trainer(
-            gaussians,
-            dataset.train,
-            options.config,
-            render=renderer,
-            extent=extent,
-            density=make_strategy(options.config, extent, gaussians, self._shell),
+        return training(
+            self.options.config,
+            self.dataset,
+            load_backend(self.options.backend),
+            Start(gaussians, self._shell),
             callbacks=[self._record],
-            parts=StepParts(
-                make_objective(options.config, self._shell),
-                model,
-                transients=make_transients(options.config, dataset.train, renderer),
-                team=self._team,
-            ),
+            team=self._team,
         )
 
     def _start_cloud(self) -> tuple[Gaussians, str | None]:
@@ -401,7 +387,7 @@ class CaptureRun:
             clean: Called with the scene and the capture first; metrics.json gets its record as "cleaning".
         """
         trainer, dataset = self.trainer, self.dataset
-        refinement = self._refinement
+        refinement = refinement_of(trainer.view_model)
         refined = None if refinement is None else with_refined_cameras(refinement, dataset)
         gaussians = trainer.gaussians.map(lambda tensor: tensor[trainer.gaussians.finite_rows()])
         if lost := len(trainer.gaussians) - len(gaussians):

@@ -17,6 +17,7 @@ from torch import Tensor
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.threads import one_thread
+from gsplat_edu.train.view_model import Rows
 
 Node = tuple[int, int]
 """A node of the tree: its level, from 0 for the views, and its place within the level."""
@@ -79,7 +80,7 @@ class ViewResult:
 
     Args:
         terms: (T,) the objective's terms, in their order.
-        rows: The view's row of each of the view model's tensors that no gradient moves, in their order.
+        rows: What the view model measured: the view's row of each measured tensor, in their order.
         visible: (M,) as in `RenderOutput`; empty if density control observes nothing.
         radii: (M, 2) likewise.
         norms: (M,) `RenderOutput.means2d_grad_norms`, likewise.
@@ -112,37 +113,31 @@ class ViewResult:
 class Batch:
     """The views of a step that this process has differentiated.
 
-    The state that a view model measures (its parameters without a group) has a row for each view, and `image` changes
-    only the row of its view. During a batch it stays what it was before: every view sees the same state, whoever
-    renders it, and `commit` writes the changed rows in the order of the places.
-
     Args:
         count: Number of views of the batch.
         learned: The parameters that the optimiser moves, by name.
-        measured: The view model's other tensors, by name.
     """
 
     count: int
     learned: Mapping[str, Tensor]
-    measured: Mapping[str, Tensor]
     results: dict[int, ViewResult] = field(default_factory=dict)
     indices: dict[int, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Remember the measured state."""
+        """Start without gradients."""
         self.sums = PartialSums(self.count)
-        self._before = {name: tensor.clone() for name, tensor in self.measured.items()}
 
     @one_thread()
-    def take(self, place: int, index: int, terms: Mapping[str, Tensor], output: RenderOutput | None) -> None:
-        """Move a view's gradients out of the parameters' `grad`, and its rows out of the measured state.
-
-        A gradient that is absent counts as zeros.
+    def take(
+        self, place: int, index: int, terms: Mapping[str, Tensor], rows: Rows, output: RenderOutput | None
+    ) -> None:
+        """Move a view's gradients out of the parameters' `grad`. A gradient that is absent counts as zeros.
 
         Args:
             place: The view's place in the batch.
             index: The view's index into the trainer's views.
             terms: () the objective's terms.
+            rows: What the view model measured.
             output: The render, for density control; None if it need not observe it later.
         """
         gradients = {}
@@ -150,23 +145,18 @@ class Batch:
             gradients[name] = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
             parameter.grad = None
         self.sums.add((0, place), gradients)
-        rows = [tensor[index].clone() for tensor in self.measured.values()]
-        for name, tensor in self.measured.items():
-            tensor[index] = self._before[name][index]
         stacked = torch.stack([*terms.values()])
-        if output is None:
-            none = stacked.new_zeros(0)
-            nothing = none.long(), none.new_zeros(0, 2), none
-            self.results[place] = ViewResult(stacked, rows, *nothing)
-        else:
+        none = stacked.new_zeros(0)
+        observed = none.long(), none.new_zeros(0, 2), none
+        if output is not None:
             observed = output.visible, output.radii.detach(), output.means2d_grad_norms().detach()
-            self.results[place] = ViewResult(stacked, rows, *observed)
+        self.results[place] = ViewResult(stacked, [*rows.values()], *observed)
         self.indices[place] = index
 
-    def commit(self) -> None:
-        """Write the measured rows of all places, in order."""
+    def store_rows(self, measured: Mapping[str, Tensor]) -> None:
+        """Write what was measured at all places into the view model's tensors, in the order of the places."""
         for place in sorted(self.results):
-            for tensor, row in zip(self.measured.values(), self.results[place].rows, strict=True):
+            for tensor, row in zip(measured.values(), self.results[place].rows, strict=True):
                 tensor[self.indices[place]] = row
 
     def mean_terms(self, names: Sequence[str]) -> dict[str, Tensor]:
@@ -175,17 +165,3 @@ class Batch:
         for terms in others:
             first = first + terms
         return dict(zip(names, (first / len(self.results)).unbind(), strict=True))
-
-
-def check_measured(measured: Mapping[str, Tensor], num_views: int) -> None:
-    """Check that a view model's measured state has a row for each view.
-
-    Raises:
-        ArgumentError: a tensor has other rows.
-    """
-    for name, tensor in measured.items():
-        if not tensor.ndim or len(tensor) != num_views:
-            raise ArgumentError(
-                f"view_model: {name!r} has shape {tuple(tensor.shape)}, but batches need a row for each of the"
-                f" {num_views} views; train with batch 1"
-            )

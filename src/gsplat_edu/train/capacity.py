@@ -19,6 +19,22 @@ full size, `snowmiku97` has 7.3."""
 WORTHWHILE = 1.5
 """Photos are reduced only by at least this factor of their sides; less saves too little."""
 
+LEAST_PLANNED = 1_000
+"""fast: smallest planned number of Gaussians, for thumbnails."""
+
+
+def planned_gaussians(pixels: float, views: int) -> int:
+    """Return the number of Gaussians that the recipe fast grows to, unless a cap is given.
+
+    n(p) = PLANNED (p / PLANNED_PIXELS)^(1/3) (views / PLANNED_VIEWS)^(1/2), from LEAST_PLANNED to p
+
+    Args:
+        pixels: Mean pixels of a view.
+        views: Number of training views.
+    """
+    share = math.cbrt(pixels / PLANNED_PIXELS) * math.sqrt(views / PLANNED_VIEWS)
+    return max(round(min(PLANNED * share, pixels)), LEAST_PLANNED)
+
 
 def resolvable_pixels(views: int) -> float:
     """Return the pixels of a photo up to which the planned Gaussians resolve it.

@@ -26,11 +26,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting
-from gsplat_edu.recolor import Behind, recolored
+from gsplat_edu.recolor import Behind, RecolorKernel
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
-from gsplat_edu.train.view_model import Identity, Seen
+from gsplat_edu.train.view_model import Identity, Rows, ViewRender
 
 NAME = "exposures"
 """Name of the state, as in checkpoints."""
@@ -61,13 +61,16 @@ class Exposure(Identity):
         count: Number of views.
         iterations: Length of the schedule.
         like: A tensor of the renders' dtype and device.
+        recolor: Applies the correction; see `Backend.recolored`.
         vignetting: Correct the vignetting too.
     """
 
-    def __init__(self, count: int, iterations: int, like: Tensor, vignetting: bool = False) -> None:
+    def __init__(
+        self, count: int, iterations: int, like: Tensor, recolor: RecolorKernel, vignetting: bool = False
+    ) -> None:
         self._state = like.new_zeros(count, 5 if vignetting else 4)
         self._begin = (LATER if vignetting else WARM_UP) * iterations
-        self._vignetting = vignetting
+        self._recolor, self._vignetting = recolor, vignetting
 
     def parameters(self) -> Mapping[str, Tensor]:
         """Return the state, (views, 4) or (views, 5)."""
@@ -77,21 +80,25 @@ class Exposure(Identity):
         """Return none: gradients do not move it."""
         return {}
 
-    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
-        """Return the render with the exposure of photo `index`, which is measured first."""
-        if iteration >= self._begin:
-            self._measure(index, seen, target)
-        matrix = color_matrix(self.log_gains()[index])
+    def measure(self, index: int, render: ViewRender, target: Target, iteration: int) -> Rows:
+        """Return the row of the view, moved towards what this render and the photo say."""
+        if iteration < self._begin:
+            return {NAME: self._state[index]}
+        return {NAME: self._measured(index, render, target)}
+
+    def correct(self, index: int, render: ViewRender, target: Target, rows: Rows) -> Float[Tensor, "H W 3"]:
+        """Return the render with the exposure of photo `index`."""
+        state = self._state.clone()
+        state[index] = rows[NAME]
+        matrix = color_matrix(_log_gains(state)[index])
         photo = target.image if target.image.dtype == torch.uint8 else None
-        behind = None if target.opaque is None else Behind(seen.transmittance, seen.background)
-        plane = falloff(self.vignetting()[index], *seen.image.shape[:2]) if self._vignetting else None
-        return recolored(seen.image, matrix, photo, behind, plane)
+        behind = None if target.opaque is None else Behind(render.transmittance, render.background)
+        plane = falloff(_vignetting(state)[index], *render.image.shape[:2]) if self._vignetting else None
+        return self._recolor(render.image, matrix, photo, behind, plane)
 
     def log_gains(self) -> Float[Tensor, "views 3"]:
         """Return the natural logarithm of every view's gains; their mean over the views is 0."""
-        logs = self._state[:, :3]
-        with one_thread():
-            return logs - logs.mean(dim=0)
+        return _log_gains(self._state)
 
     def vignetting(self) -> Float[Tensor, " views"]:
         """Return k of every view, drawn towards the mean m of the measured ones; 0 without `vignetting`.
@@ -101,25 +108,36 @@ class Exposure(Identity):
         Photos of one lens differ by errors of the measurement only, and are then corrected alike. No lens makes corners
         brighter.
         """
-        k, measured = self._state[:, 3], self._state[:, -1] > 0
-        if not self._vignetting or not bool(measured.any()):
-            return torch.zeros_like(k)
-        with one_thread():
-            mean = k[measured].mean()
-            share = (1.0 - SPREAD**2 / k[measured].var(correction=0)).clamp_min(0.0)
-            return torch.where(measured, mean + share * (k - mean), mean).clamp_max(0.0)
+        return _vignetting(self._state) if self._vignetting else torch.zeros_like(self._state[:, 3])
 
     @torch.no_grad()
-    def _measure(self, index: int, seen: Seen, target: Target) -> None:
-        counts = seen.transmittance < OPAQUE
+    def _measured(self, index: int, render: ViewRender, target: Target) -> Tensor:
+        counts = render.transmittance < OPAQUE
         for plane in (target.mask, target.opaque):
             if plane is not None:
                 counts &= plane
         measure = measured_vignetting if self._vignetting else measured_gains
-        row = self._state[index]
+        row = self._state[index].clone()
         with one_thread():
-            found = measure(seen.image, target.image, counts)
+            found = measure(render.image, target.image, counts)
             found[:3] += self._state[:, :3].mean(dim=0)
         weight = (1.0 / (1.0 + row[-1])).clamp_min(NEWEST)
         row[:-1] += weight * (found - row[:-1])
         row[-1] += 1.0
+        return row
+
+
+@one_thread()
+def _log_gains(state: Float[Tensor, "views k"]) -> Float[Tensor, "views 3"]:
+    logs = state[:, :3]
+    return logs - logs.mean(dim=0)
+
+
+@one_thread()
+def _vignetting(state: Float[Tensor, "views 5"]) -> Float[Tensor, " views"]:
+    k, measured = state[:, 3], state[:, -1] > 0
+    if not bool(measured.any()):
+        return torch.zeros_like(k)
+    mean = k[measured].mean()
+    share = (1.0 - SPREAD**2 / k[measured].var(correction=0)).clamp_min(0.0)
+    return torch.where(measured, mean + share * (k - mean), mean).clamp_max(0.0)

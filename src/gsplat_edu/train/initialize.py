@@ -13,6 +13,8 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.constants import C0, SH_OFFSET
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.noise import NoiseKernel, add_noise_natively
+from gsplat_edu.recolor import RecolorKernel, recolored
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.base import DensityStrategy
@@ -23,7 +25,7 @@ from gsplat_edu.train.far import Shell
 from gsplat_edu.train.poses import Refinement
 from gsplat_edu.train.transient_masks import FeatureRenderer
 from gsplat_edu.train.transients import Transients
-from gsplat_edu.train.view_model import Identity, InTurn, ViewModel
+from gsplat_edu.train.view_model import Chain, Identity, ViewModel
 from gsplat_edu.validation import ArrayLike, float64_array, whole_number
 from gsplat_edu.views import View
 
@@ -133,7 +135,12 @@ def from_gaussians(gaussians: Gaussians, config: TrainConfig) -> tuple[Gaussians
 
 
 def make_strategy(
-    config: TrainConfig, extent: float, gaussians: Gaussians, shell: Shell | None = None
+    config: TrainConfig,
+    extent: float,
+    gaussians: Gaussians,
+    shell: Shell | None = None,
+    add_noise: NoiseKernel = add_noise_natively,
+    generator: torch.Generator | None = None,
 ) -> DensityStrategy | None:
     """Make the density strategy of a configuration; None for the strategy "none".
 
@@ -142,36 +149,45 @@ def make_strategy(
         extent: Size of the scene, world units.
         gaussians: The start Gaussians.
         shell: Where far splats lie; None if there are none.
+        add_noise: Moves the means for mcmc; see `Backend.add_noise`.
+        generator: Source of the strategy's draws; one with the configuration's seed if None.
 
     Raises:
         ArgumentError: the strategy is mcmc or fast and there is no cap.
     """
-    generator = torch.Generator().manual_seed(config.seed)
+    if generator is None:
+        generator = torch.Generator().manual_seed(config.seed)
     if config.strategy == "adc":
         return AdaptiveDensityControl(config, extent, generator, gaussians, shell)
     if config.strategy == "fast":
         return PlannedDensity(config, gaussians, shell)
-    return MCMC(config, generator, shell) if config.strategy == "mcmc" else None
+    return MCMC(config, generator, shell, add_noise) if config.strategy == "mcmc" else None
 
 
 def make_view_model(
-    config: TrainConfig, cameras: Sequence[Camera], extent: float, gaussians: Gaussians
-) -> tuple[ViewModel, Refinement | None]:
-    """Make the view model of a configuration; return it, and the part of it that refines the cameras, if any.
+    config: TrainConfig,
+    cameras: Sequence[Camera],
+    extent: float,
+    gaussians: Gaussians,
+    recolor: RecolorKernel = recolored,
+) -> ViewModel:
+    """Make the view model of a configuration.
 
     Args:
         config: The configuration.
         cameras: The cameras of the training views, at their full size.
         extent: Size of the scene, world units.
         gaussians: The start Gaussians.
+        recolor: Applies corrections of colours; see `Backend.recolored`.
     """
-    refinement = None if config.refine == "none" else Refinement(cameras, config, extent)
-    models: list[ViewModel] = [] if refinement is None else [refinement]
+    models: list[ViewModel] = []
+    if config.refine != "none":
+        models.append(Refinement(cameras, config, extent))
     if config.appearance != "none":
         vignetting = config.appearance == "vignetting"
-        models.append(Exposure(len(cameras), config.means_rate_iterations, gaussians.means, vignetting))
-    model = models[0] if len(models) == 1 else InTurn(models) if models else Identity()
-    return model, refinement
+        length = config.means_rate_iterations
+        models.append(Exposure(len(cameras), length, gaussians.means, recolor, vignetting))
+    return models[0] if len(models) == 1 else Chain(models) if models else Identity()
 
 
 def make_transients(config: TrainConfig, views: Sequence[View], render: FeatureRenderer) -> Transients | None:

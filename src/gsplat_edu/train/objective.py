@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from gsplat_edu.buffers import reusable_tensor
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import photo_loss
+from gsplat_edu.losses import LossKernel, photo_loss
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.config import TrainConfig
@@ -102,7 +102,9 @@ def sum_of_scalars(values: Sequence[Float[Tensor, ""]]) -> Float[Tensor, ""]:
     return first
 
 
-def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective:
+def make_objective(
+    config: TrainConfig, shell: Shell | None = None, loss: LossKernel | None = None
+) -> Objective:
     """Make the objective of a configuration: the photo term and the regularisers of its strategy.
 
     (1 - k) L1 + k (1 - SSIM), for mcmc and fast + weight_o mean(opacity), and for mcmc + weight_s mean(scale);
@@ -115,10 +117,11 @@ def make_objective(config: TrainConfig, shell: Shell | None = None) -> Objective
     Args:
         config: The configuration.
         shell: Where far splats lie, whose scale is not regularised; None if there are none.
+        loss: Compares images and photos; see `photo_loss`.
 
     Source: Kerbl et al. 2023, eq. 7; Kheradmand et al. 2024, eq. 10.
     """
-    terms: dict[str, Term] = {PHOTO: PhotoTerm(config.ssim_weight)}
+    terms: dict[str, Term] = {PHOTO: PhotoTerm(config.ssim_weight, loss)}
     if config.strategy == "mcmc":
         terms["opacity"] = MeanOpacity(config.mcmc.opacity_weight)
         terms["scale"] = MeanScale(config.mcmc.scale_weight, shell)
@@ -135,14 +138,16 @@ class PhotoTerm:
 
     Args:
         ssim_weight: k, 0 to 1.
+        loss: Compares them; see `photo_loss`.
     """
 
     ssim_weight: float
+    loss: LossKernel | None = None
 
     def __call__(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Return (1 - k) L1 + k (1 - SSIM)."""
         target = rendered.target
-        return photo_loss(rendered.image, target.image, target.mask, self.ssim_weight)
+        return photo_loss(rendered.image, target.image, target.mask, self.ssim_weight, self.loss)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from gsplat_edu.adam import AdamKernel, adam_step
+from gsplat_edu.adam import AdamKernel, adam_natively
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.moments import AdamInBackward, AdamNumbers, Moments
@@ -64,7 +64,7 @@ class Adam:
         parameters: The tensors by name.
         groups: Settings by the same names; a number stands for a group with that rate. Tensors without a group do not
             change.
-        kernel: Updates one tensor; by default the fastest that supports it.
+        kernel: Updates one tensor; see `Backend.adam`.
 
     Raises:
         ArgumentError: a group has no parameter.
@@ -83,7 +83,7 @@ class Adam:
         self,
         parameters: Mapping[str, Tensor],
         groups: Mapping[str, float | ParameterGroup],
-        kernel: AdamKernel = adam_step,
+        kernel: AdamKernel = adam_natively,
     ) -> None:
         if unknown := sorted(set(groups) - set(parameters)):
             raise ArgumentError(

@@ -32,7 +32,7 @@ from gsplat_edu.threads import one_thread
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
-from gsplat_edu.train.view_model import Identity, Seen
+from gsplat_edu.train.view_model import Chain, Identity, Rows, ViewModel, ViewRender
 
 TWISTS, LENSES = "twists", "lenses"
 """Names of the parameters."""
@@ -95,18 +95,21 @@ class Refinement(Identity):
         # a camera of numbers spares the kernels its gradient
         return given if any(tensor.requires_grad for tensor in given.tensors()) else given.value()
 
-    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
-        """Return the image unchanged; measure how the camera should move, for the next render of the view."""
-        if TWISTS in self._names() and iteration >= self._begin:
-            if seen.camera is None or seen.depth is None:
-                raise ArgumentError("seen: has no camera or no depth, but poses are measured with both")
-            camera = seen.camera.value() if isinstance(seen.camera, CameraTensors) else seen.camera
-            moved = self._moved(index)
-            step = pose_step(
-                seen.image, seen.depth, camera, target.image, moved, self._spread, mask=target.mask
-            )
-            self._twists[index] += step / self._units
-        return seen.image
+    def measure(self, index: int, render: ViewRender, target: Target, iteration: int) -> Rows:
+        """Return the row of the view, moved by the step that this render and the photo ask for."""
+        if TWISTS not in self._names():
+            return {}
+        row = self._twists[index]
+        if iteration < self._begin:
+            return {TWISTS: row}
+        if render.camera is None or render.depth is None:
+            raise ArgumentError("render: has no camera or no depth, but poses are measured with both")
+        camera = render.camera.value() if isinstance(render.camera, CameraTensors) else render.camera
+        moved = self._moved(index)
+        step = pose_step(
+            render.image, render.depth, camera, target.image, moved, self._spread, mask=target.mask
+        )
+        return {TWISTS: row + step / self._units}
 
     def _moved(self, index: int) -> Float64[Tensor, "6"]:
         """Return a view's row of D - Q Qᵀ D, radians and world units."""
@@ -128,6 +131,12 @@ class Refinement(Identity):
         with torch.no_grad():
             given = CameraTensors.of(camera)
             return given.with_intrinsics(refined_intrinsics(given, self._lenses[index])).value()
+
+
+def refinement_of(model: ViewModel) -> Refinement | None:
+    """Return the part of a view model that refines the cameras; None if it refines none."""
+    models = model.models if isinstance(model, Chain) else (model,)
+    return next((part for part in models if isinstance(part, Refinement)), None)
 
 
 def lens_key(camera: Camera) -> tuple[float, ...]:

@@ -1,7 +1,8 @@
 """View models, which stand between the Gaussians and the photo of one view.
 
 A view model may correct the camera a view is rendered from, and the colours of the render before they are compared with
-the photo. It learns these corrections for each view, so that the Gaussians need not explain them.
+the photo. It learns these corrections for each view, so that the Gaussians need not explain them. Measuring a view and
+correcting it are two methods, and neither changes the model: the trainer stores what was measured.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from gsplat_edu.train.feed import Color, Target
 from gsplat_edu.train.optimizer import ParameterGroup
 
 
-class Seen(NamedTuple):
-    """What a view model sees of a render.
+class ViewRender(NamedTuple):
+    """The render of a view, as a view model gets it.
 
     Args:
         image: (H, W, 3) the render, or what models before have made of it.
@@ -36,18 +37,23 @@ class Seen(NamedTuple):
     depth: Float[Tensor, "H W"] | None = None
 
 
+Rows = Mapping[str, Tensor]
+"""A view's row of each measured tensor, by name."""
+
+
 @runtime_checkable
 class ViewModel(Protocol):
     """Corrects the camera and the image of a view.
 
     Its state consists of its parameters, which checkpoints store by name. Those with a group are leaves that collect
-    gradients, and the trainer's optimiser updates them in place; the model itself updates the others. Names must differ
+    gradients, and the trainer's optimiser updates them in place. The others are measured: they have a row for each
+    view, which the trainer replaces by what `measure` returns, once all views of a step are rendered. Names must differ
     from those of the Gaussians' parameters.
     """
 
     @property
     def needs_depth(self) -> bool:
-        """Whether `image` uses the depth of the render; only then is it rendered."""
+        """Whether `measure` uses the depth of the render; only then is it rendered."""
         ...
 
     def parameters(self) -> Mapping[str, Tensor]:
@@ -67,14 +73,25 @@ class ViewModel(Protocol):
         """
         ...
 
-    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
-        """Return the image that is compared, differentiable in the render and in the parameters.
+    def measure(self, index: int, render: ViewRender, target: Target, iteration: int) -> Rows:
+        """Return the view's rows of the measured tensors after this render; the model itself stays unchanged.
 
         Args:
             index: Index into the trainer's views.
-            seen: The render.
+            render: The render.
             target: The photo that it is compared with, and its mask.
             iteration: Counted from 0.
+        """
+        ...
+
+    def correct(self, index: int, render: ViewRender, target: Target, rows: Rows) -> Float[Tensor, "H W 3"]:
+        """Return the image that is compared, differentiable in the render and in the parameters with a group.
+
+        Args:
+            index: Index into the trainer's views.
+            render: The render.
+            target: The photo that it is compared with.
+            rows: What `measure` returned for this render; it counts instead of the view's rows in the state.
         """
         ...
 
@@ -99,13 +116,17 @@ class Identity:
         """Return the camera unchanged."""
         return camera
 
-    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
+    def measure(self, index: int, render: ViewRender, target: Target, iteration: int) -> Rows:
+        """Return none."""
+        return {}
+
+    def correct(self, index: int, render: ViewRender, target: Target, rows: Rows) -> Float[Tensor, "H W 3"]:
         """Return the image unchanged."""
-        return seen.image
+        return render.image
 
 
-class InTurn:
-    """Applies several view models, one after the other.
+class Chain:
+    """A chain of view models, each of which corrects what those before it made of a view.
 
     Args:
         models: The models; the names of their parameters differ.
@@ -133,8 +154,17 @@ class InTurn:
             camera = model.camera(index, camera)
         return camera
 
-    def image(self, index: int, seen: Seen, target: Target, iteration: int) -> Float[Tensor, "H W 3"]:
+    def measure(self, index: int, render: ViewRender, target: Target, iteration: int) -> Rows:
+        """Return the rows of all models, each measured on the image that the models before it corrected."""
+        rows: dict[str, Tensor] = {}
+        for model in self.models:
+            rows |= model.measure(index, render, target, iteration)
+            if model is not self.models[-1]:
+                render = render._replace(image=model.correct(index, render, target, rows))
+        return rows
+
+    def correct(self, index: int, render: ViewRender, target: Target, rows: Rows) -> Float[Tensor, "H W 3"]:
         """Return the image after all models."""
         for model in self.models:
-            seen = seen._replace(image=model.image(index, seen, target, iteration))
-        return seen.image
+            render = render._replace(image=model.correct(index, render, target, rows))
+        return render.image

@@ -23,7 +23,7 @@ class DensityStrategy(Protocol):
     number of threads.
 
     A strategy whose `observe` reads nothing but its `output` says so by a true attribute `observes_renders_only`. The
-    trainer may then move the Gaussians in the backward pass (`Trainer.fuses`): before `observe`, and without `grad`.
+    Gaussians may then move in the backward pass (`TensorStepper.fuses`): before `observe`, and without `grad`.
     Processes that share a step tell one another what such a strategy observes, unless its attribute `is_over` is true:
     then it ignores renders from now on.
     """

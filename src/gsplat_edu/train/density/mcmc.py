@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsplat_edu.errors import ArgumentError
 from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.noise import NoiseNumbers, add_noise
+from gsplat_edu.noise import NoiseKernel, NoiseNumbers, add_noise_natively
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
@@ -47,6 +47,7 @@ class MCMC:
         config: Window, growth and noise; `max_gaussians` has to be set.
         generator: Source of the draws and of the noise.
         shell: Where far splats lie, which get no noise; None if there are none.
+        add_noise: Moves the means; see `Backend.add_noise`.
 
     Raises:
         ArgumentError: there is no cap.
@@ -54,11 +55,17 @@ class MCMC:
 
     observes_renders_only = is_over = True
 
-    def __init__(self, config: TrainConfig, generator: torch.Generator, shell: Shell | None = None) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        generator: torch.Generator,
+        shell: Shell | None = None,
+        add_noise: NoiseKernel = add_noise_natively,
+    ) -> None:
         if config.max_gaussians is None:
             raise ArgumentError("max_gaussians: mcmc grows up to a cap and needs one, for example 200000")
         self.config, self.generator, self.cap = config, generator, config.max_gaussians
-        self.shell = shell
+        self.shell, self._noise = shell, add_noise
 
     def observe(self, gaussians: Gaussians, output: RenderOutput) -> None:
         """Do nothing: neither relocation nor growth depends on the renders."""
@@ -132,9 +139,8 @@ class MCMC:
         far = None if self.shell is None else self.shell.holds(gaussians.means)
         places = None if far is None else gaussians.means[far]
         seed = int(torch.randint(2**62, (1,), generator=self.generator))  # checkpoints store the generator
-        add_noise(
-            gaussians, NoiseNumbers(seed, rate * self.config.mcmc.noise, NOISE_SHARPNESS, NOISE_THRESHOLD)
-        )
+        numbers = NoiseNumbers(seed, rate * self.config.mcmc.noise, NOISE_SHARPNESS, NOISE_THRESHOLD)
+        self._noise(gaussians, numbers)
         if far is not None and places is not None:
             gaussians.means[far] = places
 

@@ -1,0 +1,72 @@
+"""What a backend is: the kernels of one processor, as one value that is chosen once and handed in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+
+from gsplat_edu.adam import AdamKernel
+from gsplat_edu.camera import Camera
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.losses import LossKernel
+from gsplat_edu.noise import NoiseKernel
+from gsplat_edu.recolor import RecolorKernel
+from gsplat_edu.render.camera_tensors import CameraTensors
+from gsplat_edu.render.output import Extra, RenderOutput
+from gsplat_edu.render.settings import RenderSettings
+
+Rasterize = Callable[[Gaussians, "Camera | CameraTensors", RenderSettings, Extra], RenderOutput]
+"""Renders validated arguments; `gsplat_edu.render.api.render` validates them."""
+
+FEATURES = {
+    "stop": "stops compositing pixel by pixel (RenderSettings.stop)",
+    "processes": "shares a step among processes",
+    "forecast": "is fast enough to be measured on a capture before a training",
+}
+"""What a backend may lack, by name, and what it means."""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The kernels of one processor.
+
+    `gsplat_edu.render.backends.load_backend` makes those that exist. A new one needs these functions and a name in
+    `BACKENDS`; no other module asks which backend it has.
+
+    Args:
+        name: Its name; see `gsplat_edu.render.settings.BACKENDS`.
+        device: The device on which it needs its tensors.
+        rasterize: Renders Gaussians, differentiably.
+        loss: Computes (1 - k) L1 + k (1 - SSIM), differentiably in the image.
+        adam: Takes a step of Adam for one tensor, in place. `RenderOutput.defer` takes the same step.
+        add_noise: Moves means at random along their covariances, in place.
+        recolored: Applies a matrix of colours to an image, differentiably.
+        lacks: Names of `FEATURES` that it does not offer.
+    """
+
+    name: str
+    device: torch.device
+    rasterize: Rasterize
+    loss: LossKernel
+    adam: AdamKernel
+    add_noise: NoiseKernel
+    recolored: RecolorKernel
+    lacks: frozenset[str] = field(default_factory=frozenset)
+
+    def require(self, feature: str, what: str) -> None:
+        """Check that the backend offers a feature.
+
+        Args:
+            feature: A name of `FEATURES`.
+            what: The argument or setting that needs it, and its value, for the message: "stop: 'pixel'".
+
+        Raises:
+            ArgumentError: the backend lacks the feature.
+        """
+        if feature in self.lacks:
+            raise ArgumentError(
+                f"{what} needs a backend that {FEATURES[feature]}, which {self.name} does not; use the backend cpu"
+            )

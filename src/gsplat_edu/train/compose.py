@@ -1,0 +1,147 @@
+"""The one place where a training is put together from a configuration, a dataset and a backend."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from gsplat_edu.camera import scene_extent
+from gsplat_edu.errors import ArgumentError
+from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.render.api import render
+from gsplat_edu.render.backend import Backend
+from gsplat_edu.train.capacity import planned_gaussians
+from gsplat_edu.train.config import TrainConfig
+from gsplat_edu.train.density.surgery import sorted_in_space
+from gsplat_edu.train.far import Shell
+from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
+from gsplat_edu.train.objective import make_objective
+from gsplat_edu.train.stepper import StepParts
+from gsplat_edu.train.team import ALONE, Team
+from gsplat_edu.train.trainer import Callback, Trainer
+from gsplat_edu.views import View
+
+
+@runtime_checkable
+class TrainingData(Protocol):
+    """What a training needs of a dataset; `gsplat_edu.data.dataset.Dataset` is one.
+
+    Attributes:
+        train: Training views, at least one.
+        points: (N, 3) initial point cloud, world units.
+        colors: (N, 3) their colours, 0 to 1.
+    """
+
+    @property
+    def train(self) -> Sequence[View]: ...  # noqa: D102
+
+    @property
+    def points(self) -> Float64[np.ndarray, "N 3"]: ...  # noqa: D102
+
+    @property
+    def colors(self) -> Float64[np.ndarray, "N 3"]: ...  # noqa: D102
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Training views without a point cloud, for a training that starts from Gaussians.
+
+    Args:
+        train: The views.
+    """
+
+    train: Sequence[View]
+    points: Float64[np.ndarray, "0 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    colors: Float64[np.ndarray, "0 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a training starts, if not at the points of its dataset.
+
+    Args:
+        gaussians: The start Gaussians, in the order in which they are to lie in memory.
+        shell: Where far splats lie; None if there are none.
+        extent: Size of the scene, world units; that of the training cameras if None.
+        generator: Source of the density strategy's draws; one with the configuration's seed if None.
+    """
+
+    gaussians: Gaussians
+    shell: Shell | None = None
+    extent: float | None = None
+    generator: torch.Generator | None = None
+
+
+def training(
+    config: TrainConfig,
+    dataset: TrainingData,
+    backend: Backend,
+    start: Start | None = None,
+    *,
+    callbacks: Sequence[Callback] = (),
+    team: Team = ALONE,
+    fused: bool = True,
+) -> Trainer:
+    """Put a training together: everything that the configuration asks for is made and wired, or refused.
+
+    Args:
+        config: The configuration. For the strategy fast without `max_gaussians`, the cap follows from the views.
+        dataset: The views, and the points to start from.
+        backend: The kernels; see `gsplat_edu.render.backends.load_backend`.
+        start: Where to start instead of at the dataset's points.
+        callbacks: Called after every step and every change of the Gaussians.
+        team: The processes that share each step.
+        fused: Whether Adam may take its step in the backward pass; see `StepParts.fused`.
+
+    Returns:
+        The trainer; `Trainer.run` trains.
+
+    Raises:
+        ArgumentError: there are no views or no points, or the configuration asks for what nothing here can give: mcmc
+            without a cap, a sky without its splats in `start`, masks of things that move with too few views.
+    """
+    if not dataset.train:
+        raise ArgumentError("dataset: has no training views; give at least one")
+    config = _with_cap(config, dataset.train, 0 if start is None else len(start.gaussians))
+    if config.sky != "none" and (start is None or start.shell is None):
+        raise ArgumentError(
+            f"sky: is {config.sky!r}, but start has no shell of splats; gsplat_edu.runs.skies makes it, or set"
+            " sky='none'"
+        )
+    if start is None:
+        start = Start(sorted_in_space(from_points(dataset.points, dataset.colors, config)))
+    cameras = [view.camera for view in dataset.train]
+    extent = scene_extent(cameras) if start.extent is None else start.extent
+    gaussians, shell = start.gaussians.to(backend.device), start.shell
+    features = functools.partial(render, backend=backend)
+    return Trainer(
+        gaussians,
+        dataset.train,
+        config,
+        backend,
+        extent=extent,
+        density=make_strategy(config, extent, gaussians, shell, backend.add_noise, start.generator),
+        callbacks=callbacks,
+        parts=StepParts(
+            make_objective(config, shell, backend.loss),
+            make_view_model(config, cameras, extent, gaussians, backend.recolored),
+            transients=make_transients(config, dataset.train, features),
+            fused=fused,
+            team=team,
+        ),
+    )
+
+
+def _with_cap(config: TrainConfig, views: Sequence[View], start: int) -> TrainConfig:
+    """Return the configuration with the cap that fast plans for these views, unless it has one."""
+    if config.strategy != "fast" or config.max_gaussians is not None:
+        return config
+    pixels = float(np.mean([view.camera.W * view.camera.H for view in views]))
+    return dataclasses.replace(config, max_gaussians=max(planned_gaussians(pixels, len(views)), start))
