@@ -25,6 +25,7 @@ from gsplat_edu import Camera
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import photo_loss
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.optimizer import Adam
@@ -105,8 +106,9 @@ def milliseconds(work: Callable[[], object], rounds: int) -> float:
 
 def iteration(gaussians: Gaussians, cam: Camera, photo: torch.Tensor, optimizer: Adam) -> None:
     """Run one training step."""
-    output = render(gaussians, cam, settings=SETTINGS, backend="cuda")
-    photo_loss(output.image, photo).backward()
+    backend = load_backend("cuda")
+    output = render(gaussians, cam, settings=SETTINGS, backend=backend)
+    photo_loss(output.image, photo, kernel=backend.loss).backward()
     optimizer.step(gaussians.tensors())
 
 
@@ -115,7 +117,7 @@ def stages(count: int, width: int, height: int, rounds: int) -> dict[str, float]
     gaussians, cam = scene(count, "cuda"), camera(width, height)
     photo = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, device="cuda")
     config = TrainConfig()
-    optimizer = Adam(gaussians.tensors(), gaussian_groups(config, 1.0))
+    optimizer = Adam(gaussians.tensors(), gaussian_groups(config, 1.0), load_backend("cuda").adam)
     torch.cuda.reset_peak_memory_stats()
     found = {"iteration": milliseconds(lambda: iteration(gaussians, cam, photo, optimizer), rounds)}
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]

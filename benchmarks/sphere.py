@@ -22,42 +22,48 @@ from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
-from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backends import load_backend
+from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.course import EXTENT, course_config
-from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.initialize import random_ball
-from gsplat_edu.train.trainer import Trainer
 
 SETTINGS = RenderSettings(depth=False)
 NATIVE = functools.partial(render, backend="cpu")
 
 
-def dense(gaussians: Gaussians, camera: Camera, *, settings: RenderSettings, chunk: int) -> RenderOutput:
-    """Render on the dense backend, `chunk` splats at a time."""
-    settings = dataclasses.replace(settings, dense_chunk=chunk)
-    return render(gaussians, camera, settings=settings, backend="torch")
+def dense(chunk: int) -> Backend:
+    """Return the dense backend that evaluates `chunk` splats at a time."""
+    backend = load_backend("torch")
+
+    def rasterize(
+        gaussians: Gaussians, camera: Camera, settings: RenderSettings, extra: Extra
+    ) -> RenderOutput:
+        return backend.rasterize(gaussians, camera, dataclasses.replace(settings, dense_chunk=chunk), extra)
+
+    return dataclasses.replace(backend, rasterize=rasterize)
 
 
-DENSE = {chunk: functools.partial(dense, chunk=chunk) for chunk in (512, 16)}
+CHUNKS = (512, 16)
 
 
 def whole_run(size: int, iterations: int) -> tuple[Gaussians, float]:
     """Train as in the chapter; return the scene and the milliseconds per iteration."""
     capture, config = sphere_capture_once(size), course_config(iterations)
     generator = torch.Generator().manual_seed(9)
-    start = random_ball(400, generator)
-    control = AdaptiveDensityControl(config, EXTENT, generator, start)
-    trainer = Trainer(start, capture.train, config, render=NATIVE, extent=EXTENT, density=control)
+    start = Start(random_ball(400, generator), extent=EXTENT, generator=generator)
+    trainer = training(config, Views(capture.train), load_backend("cpu"), start)
     result = trainer.run()
     return trainer.gaussians, 1e3 * result.seconds / len(result.losses)
 
 
-def iteration_ms(scene: Gaussians, renderer: object, size: int, iterations: int) -> float:
+def iteration_ms(scene: Gaussians, backend: Backend, size: int, iterations: int) -> float:
     """Return milliseconds per iteration with a fixed number of Gaussians."""
     capture = sphere_capture_once(size)
-    config = course_config(iterations=iterations)
-    trainer = Trainer(scene, capture.train, config, render=renderer, extent=EXTENT)
+    config = course_config(iterations=iterations).changed(strategy="none")
+    trainer = training(config, Views(capture.train), backend, Start(scene, extent=EXTENT))
     return 1e3 * trainer.run().seconds / iterations
 
 
@@ -100,9 +106,9 @@ def main() -> None:
     scene = runs[0][0]
     rounds = []
     for _ in range(turns):
-        rounds.append({"native": iteration_ms(scene, NATIVE, size, few)})
+        rounds.append({"native": iteration_ms(scene, load_backend("cpu"), size, few)})
         rounds[-1] |= {
-            f"dense {chunk}": iteration_ms(scene, DENSE[chunk], size, min(few, 3)) for chunk in DENSE
+            f"dense {chunk}": iteration_ms(scene, dense(chunk), size, min(few, 3)) for chunk in CHUNKS
         }
     ratios = {name: statistics.median(r[name] / r["native"] for r in rounds) for name in rounds[0]}
     medians = {name: statistics.median(r[name] for r in rounds) for name in rounds[0]}

@@ -10,9 +10,10 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.trainer import Trainer
 
 SCHEDULE = {"densify_start": 0, "densify_every": 2, "densify_stop": 60, "mcmc_stop": 60, "sh_every": 2}
@@ -36,8 +37,8 @@ class Maker:
         self.start = from_points(points, colors, self.config)
 
     def __call__(self) -> Trainer:
-        density = make_strategy(self.config, 2.0, self.start)
-        return Trainer(self.start, self.views, self.config, render=render, extent=2.0, density=density)
+        begin = Start(self.start, extent=2.0)
+        return training(self.config, Views(self.views), load_backend("cpu"), begin)
 
 
 def step(trainer: Trainer, count: int = 1) -> None:

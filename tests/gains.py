@@ -18,5 +18,5 @@ class Gains(Identity):
     def groups(self):
         return {"gains": ParameterGroup(0.02, eps=1e-8, per_gaussian=False)}
 
-    def image(self, index, seen, target, iteration):
-        return seen.image * self.gains[index]
+    def correct(self, index, render, target, rows):
+        return render.image * self.gains[index]

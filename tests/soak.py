@@ -5,7 +5,6 @@
 It runs in its own process, because other tests' remains in the heap could hide or imitate growth.
 """
 
-import functools
 import json
 import os
 import sys
@@ -16,11 +15,11 @@ import numpy as np
 from gsplat_edu.camera import orbit_camera
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_transforms
-from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
+from gsplat_edu.train.compose import Start, training
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import StepEvent
-from gsplat_edu.train.initialize import from_points, make_strategy
-from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.views import View
 
 ITERATIONS = 240
@@ -78,9 +77,8 @@ def main(case, folder):
         if isinstance(event, StepEvent):
             resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * page)
 
-    density = make_strategy(config, 1.0, start)
-    renderer = functools.partial(render, backend="cpu")
-    Trainer(start, dataset.train, config, render=renderer, density=density, callbacks=[measure]).run()
+    begin = Start(start, extent=1.0)
+    training(config, dataset, load_backend("cpu"), begin, callbacks=[measure]).run()
     print(json.dumps(resident))
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu import noise
 from gsplat_edu.gaussians import cov3d_t
-from gsplat_edu.noise import NoiseNumbers, add_noise, philox, standard_normals
+from gsplat_edu.noise import NoiseNumbers, add_noise_in_torch, add_noise_natively, philox, standard_normals
 from gsplat_edu.threads import native_threads, one_thread
 from gsplat_edu.train.initialize import random_ball
 
@@ -25,7 +24,7 @@ def scene(count, dtype=torch.float64, seed=0):
     return gaussians
 
 
-def moved(gaussians, numbers=NUMBERS, step=add_noise):
+def moved(gaussians, numbers=NUMBERS, step=add_noise_natively):
     """Return the means after a step, without changing the Gaussians."""
     copy = gaussians.map(lambda tensor: tensor.detach().clone())
     step(copy, numbers)
@@ -78,7 +77,7 @@ def test_other_seeds_give_independent_numbers(other):
 def test_the_native_step_is_that_of_torch(count, seed):
     """float64: both round a few dozen operations, on steps up to amount x 5.8 x the largest variance."""
     gaussians, numbers = scene(count), NUMBERS._replace(seed=seed)
-    found, truth = moved(gaussians, numbers), moved(gaussians, numbers, noise._add_in_torch)
+    found, truth = moved(gaussians, numbers), moved(gaussians, numbers, add_noise_in_torch)
     torch.testing.assert_close(found, truth, rtol=0, atol=1e-14)
     assert count == 0 or (found != gaussians.means).any()
 
@@ -91,7 +90,7 @@ def test_float32_is_near_float64():
     rounded.means[:] = 0
     exact.means[:] = 0
     found, truth = moved(rounded).double(), moved(exact)
-    in_torch = moved(rounded, step=noise._add_in_torch).double()
+    in_torch = moved(rounded, step=add_noise_in_torch).double()
     size = NUMBERS.amount * 5.8 * exact.scales.square().amax(dim=1, keepdim=True)
     assert ((found - truth).abs() / size).max() < 1e-5
     assert ((in_torch - truth).abs() / size).max() < 1e-5
@@ -138,7 +137,7 @@ def test_an_odd_parameter_moves_only_its_own_gaussian(name, value, dtype):
     changed = gaussians.map(lambda tensor: tensor.clone())
     row = changed.tensors()[name][70]
     row[...] = torch.where(torch.arange(row.numel()).reshape(row.shape) == 0, value, row)
-    found, truth = moved(changed), moved(changed, step=noise._add_in_torch)
+    found, truth = moved(changed), moved(changed, step=add_noise_in_torch)
     others = torch.arange(130) != 70
     assert torch.equal(found[others], moved(gaussians)[others])
     assert torch.equal(found.isfinite().all(dim=1), truth.isfinite().all(dim=1))
@@ -154,12 +153,12 @@ def test_strided_parameters_step_in_torch():
     gaussians = scene(100)
     strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], dim=-1)[..., 0])
     assert not strided.quats.is_contiguous()
-    add_noise(strided, NUMBERS)
+    add_noise_in_torch(strided, NUMBERS)
     torch.testing.assert_close(strided.means, moved(gaussians), rtol=0, atol=1e-14)
 
 
 def test_a_leaf_moves_and_autograd_knows():
     gaussians = scene(4).trainable()
     version = gaussians.means._version
-    add_noise(gaussians, NUMBERS)
+    add_noise_natively(gaussians, NUMBERS)
     assert gaussians.means._version > version and gaussians.means.requires_grad

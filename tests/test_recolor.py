@@ -6,7 +6,7 @@ import torch
 
 from gsplat_edu import ArgumentError, kernels
 from gsplat_edu.errors import ShapeError
-from gsplat_edu.recolor import Behind, recolored
+from gsplat_edu.recolor import Behind, recolored, recolored_in_torch, recolored_natively
 
 BACKGROUND = (0.3, 0.9, 0.6)
 
@@ -35,18 +35,11 @@ def corners(dtype, size=(9, 15)):
     return (0.5 + 0.8 * torch.rand(*size, generator=generator, dtype=torch.float64)).to(dtype)
 
 
-def in_torch(monkeypatch, *arguments):
-    monkeypatch.setattr(kernels, "REASON", "hidden by a test")
-    return recolored(*arguments)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (3, 21), (8, 8), (70, 130)])
 @pytest.mark.parametrize("with_photo", [False, True])
 @pytest.mark.parametrize("with_background", [False, True])
 @pytest.mark.parametrize("with_falloff", [False, True])
-def test_the_kernel_is_torchs_formula_in_value_and_gradients(
-    monkeypatch, size, with_photo, with_background, with_falloff
-):
+def test_the_kernel_is_torchs_formula_in_value_and_gradients(size, with_photo, with_background, with_falloff):
     """float64; a sum of 27,300 products of up to 2 rounds by less than 1e-11."""
     image, matrix, photo = scene(torch.float64, size)
     weights, results = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).reshape(image.shape), []
@@ -56,7 +49,7 @@ def test_the_kernel_is_torchs_formula_in_value_and_gradients(
         t = given.transmittance.requires_grad_() if given else torch.ones((), requires_grad=True)
         plane = corners(torch.float64, size) if with_falloff else None
         arguments = (x, m, photo if with_photo else None, given, plane)
-        out = recolored(*arguments) if native else in_torch(monkeypatch, *arguments)
+        out = (recolored_natively if native else recolored_in_torch)(*arguments)
         (out * weights).sum().backward()
         results.append((out.detach(), x.grad, m.grad, t.grad))
     assert (results[0][3] is None) == (not with_background)

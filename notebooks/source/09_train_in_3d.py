@@ -39,11 +39,13 @@ from gsplat_edu.data.synthetic import sphere_cameras, sphere_capture
 from gsplat_edu.gaussians import cov3d_t, quat_to_R_t
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.torch_reference import eval_sh_t, render_t
-from gsplat_edu.train import course
+from gsplat_edu.train import Start, Views, course, training
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent
 from gsplat_edu.train.initialize import random_ball
+from gsplat_edu.train.stepper import TensorStepper
 from gsplat_edu.train.trainer import Trainer
 
 # GSPLAT_EDU_BUDGET=reduced runs this page in about a minute: smaller images, fewer splats, fewer steps.
@@ -190,12 +192,14 @@ print(inspect.getsource(AdaptiveDensityControl._densify))
 # ## The loop
 #
 # One view, one render, one comparison, one step, and now and then a densification. The loop
-# ([gsplat_edu.train.trainer](../src/gsplat_edu/train/trainer.py)) is given its views and its renderer; it does not
-# ask where either comes from.
+# ([gsplat_edu.train.trainer](../src/gsplat_edu/train/trainer.py)) draws the views, and a stepper
+# ([gsplat_edu.train.stepper](../src/gsplat_edu/train/stepper.py)) holds what a step changes. Neither asks which
+# backend renders.
 
 # %%
 print(inspect.getsource(Trainer.run))
 print(inspect.getsource(Trainer._step))
+print(inspect.getsource(TensorStepper._single_step))
 
 # %%
 RENDER = functools.partial(render, backend="torch")
@@ -220,10 +224,8 @@ def follow(trainer, event):
         snapshots[MIDDLE] = held_out_image(trainer.gaussians)
 
 
-control = AdaptiveDensityControl(config, course.EXTENT, generator, cloud)
-trainer = Trainer(
-    cloud, capture.train, config, render=RENDER, extent=course.EXTENT, density=control, callbacks=[follow]
-)
+start = Start(cloud, extent=course.EXTENT, generator=generator)
+trainer = training(config, Views(capture.train), load_backend("torch"), start, callbacks=[follow])
 snapshots[0] = held_out_image(trainer.gaussians)
 result = trainer.run()
 snapshots[ITERATIONS] = held_out_image(trainer.gaussians)

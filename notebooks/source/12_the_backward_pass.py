@@ -33,12 +33,11 @@ from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, T_STOP
 from gsplat_edu.data.synthetic import sphere_cameras, sphere_capture
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
-from gsplat_edu.train import course
-from gsplat_edu.train.density.adc import AdaptiveDensityControl
+from gsplat_edu.train import Start, Views, course, training
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.optimizer import Adam
-from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import View
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())
@@ -376,8 +375,8 @@ truth = torch.tensor(capture.held_out.image)
 def whole_run(views):
     generator = torch.Generator().manual_seed(9)
     cloud = random_ball(400, generator)
-    control = AdaptiveDensityControl(config, course.EXTENT, generator, cloud)
-    job = Trainer(cloud, views, config, render=KERNELS, extent=course.EXTENT, density=control)
+    begin = Start(cloud, extent=course.EXTENT, generator=generator)
+    job = training(config, Views(views), load_backend("cpu"), begin)
     return cloud, job, job.run()
 
 
@@ -395,15 +394,15 @@ assert at_last < 0.3 * at_first
 
 def iterations(way, count, scene):
     """Return milliseconds of the processor for each, which others who want it do not lengthen; and the losses."""
-    chosen = course.course_config(count, 9, CAP)
-    job = Trainer(scene, capture.train, chosen, render=way, extent=course.EXTENT)
+    chosen = course.course_config(count, 9, CAP).changed(strategy="none")
+    job = training(chosen, Views(capture.train), load_backend(way), Start(scene, extent=course.EXTENT))
     begin = time.process_time()
     found = job.run().losses
     return 1e3 * (time.process_time() - begin) / count, found
 
 
 fast, slow = (
-    min(iterations(w, n, trainer.gaussians)[0] for _ in range(3)) for w, n in ((KERNELS, 20), (DENSE, 1))
+    min(iterations(w, n, trainer.gaussians)[0] for _ in range(3)) for w, n in (("cpu", 20), ("torch", 1))
 )
 print(f"one thread, {len(trainer.gaussians)} splats: kernels {fast:.2f} ms an iteration, dense {slow:.1f} ms")
 print(f"ratio {slow / fast:.0f}")
@@ -412,7 +411,7 @@ assert slow > (5 if SHORT else 50) * fast
 fig, axes = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained", width_ratios=[2, 1, 1])
 at = result.seconds / ITERATIONS * np.arange(1, ITERATIONS + 1)
 axes[0].loglog(at, result.losses, linewidth=0.8, label=f"kernels, all {ITERATIONS} iterations")
-early, falls = iterations(DENSE, 5, cloud)  # from the same start
+early, falls = iterations("torch", 5, cloud)  # from the same start
 assert abs(falls[0] / result.losses[0] - 1) < 1e-3  # but for the kernels' early stop
 axes[0].loglog(early / 1e3 * np.arange(1, 6), falls, "o-", color="tab:red", label="dense, 5 of them")
 axes[0].set(title="the same training by two renderers", xlabel="time, s", ylabel="L1 of the iteration's view")

@@ -116,8 +116,9 @@ class Gaussians:
         return self.map(lambda tensor: tensor.to(device))
 
     def trainable(self) -> Gaussians:
-        """Return a copy whose parameters are leaves that accumulate gradients."""
-        return self.map(lambda tensor: tensor.detach().clone().requires_grad_())
+        """Return a contiguous copy whose parameters are leaves that accumulate gradients."""
+        dense = torch.contiguous_format
+        return self.map(lambda tensor: tensor.detach().clone(memory_format=dense).requires_grad_())
 
     @staticmethod
     def concatenated(parts: Sequence[Gaussians]) -> Gaussians:

@@ -8,7 +8,6 @@ faintest Gaussian has opacity 0.042, and only those below 0.005 are pruned.
 The native kernels also stop a tile below 1e-4. Their tolerance is 1e-3, and their first densification is the same.
 """
 
-import functools
 import re
 
 import pytest
@@ -18,6 +17,7 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.losses import l1
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.threads import one_thread
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
@@ -45,7 +45,7 @@ def test_the_first_iterations_give_the_numbers_of_the_chapter(backend, iteration
         start,
         capture.train,
         config,
-        render=functools.partial(render, backend=backend),
+        load_backend(backend),
         extent=EXTENT,
         density=AdaptiveDensityControl(config, EXTENT, generator, start),
         callbacks=[lambda _, event: densified.append(event) if isinstance(event, DensifyEvent) else None],

@@ -1,16 +1,15 @@
 """Training on the backend cuda is deterministic, follows the native backend, and can resume on another backend."""
 
-import functools
-
 import pytest
 import torch
 
 from gsplat_edu.data.synthetic import sphere_capture
-from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.course import EXTENT, course_config
-from gsplat_edu.train.initialize import make_strategy, random_ball
+from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
 
 ITERATIONS = 4
@@ -24,9 +23,7 @@ def views():
 def trainer(views, backend, device, config: TrainConfig | None = None) -> Trainer:
     config = config or course_config(iterations=ITERATIONS, max_gaussians=80)
     start = random_ball(40, torch.Generator().manual_seed(9)).to(torch.device(device))
-    renderer = functools.partial(render, backend=backend)
-    density = make_strategy(config, EXTENT, start)
-    return Trainer(start, views, config, render=renderer, extent=EXTENT, density=density)
+    return training(config, Views(views), load_backend(backend), Start(start, extent=EXTENT))
 
 
 def tensors(run):

@@ -1,13 +1,12 @@
 """Results are the same to the bit on any number of threads, and from run to run."""
 
-import functools
-
 import pytest
 import torch
 
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.initialize import random_ball
@@ -24,8 +23,7 @@ def test_300_training_iterations_do_not_depend_on_threads(set_threads):
         generator = torch.Generator().manual_seed(9)
         start = random_ball(400, generator)
         control = AdaptiveDensityControl(config, EXTENT, generator, start)
-        renderer = functools.partial(render, backend="cpu")
-        trainer = Trainer(start, views, config, render=renderer, extent=EXTENT, density=control)
+        trainer = Trainer(start, views, config, load_backend("cpu"), extent=EXTENT, density=control)
         trainer.run()
         runs.append(trainer.gaussians.tensors())
     assert len(runs[0]["means"]) == 800

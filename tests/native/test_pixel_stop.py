@@ -107,7 +107,7 @@ def test_other_backends_refuse_it(random_camera):
         "logit_opacities": (2,),
     }
     gaussians = Gaussians(**{name: torch.ones(shape) for name, shape in shapes.items()})
-    with pytest.raises(ArgumentError, match=r"^stop: .* only the backend cpu offers, not torch"):
+    with pytest.raises(ArgumentError, match="^stop: 'pixel' needs a backend .* torch does not; use"):
         render(gaussians, random_camera, settings=SETTINGS, backend="torch")
     with pytest.raises(ArgumentError, match="^stop: is 'box'"):
         RenderSettings(stop="box")

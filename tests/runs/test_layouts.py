@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
+from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_blender, write_colmap, write_transforms
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.compose import Start, training
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.initialize import from_points, make_strategy
-from gsplat_edu.train.trainer import Trainer
+from gsplat_edu.train.initialize import from_points
 
 LAYOUTS = ("COLMAP", "transforms.json", "Blender")
 SETTINGS = RenderSettings(jacobian_limit=1.3)
@@ -63,10 +64,7 @@ def test_first_images_agree(datasets, layout):
 @functools.cache
 def trained_psnr(dataset):
     config = recipe(300, densify_start=300, densify_stop=300)
-    extent = scene_extent([view.camera for view in dataset.train])
-    gaussians = start(dataset, config)
-    strategy = make_strategy(config, extent, gaussians)
-    trainer = Trainer(gaussians, dataset.train, config, render=render, extent=extent, density=strategy)
+    trainer = training(config, dataset, load_backend("cpu"), Start(start(dataset, config)))
     trainer.run()
     renderer = functools.partial(render, settings=SETTINGS)
     return summarize(score_views(trainer.gaussians, dataset.test, renderer, (0, 0, 0)))["psnr"]

@@ -6,15 +6,16 @@ import pytest
 import torch
 
 import checkpoints
-from gains import Gains
 from gsplat_edu import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.errors import DatasetError
 from gsplat_edu.evaluate.metrics import score_views
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.batches import PartialSums
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import DensifyEvent, RelocateEvent, ResetEvent, StepEvent
 from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
@@ -25,6 +26,7 @@ from gsplat_edu.train.team import ALONE
 from gsplat_edu.train.trainer import StepParts, Trainer
 from gsplat_edu.views import View
 from ranks import together
+from steps import step_views
 
 SCHEDULE = {"densify_start": 3, "densify_every": 10, "sh_every": 20, "random_background": True}
 CONFIGS = {
@@ -43,12 +45,12 @@ def trainer(settings, team=ALONE, splats=900, callbacks=(), **parts):
     """A training of a procedural capture whose 600 Gaussians fill two pages and a part of a third."""
     views, points, colors = procedural_capture(24, 6, splats=splats)
     start = from_points(points, colors, settings)
-    model, _ = make_view_model(settings, [view.camera for view in views], 2.0, start)
+    model = make_view_model(settings, [view.camera for view in views], 2.0, start)
     return Trainer(
         start,
         views,
         settings,
-        render=render,
+        load_backend("cpu"),
         extent=2.0,
         density=make_strategy(settings, 2.0, start),
         callbacks=callbacks,
@@ -124,17 +126,16 @@ def test_the_gradient_of_a_batch_is_the_mean_of_those_of_its_views():
 
     def make(reduce):
         parts = StepParts(objective, reduce=reduce)
-        return Trainer(start, views, settings, render=render, parts=parts)
+        return Trainer(start, views, settings.changed(strategy="none"), load_backend("cpu"), parts=parts)
 
-    run = make(note)
-    draws = [run._feed.next() for _ in range(4)]
     single, alone = [], make(note)
-    for draw in draws:
-        terms = alone.gradients([draw])
+    for view in step_views(alone, 4):
+        terms = alone.stepper.gradients([view], 0)
         single.append(
-            {name: tensor.grad for name, tensor in alone.parameters().items()} | {"loss": terms["photo"]}
+            {name: tensor.grad for name, tensor in alone.stepper.parameters().items()}
+            | {"loss": terms["photo"]}
         )
-        for tensor in alone.parameters().values():
+        for tensor in alone.stepper.parameters().values():
             tensor.grad = None
     seen = []
     batch = make(note)
@@ -268,7 +269,7 @@ def test_a_run_goes_on_with_another_number_of_ranks(tmp_path):
 def test_moments_are_shared_out():
     def held(team):
         run = trainer(config(), team)
-        return len(run._optimizer.first["means"]), len(run._optimizer.first["sh_rest"])
+        return len(run.stepper.optimizer.first["means"]), len(run.stepper.optimizer.first["sh_rest"])
 
     assert together(2, held) == [(256, 256), (344, 344)]
 
@@ -276,14 +277,17 @@ def test_moments_are_shared_out():
 def test_what_a_view_model_measures_is_the_same_for_every_view_of_a_batch():
     settings = config("adc", appearance="exposure", random_background=False)
     run = trainer(settings)
-    run.iteration = 4  # after the warm-up
-    draws = run._draw()
-    rows = run._parts.view_model._state
-    before = rows.clone()
-    found, _ = run._differentiated(draws, range(4), 4)
-    assert torch.equal(rows, before)
-    found.commit()
-    drawn = [draw.index for draw in draws]
+    views = step_views(run, 4)
+    rows = run.view_model.parameters()["exposures"]
+    before, measure = rows.clone(), run.view_model.measure
+
+    def watching(*arguments):
+        assert torch.equal(rows, before), "no view sees what another one measured"
+        return measure(*arguments)
+
+    run.view_model.measure = watching
+    run.stepper.gradients(views, 4)  # after the warm-up
+    drawn = [view.draw.index for view in views]
     assert len(set(drawn)) == 4
     assert all((rows[i] != before[i]).any() == (i in drawn) for i in range(6))
 
@@ -318,20 +322,6 @@ def test_what_does_not_fit_a_batch_is_refused():
     with pytest.raises(ArgumentError, match="^--batch: is 4, but has to be a multiple of the 3 processes"):
         together(3, lambda team: trainer(config(), team))
 
-    class Totals(Gains):
-        def groups(self):
-            return {}
-
-    views, points, colors = procedural_capture(24, 6, splats=30)
-    with pytest.raises(ArgumentError, match="^view_model: 'gains' has shape"):
-        Trainer(
-            from_points(points, colors, config()),
-            views,
-            config(),
-            render=render,
-            parts=StepParts(view_model=Totals(4)),
-        )
-
 
 @pytest.mark.sliced(1, group="quality that comes back")
 def test_batches_learn_as_well_from_as_many_images():
@@ -341,8 +331,7 @@ def test_batches_learn_as_well_from_as_many_images():
     for batch in (1, 2, 4):
         settings = recipe(400, batch=batch, strategy="fast", max_gaussians=300, fast_start_factor=1.0)
         start = from_points(points, colors, settings)
-        density = make_strategy(settings, 2.0, start)
-        run = Trainer(start, views[1:], settings, render=render, extent=2.0, density=density)
+        run = training(settings, Views(views[1:]), load_backend("cpu"), Start(start, extent=2.0))
         run.run()
         (score,) = score_views(
             run.gaussians, views[:1], functools.partial(render, settings=RenderSettings()), (0.0,) * 3

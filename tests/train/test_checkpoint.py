@@ -10,10 +10,11 @@ import torch
 from checkpoints import Maker, read, write
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.errors import CheckpointError
-from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_seconds, save_checkpoint
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import TrainConfig, recipe
-from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.trainer import Trainer
 
 COMMON = {"densify_start": 5, "densify_every": 10, "densify_stop": 60, "mcmc_stop": 60, "sh_every": 15}
@@ -34,7 +35,7 @@ def capture():
 def trainer(capture, config: TrainConfig) -> Trainer:
     views, points, colors = capture
     start = from_points(points, colors, config)
-    return Trainer(start, views, config, render=render, extent=2.0, density=make_strategy(config, 2.0, start))
+    return training(config, Views(views), load_backend("cpu"), Start(start, extent=2.0))
 
 
 def steps(run: Trainer, count: int) -> None:

@@ -10,11 +10,12 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.exposure import stops
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.exposure import NAME
-from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
-from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.views import View
 from test_exposure import photographed
 
@@ -37,15 +38,7 @@ def capture():
 def trainer(capture, views, appearance, iterations=400):
     config = recipe(iterations, strategy="fast", max_gaussians=3_000, appearance=appearance, sh_degree=1)
     start = from_points(*capture[2:4], config)
-    return Trainer(
-        start,
-        views,
-        config,
-        render=render,
-        extent=2.0,
-        density=make_strategy(config, 2.0, start),
-        parts=StepParts(view_model=make_view_model(config, [view.camera for view in views], 2.0, start)[0]),
-    )
+    return training(config, Views(views), load_backend("cpu"), Start(start, extent=2.0))
 
 
 def fitted(run, views):

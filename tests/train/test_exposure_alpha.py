@@ -7,15 +7,17 @@ import torch
 from gsplat_edu.data import procedural
 from gsplat_edu.evaluate.metrics import at_exposure_of, psnr_fitted, score_views, seen_through, summarize
 from gsplat_edu.exposure import stops
+from gsplat_edu.recolor import recolored_natively
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.feed import Target
-from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
-from gsplat_edu.train.trainer import StepParts, Trainer
-from gsplat_edu.train.view_model import Seen
+from gsplat_edu.train.initialize import from_points
+from gsplat_edu.train.view_model import ViewRender
 from gsplat_edu.views import Photo, View
 from test_exposure import photographed
 
@@ -50,16 +52,7 @@ def trained(capture, views, appearance):
         400, strategy="fast", max_gaussians=3_000, appearance=appearance, sh_degree=1, background=GREY
     )
     start = from_points(*capture[2:4], config)
-    cameras = [view.camera for view in views]
-    run = Trainer(
-        start,
-        views,
-        config,
-        render=render,
-        extent=2.0,
-        density=make_strategy(config, 2.0, start),
-        parts=StepParts(view_model=make_view_model(config, cameras, 2.0, start)[0]),
-    )
+    run = training(config, Views(views), load_backend("cpu"), Start(start, extent=2.0))
     run.run()
     return run
 
@@ -89,15 +82,16 @@ def test_exposures_of_transparent_photos_come_back(capture):
 def test_gradients_pass_through_the_view_model_to_image_and_transmittance():
     """float64; the model is linear in both once its gains are measured, and no value is cut: the photo is not 255."""
     generator = torch.Generator().manual_seed(2)
-    model = Exposure(2, 100, torch.zeros(1, dtype=torch.float64))
+    model = Exposure(2, 100, torch.zeros(1, dtype=torch.float64), recolored_natively)
     model.parameters()["exposures"][:, :3] = torch.tensor([[0.2, 0.1, 0.0], [-0.2, 0.0, 0.1]])
     image, transmittance = (
         torch.rand(*shape, generator=generator, dtype=torch.float64).requires_grad_()
         for shape in ((8, 9, 3), (8, 9))
     )
     target = Target(torch.full((8, 9, 3), 99, dtype=torch.uint8), None, torch.ones(8, 9, dtype=torch.bool))
+    rows = {"exposures": model.parameters()["exposures"][0]}
     assert torch.autograd.gradcheck(
-        lambda x, t: model.image(0, Seen(x, t, GREY), target, 0), (image, transmittance)
+        lambda x, t: model.correct(0, ViewRender(x, t, GREY), target, rows), (image, transmittance)
     )
 
 
@@ -110,8 +104,11 @@ def test_gains_are_measured_where_photo_and_render_are_opaque():
     opaque[:, :8] = True
     photo[:, 8:] = 140
     target = Target(photo, None, opaque)
-    model = Exposure(2, 100, colors)
-    model.image(0, Seen(colors, torch.zeros(20, 24), GREY), target, 50)
+    model = Exposure(2, 100, colors, recolored_natively)
+    before = model.parameters()["exposures"].clone()
+    rows = model.measure(0, ViewRender(colors, torch.zeros(20, 24), GREY), target, 50)
+    assert torch.equal(model.parameters()["exposures"], before), "measuring changes nothing"
+    model.parameters()["exposures"][0] = rows["exposures"]
     # Half of the gain, since the mean over the two photos is taken off; bytes round by 1/255.
     np.testing.assert_allclose(stops(model.log_gains())[0].numpy(), np.log2(1.5) / 2, atol=0.01)
 

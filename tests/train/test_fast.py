@@ -12,7 +12,9 @@ from gsplat_edu.camera import Camera, orbit_camera
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.gaussians import Gaussians, cov3d_t
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import STRATEGIES, recipe
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.surgery import long_axis_children
@@ -21,7 +23,6 @@ from gsplat_edu.train.feed import REDUCED_ROOM, SMALLEST_SIDE, ViewFeed
 from gsplat_edu.train.initialize import from_points, make_strategy, random_ball
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor
-from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import Photo, View
 
 RENDER = functools.partial(render, backend="cpu")
@@ -307,8 +308,7 @@ def trainer(run, views=None, points=None):
     where = where if points is None else points
     colors = colors if points is None else np.full_like(points, 0.5)
     start = from_points(where, colors, run)
-    density = make_strategy(run, 2.0, start)
-    return Trainer(start, views or known, run, render=RENDER, extent=2.0, density=density)
+    return training(run, Views(views or known), load_backend("cpu"), Start(start, extent=2.0))
 
 
 SHORT = {"densify_every": 10, "max_gaussians": 200}

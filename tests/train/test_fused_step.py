@@ -1,6 +1,7 @@
 """Adam in the backward pass gives the same bits as gradients followed by Adam, wherever the trainer chooses it."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ import torch
 
 from gains import Gains
 from gsplat_edu import ArgumentError
-from gsplat_edu.adam import adam_step
+from gsplat_edu.adam import adam_natively
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points, make_strategy
@@ -35,18 +37,24 @@ def capture():
 
 
 class Deferrals:
-    """The renderer of a backend that records for every render whether its step was deferred."""
+    """A backend that records for every render whether its step was deferred.
 
-    def __init__(self, backend="cpu"):
-        self.backend, self.seen = backend, []
+    Args:
+        name: Its kernels.
+    """
 
-    def __call__(self, gaussians, camera, *, settings):
-        output = render(gaussians, camera, settings=settings, backend=self.backend)
+    def __init__(self, name="cpu"):
+        loaded, self.seen = load_backend(name), []
+        self._rasterize = loaded.rasterize
+        self.backend = replace(loaded, rasterize=self.rasterize)
+
+    def rasterize(self, *arguments):
+        output = self._rasterize(*arguments)
         place = len(self.seen)
         self.seen.append(False)
         if output.defer is None:
             return output
-        return type(output)(**output.__dict__ | {"defer": functools.partial(self.note, output.defer, place)})
+        return replace(output, defer=functools.partial(self.note, output.defer, place))
 
     def note(self, defer, place):
         self.seen[place] = True
@@ -57,8 +65,10 @@ def trainer(capture, config, parts=None, **changes):
     views, *cloud = capture
     start = from_points(*cloud, config)
     density = changes.pop("density", make_strategy(config, 2.0, start))
-    options = {"render": Deferrals(), "extent": 2.0, "density": density, "parts": parts} | changes
-    return Trainer(start, options.pop("views", views), config, **options)
+    deferrals = changes.pop("deferrals", Deferrals())
+    options = {"extent": 2.0, "density": density, "parts": parts} | changes
+    made = Trainer(start, options.pop("views", views), config, deferrals.backend, **options)
+    return made, deferrals.seen
 
 
 def check_same(one, other):
@@ -70,12 +80,12 @@ def check_same(one, other):
 
 def pair(capture, config, make_parts=StepParts, **changes):
     """Train both ways; return the fused trainer."""
-    fused = trainer(capture, config, make_parts(fused=True), **changes)
-    two_steps = trainer(capture, config, make_parts(fused=False), **changes)
-    assert fused.fuses and not two_steps.fuses
+    fused, deferred = trainer(capture, config, make_parts(fused=True), **changes)
+    two_steps, stored = trainer(capture, config, make_parts(fused=False), **changes)
+    assert fused.stepper.fuses and not two_steps.stepper.fuses
     assert fused.run().losses == two_steps.run().losses
-    assert all(fused._render.seen) and len(fused._render.seen) == fused.iteration
-    assert not any(two_steps._render.seen)
+    assert all(deferred) and len(deferred) == fused.iteration
+    assert not any(stored)
     check_same(fused, two_steps)
     return fused
 
@@ -83,7 +93,7 @@ def pair(capture, config, make_parts=StepParts, **changes):
 @pytest.mark.parametrize("case", CASES)
 def test_a_training_has_the_same_bits(capture, case):
     run = pair(capture, CASES[case])
-    assert all(parameter.grad is None for parameter in run.parameters().values())
+    assert all(parameter.grad is None for parameter in run.stepper.parameters().values())
 
 
 def test_masks_depth_view_models_and_several_regularisers(capture):
@@ -105,7 +115,7 @@ def test_masks_depth_view_models_and_several_regularisers(capture):
     terms["means"] = lambda rendered: 1e-3 * rendered.gaussians.means.sum()  # an expanded gradient
     make = lambda fused: StepParts(objective=Objective(terms), view_model=Gains(4), fused=fused)  # noqa: E731
     run = pair(capture, CASES["adc"], make, views=masked)
-    assert not torch.equal(run.parameters()["gains"].detach(), torch.ones(4))
+    assert not torch.equal(run.stepper.parameters()["gains"].detach(), torch.ones(4))
 
 
 def test_poisoned_gradients_and_parameters(capture):
@@ -124,12 +134,13 @@ def test_poisoned_gradients_and_parameters(capture):
     def run(fused):
         start = from_points(points, colors, config)
         start.means[7], start.means[11], start.log_scales[13] = float("nan"), 1e30, float("inf")
-        made = Trainer(start, views, config, render=Deferrals(), parts=make(fused))
+        deferrals = Deferrals()
+        made = Trainer(start, views, config, deferrals.backend, parts=make(fused))
         losses = made.run().losses
-        return made, losses
+        return made, losses, deferrals.seen
 
-    (fused, losses), (two_steps, others) = run(True), run(False)
-    assert all(fused._render.seen) and np.array_equal(losses, others, equal_nan=True)
+    (fused, losses, deferred), (two_steps, others, _) = run(True), run(False)
+    assert all(deferred) and np.array_equal(losses, others, equal_nan=True)
     assert fused.gaussians.log_scales[3].isnan().all()
     assert fused.gaussians.means[20].isfinite().all()
     check_same(fused, two_steps)
@@ -138,12 +149,12 @@ def test_poisoned_gradients_and_parameters(capture):
 @pytest.mark.parametrize("case", ["adc", "mcmc"])
 def test_a_fused_run_resumes_to_the_same_bits(capture, case, tmp_path):
     config = CASES[case]
-    whole, first, second = (trainer(capture, config) for _ in range(3))
+    (whole, _), (first, _), (second, deferred) = (trainer(capture, config) for _ in range(3))
     whole.run()
     first.run(stop=lambda: first.iteration == 9)
     load_checkpoint(save_checkpoint(tmp_path, first, 1.0), second)
     second.run()
-    assert all(second._render.seen)
+    assert all(deferred)
     check_same(whole, second)
 
 
@@ -173,26 +184,25 @@ def test_gradients_are_stored_where_something_needs_them(capture):
     config, strategy = recipe(2, strategy="none"), Watching()
     for parts, changes in (
         (StepParts(reduce=lambda parameters, count: None), {}),
-        (StepParts(adam=functools.partial(adam_step)), {}),
+        (StepParts(adam=functools.partial(adam_natively)), {}),
         (StepParts(objective=Twice({"photo": PhotoTerm(0.2)})), {}),
         (StepParts(), {"density": strategy}),
     ):
-        run = trainer(capture, config, parts, **changes)
-        assert not run.fuses
+        run, deferred = trainer(capture, config, parts, **changes)
+        assert not run.stepper.fuses
         run.run()
-        assert run._render.seen == [False, False]
+        assert deferred == [False, False]
     assert len(strategy.seen) == 2 and all(seen > 0 for seen in strategy.seen)
 
 
-def test_batches_and_other_backends_take_two_steps(capture, monkeypatch):
+def test_batches_and_other_backends_take_two_steps(capture):
     config = recipe(2, strategy="none", sh_degree=0)
-    dense = trainer(capture, config, render=Deferrals("torch"))
+    dense, deferred = trainer(capture, config, deferrals=Deferrals("torch"))
     dense.run()
-    assert dense.fuses and dense._render.seen == [False, False]
-    batches = trainer(capture, config)
-    monkeypatch.setattr(batches, "_draw", lambda: [batches._feed.next() for _ in range(2)])
+    assert dense.stepper.fuses and deferred == [False, False]
+    batches, deferred = trainer(capture, recipe(4, strategy="none", sh_degree=0, batch=2))
     batches.run()
-    assert batches._render.seen == [False] * 4
+    assert deferred == [False] * 4
 
 
 def test_a_deferred_image_takes_one_pass_and_one_step(capture):

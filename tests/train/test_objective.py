@@ -12,6 +12,7 @@ from gsplat_edu import ArgumentError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.figures import run_curve_figures
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.log import LogWriter
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
@@ -20,6 +21,7 @@ from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, make_objective
 from gsplat_edu.train.trainer import StepParts, Trainer
 from gsplat_edu.views import View
+from steps import step_views
 
 CONFIG = recipe(40, densify_start=2, densify_every=5, grad_threshold=5e-5, sh_degree=0)
 MCMC = recipe(20, strategy="mcmc", max_gaussians=60, sh_degree=0)
@@ -36,7 +38,7 @@ def trainer(capture, config, parts=None, callbacks=(), views=None):
         start,
         views or capture[0],
         config,
-        render=render,
+        load_backend("cpu"),
         extent=2.0,
         density=make_strategy(config, 2.0, start),
         callbacks=callbacks,
@@ -45,14 +47,14 @@ def trainer(capture, config, parts=None, callbacks=(), views=None):
 
 
 def grads(run):
-    return {name: tensor.grad.clone() for name, tensor in run.parameters().items() if tensor.numel()}
+    return {name: tensor.grad.clone() for name, tensor in run.stepper.parameters().items() if tensor.numel()}
 
 
 def test_regularisers_match_the_paper(capture):
     """Values and gradients against autograd of weight mean(opacity) + weight mean(scale)."""
     run, seen = trainer(capture, MCMC), []
-    run._objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
-    run.gradients([run._feed.next()])
+    run.stepper.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
+    run.stepper.gradients(step_views(run), 0)
     (rendered,) = seen
     assert isinstance(rendered, Rendered) and rendered.iteration == 0
     with_all = grads(run)
@@ -60,14 +62,14 @@ def test_regularisers_match_the_paper(capture):
     twin = run.gaussians.trainable()
     expected = {"opacity": 0.01 * twin.opacities.mean(), "scale": 0.01 * twin.scales.mean()}
     torch.testing.assert_close(values, expected)
-    for tensor in run.parameters().values():
+    for tensor in run.stepper.parameters().values():
         tensor.grad = None
     Objective({"photo": PhotoTerm(MCMC.ssim_weight)}).backward(
         Rendered(run.gaussians, rendered.draw, *_rendered_again(run, rendered), rendered.target, 0)
     )
     sum(expected.values()).backward()
     for name in ("logit_opacities", "log_scales"):
-        without = run.parameters()[name].grad
+        without = run.stepper.parameters()[name].grad
         torch.testing.assert_close(with_all[name], without + getattr(twin, name).grad)
     assert torch.equal(with_all["means"], run.gaussians.means.grad)
 
@@ -82,8 +84,8 @@ def test_fast_weighs_the_opacity_of_what_a_view_shows_if_that_is_little(capture)
     more = np.concatenate([points, *(points + np.array([0.0, 100.0 + 10 * k, 0.0]) for k in range(4))])
     config = recipe(60, strategy="fast", max_gaussians=5 * len(points), sh_degree=0)
     run, seen = trainer((views, more, np.concatenate([colors] * 5)), config), []
-    run._objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
-    run.gradients([run._feed.next()])
+    run.stepper.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
+    run.stepper.gradients(step_views(run), 0)
     (rendered,) = seen
     term, twin = make_objective(config).terms["opacity"], run.gaussians.trainable()
     run.gaussians.logit_opacities.grad = None
@@ -93,7 +95,7 @@ def test_fast_weighs_the_opacity_of_what_a_view_shows_if_that_is_little(capture)
     value.backward()
     expected.backward()
     torch.testing.assert_close(run.gaussians.logit_opacities.grad, twin.logit_opacities.grad)
-    del run._objective.terms["seen"]
+    del run.stepper.objective.terms["seen"]
     far = run.gaussians.means[:, 1] > 50
     before = run.gaussians.logit_opacities[far].detach().clone()
     run.run()
@@ -102,8 +104,8 @@ def test_fast_weighs_the_opacity_of_what_a_view_shows_if_that_is_little(capture)
 
 def test_fast_weighs_the_opacity_of_all_if_a_view_shows_many(capture):
     run, seen = trainer(capture, recipe(60, strategy="fast", max_gaussians=100, sh_degree=0)), []
-    run._objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
-    run.gradients([run._feed.next()])
+    run.stepper.objective.terms["seen"] = lambda rendered: seen.append(rendered) or torch.zeros(())
+    run.stepper.gradients(step_views(run), 0)
     (rendered,) = seen
     output = rendered.output
     few = replace(rendered, output=replace(output, visible=output.visible[:20], radii=output.radii[:20]))
@@ -122,16 +124,16 @@ def _rendered_again(run, rendered):
 
 def test_a_batch_has_the_mean_gradient_of_its_views(capture):
     run = trainer(capture, CONFIG)
-    draws = [run._feed.next() for _ in range(3)]
-    assert len({draw.index for draw in draws}) == 3
+    views = step_views(run, 3)
+    assert len({view.draw.index for view in views}) == 3
     single, losses = [], []
-    for draw in draws:
-        losses.append(run.gradients([draw])["photo"])
+    for view in views:
+        losses.append(run.stepper.gradients([view], 0)["photo"])
         single.append(grads(run))
-        for tensor in run.parameters().values():
+        for tensor in run.stepper.parameters().values():
             tensor.grad = None
-    terms = run.gradients(draws)
-    run._parts.reduce(run.parameters(), 3)
+    terms = run.stepper.gradients(views, 0)
+    run.stepper.parts.reduce(run.stepper.parameters(), 3)
     torch.testing.assert_close(terms["photo"], sum(losses) / 3)
     for name, found in grads(run).items():
         # Two sums of three float32 numbers in different orders differ by at most four roundings of the largest.

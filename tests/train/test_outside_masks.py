@@ -10,13 +10,14 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.feed import Target, ViewFeed
-from gsplat_edu.train.initialize import from_points, make_strategy
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import EmptyOutside, Rendered, make_objective
-from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import Photo, View
 from masked_object import masked_object
 
@@ -31,7 +32,7 @@ def trainer(views, points, colors, outside, iterations=200):
         fast_start_factor=1.0,
     )
     start = from_points(points, colors, config)
-    return Trainer(start, views, config, render=render, extent=3.5, density=make_strategy(config, 3.5, start))
+    return training(config, Views(views), load_backend("cpu"), Start(start, extent=3.5))
 
 
 def shown(gaussians, views):

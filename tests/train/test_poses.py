@@ -10,12 +10,13 @@ from gsplat_edu.camera import Camera
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.alignment import aligned_psnr
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
-from gsplat_edu.train.initialize import from_points, make_strategy, make_view_model
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.poses import LENSES, TWISTS, Refinement, gauge
-from gsplat_edu.train.trainer import StepParts, Trainer
 from gsplat_edu.views import View
 
 EXTENT = 4.0
@@ -51,16 +52,7 @@ def capture():
 def trainer(capture, views, refine, iterations=600, **changes):
     config = recipe(iterations, strategy="fast", max_gaussians=800, sh_degree=1, refine=refine, **changes)
     start = from_points(*capture[2:], config)
-    model, _ = make_view_model(config, [view.camera for view in views], EXTENT, start)
-    return Trainer(
-        start,
-        views,
-        config,
-        render=render,
-        extent=EXTENT,
-        density=make_strategy(config, EXTENT, start),
-        parts=StepParts(view_model=model),
-    )
+    return training(config, Views(views), load_backend("cpu"), Start(start, extent=EXTENT))
 
 
 def aligned(run, views):

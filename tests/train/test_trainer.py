@@ -1,4 +1,5 @@
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from gsplat_edu import ArgumentError, ShapeError
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
@@ -16,8 +18,13 @@ from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
 from gsplat_edu.views import View
 
-RENDER = functools.partial(render, backend="torch")
+RENDER, DENSE = functools.partial(render, backend="torch"), load_backend("torch")
 SHORT = course_config(iterations=12, max_gaussians=80).changed(densify_stop=12, densify_every=4)
+
+
+def fixed(iterations, **changes):
+    """The course's configuration with a fixed number of Gaussians."""
+    return course_config(iterations, **changes).changed(strategy="none")
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +36,7 @@ def trainer(views, callbacks=()):
     generator = torch.Generator().manual_seed(9)
     start = random_ball(60, generator)
     control = AdaptiveDensityControl(SHORT, EXTENT, generator, start)
-    return Trainer(start, views, SHORT, render=RENDER, extent=EXTENT, density=control, callbacks=callbacks)
+    return Trainer(start, views, SHORT, DENSE, extent=EXTENT, density=control, callbacks=callbacks)
 
 
 @pytest.fixture
@@ -69,7 +76,7 @@ def test_callbacks_get_every_step_and_densification_in_order(views):
 def test_the_start_is_not_modified(views):
     start = random_ball(20, torch.Generator().manual_seed(0))
     before = start.map(torch.clone)
-    Trainer(start, views, course_config(iterations=2), render=RENDER).run()
+    Trainer(start, views, fixed(2), DENSE).run()
     for name, tensor in start.tensors().items():
         assert torch.equal(tensor, before.tensors()[name])
 
@@ -77,12 +84,12 @@ def test_the_start_is_not_modified(views):
 def test_views_are_drawn_with_the_seed(views):
     seen = []
 
-    def watching(gaussians, camera, *, settings):
+    def watching(gaussians, camera, settings, extra):
         seen.append(next(i for i, view in enumerate(views) if view.camera is camera))
-        return RENDER(gaussians, camera, settings=settings)
+        return DENSE.rasterize(gaussians, camera, settings, extra)
 
-    config = course_config(iterations=6, seed=3)
-    Trainer(random_ball(10, torch.Generator()), views, config, render=watching).run()
+    watched = replace(DENSE, rasterize=watching)
+    Trainer(random_ball(10, torch.Generator()), views, fixed(6, seed=3), watched).run()
     rng = np.random.default_rng(3)
     assert seen == [int(rng.integers(24)) for _ in range(6)]
 
@@ -104,7 +111,7 @@ def test_one_gaussian_fits_one_blob(views):
     )
     target = View(camera, RENDER(blob, camera).image.numpy())
     start = blob.map(lambda t: t + 0.05)
-    result = Trainer(start, [target], course_config(iterations=150), render=RENDER, extent=EXTENT).run()
+    result = Trainer(start, [target], fixed(150), DENSE, extent=EXTENT).run()
     assert result.losses[-1] < 0.1 * result.losses[0]
 
 
@@ -113,16 +120,16 @@ def test_a_scene_that_vanishes_does_not_stop_the_run(views):
     faint.logit_opacities.fill_(-9.0)
     config = course_config(iterations=4).changed(densify_stop=3, densify_every=1)
     control = AdaptiveDensityControl(config, EXTENT, torch.Generator(), faint)
-    run = Trainer(faint, views, config, render=RENDER, density=control)
+    run = Trainer(faint, views, config, DENSE, density=control)
     assert run.run().counts == [3, 3, 0, 0]
 
 
 def test_no_views_or_no_gaussians_are_refused(views):
     some = random_ball(3, torch.Generator())
     with pytest.raises(ArgumentError, match="^views: "):
-        Trainer(some, [], SHORT, render=RENDER)
+        Trainer(some, [], SHORT, DENSE)
     with pytest.raises(ArgumentError, match="^gaussians: "):
-        Trainer(random_ball(0, torch.Generator()), views, SHORT, render=RENDER)
+        Trainer(random_ball(0, torch.Generator()), views, SHORT, DENSE)
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,12 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.render.api import render
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
+from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.feed import Target
-from gsplat_edu.train.initialize import from_points, make_strategy, make_transients, make_view_model
-from gsplat_edu.train.trainer import StepParts, Trainer
+from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.transients import LONGEST, MASKS, TOO_LARGE, resized_mask
 from gsplat_edu.views import View
 from passers_by import pasted
@@ -36,16 +37,7 @@ def trainer(capture, views, transients, iterations=400, **changes):
     numbers = {"strategy": "fast", "max_gaussians": 3_000, "sh_degree": 1} | changes
     config = recipe(iterations, transients=transients, **numbers)
     start = from_points(*capture[2:], config)
-    model, _ = make_view_model(config, [view.camera for view in views], 2.0, start)
-    return Trainer(
-        start,
-        views,
-        config,
-        render=render,
-        extent=2.0,
-        density=make_strategy(config, 2.0, start),
-        parts=StepParts(view_model=model, transients=make_transients(config, views, render)),
-    )
+    return training(config, Views(views), load_backend("cpu"), Start(start, extent=2.0))
 
 
 def trained(capture, views, transients, **changes):

@@ -7,11 +7,12 @@ import torch
 from doctor.rooms import room
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.exposure import falloff
+from gsplat_edu.recolor import recolored_natively
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.train.exposure import NAME, SPREAD, Exposure
 from gsplat_edu.train.feed import Target
-from gsplat_edu.train.view_model import Seen
+from gsplat_edu.train.view_model import ViewRender
 from gsplat_edu.views import View
 from test_exposure import photographed
 from train.test_exposure import trainer
@@ -63,7 +64,7 @@ def test_dark_corners_come_back_and_the_held_out_quality_with_them(capture):
 
 
 def model_with(ks, measured=None):
-    model = Exposure(len(ks), 100, torch.zeros(1, dtype=torch.float64), vignetting=True)
+    model = Exposure(len(ks), 100, torch.zeros(1, dtype=torch.float64), recolored_natively, vignetting=True)
     state = model.parameters()[NAME]
     state[:, 3] = torch.tensor(ks)
     state[:, 4] = torch.ones(len(ks)) if measured is None else torch.tensor(measured)
@@ -83,7 +84,7 @@ def test_a_photo_that_was_not_measured_has_the_mean_of_the_others():
     np.testing.assert_allclose(model_with([-0.6, 0.0, -9.0], [2.0, 1.0, 0.0]).vignetting()[2].item(), -0.3)
     assert model_with([0.4, 0.1, 0.3]).vignetting().tolist() == [0.0] * 3, "no lens makes corners brighter"
     assert model_with([9.0, 9.0], [0.0, 0.0]).vignetting().tolist() == [0.0, 0.0]
-    assert Exposure(2, 100, torch.zeros(1)).vignetting().tolist() == [0.0, 0.0]
+    assert Exposure(2, 100, torch.zeros(1), recolored_natively).vignetting().tolist() == [0.0, 0.0]
 
 
 def test_the_mean_correction_is_the_identity():
@@ -92,7 +93,9 @@ def test_the_mean_correction_is_the_identity():
     model.parameters()[NAME][:, :3] = torch.randn(4, 3, dtype=torch.float64) / 5
     image = torch.full((12, 17, 3), 0.5, dtype=torch.float64)
     target = Target(torch.full((12, 17, 3), 99, dtype=torch.uint8), None)
-    seen = Seen(image, torch.zeros(12, 17, dtype=torch.float64), (0.0, 0.0, 0.0))
-    logs = [torch.log((model.image(i, seen, target, 0) + 0.055) / (image + 0.055)) for i in range(4)]
+    given = ViewRender(image, torch.zeros(12, 17, dtype=torch.float64), (0.0, 0.0, 0.0))
+    rows = [{NAME: row} for row in model.parameters()[NAME]]
+    found = [model.correct(i, given, target, rows[i]) for i in range(4)]
+    logs = [torch.log((one + 0.055) / (image + 0.055)) for one in found]
     assert torch.stack(logs).abs().max() > 0.1
     np.testing.assert_allclose(torch.stack(logs).mean(dim=(0, 1, 2)).numpy(), 0.0, atol=1e-12)
