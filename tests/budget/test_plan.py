@@ -12,9 +12,6 @@ import torch
 
 from gsplat_edu.budget.costs import (
     LATER,
-    PLANNED,
-    PLANNED_PIXELS,
-    PLANNED_VIEWS,
     Facts,
     Footprint,
     Measurements,
@@ -36,7 +33,7 @@ from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished
-from gsplat_edu.train.capacity import LEAST_PLANNED
+from gsplat_edu.train.capacity import LEAST_PLANNED, PLANNED, PLANNED_PIXELS, PLANNED_VIEWS
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.initialize import random_ball

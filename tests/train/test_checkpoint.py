@@ -249,7 +249,7 @@ def test_running_out_of_memory_is_not_reported_as_damage(tiny, tmp_path, monkeyp
     path = tmp_path / "iteration_3.safetensors"
     write(path, tensors, metadata)
 
-    def refuse(tensor):
+    def refuse(tensor, **options):
         raise error
 
     monkeypatch.setattr(torch.Tensor, "clone", refuse)
