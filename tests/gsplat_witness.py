@@ -44,6 +44,16 @@ def scene(count=40, cameras=2, dtype=torch.float64, seed=0):
     return {name: tensor.to(dtype).requires_grad_() for name, tensor in tensors.items()}
 
 
+def smooth():
+    """Few wide Gaussians, above 1/255 and below the clamps in every pixel: finite differences meet no step."""
+    tensors = scene(count=4, cameras=2)
+    tensors["means"] = torch.tensor([[0.1, 0.2, 2.0], [-0.2, 0.1, 2.5], [0.3, -0.2, 3.0], [0.0, 0.1, 3.5]])
+    tensors["scales"] = torch.tensor([[1.5, 1.7, 1.6]]).repeat(4, 1) + 0.1 * torch.arange(4)[:, None]
+    tensors["opacities"] = torch.tensor([0.5, 0.6, 0.4, 0.7])
+    tensors["colors"] = 0.1 * tensors["colors"].detach()
+    return {name: t.detach().double().requires_grad_() for name, t in tensors.items()}
+
+
 def rendered(tensors, width, height, sh_degree=None, antialiased=False, mode="RGB", **limits):
     """Render with gsplat's torch functions; return images, alphas, means2d of each camera and of each pixel."""
     t, C = tensors, len(tensors["viewmats"])

@@ -1,5 +1,8 @@
 """What `rasterization` does not support is refused by name, and so are values of wrong shapes, types and ranges."""
 
+import inspect
+import re
+
 import pytest
 import torch
 
@@ -21,6 +24,13 @@ UNSUPPORTED = {
     "ftheta_coeffs": object(),
     "rolling_shutter": RollingShutterType.ROLLING_TOP_TO_BOTTOM,
     "viewmats_rs": torch.eye(4).repeat(C, 1, 1),
+    "return_normals": True,
+    "global_z_order": False,
+    "rays": torch.zeros(C, 12, 16, 6),
+    "lidar_coeffs": object(),
+    "external_distortion_coeffs": object(),
+    "ut_params": object(),
+    "renderer_config": object(),
 }
 
 
@@ -28,6 +38,38 @@ UNSUPPORTED = {
 def test_what_is_not_supported_is_refused_by_name(name):
     with pytest.raises(ArgumentError, match=f"^{name}: .* only .* is supported"):
         rasterization(**arguments(), **{name: UNSUPPORTED[name]})
+
+
+ADDED = {
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
+    "ut_params": None,
+    "extra_signals": None,
+    "extra_signals_sh_degree": None,
+    "renderer_config": None,
+}
+"""What gsplat's main branch has added, with its defaults."""
+
+
+def test_added_arguments_have_gsplats_defaults():
+    parameters = inspect.signature(rasterization).parameters.values()
+    assert {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY} == ADDED
+    plain, given = rasterization(**arguments()), rasterization(**arguments(), **ADDED)
+    assert torch.equal(plain[0], given[0]) and sorted(plain[2]) == sorted(given[2])
+
+
+def test_gsplats_default_renderer_is_taken_by_its_name():
+    default = type("RendererConfig_MixedBatch", (), {})()
+    images = rasterization(**arguments(), renderer_config=default)[0]
+    assert torch.equal(images, rasterization(**arguments())[0])
+    other = type("RendererConfig_ParallelBatch", (), {})()
+    with pytest.raises(
+        ArgumentError, match="^renderer_config: is of type RendererConfig_ParallelBatch, but only None"
+    ):
+        rasterization(**arguments(), renderer_config=other)
 
 
 @pytest.mark.parametrize("value", ["ortho", "ftheta", "panorama"])
@@ -54,6 +96,8 @@ WRONG = {
     "colors": torch.full((N, 3), 2e6),
     "covars": torch.full((N, 3, 3), float("inf")),
     "backgrounds": [0.0, 0.0, 0.0],
+    "extra_signals": torch.full((N, 2), float("nan")),
+    "extra_signals_sh_degree": 0,
 }
 
 
@@ -73,6 +117,7 @@ SHAPES = {
     "Ks": (C + 1, 3, 3),
     "covars": (N, 6),
     "backgrounds": (C, 4),
+    "extra_signals": (C + 1, N, 2),
 }
 
 
@@ -86,6 +131,45 @@ def test_wrong_shapes_are_refused_by_name(name):
 def test_harmonics_need_a_degree_that_the_coefficients_have(degree):
     with pytest.raises(ArgumentError, match="^(colors|sh_degree): "):
         rasterization(**arguments(colors=torch.zeros(N, 4, 3)), sh_degree=degree)
+
+
+@pytest.mark.parametrize("degree", [2, 5, -1, 1.0])
+def test_harmonics_of_extra_signals_need_a_degree_that_they_have(degree):
+    with pytest.raises(ArgumentError, match="^(extra_signals|extra_signals_sh_degree): "):
+        rasterization(**arguments(), extra_signals=torch.zeros(N, 4, 2), extra_signals_sh_degree=degree)
+
+
+def test_coefficients_of_extra_signals_have_no_axis_of_cameras():
+    coefficients = torch.zeros(C, N, 4, 2)
+    with pytest.raises(
+        ShapeError, match=r"^extra_signals: has shape \(2, 6, 4, 2\), but has to be \(6, 4, 2\)"
+    ):
+        rasterization(**arguments(), extra_signals=coefficients, extra_signals_sh_degree=1)
+
+
+def test_extra_signals_need_a_channel():
+    with pytest.raises(ShapeError, match="^extra_signals: has shape"):
+        rasterization(**arguments(), extra_signals=torch.zeros(N, 0))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGB+D", "RGB+ED"])
+def test_colors_may_be_missing_where_none_are_returned_only(mode):
+    with pytest.raises(
+        ArgumentError, match=f"^colors: is None, but render_mode '{re.escape(mode)}' returns colours"
+    ):
+        rasterization(**arguments(colors=None), render_mode=mode)
+    with pytest.raises(ArgumentError, match="^sh_degree: is given, but colors is None"):
+        rasterization(**arguments(colors=None), render_mode="ED", sh_degree=1)
+
+
+def test_backgrounds_cover_extra_signals():
+    signals = torch.zeros(N, 2)
+    for mode, right, wrong in (("RGB", 5, 3), ("RGB+ED", 5, 3), ("D", 2, 3)):
+        given = arguments(backgrounds=torch.zeros(C, right)) | {"extra_signals": signals, "render_mode": mode}
+        rasterization(**given)
+        expected = rf"^backgrounds: has shape \(2, {wrong}\), but has to be \(2, {right}\)"
+        with pytest.raises(ShapeError, match=expected):
+            rasterization(**given | {"backgrounds": torch.zeros(C, wrong)})
 
 
 def test_gaussians_need_a_shape():

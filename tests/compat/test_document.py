@@ -24,5 +24,7 @@ def test_the_table_lists_the_arguments_in_order():
 
 def test_the_table_lists_the_keys_of_meta():
     tensors = [torch.zeros(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), torch.ones(1, 3)]
-    _, _, meta = rasterization(*tensors, torch.eye(4)[None], torch.eye(3)[None], 4, 4)
+    _, _, meta = rasterization(
+        *tensors, torch.eye(4)[None], torch.eye(3)[None], 4, 4, extra_signals=torch.ones(1, 2)
+    )
     assert sorted(named("What meta holds")) == sorted(meta)

@@ -287,20 +287,10 @@ def test_an_empty_view_is_background(count):
     assert torch.equal(tensors["means"].grad, torch.zeros(count, 3, dtype=torch.float64))
 
 
-def smooth():
-    """Few wide Gaussians, above 1/255 and below the clamps in every pixel: finite differences meet no step."""
-    tensors = gsplat_witness.scene(count=4, cameras=2)
-    tensors["means"] = torch.tensor([[0.1, 0.2, 2.0], [-0.2, 0.1, 2.5], [0.3, -0.2, 3.0], [0.0, 0.1, 3.5]])
-    tensors["scales"] = torch.tensor([[1.5, 1.7, 1.6]]).repeat(4, 1) + 0.1 * torch.arange(4)[:, None]
-    tensors["opacities"] = torch.tensor([0.5, 0.6, 0.4, 0.7])
-    tensors["colors"] = 0.1 * tensors["colors"].detach()
-    return {name: t.detach().double().requires_grad_() for name, t in tensors.items()}
-
-
 @pytest.mark.sliced(1)
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 def test_finite_differences(rasterize_mode):
-    tensors = smooth()
+    tensors = gsplat_witness.smooth()
     names = list(tensors)
     options = {"sh_degree": 2, "render_mode": "RGB+ED", "rasterize_mode": rasterize_mode}
 
@@ -320,7 +310,7 @@ def test_finite_differences(rasterize_mode):
 def test_float32_agrees_with_float64():
     """Alpha is 2^p with |p| < 8. A chain of about 30 operations leads to p, so p and alpha are off by less than 30 * 8
     half roundings, 2^-24 each. Four Gaussians: 4 * 240 * 2^-24 = 6e-5 of the largest channel, doubled for its sum."""
-    exact = {name: t.detach() for name, t in smooth().items()}
+    exact = {name: t.detach() for name, t in gsplat_witness.smooth().items()}
     single = {name: t.float() for name, t in exact.items()}
     options = {"sh_degree": 3, "render_mode": "RGB+ED"}
     wanted, found = render(exact, **options)[0], render(single, **options)[0]

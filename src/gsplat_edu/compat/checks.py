@@ -41,23 +41,47 @@ ONLY_VALUES = {
     "camera_model": "pinhole",
     "with_ut": False,
     "with_eval3d": False,
+    "return_normals": False,
+    "global_z_order": True,
+    "rays": None,
     "radial_coeffs": None,
     "tangential_coeffs": None,
     "thin_prism_coeffs": None,
     "ftheta_coeffs": None,
+    "lidar_coeffs": None,
+    "external_distortion_coeffs": None,
     "rolling_shutter": RollingShutterType.GLOBAL,
     "viewmats_rs": None,
+    "ut_params": None,
+    "renderer_config": None,
 }
 """Arguments that `rasterization` has with one value only."""
 
 REMEDIES = {
     "sparse_grad": "gradients are dense",
     "distributed": "render on one machine",
-    "camera_model": "undistort the photos first",
+    "return_normals": "gsplat_edu.render.maps.render_maps renders normals",
+    "global_z_order": "Gaussians are sorted by camera depth",
+    "rays": "give pinhole cameras by viewmats and Ks",
+    "lidar_coeffs": "give pinhole cameras by viewmats and Ks",
+    "ut_params": "leave it out, because the projection has no unscented transform",
+    "renderer_config": "leave it out, because there is one rasteriser",
 }
 """What to do instead, where it is not `UNDISTORT`."""
 
+DEFAULT_RENDERER = "RendererConfig_MixedBatch"
+"""Name of the class that gsplat takes for `renderer_config=None`."""
+
 UNDISTORT = "undistort the photos first"
+
+DEGREES = {"colors": "sh_degree", "extra_signals": "extra_signals_sh_degree"}
+"""Which argument is the degree of which coefficients."""
+
+MOST_DEGREE = 4
+"""Highest degree of harmonics. Our own renderer, and the scene files of the field, end at 3."""
+
+DEPTH_ONLY = ("D", "ED")
+"""Values of `render_mode` that return no colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +97,7 @@ class Arguments:
         scales: (..., N, 3) standard deviations, world units. Ignored with `covars`.
         opacities: (..., N) 0 to 1.
         colors: (..., N, D) or (..., C, N, D) numbers to composite; with `sh_degree` (..., N, K, 3) or (..., C, N, K, 3)
-            coefficients.
+            coefficients. None is allowed if `render_mode` is D or ED.
         viewmats: (..., C, 4, 4) world to camera, OpenCV axes.
         Ks: (..., C, 3, 3) intrinsics, px; the centre of the first pixel is at (0.5, 0.5).
         width: Width of the images, px.
@@ -86,7 +110,8 @@ class Arguments:
         packed: Whether `meta` lists the drawn Gaussians only, (nnz, ...), instead of all, (..., C, N, ...). The images
             and the work are the same.
         tile_size: Only sets tile_width and tile_height in `meta`; the kernels have tiles of 16 px.
-        backgrounds: (..., C, D) colours behind everything; None for 0.
+        backgrounds: (..., C, D) colours behind everything; None for 0. With `extra_signals` (..., C, D + E), or
+            (..., C, E) for D and ED, which ignore `backgrounds` otherwise.
         render_mode: Which channels to return: RGB, D, ED, RGB+D, RGB+ED.
         sparse_grad: False.
         absgrad: Whether the backward pass sets `meta["means2d"].absgrad`.
@@ -98,12 +123,23 @@ class Arguments:
         covars: (..., N, 3, 3) covariances, world units²; the upper triangle is read.
         with_ut: False.
         with_eval3d: False.
+        return_normals: False.
+        global_z_order: True.
+        rays: None.
         radial_coeffs: None.
         tangential_coeffs: None.
         thin_prism_coeffs: None.
         ftheta_coeffs: None.
+        lidar_coeffs: None.
+        external_distortion_coeffs: None.
         rolling_shutter: GLOBAL, ours or gsplat's.
         viewmats_rs: None.
+        ut_params: None.
+        extra_signals: (..., N, E) or (..., C, N, E) further channels, composited with the weights of the colours into
+            `meta["render_extra_signals"]`; with `extra_signals_sh_degree` (N, K, E) coefficients, shared by all scenes.
+        extra_signals_sh_degree: Highest degree of their harmonics to use, 0 to 4. 0.5 is added to the sum, as for
+            colours, but there is no floor.
+        renderer_config: None, or gsplat's default, `RendererConfig_MixedBatch()`.
 
     Raises:
         ShapeError: a shape differs.
@@ -114,7 +150,7 @@ class Arguments:
     quats: Tensor | None
     scales: Tensor | None
     opacities: Tensor
-    colors: Tensor
+    colors: Tensor | None
     viewmats: Tensor
     Ks: Tensor
     width: int
@@ -138,12 +174,21 @@ class Arguments:
     covars: Tensor | None
     with_ut: bool
     with_eval3d: bool
+    return_normals: bool
+    global_z_order: bool
+    rays: Any
     radial_coeffs: Any
     tangential_coeffs: Any
     thin_prism_coeffs: Any
     ftheta_coeffs: Any
+    lidar_coeffs: Any
+    external_distortion_coeffs: Any
     rolling_shutter: Any
     viewmats_rs: Any
+    ut_params: Any
+    extra_signals: Tensor | None
+    extra_signals_sh_degree: int | None
+    renderer_config: Any
     batch: tuple[int, ...] = field(init=False)
     N: int = field(init=False)
     C: int = field(init=False)
@@ -167,27 +212,77 @@ class Arguments:
         C = check_cameras(self.viewmats, self.Ks, batch, self.means)
         for name, value in (("batch", batch), ("N", N), ("C", C)):
             object.__setattr__(self, name, value)
-        self._check_colors()
-
-    def _check_colors(self) -> None:
-        """Check colours or coefficients, and backgrounds."""
-        check_tensor("colors", self.colors, ("...",), {})
-        channels = self.colors.shape[-1] if self.colors.ndim else 0
-        tail: tuple[int, ...] = (channels,)
-        if self.sh_degree is not None:
-            K = max((whole_number("sh_degree", self.sh_degree, 0, 4) + 1) ** 2, *self.colors.shape[-2:-1])
-            channels, tail = 3, (K, 3)
-        per_camera = self.colors.ndim == len(self.batch) + 2 + len(tail)
-        expect(
-            "colors", self.colors, (*self.batch, *([self.C] if per_camera else []), self.N, *tail), self.means
-        )
+        colors = self._check_colors()
+        drawn = (0 if self.render_mode in DEPTH_ONLY else colors) + self._check_extra_signals()
         if self.backgrounds is not None:
+            check_tensor("backgrounds", self.backgrounds, ("...",), {})
+            # Backgrounds that no channel is composited over have no effect; gsplat takes them.
+            channels = drawn or colors or (0, *self.backgrounds.shape)[-1]
             expect("backgrounds", self.backgrounds, (*self.batch, self.C, channels), self.means)
+
+    def _check_colors(self) -> int:
+        """Check colours or coefficients; return the number of their channels."""
+        if self.colors is None:
+            if self.render_mode not in DEPTH_ONLY:
+                raise ArgumentError(
+                    f"colors: is None, but render_mode {self.render_mode!r} returns colours; give them, or render 'ED'"
+                )
+            if self.sh_degree is not None:
+                raise ArgumentError(
+                    "sh_degree: is given, but colors is None; give coefficients, or no degree"
+                )
+            return 0
+        return self._check_channels("colors", self.colors, self.sh_degree, self.colors_per_camera, 3)
+
+    def _check_extra_signals(self) -> int:
+        """Check further channels; return their number."""
+        signals, degree = self.extra_signals, self.extra_signals_sh_degree
+        if signals is None:
+            if degree is not None:
+                raise ArgumentError(
+                    "extra_signals_sh_degree: is given, but extra_signals is None; give coefficients, or no degree"
+                )
+            return 0
+        channels = self._check_channels("extra_signals", signals, degree, self.extra_signals_per_camera, None)
+        if channels == 0:
+            raise ShapeError(f"extra_signals: has shape {tuple(signals.shape)}, but has to have a channel")
+        return channels
+
+    def _check_channels(
+        self, name: str, tensor: Tensor, degree: int | None, per_camera: bool, of_harmonics: int | None
+    ) -> int:
+        """Check channels of Gaussians, or coefficients of them; return the number of channels.
+
+        Args:
+            name: The argument to name.
+            tensor: Its value.
+            degree: Highest degree of the harmonics; None for channels.
+            per_camera: Whether it has an axis of cameras.
+            of_harmonics: Channels that coefficients have; None for any, and for coefficients without leading axes.
+        """
+        check_tensor(name, tensor, ("...",), {})
+        channels = tensor.shape[-1] if tensor.ndim else 0
+        lead = (*self.batch, *([self.C] if per_camera else []))
+        tail: tuple[int, ...] = (channels,)
+        if degree is not None:
+            most = (whole_number(DEGREES[name], degree, 0, MOST_DEGREE) + 1) ** 2
+            channels = channels if of_harmonics is None else of_harmonics
+            lead, tail = () if of_harmonics is None else lead, (max(most, *tensor.shape[-2:-1]), channels)
+        expect(name, tensor, (*lead, self.N, *tail), self.means)
+        return channels
 
     @property
     def colors_per_camera(self) -> bool:
         """Whether `colors` have an axis of cameras."""
-        return self.colors.ndim == len(self.batch) + (3 if self.sh_degree is None else 4)
+        axes = len(self.batch) + (3 if self.sh_degree is None else 4)
+        return isinstance(self.colors, Tensor) and self.colors.ndim == axes
+
+    @property
+    def extra_signals_per_camera(self) -> bool:
+        """Whether `extra_signals` have an axis of cameras; coefficients have none."""
+        if self.extra_signals_sh_degree is not None or not isinstance(self.extra_signals, Tensor):
+            return False
+        return self.extra_signals.ndim == len(self.batch) + 3
 
     @property
     def batches(self) -> int:
@@ -199,6 +294,8 @@ def _check_only(name: str, value: object, only: object) -> None:
     """Check an argument of which one value is supported."""
     if name == "rolling_shutter":
         value, only = getattr(value, "name", value), RollingShutterType.GLOBAL.name
+    if name == "renderer_config" and type(value).__name__ == DEFAULT_RENDERER:
+        return
     if type(value) is not type(only) or value != only:
         plain = isinstance(value, bool | int | float | str | Enum)
         shown = repr(value) if plain else f"of type {type(value).__name__}"

@@ -1,5 +1,8 @@
 """A drop-in for gsplat 1.5.3: its `rasterization`, and the steps it is made of, on any CPU.
 
+`rasterization` also has the nine arguments that gsplat's main branch has added since. There they stand between those of
+1.5.3; here they are keywords only, so that positional calls written for 1.5.3 keep their meaning.
+
     from gsplat_edu.compat.gsplat import rasterization      # instead of: from gsplat import rasterization
 
 gsplat's `DefaultStrategy` runs on it as it is, its `MCMCStrategy` with `compute_relocation` and
@@ -28,8 +31,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.compat.checks import Arguments, RollingShutterType, check_spreads
-from gsplat_edu.compat.harmonics import spherical_harmonics
+from gsplat_edu.compat.checks import DEPTH_ONLY, Arguments, RollingShutterType, check_spreads
+from gsplat_edu.compat.harmonics import evaluate, spherical_harmonics
 from gsplat_edu.compat.images import Splats, absgrad_store, composite
 from gsplat_edu.compat.parts import compute_relocation, proj, quat_scale_to_covar_preci, world_to_cam
 from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
@@ -63,7 +66,7 @@ def rasterization(
     quats: Tensor | None,
     scales: Tensor | None,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -93,19 +96,29 @@ def rasterization(
     ftheta_coeffs: object = None,
     rolling_shutter: object = RollingShutterType.GLOBAL,
     viewmats_rs: Tensor | None = None,
+    *,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
+    lidar_coeffs: object = None,
+    external_distortion_coeffs: object = None,
+    ut_params: object = None,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: object = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians into C cameras with gsplat's arguments, which `gsplat_edu.compat.checks.Arguments` describes.
 
     Returns:
         images (..., C, H, W, channels), alphas (..., C, H, W, 1), and `meta`: means2d, radii, depths, conics,
         opacities, gaussian_ids, camera_ids, batch_ids, width, height, n_cameras, n_batches, tile_size, tile_width,
-        tile_height.
+        tile_height; with `extra_signals` also render_extra_signals (..., C, H, W, E).
 
     Raises:
         ShapeError: a shape differs.
         ArgumentError: a value is not finite, out of range or not supported.
 
-    Differentiable in: means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds.
+    Differentiable in: means, quats, scales, covars, opacities, colors, viewmats, Ks, backgrounds, extra_signals.
     """
     return _rasterize(Arguments(**without_bad_gaussians(dict(locals()))))
 
@@ -160,6 +173,11 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     views = _draw(a, lens, drawn, (rows, found.spreads), meta)
     image, transmittance = (torch.stack(each).view(*a.batch, a.C, *each[0].shape) for each in views)
     alphas = 1.0 - transmittance[..., None]
+    if a.extra_signals is not None:
+        E = a.extra_signals.shape[-1]
+        first = image.shape[-1] - E - int(a.render_mode != "RGB")
+        meta["render_extra_signals"] = image[..., first : first + E]
+        image = torch.cat([image[..., :first], image[..., first + E :]], dim=-1)
     if a.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=ALPHA_FLOOR)], dim=-1)
     return image, alphas, meta
@@ -182,8 +200,11 @@ def _draw(
     axes = 1 if a.packed else len(a.batch) + 2
     means2d, depths, opacities = (_rows(meta[name], axes) for name in ("means2d", "depths", "opacities"))
     with_depth = a.render_mode != "RGB"
-    colors = None if a.render_mode in ("D", "ED") else _colors(a, drawn)
-    backgrounds = None if colors is None or a.backgrounds is None else _rows(a.backgrounds, len(a.batch) + 1)
+    colors = None if a.render_mode in DEPTH_ONLY or a.colors is None else _colors(a, a.colors, drawn)
+    signals = None if a.extra_signals is None else _extra_signals(a, a.extra_signals, drawn)
+    backgrounds = None if a.backgrounds is None else _rows(a.backgrounds, len(a.batch) + 1)
+    if colors is None and signals is None:
+        backgrounds = None  # a depth has no background
     ends = torch.bincount(drawn.images, minlength=a.batches * a.C).cumsum(0).tolist()
     images, transmittances = [], []
     for k, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
@@ -197,6 +218,7 @@ def _draw(
             None if colors is None else colors.index_select(0, order),
             depths.index_select(0, own) if with_depth else None,
             None if backgrounds is None else backgrounds[k],
+            None if signals is None else signals.index_select(0, order),
         )
         store = absgrad_store(meta["means2d"], own) if a.absgrad else None
         image, transmittance = composite(splats, lens, store)
@@ -205,13 +227,26 @@ def _draw(
     return images, transmittances
 
 
-def _colors(a: Arguments, drawn: _Drawn) -> Float[Tensor, "nnz D"]:
+def _colors(a: Arguments, colors: Tensor, drawn: _Drawn) -> Float[Tensor, "nnz D"]:
     """Return the colours of the drawn Gaussians, from the harmonics if there are any."""
     row = (drawn.images if a.colors_per_camera else drawn.scenes) * a.N + drawn.gaussians
     if a.sh_degree is None:
-        return _rows(a.colors, a.colors.ndim - 1).index_select(0, row)
-    coefficients = _rows(a.colors, a.colors.ndim - 2).index_select(0, row)
+        return _rows(colors, colors.ndim - 1).index_select(0, row)
+    coefficients = _rows(colors, colors.ndim - 2).index_select(0, row)
+    return torch.clamp_min(evaluate(a.sh_degree, _directions(a, drawn), coefficients) + SH_OFFSET, 0.0)
+
+
+def _extra_signals(a: Arguments, signals: Tensor, drawn: _Drawn) -> Float[Tensor, "nnz E"]:
+    """Return the extra signals of the drawn Gaussians; gsplat offsets those of harmonics, but has no floor."""
+    if a.extra_signals_sh_degree is None:
+        row = (drawn.images if a.extra_signals_per_camera else drawn.scenes) * a.N + drawn.gaussians
+        return _rows(signals, signals.ndim - 1).index_select(0, row)
+    coefficients = signals.index_select(0, drawn.gaussians)
+    return evaluate(a.extra_signals_sh_degree, _directions(a, drawn), coefficients) + SH_OFFSET
+
+
+def _directions(a: Arguments, drawn: _Drawn) -> Float[Tensor, "nnz 3"]:
+    """Return the vectors from the cameras to the drawn Gaussians."""
     eyes = torch.inverse(a.viewmats)[..., :3, 3].reshape(-1, 3)
     means = _rows(a.means, a.means.ndim - 1).index_select(0, drawn.scenes * a.N + drawn.gaussians)
-    colors = spherical_harmonics(a.sh_degree, means - eyes.index_select(0, drawn.images), coefficients)
-    return torch.clamp_min(colors + SH_OFFSET, 0.0)
+    return means - eyes.index_select(0, drawn.images)

@@ -6,15 +6,14 @@ import math
 from collections.abc import Iterator
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from gsplat_edu.compat.checks import MOST_DEGREE
 from gsplat_edu.errors import ArgumentError, ShapeError
 from gsplat_edu.gaussians import check_tensor
 from gsplat_edu.sh import basis_terms
 from gsplat_edu.validation import whole_number
-
-MOST_DEGREE = 4
-"""Highest degree. Our own renderer, and the scene files of the field, end at 3."""
 
 C4 = (
     0.75 * math.sqrt(35.0 / math.pi),
@@ -65,12 +64,20 @@ def spherical_harmonics(
             raise ArgumentError(f"masks: is {masks.dtype}, but has to be torch.bool")
         if masks.shape != batch:
             raise ShapeError(f"masks: has shape {tuple(masks.shape)}, but has to be {tuple(batch)}")
+    colors = evaluate(degree, dirs, coeffs)
+    return colors if masks is None else torch.where(masks[..., None], colors, 0.0)
+
+
+def evaluate(
+    degree: int, dirs: Float[Tensor, "*B 3"], coeffs: Float[Tensor, "*B K D"]
+) -> Float[Tensor, "*B D"]:
+    """Evaluate harmonics of any number of channels without checks; see `spherical_harmonics`."""
     unit = torch.nn.functional.normalize(dirs, dim=-1)
     first, *others = basis_terms(min(degree, 3), *unit.unbind(-1))
     others += _fourth_degree(*unit.unbind(-1)) if degree == MOST_DEGREE else []
     basis = torch.stack([torch.full_like(unit[..., 0], first), *others], dim=-1)
-    colors: Tensor = (basis[..., None] * coeffs[..., :count, :]).sum(dim=-2)
-    return colors if masks is None else torch.where(masks[..., None], colors, 0.0)
+    values: Tensor = (basis[..., None] * coeffs[..., : (degree + 1) ** 2, :]).sum(dim=-2)
+    return values
 
 
 def _fourth_degree(x: Tensor, y: Tensor, z: Tensor) -> Iterator[Tensor]:

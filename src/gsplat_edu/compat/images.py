@@ -45,16 +45,17 @@ class Splats(NamedTuple):
     opacities: Float[Tensor, " M"]
     colors: Float[Tensor, "M D"] | None
     depths: Float[Tensor, " M"] | None
-    background: Float[Tensor, " D"] | None
+    background: Float[Tensor, " D_plus_E"] | None
+    extra_signals: Float[Tensor, "M E"] | None = None
 
 
 def composite(
     splats: Splats, lens: Lens, absgrad: Callable[[Int64[Tensor, " V"], Tensor], None] | None
 ) -> tuple[Float[Tensor, "H W K"], Float[Tensor, "H W"]]:
-    """Composite colours, then depth, over the background.
+    """Composite colours, then extra signals, then depth, over the background.
 
     Args:
-        splats: The Gaussians; K is the number of colours, and one more for depths.
+        splats: The Gaussians; K is the number of colours and extra signals, and one more for depths.
         lens: Size of the image and eps2d.
         absgrad: Receives, in each backward pass, rows and their sums over pixels of |dL/du| and |dL/dv|, per px.
 
@@ -64,7 +65,10 @@ def composite(
     M = len(splats.opacities)
     colors = splats.means2d.new_zeros(M, 0) if splats.colors is None else splats.colors
     front, features = colors[:, :COLOR_CHANNELS], colors[:, COLOR_CHANNELS:]
-    # The depth is a feature, never a colour, because the kernels skip Gaussians whose colours exceed COLOR_LIMIT.
+    # Extra signals and depth are features, never colours, because the kernels skip Gaussians whose colours exceed
+    # COLOR_LIMIT.
+    if splats.extra_signals is not None:
+        features = torch.cat([features, splats.extra_signals], dim=1)
     if splats.depths is not None:
         features = torch.cat([features, splats.depths[:, None]], dim=1)
     view = _render(splats, front, features, lens, absgrad)

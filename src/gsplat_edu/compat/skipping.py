@@ -10,9 +10,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsplat_edu.compat.checks import DEGREES
+
 SKIPPING = contextvars.ContextVar("skipping bad Gaussians", default=False)
 
-PLAIN = {"means": 0.0, "quats": 1.0, "scales": 1.0, "opacities": 0.0, "colors": 0.0, "covars": 0.0}
+PLAIN = {
+    "means": 0.0,
+    "quats": 1.0,
+    "scales": 1.0,
+    "opacities": 0.0,
+    "colors": 0.0,
+    "covars": 0.0,
+    "extra_signals": 0.0,
+}
 """What stands for the numbers of a bad Gaussian. Its opacity is 0, so that it is not drawn."""
 
 
@@ -37,23 +47,33 @@ def without_bad_gaussians(given: dict[str, Any]) -> dict[str, Any]:
         return given
     own = {name: t for name, t in given.items() if name in PLAIN and isinstance(t, Tensor)}
     bad = torch.zeros(means.shape[:-1], dtype=torch.bool)
+    degrees = {name: given[degree] for name, degree in DEGREES.items()}
+    # Coefficients of extra signals have no leading axes: a bad row of theirs is bad in every scene.
+    shared = {"extra_signals"} if degrees["extra_signals"] is not None else set()
     cameras, axes = bad.ndim - 1, bad.ndim
-    per_camera = "colors" in own and own["colors"].ndim == axes + (2 if given["sh_degree"] is None else 3)
+    per_camera = {
+        name
+        for name, degree in degrees.items()
+        if name in own and name not in shared and own[name].ndim == axes + (2 if degree is None else 3)
+    }
     for name, tensor in own.items():
         wrong = ~torch.isfinite(tensor.detach())
         if name == "quats" and tensor.ndim:
             wrong = wrong | (tensor.detach() == 0).all(dim=-1, keepdim=True)
-        if name == "colors" and per_camera:
+        if name in per_camera:
             wrong = wrong.any(dim=cameras)
-        if wrong.shape[:axes] != bad.shape:
+        leading = 1 if name in shared else axes
+        if wrong.shape[:leading] != bad.shape[-leading:]:
             return given  # the check of shapes explains it
-        bad |= wrong.reshape(*bad.shape, -1).any(dim=-1)
+        bad |= wrong.reshape(*wrong.shape[:leading], -1).any(dim=-1)
     if not bool(bad.any()):
         return given
-    return given | {
-        name: _filled(name, tensor, bad.unsqueeze(cameras) if name == "colors" and per_camera else bad)
-        for name, tensor in own.items()
-    }
+    in_every_scene = bad.reshape(-1, bad.shape[-1]).all(dim=0)
+    filled = dict(given)
+    for name, tensor in own.items():
+        rows = bad.unsqueeze(cameras) if name in per_camera else bad
+        filled[name] = _filled(name, tensor, in_every_scene if name in shared else rows)
+    return filled
 
 
 def _filled(name: str, tensor: Tensor, bad: Tensor) -> Tensor:
