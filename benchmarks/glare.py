@@ -76,6 +76,7 @@ SHAPES = (
 
 RECIPES = {
     "fast": (),
+    "rest-1/20": ("--sh-rest-rate", "2.5e-4"),
     "rest-1/10": ("--sh-rest-rate", "5e-4"),
     "rest-1/4": ("--sh-rest-rate", "1.25e-3"),
     "rest-1/2": ("--sh-rest-rate", "2.5e-3"),
@@ -90,7 +91,7 @@ RECIPES = {
     "mcmc": ("--strategy", "mcmc", "--max-gaussians", "20000"),
 }
 """Options of `gsplat-edu train` by the name of the recipe. {third}: a third of the recipe's `sh_every`; "rest":
-the rate of the higher harmonics over that of degree 0, which is 1/20 in the recipe fast."""
+the rate of the higher harmonics over that of degree 0, which is 1/8 in the recipe fast."""
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ FOR_FAST = {
     "quats_rate": 2e-3,
     "scales_rate": 1e-2,
     "sh0_rate": 5e-3,
-    "sh_rest_rate": 5e-3 / 20,
+    "sh_rest_rate": 5e-3 / 8,
     "opacities_rate": 0.1,
     "sh_every": 3_000,
     "min_opacity": 0.02,
