@@ -2,14 +2,14 @@
 
 A test marked `sliced(n)` has more cases than a change should wait for. Each case belongs to one of eight shards, and
 the number of commits up to HEAD, modulo eight, chooses the shard that runs: over eight consecutive counts every case
-runs. A test keeps at least n cases in every run, those of the next shards if its own has fewer. `sliced(n, by="is_named")`
-keeps n for each value of that parameter, and tests marked `sliced(n, group="name")` share their n. With `together=True`,
-the tests of a file that are marked for a group count as one case, because they share an expensive fixture. `sliced(0)`
+runs. A test keeps at least n cases in every run, those of the next shards if its own has fewer. `sliced(n,
+by="is_named")` keeps n for each value of that parameter, and tests marked `sliced(n, group="name")` share their n. With
+`together=True`, the tests of a file that are marked for a group are one case, because they share a fixture. `sliced(0)`
 runs in soaks and when a change touches it, and `sliced` without a number always: those tests choose their own inputs.
 
 All cases run in the test files that a change touches (touched.py says what that is), and of a test that the command
-line names with `::`. A case's shard depends on its own test only, and a change to that test's file runs all of it; so no
-case waits longer than eight commits, as long as each commit is tested and SECONDS stays the same.
+line names with `::`. A case's shard depends on its own test only, and a change to that test's file runs all of it. So
+no case waits longer than eight commits, as long as each commit is tested and SECONDS stays the same.
 
 In a shallow clone and outside git, the count and the change are unknown. Then shard 0 runs, and the header says why.
 
@@ -52,7 +52,10 @@ SHARD = int(CHOSEN) if CHOSEN in NAMES else COUNT % SHARDS
 SEED = COUNT * 100_000
 """The seed of a fuzzer's first damaged file. The seeds of two counts do not overlap."""
 
-HOW_TO_REPEAT = f"name the test with :: to run it again; GSPLAT_EDU_SLICE={COUNT} repeats the slice and its seeds on any commit"
+HOW_TO_REPEAT = (
+    "name the test with :: to run it again; "
+    f"GSPLAT_EDU_SLICE={COUNT} repeats the slice and its seeds on any commit"
+)
 
 SECONDS: Mapping[str, tuple[float, int]] = {}
 """Processor time of a case and the number of cases, for the tests that take longest; measured with one thread.
@@ -190,11 +193,14 @@ def split(
 
 def pytest_report_header() -> str:
     """Report which slice of the long tests runs."""
+    repeat = f"GSPLAT_EDU_SLICE={COUNT}"
     if SOAK:
-        return f"sliced tests: {f'shard {SHARD}' if CHOSEN in NAMES else 'every case'} of the soak, GSPLAT_EDU_SLICE={COUNT}"
+        return f"sliced tests: {f'shard {SHARD}' if CHOSEN in NAMES else 'every case'} of the soak, {repeat}"
     shard = "no shard" if CHOSEN == "none" else f"shard {SHARD} of 0 to {SHARDS - 1}"
     missing = f"; {HISTORY.missing}" if HISTORY.missing else ""
-    return f"sliced tests: {shard}, GSPLAT_EDU_SLICE={COUNT}; all cases of {len(TOUCHED)} files that the change touches{missing}"
+    return (
+        f"sliced tests: {shard}, {repeat}; all cases of {len(TOUCHED)} files that the change touches{missing}"
+    )
 
 
 def wanted(config: pytest.Config, item: pytest.Item) -> bool:

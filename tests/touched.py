@@ -1,14 +1,15 @@
 """What a change touches: the test files whose sliced cases all run (slices.py).
 
-The change is what the working tree, staged, unstaged and untracked files included, differs in from a base. The base is
-the merge base of HEAD with the main branch (origin/main, else main), if HEAD is ahead of it. On the main branch itself it
-is HEAD's first parent, so that a commit is tested alike before and after it is made. GSPLAT_EDU_BASE names another one.
+The change is every path in which the working tree (staged, unstaged and untracked files included) differs from a base.
+The base is the merge base of HEAD with the main branch (origin/main, else main) if HEAD is ahead of that branch. On the
+main branch itself it is HEAD's first parent, so uncommitted work there is tested together with the last commit.
+GSPLAT_EDU_BASE names another base.
 
-- A test file that changed is touched. A changed conftest.py, or a file beside tests that is no test, touches its folder.
+- A changed test file is touched. A changed conftest.py touches the tests of its folder, and so do data beside tests.
 - A helper of tests touches the test files that import it, also through other helpers.
 - src/gsplat_edu/PACKAGE touches tests/PACKAGE, tests/test_PACKAGE.py and what ELSEWHERE names.
 - A module without tests of its own, and one of the root package, touches the test files that import it. If at most
-  FEW packages import it, their tests are touched as well. Modules below everything stop there: all else waits its turn.
+  FEW packages import it, their tests are touched as well. With more users (errors.py), the other tests wait their turn.
 - A chapter or a benchmark touches the cases that carry its name; other files touch what ELSEWHERE names.
 """
 
@@ -36,7 +37,7 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "CMakeLists.txt": ("repo/test_wheels.py",),
     "pyproject.toml": ("repo/test_layering.py", "repo/test_wheels.py"),
 }
-"""Tests, below tests/, of files and folders beside src/gsplat_edu/PACKAGE, or of packages in folders of another name."""
+"""Tests, below tests/, of files outside the package, and of packages whose tests are in folders of another name."""
 
 
 @dataclass(frozen=True)
