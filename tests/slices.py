@@ -57,8 +57,42 @@ HOW_TO_REPEAT = (
     f"GSPLAT_EDU_SLICE={COUNT} repeats the slice and its seeds on any commit"
 )
 
-SECONDS: Mapping[str, tuple[float, int]] = {}
-"""Processor time of a case and the number of cases, for the tests that take longest; measured with one thread.
+SECONDS: Mapping[str, tuple[int, int]] = {
+    "tests/cli/test_train_3d.py::test_the_default_budget_trains_end_to_end": (51, 1),
+    "tests/repo/test_site.py": (38, 1),
+    "tests/sfm/test_panoramas.py": (37, 1),
+    "tests/studio/test_page.py::test_from_dropped_photos_to_a_downloaded_scene": (26, 1),
+    "tests/studio/test_page_intake.py::test_a_dropped_video_becomes_a_capture": (22, 1),
+    "tests/repo/test_wheels.py": (22, 1),
+    "tests/runs/test_processes.py::test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed": (16, 4),
+    "tests/sfm/test_video.py::test_frames_become_a_capture": (14, 1),
+    "tests/runs/test_pilot.py::test_poses_are_refined_if_they_are_wrong": (11, 2),
+    "tests/sfm/test_training.py::test_one_command": (10, 2),
+    "tests/studio/test_page_pictures.py::test_a_training_is_drawn_while_it_runs": (9, 1),
+    "tests/sfm/test_reconstruct.py::test_an_interrupted_run_resumes_after_the_last_completed_stage": (9, 1),
+    "tests/cli/test_view.py::test_the_browser_opens_for_a_user_at_a_screen": (7, 1),
+    "tests/gpu/test_training.py::test_a_training_is_reproducible": (7, 1),
+    "tests/train/test_exposure.py::test_exposures_come_back_and_the_held_out_quality_with_them": (7, 1),
+    "tests/train/test_exposure_alpha.py::test_exposures_of_transparent_photos_come_back": (7, 1),
+    "tests/sfm/test_wrong_poses.py": (7, 1),
+    "tests/sfm/test_phone_photos.py::test_photos_of_a_phone_become_an_upright_capture_in_srgb": (6, 1),
+    "tests/blocks/test_cluster.py::test_a_killed_worker_and_a_killed_scheduler_lose_nothing": (6, 1),
+    "tests/compat/test_rasterization.py::test_finite_differences": (6, 2),
+    "tests/sfm/test_lenses.py": (5, 1),
+    "tests/clean/test_judge.py::test_the_same_bits_on_any_number_of_threads": (5, 2),
+    "tests/runs/test_lod_refinement.py::test_refined_levels_match_the_photos_better": (5, 1),
+    "tests/budget/test_plan.py::test_a_training_stays_below_its_memory_limit_as_the_system_counts_it": (5, 1),
+    "tests/sfm/test_scale.py::test_gps_gives_scale_and_up_end_to_end": (5, 1),
+    "tests/runs/test_processes.py::test_a_mistake_is_reported_once": (5, 5),
+    "tests/native/test_robustness.py::test_memory_does_not_grow": (5, 1),
+    "tests/cli/test_sky.py::test_a_killed_run_ends_with_the_same_bytes": (5, 1),
+    "tests/blocks/test_runs.py::test_a_command_for_each_block_gives_the_bytes_of_one_command_for_all": (5, 1),
+    "tests/gpu/test_training.py::test_checkpoints_resume_on_either_backend": (5, 2),
+    "tests/sfm/test_reconstruct.py::test_focal_lengths_from_exif_separate_two_cameras": (4, 1),
+    "tests/gpu/test_compile.py::test_every_kernel_compiles_with_few_spills": (4, 12),
+    "tests/runs/test_transients.py::test_a_killed_and_resumed_run_writes_the_same_bytes": (4, 1),
+}
+"""Processor time of a case in seconds and the number of cases of the longest tests. A file that runs together is a case.
 
 The first cases of these tests are spread over the shards by this time. Other tests begin at a shard by their name.
 """

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 
-FEW = 4
+FEW = 6
 
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     "src/gsplat_edu/render": ("native", "parity", "gradients"),
