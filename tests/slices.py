@@ -17,7 +17,7 @@ In a shallow clone and outside git, the count and the change are unknown. Then s
     GSPLAT_EDU_SHARD   0 to 7: this shard alone; none: only what the change touches
     GSPLAT_EDU_BASE    the commit with which the working tree is compared (touched.py)
     GSPLAT_EDU_SOAK    1: the soak's sizes and, without GSPLAT_EDU_SHARD, every case (`make soak`)
-    GSPLAT_EDU_SPLIT   all: a shard takes an eighth of every test's cases, sliced or not
+    GSPLAT_EDU_SPLIT   all: the shard of GSPLAT_EDU_SHARD takes an eighth of every test's cases, sliced or not
 
 conftest.py imports the hooks from here. `python tests/slices.py` prints the shard of this commit.
 """
@@ -40,7 +40,7 @@ SOAK = os.environ.get("GSPLAT_EDU_SOAK", "") not in ("", "0")
 CHOSEN = os.environ.get("GSPLAT_EDU_SHARD", "")
 if CHOSEN not in ("", "none", *NAMES):
     raise pytest.UsageError(f"GSPLAT_EDU_SHARD is {CHOSEN!r}; give a number from 0 to {SHARDS - 1}, or none")
-EVERY_TEST = os.environ.get("GSPLAT_EDU_SPLIT", "") == "all"
+EVERY_TEST = CHOSEN in NAMES and os.environ.get("GSPLAT_EDU_SPLIT", "") == "all"
 
 HISTORY = touched.history(ROOT)
 # Stored in the environment, so that the workers of pytest-xdist choose the same cases, whatever changes meanwhile.
@@ -92,7 +92,7 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     "tests/gpu/test_compile.py::test_every_kernel_compiles_with_few_spills": (4, 12),
     "tests/runs/test_transients.py::test_a_killed_and_resumed_run_writes_the_same_bytes": (4, 1),
 }
-"""Processor time of a case in seconds and the number of cases of the longest tests. A file that runs together is a case.
+"""Processor time of a case in seconds, and the number of cases, of the longest tests. A file that runs together is one.
 
 The first cases of these tests are spread over the shards by this time. Other tests begin at a shard by their name.
 """

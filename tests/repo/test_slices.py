@@ -112,6 +112,14 @@ def test_a_cases_shard_depends_on_no_other_test():
     assert alone == {item: shard for item, shard in slices.numbered(items).items() if item in alone}
 
 
+def test_a_shard_may_take_an_eighth_of_every_test(monkeypatch):
+    items = cases("one", None, range(16)) + cases("two", pytest.mark.sliced(3), range(8))
+    assert all(len(kept) == 16 + 1 for kept in runs(items, soak=True))
+    monkeypatch.setattr(slices, "EVERY_TEST", True)
+    assert Counter(name for kept in runs(items, soak=True) for name in kept) == dict.fromkeys(names(items), 1)
+    assert all(len(kept) == 2 + 1 for kept in runs(items, soak=True))
+
+
 def test_no_shard_leaves_only_what_the_change_touches():
     items = cases("long", pytest.mark.sliced(3), range(12)) + cases("short", None, range(4))
     shards = slices.numbered(items)
@@ -176,6 +184,8 @@ def test_a_failure_says_how_to_repeat_its_slice(tmp_path):
         ((), {"GSPLAT_EDU_TOUCHED": "test_failing.py"}, "5 failed"),
         ((), {"GSPLAT_EDU_TOUCHED": "[3]", "GSPLAT_EDU_SHARD": "none"}, "1 failed, 4 deselected"),
         ((), {"GSPLAT_EDU_SOAK": "1"}, "5 failed"),
+        ((), {"GSPLAT_EDU_SOAK": "1", "GSPLAT_EDU_SPLIT": "all"}, "5 failed"),
+        ((), {"GSPLAT_EDU_SOAK": "1", "GSPLAT_EDU_SHARD": "4"}, "deselected"),
         ((), {"GSPLAT_EDU_SHARD": "8"}, "GSPLAT_EDU_SHARD is '8'; give a number from 0 to 7, or none"),
     ],
 )
