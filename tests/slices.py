@@ -58,6 +58,7 @@ HOW_TO_REPEAT = (
 )
 
 SECONDS: Mapping[str, tuple[int, int]] = {
+    "tests/golden/test_chapter_trajectory.py::test_the_first_iterations_give_the_numbers_of_the_chapter": (95, 1),
     "tests/cli/test_train_3d.py::test_the_default_budget_trains_end_to_end": (51, 1),
     "tests/repo/test_site.py": (38, 1),
     "tests/sfm/test_panoramas.py": (37, 1),
@@ -66,6 +67,10 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     "tests/repo/test_wheels.py": (22, 1),
     "tests/runs/test_processes.py::test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed": (16, 4),
     "tests/sfm/test_video.py::test_frames_become_a_capture": (14, 1),
+    "tests/train/test_vignetting.py::test_dark_corners_come_back_and_the_held_out_quality_with_them": (14, 1),
+    "tests/repo/test_notebooks.py::test_chapters_execute_on_a_reduced_budget": (14, 13),
+    "tests/train/test_transients.py::test_most_of_what_true_masks_give_comes_back": (13, 1),
+    "tests/train/test_poses.py::test_wrong_poses_come_back_and_the_held_out_quality_with_them": (12, 1),
     "tests/runs/test_pilot.py::test_poses_are_refined_if_they_are_wrong": (11, 2),
     "tests/sfm/test_training.py::test_one_command": (10, 2),
     "tests/studio/test_page_pictures.py::test_a_training_is_drawn_while_it_runs": (9, 1),
@@ -84,6 +89,7 @@ SECONDS: Mapping[str, tuple[int, int]] = {
     "tests/budget/test_plan.py::test_a_training_stays_below_its_memory_limit_as_the_system_counts_it": (5, 1),
     "tests/sfm/test_scale.py::test_gps_gives_scale_and_up_end_to_end": (5, 1),
     "tests/runs/test_processes.py::test_a_mistake_is_reported_once": (5, 5),
+    "tests/train/test_trainer.py::test_two_runs_give_the_same_bits": (5, 2),
     "tests/native/test_robustness.py::test_memory_does_not_grow": (5, 1),
     "tests/cli/test_sky.py::test_a_killed_run_ends_with_the_same_bytes": (5, 1),
     "tests/blocks/test_runs.py::test_a_command_for_each_block_gives_the_bytes_of_one_command_for_all": (5, 1),
