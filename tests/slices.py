@@ -58,7 +58,10 @@ HOW_TO_REPEAT = (
 )
 
 SECONDS: Mapping[str, tuple[int, int]] = {
-    "tests/golden/test_chapter_trajectory.py::test_the_first_iterations_give_the_numbers_of_the_chapter": (95, 1),
+    "tests/golden/test_chapter_trajectory.py::test_the_first_iterations_give_the_numbers_of_the_chapter": (
+        40,
+        1,
+    ),
     "tests/cli/test_train_3d.py::test_the_default_budget_trains_end_to_end": (51, 1),
     "tests/repo/test_site.py": (38, 1),
     "tests/sfm/test_panoramas.py": (37, 1),
