@@ -28,6 +28,7 @@ from typing import Any
 import hardware
 import numpy as np
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.blocks.cluster import ClusterOptions, run_on_cluster
 from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.merge import finished_blocks, merged
@@ -37,7 +38,6 @@ from gsplat_edu.blocks.split import SplitOptions, coarse_scene, split_capture
 from gsplat_edu.blocks.task import block_options
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.city import City, write_city
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.io.ply import save_ply

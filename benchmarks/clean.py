@@ -38,9 +38,9 @@ from gsplat_edu.clean.judge import Reason
 from gsplat_edu.clean.plant import floaters
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.evaluate.metrics import score_views, summarize
-from gsplat_edu.gaussians import Gaussians, quat_to_R_t
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.cleaning import Subject, open_subject
+from gsplat_edu.scene.gaussians import Gaussians, quat_to_R_t
 
 MILLION = 1_000_000
 

@@ -39,9 +39,9 @@ def serve(module: Path, capture: Path, views: int) -> None:
     load(module)
     import torch
 
-    from gsplat_edu.buffers import reused_buffers
+    from gsplat_edu.base.buffers import reused_buffers
     from gsplat_edu.data.dataset import load_dataset
-    from gsplat_edu.losses import photo_loss
+    from gsplat_edu.ops.losses import photo_loss
     from gsplat_edu.render.api import render
     from gsplat_edu.render.settings import RenderSettings
     from gsplat_edu.train.config import TrainConfig

@@ -17,9 +17,9 @@ import torch
 
 from gsplat_edu import Camera
 from gsplat_edu.data.synthetic import sphere_cameras
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.initialize import random_ball
 
 CHUNKS = (512, 128, 64, 32, 16, 8, 4)

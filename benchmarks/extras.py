@@ -23,18 +23,18 @@ import hardware
 import torch
 from captures import capture
 
-from gsplat_edu.buffers import reused_buffers
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.buffers import reused_buffers
 from gsplat_edu.data.dataset import load_dataset
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import read_scene
-from gsplat_edu.losses import photo_loss
+from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.views import View
 
 WARM_UP = 2
 CHANNELS = (1, 3, 7, 16, 32)

@@ -43,8 +43,8 @@ from captures import capture
 from jaxtyping import Bool, Float64
 from traced import traced_capture
 
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.camera import Camera
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
 from gsplat_edu.data.dataset import load_dataset, scene_extent
@@ -52,14 +52,14 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
 from gsplat_edu.evaluate.metrics import score_views, summarize
-from gsplat_edu.exposure import stops
+from gsplat_edu.ops.exposure import stops
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import Photo, View
 from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.poses import Refinement, gauge
 from gsplat_edu.train.transients import resized_mask
-from gsplat_edu.validation import ArrayLike
-from gsplat_edu.views import Photo, View
 
 TRACED = "traced"
 """Name of the capture that is traced here."""

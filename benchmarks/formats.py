@@ -21,11 +21,11 @@ import hardware
 import torch
 
 from gsplat_edu.cli.arguments import run_command
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import FORMATS
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.source import Source, open_source
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import export
 
 ROUNDS = 3

@@ -28,17 +28,17 @@ import torch
 from jaxtyping import Bool, Float64
 from traced import LIGHT, Scene, Shape, camera_at, checks, photographed, placed
 
+from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.camera import Camera
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
-from gsplat_edu.constants import SH_MAX_DEGREE
 from gsplat_edu.data.writers import write_blender
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.runs.training import CaptureRun
-from gsplat_edu.sh import sh_basis
-from gsplat_edu.validation import whole_number
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.sh import sh_basis
+from gsplat_edu.scene.views import View
 
 PLATE, GREY = 0.6, (0.22, 0.3, 0.24)
 """Strength of the plate's highlight and its darker colour; the brighter one is a tenth brighter."""

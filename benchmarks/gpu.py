@@ -22,11 +22,11 @@ import hardware
 import torch
 
 from gsplat_edu import Camera
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import photo_loss
+from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import gaussian_groups

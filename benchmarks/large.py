@@ -27,8 +27,8 @@ def measured(count: int, z: float) -> dict[str, Any]:
     """Take the steps; return memory in GiB and the second step's milliseconds."""
     import torch
 
-    from gsplat_edu.buffers import reused_buffers
-    from gsplat_edu.losses import photo_loss
+    from gsplat_edu.base.buffers import reused_buffers
+    from gsplat_edu.ops.losses import photo_loss
     from gsplat_edu.render.api import render
     from gsplat_edu.render.settings import RenderSettings
     from gsplat_edu.train.config import TrainConfig
@@ -57,8 +57,8 @@ def scene(count: int) -> Any:  # noqa: ANN401
     """Make the Gaussians without a second copy of their harmonics."""
     import torch
 
-    from gsplat_edu.gaussians import Gaussians
-    from gsplat_edu.morton import order_in_space
+    from gsplat_edu.scene.gaussians import Gaussians
+    from gsplat_edu.scene.morton import order_in_space
 
     generator = torch.Generator().manual_seed(0)
 
@@ -80,7 +80,7 @@ def camera(z: float) -> Any:  # noqa: ANN401
     """Return a camera that looks along the z axis."""
     import numpy as np
 
-    from gsplat_edu.camera import Camera
+    from gsplat_edu.scene.camera import Camera
 
     return Camera(np.eye(3), np.array([0.0, 0.0, z]), FOCAL, FOCAL, (W - 1) / 2, (H - 1) / 2, H, W)
 

@@ -48,9 +48,9 @@ def make_capture(folder: Path, size: int, count: int) -> None:
         size: Height and width of the photos, px.
         count: Number of training photos.
     """
-    from gsplat_edu.camera import Camera, look_at
     from gsplat_edu.data.writers import write_blender
-    from gsplat_edu.views import View
+    from gsplat_edu.scene.camera import Camera, look_at
+    from gsplat_edu.scene.views import View
 
     views, total, focal = [], count + TEST_PHOTOS, 1.2 * size
     for i in range(total):

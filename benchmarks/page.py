@@ -37,9 +37,9 @@ import hardware
 import torch
 from live import FLAGS, browser_seconds
 
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.gaussians import Gaussians
 
 COUNTS = (200_000, 1_000_000)
 WINDOWS = {"laptop": (1280, 720), "phone": (390, 844)}

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 
 from gsplat_edu import Camera, SplatError, build_cov3d_batch, eval_sh, quat_to_R_batch, render_gaussians
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, T_STOP, TILE, Z_NEAR
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, DILATION, T_STOP, TILE, Z_NEAR
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
 
 SETTINGS = RenderSettings(depth=False, background=(0.2, 0.5, 0.9))
 EPS = 2.0**-24

@@ -36,21 +36,21 @@ from captures import capture
 from matplotlib.figure import Figure
 from traced import traced_capture
 
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.budget.plan import Limits, plan
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
 from gsplat_edu.data.writers import write_blender
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.figures import save_figure
 from gsplat_edu.evaluate.metrics import ImageScore, OnImage, score_views, summarize
-from gsplat_edu.files import written_aside
 from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import QUALITIES
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.trainer import Trainer
-from gsplat_edu.validation import in_range, whole_number
-from gsplat_edu.views import View
 
 try:
     import flip_evaluator

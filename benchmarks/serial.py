@@ -23,21 +23,21 @@ import numpy as np
 import torch
 from captures import capture
 
-from gsplat_edu.buffers import reused_buffers
+from gsplat_edu.base.buffers import reused_buffers
 from gsplat_edu.data.dataset import Dataset, load_dataset
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import read_scene
-from gsplat_edu.kernels import native
-from gsplat_edu.losses import photo_loss
+from gsplat_edu.ops.kernels import native
+from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.feed import ViewFeed
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.optimizer import Adam, ParameterGroup
 from gsplat_edu.train.schedule import gaussian_groups
-from gsplat_edu.views import View
 
 STAGES = ("project", "sort", "intersect", "composite", "composite_backward", "project_backward, Adam")
 COUNT = 160_000

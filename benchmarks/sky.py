@@ -26,20 +26,20 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
+from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.budget.plan import Limits, plan
-from gsplat_edu.camera import Camera, look_at
 from gsplat_edu.cli.arguments import OneLineParser, run_command
 from gsplat_edu.cli.options import train as command
-from gsplat_edu.constants import C0, SH_OFFSET
 from gsplat_edu.data.outdoors import outdoor_capture, photograph
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.remedies import remedies_for
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.runs import skies
 from gsplat_edu.runs.training import CaptureRun
-from gsplat_edu.shells import far_shell
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.scene.views import View
 
 Judges = Sequence[tuple[View, Bool[np.ndarray, "_ _"]]]
 """Views and where they show the sky."""

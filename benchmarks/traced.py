@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.views import View
 
 Points = Float64[np.ndarray, "3 N"]
 """Points, directions or colours; components first, since NumPy reduces a short last axis slowly."""

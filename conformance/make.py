@@ -20,13 +20,13 @@ import torch
 from safetensors.numpy import save_file
 
 from gsplat_edu import Camera, build_cov3d_batch, project_cov3d, quat_to_R_batch, render_gaussians, sh_basis
-from gsplat_edu.constants import ALPHA_MIN, SH_OFFSET
-from gsplat_edu.gaussian_math import opacity_compensation
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import ALPHA_MIN, SH_OFFSET
 from gsplat_edu.render.api import render
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.numpy_reference import project
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussian_math import opacity_compensation
+from gsplat_edu.scene.gaussians import Gaussians
 from kit_scenes import Arrays, Plan, plans
 from run import CASES, EPSILON, INPUT_ROUNDINGS, T_STOP, load_cases, tolerance
 

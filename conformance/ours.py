@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of
 from gsplat_edu.render.camera_tensors import INTRINSICS, CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
 
 Arrays = dict[str, Any]
 

@@ -1,4 +1,4 @@
-// Made by tools/generate_constants.py from src/gsplat_edu/constants.py. Do not edit.
+// Made by tools/generate_constants.py from src/gsplat_edu/base/constants.py. Do not edit.
 // clang-format off
 #pragma once
 

@@ -1,5 +1,5 @@
 // The mathematics of a Gaussian, forward and backward: quaternion, covariance, projection, harmonics; a lane for each
-// Gaussian. Mirrors src/gsplat_edu/gaussian_math.py and sh.py. Compiled once per instruction set, like simd.h.
+// Gaussian. Mirrors src/gsplat_edu/scene/gaussian_math.py and sh.py. Compiled once per instruction set, like simd.h.
 #pragma once
 
 #include "kernels.h"

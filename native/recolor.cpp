@@ -1,7 +1,7 @@
 // recolor: an image through one matrix of colours, y = A x + b + T s, and back. T is the transmittance, s the shift; see bindings.cpp.
 //
 // A falloff v scales the light of the object: v (y + o - T (o + c)) - o + T (o + c), with o = 0.055 and the background c. These are the
-// premultiplied colours y - T c, with (1 - T) o added and subtracted as `gsplat_edu.exposure` does for opaque ones.
+// premultiplied colours y - T c, with (1 - T) o added and subtracted as `gsplat_edu.ops.exposure` does for opaque ones.
 //
 // Where the photo is saturated (255), y above 1 counts as 1 and has no gradient: such a pixel says only that the scene is at least
 // that bright, not how bright.

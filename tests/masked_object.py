@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsplat_edu.data import procedural
-from gsplat_edu.views import View
+from gsplat_edu.scene.views import View
 
 ROOM = 6.0
 """Radius of the sphere that is painted as the room."""

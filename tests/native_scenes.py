@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from gsplat_edu import Camera, build_cov3d_batch, eval_sh, project_cov3d, quat_to_R_batch, render_gaussians
-from gsplat_edu.constants import DILATION
-from gsplat_edu.gaussian_math import opacity_compensation
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import DILATION
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussian_math import opacity_compensation
+from gsplat_edu.scene.gaussians import Gaussians
 
 BACKGROUND = (0.2, 0.5, 0.9)
 

@@ -9,7 +9,7 @@ import functools
 import cv2
 import numpy as np
 
-from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.scene.camera import Camera, look_at
 
 ROOM = np.array([[-3.0, -2.2, -2.5], [3.0, 0.6, 2.5]])
 """Lowest and highest corner, world units; y points down, so the floor is y = 0.6."""

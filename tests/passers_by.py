@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsplat_edu.views import View
+from gsplat_edu.scene.views import View
 
 
 def pasted(views, share=0.3, seed=3, area=0.05):

@@ -11,7 +11,7 @@ from datetime import timedelta
 import torch
 import torch.distributed as dist
 
-from gsplat_edu.errors import ProcessLostError
+from gsplat_edu.base.errors import ProcessLostError
 from gsplat_edu.runs.processes import Processes
 
 MEETING = timedelta(seconds=60)

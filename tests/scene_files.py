@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import LOD_META, SOG_META, write_scene
 from gsplat_edu.io.lod import codec as lod
 from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 RUN_UP = np.array([0.0, -0.6, 0.8])
 

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gsplat_edu.camera import orbit_camera
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_transforms
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.camera import orbit_camera
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Start, training
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.views import View
 
 ITERATIONS = 240
 SIZES = {"one": [(320, 240)], "mixed": [(320, 240), (240, 320), (304, 304), (360, 200)]}

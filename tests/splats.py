@@ -3,7 +3,7 @@
 import torch
 
 from gsplat_edu import C0
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.gaussians import Gaussians
 
 
 def splats_on(points, colors) -> Gaussians:

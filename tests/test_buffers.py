@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsplat_edu import buffers
-from gsplat_edu.buffers import LARGE, reusable_tensor, reused_buffers
+from gsplat_edu.base import buffers
+from gsplat_edu.base.buffers import LARGE, reusable_tensor, reused_buffers
 
 SHAPE = (LARGE // 4, 3)
 LIKE = torch.zeros(())
@@ -152,7 +152,7 @@ def test_unused_buffers_are_freed_in_time():
 def test_a_forked_child_has_its_own_copy():
     code = """
 import os, torch
-from gsplat_edu.buffers import reusable_tensor, reused_buffers
+from gsplat_edu.base.buffers import reusable_tensor, reused_buffers
 with reused_buffers():
     image = reusable_tensor((1000, 1000), torch.zeros(())).fill_(1.0)
     child = os.fork()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting, stops
-from gsplat_edu.recolor import recolored
+from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting, stops
+from gsplat_edu.ops.recolor import recolored
 
 
 def decoded(encoded):

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from gsplat_edu import ArgumentError
+from gsplat_edu.base.files import check_writable, described, unreadable, written_aside
 from gsplat_edu.cli.arguments import run_command
-from gsplat_edu.files import check_writable, described, unreadable, written_aside
 from systems import needs_posix
 
 

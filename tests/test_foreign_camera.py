@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from gsplat_edu import ArgumentError, Camera, CameraLike, ShapeError, project_cov3d, render_gaussians
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.render.torch_reference import render_t
+from gsplat_edu.scene.gaussians import Gaussians
 
 pytestmark = pytest.mark.usefixtures("as_shipped")  # otherwise annotations are checked before the arguments
 

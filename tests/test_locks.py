@@ -8,15 +8,15 @@ import sys
 
 import pytest
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.locks import LOCK, locked
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.locks import LOCK, locked
 
 fcntl = pytest.importorskip("fcntl", reason="needs POSIX: flock and fork")
 
 HOLDS = """
 import sys, os
 from pathlib import Path
-from gsplat_edu.locks import locked
+from gsplat_edu.base.locks import locked
 with locked("--out", Path(sys.argv[1]), "gsplat-edu train", print):
     child = os.fork() if sys.argv[2] == "fork" else 1
     if child == 0:

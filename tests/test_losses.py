@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from gsplat_edu import ArgumentError
-from gsplat_edu.losses import l1, l1_ssim
+from gsplat_edu.ops.losses import l1, l1_ssim
 
 
 def test_l1_is_the_mean_over_pixels_and_channels():

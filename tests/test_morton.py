@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsplat_edu.morton import morton_codes, order_in_space
+from gsplat_edu.scene.morton import morton_codes, order_in_space
 
 
 def interleaved(row):

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.gaussians import cov3d_t
-from gsplat_edu.noise import NoiseNumbers, add_noise_in_torch, add_noise_natively, philox, standard_normals
-from gsplat_edu.threads import native_threads, one_thread
+from gsplat_edu.base.threads import native_threads, one_thread
+from gsplat_edu.ops.noise import (
+    NoiseNumbers,
+    add_noise_in_torch,
+    add_noise_natively,
+    philox,
+    standard_normals,
+)
+from gsplat_edu.scene.gaussians import cov3d_t
 from gsplat_edu.train.initialize import random_ball
 
 NUMBERS = NoiseNumbers(seed=0x0123456789ABCDEF, amount=0.7, sharpness=100.0, threshold=0.005)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu import ArgumentError, kernels
-from gsplat_edu.errors import ShapeError
-from gsplat_edu.recolor import Behind, recolored, recolored_in_torch, recolored_natively
+from gsplat_edu import ArgumentError
+from gsplat_edu.base.errors import ShapeError
+from gsplat_edu.ops import kernels
+from gsplat_edu.ops.recolor import Behind, recolored, recolored_in_torch, recolored_natively
 
 BACKGROUND = (0.3, 0.9, 0.6)
 

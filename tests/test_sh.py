@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsplat_edu import C0, eval_sh, sh_basis
-from gsplat_edu.sh import sh_rotation
+from gsplat_edu.scene.sh import sh_rotation
 
 SAMPLES = 400_000
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsplat_edu.shells import far_shell
+from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.sky.find import fibonacci
 
 

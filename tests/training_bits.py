@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsplat_edu import kernels
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.synthetic import sphere_capture
+from gsplat_edu.ops import kernels
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe

@@ -13,10 +13,10 @@ import re
 import sys
 from pathlib import Path
 
+from gsplat_edu.base.files import written_aside
 from gsplat_edu.cli.arguments import OneLineParser
 from gsplat_edu.cli.main import COMMANDS, build_parser
 from gsplat_edu.cli.options import demo
-from gsplat_edu.files import written_aside
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = ROOT / "docs" / "CLI.md"

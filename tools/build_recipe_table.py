@@ -11,7 +11,7 @@ import argparse
 import re
 from pathlib import Path
 
-from gsplat_edu.files import written_aside
+from gsplat_edu.base.files import written_aside
 from gsplat_edu.train.config import FOR_FAST, SETTINGS, Setting
 
 RECIPE = Path(__file__).resolve().parent.parent / "docs" / "RECIPE.md"

@@ -1,6 +1,6 @@
 """Build the site: chapters, documents and the reference of every module, as pages that open from disk.
 
-    python tools/build_site.py [--out out/site] [--members gsplat_edu.camera ...]
+    python tools/build_site.py [--out out/site] [--members gsplat_edu.scene.camera ...]
 
 Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
 reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
@@ -74,9 +74,9 @@ PUBLIC = {
     "Course (NumPy, from `gsplat_edu`)": "gsplat_edu",
     "Rendering": (
         "gsplat_edu.render.api.render",
-        "gsplat_edu.gaussians.Gaussians",
-        "gsplat_edu.camera.Camera",
-        "gsplat_edu.intrinsics.Intrinsics",
+        "gsplat_edu.scene.gaussians.Gaussians",
+        "gsplat_edu.scene.camera.Camera",
+        "gsplat_edu.scene.intrinsics.Intrinsics",
         "gsplat_edu.render.settings.RenderSettings",
         "gsplat_edu.render.output.RenderOutput",
         "gsplat_edu.render.cpu.render_covariances",
@@ -86,8 +86,8 @@ PUBLIC = {
     "Captures": (
         "gsplat_edu.data.dataset.load_dataset",
         "gsplat_edu.data.dataset.scene_extent",
-        "gsplat_edu.views.View",
-        "gsplat_edu.views.Photo",
+        "gsplat_edu.scene.views.View",
+        "gsplat_edu.scene.views.Photo",
     ),
     "Training": (
         "gsplat_edu.train.config.recipe",
@@ -95,7 +95,7 @@ PUBLIC = {
         "gsplat_edu.train.initialize.from_points",
         "gsplat_edu.train.initialize.make_strategy",
         "gsplat_edu.train.trainer.Trainer",
-        "gsplat_edu.losses.photo_loss",
+        "gsplat_edu.ops.losses.photo_loss",
     ),
     "Scene files": (
         "gsplat_edu.io.formats.read_scene",

@@ -1,4 +1,4 @@
-"""Write native/constants.h from src/gsplat_edu/constants.py, so that each constant is defined once.
+"""Write native/constants.h from src/gsplat_edu/base/constants.py, so that each constant is defined once.
 
     python tools/generate_constants.py
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from gsplat_edu import constants as c
+from gsplat_edu.base import constants as c
 
 HEADER = Path(__file__).resolve().parent.parent / "native" / "constants.h"
 NAMES = (
@@ -39,7 +39,7 @@ SSIM_TAPS = 6
 def header() -> str:
     """Return the text of the header."""
     lines = [
-        "// Made by tools/generate_constants.py from src/gsplat_edu/constants.py. Do not edit.",
+        "// Made by tools/generate_constants.py from src/gsplat_edu/base/constants.py. Do not edit.",
         "// clang-format off",
         "#pragma once",
     ]

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import hardware
 
-from gsplat_edu.errors import BackendUnavailableError
+from gsplat_edu.base.errors import BackendUnavailableError
 from ladder import forward
 from ladder.splats import scene
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsplat_edu.constants import TILE
+from gsplat_edu.base.constants import TILE
 from ladder.build import library
 from ladder.splats import Splats
 

@@ -13,8 +13,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from gsplat_edu.constants import LAMBDA_FLOOR
-from gsplat_edu.errors import BackendUnavailableError
+from gsplat_edu.base.constants import LAMBDA_FLOOR
+from gsplat_edu.base.errors import BackendUnavailableError
 
 HERE = Path(__file__).resolve().parent
 NATIVE = HERE.parents[1] / "native"

@@ -21,7 +21,7 @@ os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")  # otherwise triton 3.9 w
 import triton  # noqa: E402
 import triton.language as tl  # noqa: E402
 
-from gsplat_edu import constants  # noqa: E402
+from gsplat_edu.base import constants  # noqa: E402
 from ladder.splats import Splats  # noqa: E402
 
 ALPHA_MIN, ALPHA_MAX = tl.constexpr(constants.ALPHA_MIN), tl.constexpr(constants.ALPHA_MAX)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN
 from gsplat_edu.render.numpy_reference import Extent, Stop, render_gaussians
 from ladder.splats import Splats
 

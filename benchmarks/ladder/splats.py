@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.constants import DILATION, Z_NEAR
+from gsplat_edu.base.constants import DILATION, Z_NEAR
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.render.numpy_reference import project
-from gsplat_edu.validation import ArrayLike
+from gsplat_edu.scene.camera import Camera
 
 SIGMA = 2.0
 """px: standard deviation of the splats of `scene` before their dilation, as in benchmarks/raster.py."""

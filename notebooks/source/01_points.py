@@ -110,7 +110,7 @@ print(turned_camera.R.round(3))
 print(f"largest difference from Camera.project: {np.abs(mine - theirs).max():.1e} px")
 
 # %% [markdown]
-# [gsplat_edu.camera](../src/gsplat_edu/camera.py) is this with checks around it, and for all points at
+# [gsplat_edu.scene.camera](../src/gsplat_edu/scene/camera.py) is this with checks around it, and for all points at
 # once. From here on it does the projecting.
 #
 # ## Which of them

@@ -25,7 +25,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from gsplat_edu import ALPHA_MIN, DILATION
-from gsplat_edu.gaussian_math import opacity_compensation
+from gsplat_edu.scene.gaussian_math import opacity_compensation
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 DRAWN, SPOTS = (20_000, 41) if SHORT else (400_000, 161)
@@ -242,7 +242,7 @@ plt.show()
 #
 # By the formula above this $\delta$ leaves a ripple of $2e^{-2\pi^2\delta}$ in one dimension. A smaller one
 # would flicker, a larger one would blur everything. The value is that of the code of Kerbl et al. (2023), and
-# stands once, in [gsplat_edu.constants](../src/gsplat_edu/constants.py).
+# stands once, in [gsplat_edu.base.constants](../src/gsplat_edu/base/constants.py).
 
 # %%
 added_up = samples + rng.normal(size=(DRAWN, 2)) * np.sqrt(DILATION)
@@ -264,7 +264,7 @@ print(f"ripple left in one dimension: {2 * np.exp(-2 * np.pi**2 * DILATION):.4f}
 # $$\rho = \sqrt{\frac{\det\Sigma}{\det(\Sigma + \delta I)}},$$
 #
 # as Mip-Splatting (Yu et al. 2024) does. In the package it is `opacity_compensation`, in
-# [gsplat_edu.gaussian_math](../src/gsplat_edu/gaussian_math.py).
+# [gsplat_edu.scene.gaussian_math](../src/gsplat_edu/scene/gaussian_math.py).
 
 # %%
 MODES = ("as it is", "dilated", "dilated, compensated")

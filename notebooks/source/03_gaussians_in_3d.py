@@ -197,8 +197,9 @@ assert np.allclose(R @ axis, axis, rtol=0, atol=1e-14) and np.isclose(np.trace(R
 print("q v q* agrees with quat_to_R")
 
 # %% [markdown]
-# Both functions, `quat_to_R` and `build_cov3d`, are in [gsplat_edu.gaussian_math](../src/gsplat_edu/gaussian_math.py).
-# What they make is an ellipsoid: the points at one standard deviation, with the columns of $R$ as axes.
+# Both functions, `quat_to_R` and `build_cov3d`, are in
+# [gsplat_edu.scene.gaussian_math](../src/gsplat_edu/scene/gaussian_math.py). What they make is an ellipsoid: the points
+# at one standard deviation, with the columns of $R$ as axes.
 
 # %%
 ball = rng.normal(size=(DRAWN, 3))
@@ -260,9 +261,9 @@ assert np.all(
 )  # the skewness of n normal numbers varies by that
 
 # %% [markdown]
-# The pinhole of [gsplat_edu.camera](../src/gsplat_edu/camera.py) divides by depth. Points of the near end of a splat
-# are spread out more than those of the far end. So take one that is long, leans away from the camera and stands off
-# the axis, and walk towards it along one ray.
+# The pinhole of [gsplat_edu.scene.camera](../src/gsplat_edu/scene/camera.py) divides by depth. Points of the near end
+# of a splat are spread out more than those of the far end. So take one that is long, leans away from the camera and
+# stands off the axis, and walk towards it along one ray.
 
 # %%
 DIRECTION = np.array([0.3, 0.1, 1.0])  # of the ray, scaled to depth 1

@@ -28,7 +28,7 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 
 from gsplat_edu import ALPHA_MIN, DILATION, Z_NEAR, Camera, sphere_shell
-from gsplat_edu.gaussian_math import build_cov3d, project_cov3d, quat_to_R
+from gsplat_edu.scene.gaussian_math import build_cov3d, project_cov3d, quat_to_R
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 CLOUD, PAIRS_DRAWN = (100_000, 50_000) if SHORT else (400_000, 400_000)
@@ -131,8 +131,8 @@ assert np.abs(J @ close_mean).max() < 1e-12
 # two by two, in square pixels, around the projected mean. The formula is that of Zwicker et al. (2001). They convolve
 # this ellipse with the pixel's low-pass filter, as chapter 02 does with its dilation, and call that EWA splatting,
 # after Heckbert's elliptical weighted average. The ellipse is the *splat*. Written out it is one line, and
-# `project_cov3d` in [gsplat_edu.gaussian_math](../src/gsplat_edu/gaussian_math.py) is that line for many Gaussians at
-# once.
+# `project_cov3d` in [gsplat_edu.scene.gaussian_math](../src/gsplat_edu/scene/gaussian_math.py) is that line for many
+# Gaussians at once.
 
 
 # %%

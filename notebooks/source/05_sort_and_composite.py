@@ -15,9 +15,10 @@
 # # 05 - Which one is in front
 #
 # [Chapter 04](04_splatting.ipynb) gave every Gaussian its ellipse, and ended with a sphere whose far side was painted
-# over the near one. The scene here is the same: `sphere_shell` of [gsplat_edu.scenes](../src/gsplat_edu/scenes.py),
-# flat disks on the unit sphere, coloured by where they are. It makes a good test, because the right picture is known
-# without any splats: each ray shows the colour of the point where it first meets the sphere.
+# over the near one. The scene here is the same: `sphere_shell` of
+# [gsplat_edu.scene.sphere_shell](../src/gsplat_edu/scene/sphere_shell.py), flat disks on the unit sphere, coloured by
+# where they are. It makes a good test, because the right picture is known without any splats: each ray shows the colour
+# of the point where it first meets the sphere.
 
 # %%
 import os
@@ -26,7 +27,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from gsplat_edu import build_cov3d_batch, orbit_camera, project_cov3d, render_gaussians, sphere_shell
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, T_STOP, Z_NEAR
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, DILATION, T_STOP, Z_NEAR
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 EDGE = 64 if SHORT else 128

@@ -25,8 +25,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from gsplat_edu import C0, eval_sh, orbit_camera, quat_to_R, render_gaussians, sh_basis, sphere_shell
-from gsplat_edu.constants import SH_OFFSET
-from gsplat_edu.sh import num_coefficients, sh_rotation
+from gsplat_edu.base.constants import SH_OFFSET
+from gsplat_edu.scene.sh import num_coefficients, sh_rotation
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 EDGE, SPLATS = (64, 1200) if SHORT else (128, 2500)
@@ -164,10 +164,11 @@ assert np.abs(coarse - np.eye(16)).max() > 0.1
 
 # %% [markdown]
 # The loop above is Gram and Schmidt's: take a polynomial, remove what earlier ones explain, scale the rest to length
-# one. It yields every constant of `sh_basis` in [gsplat_edu.sh](../src/gsplat_edu/sh.py) up to rounding, which for
-# sums of 28 terms of order one is about $10^{-14}$; ten times that is asserted. Only the order and the signs are a
-# convention: within a degree from $m = -l$ to $l$, and every second one of the sixteen negative. They are those of
-# Kerbl et al.'s code, and a scene file means nothing without them. The functions are called real spherical harmonics.
+# one. It yields every constant of `sh_basis` in [gsplat_edu.scene.sh](../src/gsplat_edu/scene/sh.py) up to rounding,
+# which for sums of 28 terms of order one is about $10^{-14}$; ten times that is asserted. Only the order and the signs
+# are a convention: within a degree from $m = -l$ to $l$, and every second one of the sixteen negative. They are those
+# of Kerbl et al.'s code, and a scene file means nothing without them. The functions are called real spherical
+# harmonics.
 
 # %%
 polar, azimuth = np.meshgrid(np.linspace(0, np.pi, 60), np.linspace(-np.pi, np.pi, 120), indexing="ij")

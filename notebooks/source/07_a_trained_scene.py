@@ -30,11 +30,11 @@ from gsplat_edu import C0, Camera, build_cov3d_batch, eval_sh, render_gaussians
 from gsplat_edu.cli.sphere import Budget, SphereOptions, run_sphere
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.axes import half_turned
 from gsplat_edu.io.formats import FORMATS, read_scene, stored_bytes, write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
+from gsplat_edu.scene.gaussians import Gaussians
 
 SHORT = os.environ.get("GSPLAT_EDU_BUDGET") == "reduced"
 budget = Budget(iters=300, cap=800, size=64) if SHORT else Budget(iters=800, cap=1600, size=128)
@@ -244,8 +244,8 @@ print(f"scales from {s.min():.4f} to {s.max():.3f}, opacities above one half: {1
 # Stored, the numbers are spread out, and a step finds room on either side. As they are drawn they are crowded: scales
 # towards zero, opacities against both fences, where a parameter that was cut off would have stuck. Nothing pulls the
 # length of a quaternion anywhere, because nothing shows it, so it drifts.
-# [gsplat_edu.gaussians](../src/gsplat_edu/gaussians.py) keeps the raw values and has the others as properties; a name
-# says which it is, `log_` or `logit_` or neither, and no function takes both.
+# [gsplat_edu.scene.gaussians](../src/gsplat_edu/scene/gaussians.py) keeps the raw values and has the others as
+# properties; a name says which it is, `log_` or `logit_` or neither, and no function takes both.
 #
 # ## The same picture twice
 #

@@ -36,11 +36,11 @@ import torch
 
 from gsplat_edu import C0, Camera, build_cov3d_batch, quat_to_R_batch, render_gaussians, sphere_shell
 from gsplat_edu.data.synthetic import sphere_cameras, sphere_capture
-from gsplat_edu.gaussians import cov3d_t, quat_to_R_t
-from gsplat_edu.losses import l1
+from gsplat_edu.ops.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.torch_reference import eval_sh_t, render_t
+from gsplat_edu.scene.gaussians import cov3d_t, quat_to_R_t
 from gsplat_edu.train import Start, Views, course, training
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent

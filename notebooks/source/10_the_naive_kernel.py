@@ -32,7 +32,7 @@ import numpy as np
 import torch
 
 from gsplat_edu import _native, render_gaussians, sphere_shell
-from gsplat_edu.constants import ALPHA_MIN
+from gsplat_edu.base.constants import ALPHA_MIN
 from gsplat_edu.data.synthetic import sphere_cameras
 from gsplat_edu.render.torch_reference import render_t
 
@@ -127,7 +127,7 @@ print((LADDER / "naive.cpp").read_text())
 # The line with `continue` is the floor. The last lines of the loop count, because a count does not
 # depend on how busy the machine is. The page compiles this with the C++ compiler of the machine and
 # calls it through `ctypes`; inside the package the same step is made once, at installation, and
-# [gsplat_edu.kernels](../src/gsplat_edu/kernels.py) is what every call goes through.
+# [gsplat_edu.ops.kernels](../src/gsplat_edu/ops/kernels.py) is what every call goes through.
 #
 # ## Is it right?
 #

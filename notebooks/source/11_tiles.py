@@ -29,7 +29,7 @@ import torch
 from matplotlib.patches import Ellipse, Rectangle
 
 from gsplat_edu import _native, sphere_shell
-from gsplat_edu.constants import ALPHA_MIN, DILATION, T_STOP, TILE
+from gsplat_edu.base.constants import ALPHA_MIN, DILATION, T_STOP, TILE
 from gsplat_edu.data.synthetic import sphere_cameras
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())

@@ -29,16 +29,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, T_STOP
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, T_STOP
 from gsplat_edu.data.synthetic import sphere_cameras, sphere_capture
-from gsplat_edu.losses import l1
+from gsplat_edu.ops.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
+from gsplat_edu.scene.views import View
 from gsplat_edu.train import Start, Views, course, training
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.optimizer import Adam
-from gsplat_edu.views import View
 
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks" / "ladder").is_dir())
 sys.path.append(str(ROOT / "benchmarks"))
@@ -291,7 +291,7 @@ assert len(shared) == 3 and len(slotted) == 1
 # in one pass over the splats, through conic, covariance and projection to the raw parameters. To torch all of it is
 # one function. In float64 it has to agree with autograd's way through the dense renderer, and it keeps two images
 # where that kept the table above.
-# [Adam](../src/gsplat_edu/train/optimizer.py)'s [step](../src/gsplat_edu/adam.py) is one more pass over memory.
+# [Adam](../src/gsplat_edu/train/optimizer.py)'s [step](../src/gsplat_edu/ops/adam.py) is one more pass over memory.
 
 # %%
 cloud = random_ball(60, torch.Generator().manual_seed(5)).map(lambda tensor: tensor.double())

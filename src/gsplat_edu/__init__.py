@@ -4,13 +4,19 @@ The names here are the NumPy part of the system, as in the chapters. Training is
 rendering in `gsplat_edu.render.api`; those import torch, these do not.
 """
 
-from gsplat_edu.camera import Camera, CameraLike, look_at, orbit_camera
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, C0, C1, C2, C3, DILATION, T_STOP, TILE, Z_NEAR
-from gsplat_edu.errors import ArgumentError, BackendUnavailableError, ShapeError, SplatError
-from gsplat_edu.gaussian_math import build_cov3d, build_cov3d_batch, project_cov3d, quat_to_R, quat_to_R_batch
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, C0, C1, C2, C3, DILATION, T_STOP, TILE, Z_NEAR
+from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError, ShapeError, SplatError
 from gsplat_edu.render.numpy_reference import render_gaussians
-from gsplat_edu.scenes import sphere_shell
-from gsplat_edu.sh import eval_sh, sh_basis
+from gsplat_edu.scene.camera import Camera, CameraLike, look_at, orbit_camera
+from gsplat_edu.scene.gaussian_math import (
+    build_cov3d,
+    build_cov3d_batch,
+    project_cov3d,
+    quat_to_R,
+    quat_to_R_batch,
+)
+from gsplat_edu.scene.sh import eval_sh, sh_basis
+from gsplat_edu.scene.sphere_shell import sphere_shell
 
 __version__ = "0.1.0"
 

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
+from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.blocks.layout import PLAN
 from gsplat_edu.blocks.plan import Block, BlockPlan, Cell, automatic_count, halved, measured_area
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.errors import CheckpointError
+from gsplat_edu.scene.camera import Camera, look_at
 
 
 def flight(rows, columns, turn=0.0, spacing=2.0):

@@ -8,9 +8,9 @@ import torch
 
 from gsplat_edu.blocks.plan import Area, Cell, Ground
 from gsplat_edu.blocks.views import airspace_shares, in_any_view, seen_shares
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
 
 GROUND = Ground((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)))
 AREA = Area(GROUND, (-10.0, -10.0), (10.0, 10.0), (0.0, 0.01))

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.text import spelled_seconds
 from gsplat_edu.budget.costs import (
     Facts,
     Footprint,
@@ -23,9 +25,7 @@ from gsplat_edu.cli.process import process_age
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.text import spelled_seconds
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.fast import PlannedDensity
 from gsplat_edu.train.density.mcmc import MCMC

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.budget.costs import (
     LATER,
     Facts,
@@ -29,7 +30,6 @@ from gsplat_edu.cli.options.train import options_from
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.training import CaptureRun, RunOptions, is_finished

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.base.constants import C0
 from gsplat_edu.clean.plant import floaters
-from gsplat_edu.constants import C0
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 SETTINGS = RenderSettings(depth=False, sh_degree=0, jacobian_limit=1.3)
 

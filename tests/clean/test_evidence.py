@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.constants import C0
 from gsplat_edu.clean.evidence import FAINT, MOST_OPAQUE, TURNS, gather, peak_weights
-from gsplat_edu.constants import C0
-from gsplat_edu.gaussian_math import build_cov3d_batch, quat_to_R_batch
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.numpy_reference import render_gaussians
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussian_math import build_cov3d_batch, quat_to_R_batch
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 CAMERA = Camera(np.eye(3), (0.1, -0.05, -3.0), fx=50.0, fy=45.0, cx=20.3, cy=16.8, H=35, W=41)
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.base.constants import ALPHA_MIN
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.evidence import peak_weights
 from gsplat_edu.clean.guard import clean
 from gsplat_edu.clean.judge import Reason, judge
-from gsplat_edu.constants import ALPHA_MIN
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
-from gsplat_edu.views import View
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 from .conftest import SETTINGS, photographed, shell
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gsplat_edu.clean.settle import Doubtful, _slope, settle
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
+from gsplat_edu.scene.gaussians import Gaussians
 
 from .conftest import SETTINGS, photographed
 

@@ -11,7 +11,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.runs.dataset import run_dataset
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.views import View
+from gsplat_edu.scene.views import View
 
 
 @pytest.fixture(scope="module")

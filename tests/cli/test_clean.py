@@ -8,17 +8,17 @@ import pytest
 import torch
 
 import gsplat_edu.cli.main as command_line
+from gsplat_edu.base.constants import C0
 from gsplat_edu.clean.plant import floaters
-from gsplat_edu.constants import C0
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.cleaning import default_target
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 from splats import splats_on
 

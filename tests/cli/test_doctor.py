@@ -16,7 +16,7 @@ from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.views import View
+from gsplat_edu.scene.views import View
 from splats import splats_on
 
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 import gsplat_edu.cli.main as command_line
+from gsplat_edu.base.locks import LOCK
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.io.ply import save_ply
-from gsplat_edu.locks import LOCK
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import photo_digests

@@ -6,9 +6,9 @@ import torch
 import gsplat_edu.cli.main as command_line
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.scene.gaussians import Gaussians
 
 
 @pytest.fixture

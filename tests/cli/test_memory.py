@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu import headroom
+from gsplat_edu.base import headroom
+from gsplat_edu.base.errors import NotEnoughMemoryError
+from gsplat_edu.base.headroom import available_memory, require_memory
 from gsplat_edu.cli.arguments import run_command
 from gsplat_edu.data.images import decode
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
-from gsplat_edu.errors import NotEnoughMemoryError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.headroom import available_memory, require_memory
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.scene.gaussians import Gaussians
 
 CHILD = """
 import resource, sys

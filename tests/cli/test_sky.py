@@ -15,8 +15,8 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.outdoors import outdoor_capture
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.io.formats import read_scene
-from gsplat_edu.shells import far_shell
-from gsplat_edu.views import View
+from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.scene.views import View
 
 SHORT = ("--iterations", "20", "--max-gaussians", "1200", "--eval-every", "0")
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gsplat_calls import C, N, arguments
+from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.compat.gsplat import RollingShutterType, fully_fused_projection, rasterization
-from gsplat_edu.errors import ArgumentError, ShapeError
 
 pytestmark = pytest.mark.usefixtures("as_shipped")
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 import gsplat_witness
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.compat import gsplat as compat
-from gsplat_edu.errors import ArgumentError
 
 theirs = gsplat_witness.torch_impl
 W, H = 23, 18

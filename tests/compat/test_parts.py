@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import gsplat_witness
+from gsplat_edu.base.errors import ShapeError
 from gsplat_edu.compat import gsplat as ours
-from gsplat_edu.errors import ShapeError
 
 theirs = pytest.importorskip("gsplat", reason="gsplat is not installed (extra dev)")
 W, H = 23, 18

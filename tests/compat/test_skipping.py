@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from gsplat_calls import arguments
+from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.compat.gsplat import rasterization, skipping_bad_gaussians
-from gsplat_edu.errors import ArgumentError, ShapeError
 
 BAD = {
     "means": float("nan"),

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from gsplat_calls import arguments
+from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.compat import gsplat as compat
-from gsplat_edu.errors import ArgumentError, SplatError
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
 from native_scenes import smooth_scene

@@ -11,12 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data import colmap_files
 from gsplat_edu.data.colmap import find_model, read_cameras, read_colmap, read_images, read_points
 from gsplat_edu.data.colmap_files import MODELS
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import DatasetError
 from systems import needs_posix
 
 EVERYTHING = DataSettings(test_every=0)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.data.images import ImageStore, PhotoFile
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.points import read_points_ply, write_points_ply
 from gsplat_edu.data.writers import write_colmap, write_transforms
-from gsplat_edu.errors import ArgumentError, DatasetError
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.views import View
 
 
 @pytest.mark.parametrize(

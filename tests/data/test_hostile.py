@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from PIL import EpsImagePlugin, Image
 
+from gsplat_edu.base.errors import DatasetError, SceneFormatError
 from gsplat_edu.data import capture
 from gsplat_edu.data.colmap import read_images, read_points
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import ImageHeader, decode, decode_mask, image_size
 from gsplat_edu.data.points import read_points_ply
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import DatasetError, SceneFormatError
 from gsplat_edu.io.formats import read_scene
 from systems import needs_posix
 
@@ -154,7 +154,7 @@ def test_elements_larger_than_any_file(tmp_path):
 
 def test_thousands_of_elements_and_properties_are_looked_up_in_tables(tmp_path, monkeypatch):
     """The names count their comparisons: a few per name, not one with every other name."""
-    from gsplat_edu import ply_table
+    from gsplat_edu.base import ply_table
 
     compared = 0
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import decode, decode_mask, image_size
 from gsplat_edu.data.writers import write_transforms
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.image_files import PIXELS_PER_BYTE
-from gsplat_edu.views import View
+from gsplat_edu.photos.image_files import PIXELS_PER_BYTE
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import View
 from photos import blank_png
 
 RNG = np.random.default_rng(11)

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_blender, write_colmap, write_transforms
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.views import View
 
 EVERYTHING = DataSettings(test_every=0)
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.lens import BAND, Lens, bands, lens_of, undistortion
 from gsplat_edu.data.lens_formulas import PERSPECTIVE
-from gsplat_edu.errors import DatasetError
 
 W, H, FX, FY, CX, CY = 160, 120, 140.0, 133.0, 83.0, 57.0  # corner convention, as in files
 

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from gsplat_edu.base.errors import DatasetError, ShapeError
 from gsplat_edu.data.colmap import read_cameras
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import PhotoFile
@@ -22,7 +23,6 @@ from gsplat_edu.data.panorama import (
 from gsplat_edu.doctor.cameras import check_sizes
 from gsplat_edu.doctor.photos import measure_photo
 from gsplat_edu.doctor.survey import prepare
-from gsplat_edu.errors import DatasetError, ShapeError
 
 
 def directions(W, H):

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gsplat_edu.constants import C0
+from gsplat_edu.base.constants import C0
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import finite_cloud, read_points_ply, write_points_ply
-from gsplat_edu.errors import DatasetError
 
 HEADER = "ply\nformat {kind} 1.0\ncomment made by hand\nelement vertex 2\n{fields}{more}end_header\n"
 XYZ = "".join(f"property float {axis}\n" for axis in "xyz")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.writers import write_blender, write_colmap, write_transforms
-from gsplat_edu.errors import DatasetError
 
 EVERYTHING = DataSettings(test_every=0)
 PIXELS = np.full((20, 30, 3), 80, np.uint8)

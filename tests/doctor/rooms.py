@@ -6,8 +6,8 @@ import math
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.views import View
 
 WALL = 5.0
 """Half the edge of the room."""

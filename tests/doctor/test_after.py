@@ -15,10 +15,10 @@ from gsplat_edu.doctor.after import Trained, examine_run, view_lines
 from gsplat_edu.doctor.finding import Finding, Severity, diagnosis_lines
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.views import View
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from splats import splats_on
 
 BACKGROUND = (0.2, 0.3, 0.4)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from doctor.rooms import replaced, room, turned, with_camera
-from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import read_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.cameras import check_away
@@ -18,6 +17,7 @@ from gsplat_edu.doctor.finding import Severity
 from gsplat_edu.doctor.photos import PhotoStats
 from gsplat_edu.doctor.support import observed_points
 from gsplat_edu.doctor.survey import Shot, Survey
+from gsplat_edu.scene.camera import Camera
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

@@ -8,7 +8,7 @@ import pytest
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.doctor.cut_out import outside_masks_for
-from gsplat_edu.views import View
+from gsplat_edu.scene.views import View
 from masked_object import masked_object
 
 H, W, N = 72, 96, 10

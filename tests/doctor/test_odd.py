@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from doctor.rooms import room, with_camera
-from gsplat_edu.camera import Camera
 from gsplat_edu.doctor.finding import advice_lines, diagnosis_lines
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import View
 
 
 def flat(view, W=None, H=None, value=0):

@@ -7,7 +7,7 @@ from doctor.rooms import replaced, room, with_photo
 from gsplat_edu.data.outdoors import outdoor_capture
 from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.doctor.remedies import remedies_for, transients_for
-from gsplat_edu.views import View
+from gsplat_edu.scene.views import View
 
 
 def written(folder, views, points):

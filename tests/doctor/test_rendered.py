@@ -9,7 +9,7 @@ from gsplat_edu.data.writers import write_blender, write_colmap
 from gsplat_edu.doctor.before import examine
 from gsplat_edu.doctor.finding import Severity
 from gsplat_edu.doctor.survey import prepare
-from gsplat_edu.views import View
+from gsplat_edu.scene.views import View
 
 WHITE = (1.0, 1.0, 1.0)
 

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 import native_scenes
-from gsplat_edu.camera import Camera, look_at
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.apply import (
     DELETED,
@@ -20,11 +19,12 @@ from gsplat_edu.edits.apply import (
 )
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.edit import IDENTITY, Filter
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 ALL = ops.Select("replace", ops.Everything())

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.document import MOST_POINTS, empty_document, parse_edits, read_edits
 from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.stored import MOST_BYTES
-from gsplat_edu.errors import ArgumentError
 
 SCENE = Identity(7, "ab" * 32, (1.0, 2.5, -3.0))
 EYE = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]

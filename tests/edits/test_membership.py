@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.cells import MOST_TESTS, Work
 from gsplat_edu.edits.document import NEAR
 from gsplat_edu.edits.membership import Values, members
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.gaussians import Gaussians
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FRONT = ops.Picture((0.0, 0.0, -1.0), AXES, 10.0, 20.0, 5.0, 6.0)

@@ -9,9 +9,9 @@ from gsplat_edu.evaluate.alignment import SQUARES, aligned_psnr, light_squares
 from gsplat_edu.render.api import render
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.views import View
 from test_exposure import photographed
 
 GREY, EXTENT = (0.55, 0.5, 0.45), 4.0

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.files import written_aside
 from gsplat_edu.evaluate.images import NOT_WRITTEN, save_png, side_by_side, write_frames
-from gsplat_edu.files import written_aside
 
 
 def colour(height, width, rgb):

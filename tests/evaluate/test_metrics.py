@@ -5,8 +5,7 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.evaluate.metrics import (
     best,
     mean_absolute_error,
@@ -19,9 +18,10 @@ from gsplat_edu.evaluate.metrics import (
     to_bytes,
     worst,
 )
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 
 def noise(*shape, seed=0):

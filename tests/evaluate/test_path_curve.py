@@ -7,9 +7,9 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.camera import look_at
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
 from gsplat_edu.evaluate.path_curve import PathCurve, Travel, _monotone
+from gsplat_edu.scene.camera import look_at
 
 # Unevenly spaced; the camera also turns and zooms.
 EYES = [(0, 0, -4), (0.3, -0.2, -3.8), (2.5, -0.5, -2), (3, 0, 1), (0.5, 0.4, 3.5)]

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 
 
 def image_of(camera, point):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.evaluate.images import write_frames
 from gsplat_edu.evaluate.video import streamable
 

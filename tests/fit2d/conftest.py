@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN
 from gsplat_edu.fit2d.splats import Splats2D, render_2d
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsplat_edu import Camera, ShapeError
-from gsplat_edu.constants import ALPHA_MAX
+from gsplat_edu.base.constants import ALPHA_MAX
 from gsplat_edu.fit2d.gradients import backward_2d, squared_error
 from gsplat_edu.fit2d.splats import PER_SPLAT, Splats2D, render_2d
 from gsplat_edu.render.torch_reference import render_t

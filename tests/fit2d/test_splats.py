@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsplat_edu import ArgumentError, Camera, ShapeError, render_gaussians
-from gsplat_edu.constants import DILATION
+from gsplat_edu.base.constants import DILATION
 from gsplat_edu.fit2d.splats import Splats2D, ellipses_2d, random_splats_2d, render_2d
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import slices
 from checkpoints import Maker, mutate, step
-from gsplat_edu.errors import CheckpointError
+from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.train.checkpoint import load_checkpoint, read_seconds, save_checkpoint
 
 MUTATIONS = slices.count("GSPLAT_EDU_FUZZ_CHECKPOINTS", 50, 2_000)

@@ -9,10 +9,10 @@ import pytest
 
 import slices
 from checkpoints import changed_json, spelled
+from gsplat_edu.base.errors import SplatError
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import SplatError
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.source import open_source
 

@@ -14,13 +14,13 @@ import pytest
 import slices
 from blocks.test_plan import flight, under
 from checkpoints import changed_json, spelled
+from gsplat_edu.base.errors import SplatError
 from gsplat_edu.blocks.layout import BlocksFolder, Done
 from gsplat_edu.blocks.plan import Block, BlockPlan, Cell, measured_area
 from gsplat_edu.blocks.split import recipe_of
 from gsplat_edu.blocks.task import block_options
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.edits.document import parse_edits
-from gsplat_edu.errors import SplatError
 from gsplat_edu.jobs.events import Progress, line_of, parse_line
 from gsplat_edu.jobs.record import JobFolder, Purpose
 from gsplat_edu.runs.options import RunOptions

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import slices
-from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.formats import FORMATS, read_scene
 from scene_files import small_file, small_levels
 

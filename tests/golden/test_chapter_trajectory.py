@@ -13,12 +13,12 @@ import re
 import pytest
 import torch
 
+from gsplat_edu.base.threads import one_thread
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.synthetic import sphere_capture
-from gsplat_edu.losses import l1
+from gsplat_edu.ops.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
-from gsplat_edu.threads import one_thread
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent

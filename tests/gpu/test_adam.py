@@ -1,12 +1,13 @@
 import pytest
 import torch
 
-from gsplat_edu import ArgumentError, kernels
+from gsplat_edu import ArgumentError
+from gsplat_edu.ops import kernels
 
 # Not `triton`: without its wheel, that name means this folder.
 pytest.importorskip("triton.language", reason="triton is not installed")
 
-from gsplat_edu.adam import AdamNumbers
+from gsplat_edu.ops.adam import AdamNumbers
 from gsplat_edu.render.triton.adam import adam_triton
 
 U = 2.0**-24

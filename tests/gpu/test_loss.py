@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 
-from gsplat_edu import ArgumentError, kernels
-from gsplat_edu.losses import l1_ssim
+from gsplat_edu import ArgumentError
+from gsplat_edu.ops import kernels
+from gsplat_edu.ops.losses import l1_ssim
 
 # Not `triton`: without its wheel, that name means this folder.
 pytest.importorskip("triton.language", reason="triton is not installed")

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gsplat_edu import Camera
-from gsplat_edu.errors import ArgumentError, BackendUnavailableError
+from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.render.camera_tensors import CameraTensors

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from gsplat_edu import kernels
+from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
 from gsplat_edu.cli.main import main
-from gsplat_edu.errors import BackendUnavailableError, BackendWarning
 from gsplat_edu.io.ply import save_ply
+from gsplat_edu.ops import kernels
 from gsplat_edu.render import backends, self_check
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.render.triton import rasterize

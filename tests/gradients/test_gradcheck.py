@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from gsplat_edu import C0, Camera
-from gsplat_edu.gaussians import cov3d_t
 from gsplat_edu.render.torch_reference import eval_sh_t, render_t
+from gsplat_edu.scene.gaussians import cov3d_t
 
 CAMERA = Camera.looking_at(eye=[0, 0, -3], target=[0, 0, 0], fx=16, fy=16, H=16, W=16)
 

@@ -5,7 +5,7 @@ import tracemalloc
 import pytest
 import torch
 
-from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.formats import FORMATS, format_of, read_scene, write_scene
 from scene_files import random_scene, small_file
 

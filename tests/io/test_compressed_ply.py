@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from gsplat_edu.constants import C0
-from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.constants import C0
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.compressed_ply import read, write
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.ply import load_ply

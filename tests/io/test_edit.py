@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import native_scenes
-from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.io.axes import half_turned
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.io.scene import Scene

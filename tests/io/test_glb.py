@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.gaussians import Gaussians, cov3d_t
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io import glb
 from gsplat_edu.io.axes import half_turned
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.sh import eval_sh
+from gsplat_edu.scene.gaussians import Gaussians, cov3d_t
+from gsplat_edu.scene.sh import eval_sh
 
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 PREFIX = "KHR_gaussian_splatting:"

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu import ply_table
-from gsplat_edu.errors import SceneFormatError, ShapeError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base import ply_table
+from gsplat_edu.base.errors import SceneFormatError, ShapeError
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply, read, save_ply, write
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.gaussians import Gaussians
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

@@ -10,15 +10,15 @@ import pytest
 import torch
 from PIL import Image
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians, quat_to_R_t
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.sog import codec as sog
 from gsplat_edu.io.sog.palette import _picked, codebook, nearest_in_codebook, palette
 from gsplat_edu.io.sog.values import positions_to_steps, quats_to_pixels
-from gsplat_edu.morton import morton_codes
+from gsplat_edu.scene.gaussians import Gaussians, quat_to_R_t
+from gsplat_edu.scene.morton import morton_codes
 from scene_files import random_scene
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.sog import codec as sog
 from scene_files import random_scene
 

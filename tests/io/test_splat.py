@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.constants import C0
-from gsplat_edu.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.constants import C0
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.splat import MIN_SCALE, read, write

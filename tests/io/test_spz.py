@@ -13,13 +13,13 @@ import pytest
 import torch
 import zstandard
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.gaussians import Gaussians, cov3d_t
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io import compressed_ply, ply, spz
 from gsplat_edu.io.axes import half_turned
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians, cov3d_t
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.jobs import queue as queue_module
 from gsplat_edu.jobs.process import carries, identity, is_running
 from gsplat_edu.jobs.queue import JobQueue

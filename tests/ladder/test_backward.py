@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, T_STOP, TILE
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, T_STOP, TILE
 from ladder import backward, forward, splats
 
 EPS = 2.0**-23  # float32

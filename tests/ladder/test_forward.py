@@ -8,8 +8,8 @@ from ladder.oracle import oracle, tolerance
 from ladder.splats import Splats, from_cov2d, projected, scene
 
 from gsplat_edu import Camera, render_gaussians, sphere_shell
-from gsplat_edu.constants import ALPHA_MIN, T_STOP
-from gsplat_edu.errors import BackendUnavailableError
+from gsplat_edu.base.constants import ALPHA_MIN, T_STOP
+from gsplat_edu.base.errors import BackendUnavailableError
 from ladder import build, forward
 
 ORACLES = {

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.optimizer import Adam, ParameterGroup
 from native_scenes import random
 

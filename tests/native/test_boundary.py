@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu import _native, kernels
-from gsplat_edu.camera import orbit_camera
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import photo_loss
+from gsplat_edu import _native
+from gsplat_edu.ops import kernels
+from gsplat_edu.ops.losses import photo_loss
 from gsplat_edu.render.api import render
+from gsplat_edu.scene.camera import orbit_camera
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.optimizer import Adam
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from gsplat_edu.data.synthetic import sphere_capture
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.initialize import random_ball

@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from gsplat_edu import Camera, build_cov3d_batch, quat_to_R_batch, render_gaussians
-from gsplat_edu.constants import DET_FLOOR, THINNEST
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussian_math import opacity_compensation
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import DET_FLOOR, THINNEST
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.api import render
 from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussian_math import opacity_compensation
+from gsplat_edu.scene.gaussians import Gaussians
 from native_scenes import BACKGROUND, SCENES, camera, smooth_scene
 
 DILATIONS = (0.0, 0.1, 0.3, 1.0)

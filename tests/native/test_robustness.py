@@ -13,11 +13,11 @@ import torch
 import torch.utils.checkpoint
 
 from gsplat_edu import ArgumentError, Camera, _native, orbit_camera
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.headroom import available_memory
+from gsplat_edu.base.headroom import available_memory
 from gsplat_edu.render.api import render
 from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
 from native_scenes import camera, random
 
 POISONS = (float("nan"), float("inf"), -float("inf"), 1e-42, 3e38, -3e38, 1e20, -1e20, 0.0)

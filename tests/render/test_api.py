@@ -12,9 +12,9 @@ from gsplat_edu import (
     quat_to_R_batch,
     render_gaussians,
 )
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
 
 BACKGROUND = (0.2, 0.5, 0.9)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gsplat_edu import constants
+from gsplat_edu.base import constants
 from gsplat_edu.cli.main import build_parser
 
 ROOT = Path(__file__).parents[2]

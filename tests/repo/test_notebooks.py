@@ -97,7 +97,7 @@ def test_no_chapter_redefines_a_public_name(source):
         "from gsplat_edu2 import Camera",
         "lambda Camera: 1",
         "match 1:\n    case Camera: pass",
-        "gsplat_edu.camera.Camera = 1",
+        "gsplat_edu.scene.camera.Camera = 1",
     ],
 )
 def test_a_redefinition_is_found(text):
@@ -137,7 +137,7 @@ def violations(text: str) -> list[str]:
 
 
 GOOD = """# %% [markdown]
-# [a module](../src/gsplat_edu/camera.py)
+# [a module](../src/gsplat_edu/scene/camera.py)
 # %%
 import matplotlib.pyplot as plt
 fig, ax = plt.subplots()
@@ -174,7 +174,7 @@ def test_chapters_follow_the_rules(source):
         ("assert", "with contextlib.suppress(OSError):\n    pass\nassert", "it swallows errors"),
         ("assert", "warnings.simplefilter('ignore')\nassert", "it silences warnings"),
         ("# ## The next failure", "# ## Summary", "it does not end by naming the next failure"),
-        ("../src/gsplat_edu/camera.py", "https://example.org", "it links no module"),
+        ("../src/gsplat_edu/scene/camera.py", "https://example.org", "it links no module"),
     ],
 )
 def test_a_chapter_that_breaks_a_rule_is_rejected(old, new, what):

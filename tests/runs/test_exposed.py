@@ -8,13 +8,13 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.exposure import falloff
+from gsplat_edu.ops.exposure import falloff
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.cleaning import open_subject
 from gsplat_edu.runs.exposed import at_exposure_of_scene
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
-from gsplat_edu.views import View
 from test_exposure import photographed
 
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import View
 
 
 @pytest.fixture

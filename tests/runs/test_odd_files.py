@@ -5,10 +5,10 @@ import json
 import pytest
 import torch
 
+from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_transforms
-from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
 
 ODD = ["text", -1.5, True, [], [1], {}, {"psnr": "x"}, 10**400, "\ud800\x1b"]

@@ -13,8 +13,8 @@ from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.runs import pilot
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.pilot import CLEARLY, refinement_for
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import recipe
-from gsplat_edu.views import View
 
 
 def options(folder, tmp_path, **data):

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 import checkpoints
+from gsplat_edu.base.errors import CheckpointError, ProcessLostError, SplatError
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import CheckpointError, ProcessLostError, SplatError
 from gsplat_edu.runs.options import DataSettings, RunOptions
 from gsplat_edu.runs.processes import check_alike, facts, pack, unpack
 from gsplat_edu.runs.training import CaptureRun

@@ -12,9 +12,9 @@ from gsplat_edu.cli.options import train as command
 from gsplat_edu.data.outdoors import outdoor_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.events import StepEvent
 from gsplat_edu.train.poses import LENSES, TWISTS
-from gsplat_edu.views import View
 from passers_by import pasted
 
 EVERYTHING = ("--refine", "both", "--appearance", "exposure", "--transients", "mask", "--sky", "shell")

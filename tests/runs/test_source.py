@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.source import CAPTURE_JACOBIAN_LIMIT, open_source, relative_to

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.edit import Similarity
+from gsplat_edu.scene.camera import Camera, look_at
 from gsplat_edu.sfm.align import upright
 
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.lens import Lens
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm import mapping
 from gsplat_edu.sfm.mapping import MANY_PHOTOS, Attempt, attempts, best_model, shared_cameras
 from gsplat_edu.sfm.photos import PhotoFacts

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.images import decode_mask
 from gsplat_edu.data.textured_box import box_orbit, photograph_box
-from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.masks import find_masks, unused_folders, upright_masks
 from gsplat_edu.sfm.photos import copy_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct

@@ -9,21 +9,21 @@ import pytest
 import torch
 from PIL import Image
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.panorama import FACES, face_pinhole, face_rotations
 from gsplat_edu.data.textured_box import align_cameras
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import DatasetError
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.intrinsics import Intrinsics
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.intrinsics import Intrinsics
+from gsplat_edu.scene.views import View
 from gsplat_edu.sfm.panoramas import are_panoramas, cut_panoramas
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
-from gsplat_edu.views import View
 from panorama_room import held_out, panorama, photo, walk
 
 COUNT, WIDTH, TURN = 7, 512, 0.3

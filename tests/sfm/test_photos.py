@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.sfm.photos import PhotoFacts, camera_kinds, copy_photos, fingerprint, photo_files
 from systems import needs_posix
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.data.colmap import read_cameras
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.textured_box import align_cameras, box_orbit, photograph_box
-from gsplat_edu.errors import ArgumentError, DatasetError
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.mapping import attempts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct

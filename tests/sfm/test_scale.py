@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.scale import Scale, read_scale
 from gsplat_edu.data.textured_box import align_cameras, box_orbit, photograph_box
-from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.scale import Sight, placed

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.cli.main import main
-from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.source import check_source, needs_poses
 
 RNG = np.random.default_rng(0)

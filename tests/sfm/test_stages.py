@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.sfm.stages import Stages
 
 GOOD = {

@@ -11,7 +11,7 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.data.textured_box import align_cameras, box_camera, box_orbit, photograph_box
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.views import View
+from gsplat_edu.scene.views import View
 from sfm.test_video import write_video
 from sfm.textured_box import cameras_of, check
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.data.textured_box import align_cameras, box_camera, photograph_box
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from sfm.textured_box import cameras_of
 

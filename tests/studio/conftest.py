@@ -9,9 +9,9 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from browsers import chromium
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.studio.app import application
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.state import Studio

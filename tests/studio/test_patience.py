@@ -7,11 +7,11 @@ import struct
 
 import pytest
 
+from gsplat_edu.base.text import LONGEST_LINE, LONGEST_WORD, bounded
 from gsplat_edu.cli.main import main
 from gsplat_edu.studio.patience import LEAST_GAIN, Patience
 from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.uploads import Limits
-from gsplat_edu.text import LONGEST_LINE, LONGEST_WORD, bounded
 from studio.conftest import Inline
 from studio.pages import TOKEN, served
 from studio.test_stream import ODD

@@ -7,12 +7,13 @@ import torch
 
 import checkpoints
 from gsplat_edu import ArgumentError
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.errors import DatasetError
 from gsplat_edu.evaluate.metrics import score_views
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.batches import PartialSums
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
@@ -24,7 +25,6 @@ from gsplat_edu.train.optimizer import Adam, ParameterGroup
 from gsplat_edu.train.schedule import milestone
 from gsplat_edu.train.team import ALONE
 from gsplat_edu.train.trainer import StepParts, Trainer
-from gsplat_edu.views import View
 from ranks import together
 from steps import step_views
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from checkpoints import Maker, read, write
+from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.errors import CheckpointError
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.train.checkpoint import list_checkpoints, load_checkpoint, read_seconds, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training

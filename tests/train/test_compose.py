@@ -11,6 +11,7 @@ from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.render.backend import FEATURES
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.views import View
 from gsplat_edu.train import Start, Views, training
 from gsplat_edu.train.capacity import planned_gaussians
 from gsplat_edu.train.config import recipe
@@ -22,7 +23,6 @@ from gsplat_edu.train.far import Shell
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.poses import LENSES, TWISTS, Refinement, refinement_of
 from gsplat_edu.train.trainer import Trainer
-from gsplat_edu.views import View
 
 CPU = load_backend("cpu")
 

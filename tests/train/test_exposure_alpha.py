@@ -6,19 +6,19 @@ import torch
 
 from gsplat_edu.data import procedural
 from gsplat_edu.evaluate.metrics import at_exposure_of, psnr_fitted, score_views, seen_through, summarize
-from gsplat_edu.exposure import stops
-from gsplat_edu.recolor import recolored_natively
+from gsplat_edu.ops.exposure import stops
+from gsplat_edu.ops.recolor import recolored_natively
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.views import Photo, View
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.exposure import Exposure
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.view_model import ViewRender
-from gsplat_edu.views import Photo, View
 from test_exposure import photographed
 
 GREY = (0.55, 0.5, 0.45)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.mcmc import MCMC

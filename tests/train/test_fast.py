@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from gsplat_edu import ArgumentError
-from gsplat_edu.camera import Camera, orbit_camera
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.gaussians import Gaussians, cov3d_t
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.camera import Camera, orbit_camera
+from gsplat_edu.scene.gaussians import Gaussians, cov3d_t
+from gsplat_edu.scene.views import Photo, View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import STRATEGIES, recipe
@@ -23,7 +24,6 @@ from gsplat_edu.train.feed import REDUCED_ROOM, SMALLEST_SIDE, ViewFeed
 from gsplat_edu.train.initialize import from_points, make_strategy, random_ball
 from gsplat_edu.train.optimizer import Adam
 from gsplat_edu.train.schedule import gaussian_groups, photo_factor
-from gsplat_edu.views import Photo, View
 
 RENDER = functools.partial(render, backend="cpu")
 PARAMETERS = ("quats", "log_scales", "sh0", "sh_rest", "logit_opacities")

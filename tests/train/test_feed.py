@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.camera import orbit_camera
+from gsplat_edu.scene.camera import orbit_camera
+from gsplat_edu.scene.views import AT_ONCE, Photo, View
 from gsplat_edu.train.feed import ViewFeed
-from gsplat_edu.views import AT_ONCE, Photo, View
 
 SIZE = 16
 BYTES = 3 * SIZE * SIZE

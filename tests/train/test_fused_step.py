@@ -9,16 +9,16 @@ import torch
 
 from gains import Gains
 from gsplat_edu import ArgumentError
-from gsplat_edu.adam import adam_natively
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.ops.adam import adam_natively
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.objective import MeanOpacity, MeanScale, Objective, PhotoTerm
 from gsplat_edu.train.trainer import StepParts, Trainer
-from gsplat_edu.views import View
 
 SCHEDULE = {"densify_start": 2, "densify_every": 6, "sh_every": 7, "grad_threshold": 5e-5}
 CASES = {

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_edu import ArgumentError
-from gsplat_edu.gaussians import cov3d_t
+from gsplat_edu.scene.gaussians import cov3d_t
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.mcmc import MCMC, MOST_SHARERS, shared_shape
 from gsplat_edu.train.initialize import random_ball

@@ -15,12 +15,12 @@ from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.log import LogWriter
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points, make_strategy
 from gsplat_edu.train.objective import Objective, PhotoTerm, Rendered, make_objective
 from gsplat_edu.train.trainer import StepParts, Trainer
-from gsplat_edu.views import View
 from steps import step_views
 
 CONFIG = recipe(40, densify_start=2, densify_every=5, grad_threshold=5e-5, sh_degree=0)
@@ -247,7 +247,7 @@ def test_a_view_model_resumes_to_the_bit_across_density_surgery(capture, tmp_pat
 
 
 def test_a_checkpoint_with_another_view_model_is_refused(capture, tmp_path):
-    from gsplat_edu.errors import CheckpointError
+    from gsplat_edu.base.errors import CheckpointError
 
     with_gains = trainer(capture, CONFIG, StepParts(view_model=Gains(4)))
     path = save_checkpoint(tmp_path, with_gains, 0.0)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_edu import ArgumentError
-from gsplat_edu.adam import adam_in_torch, adam_natively
+from gsplat_edu.ops.adam import adam_in_torch, adam_natively
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.optimizer import Adam, ParameterGroup
 

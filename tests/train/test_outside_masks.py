@@ -8,17 +8,17 @@ import torch
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import Photo, View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.feed import Target, ViewFeed
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.objective import EmptyOutside, Rendered, make_objective
-from gsplat_edu.views import Photo, View
 from masked_object import masked_object
 
 

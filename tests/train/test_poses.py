@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.evaluate.alignment import aligned_psnr
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.poses import LENSES, TWISTS, Refinement, gauge
-from gsplat_edu.views import View
 
 EXTENT = 4.0
 """World units; the procedural cameras are about 4 from the centre."""

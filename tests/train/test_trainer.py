@@ -7,16 +7,16 @@ import torch
 
 from gsplat_edu import ArgumentError, ShapeError
 from gsplat_edu.data.synthetic import sphere_capture
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import TrainConfig, recipe
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.events import DensifyEvent, StepEvent
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Trainer
-from gsplat_edu.views import View
 
 RENDER, DENSE = functools.partial(render, backend="torch"), load_backend("torch")
 SHORT = course_config(iterations=12, max_gaussians=80).changed(densify_stop=12, densify_every=4)

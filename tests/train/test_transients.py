@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import load_backend
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.checkpoint import load_checkpoint, save_checkpoint
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import recipe
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.transients import LONGEST, MASKS, TOO_LARGE, resized_mask
-from gsplat_edu.views import View
 from passers_by import pasted
 
 HELD_OUT = slice(3, None, 6)

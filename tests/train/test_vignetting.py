@@ -6,14 +6,14 @@ import torch
 
 from doctor.rooms import room
 from gsplat_edu.evaluate.metrics import score_views, summarize
-from gsplat_edu.exposure import falloff
-from gsplat_edu.recolor import recolored_natively
+from gsplat_edu.ops.exposure import falloff
+from gsplat_edu.ops.recolor import recolored_natively
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.exposure import NAME, SPREAD, Exposure
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.view_model import ViewRender
-from gsplat_edu.views import View
 from test_exposure import photographed
 from train.test_exposure import trainer
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from browsers import chromium
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

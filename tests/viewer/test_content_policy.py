@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsplat_edu.content_policy import content_policy
+from gsplat_edu.base.content_policy import content_policy
 from gsplat_edu.evaluate.report import Picture, Report, write_report
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.viewer import page

@@ -11,10 +11,10 @@ from gsplat_edu.cli.main import main
 from gsplat_edu.edits.apply import flags_after, views_after
 from gsplat_edu.edits.document import read_edits
 from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import write_scene
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.runs.source import open_source
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.edit_page import editing_of
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer

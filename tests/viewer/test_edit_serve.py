@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 import pytest
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.edits.document import empty_document
 from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.stored import MOST_BYTES, NO_FILE
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.viewer.edit_serve import ADDRESS, EditServer
 
 SCENE = Identity(7, "ab" * 32, (0.0, 0.0, 0.0))

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.lod import codec
 from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.source import file_settings
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page_parts
 from gsplat_edu.viewer.serve import PageServer
 from gsplat_edu.viewer.stream import folder_page

@@ -10,12 +10,12 @@ import pytest
 import torch
 from PIL import Image
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import ArgumentError, NotEnoughMemoryError
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
-from gsplat_edu.errors import ArgumentError, NotEnoughMemoryError
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.render.api import render
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.train.checkpoint import list_checkpoints
 from gsplat_edu.viewer import live, snapshots
 from gsplat_edu.viewer.live import picture_camera

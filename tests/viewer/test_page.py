@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page, page_data
 from gsplat_edu.viewer.page_start import first_camera, pivot_of, start_of
 from scene_files import random_scene

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 
 SIZE = (640, 400)

@@ -13,14 +13,14 @@ import pytest
 import torch
 from PIL import Image
 
-from gsplat_edu.camera import Camera, look_at
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.evaluate.paths import orbit_of_scene
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page
 
 DATA = Path(os.environ.get("GSPLAT_EDU_DATA", Path(__file__).parents[3] / "shared" / "data"))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.camera import look_at
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath, read_path
 from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.camera import look_at
 from gsplat_edu.viewer import page
 
 ORIGIN = (500.0, -64.0, 8.0)

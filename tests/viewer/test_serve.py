@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.viewer import page, page_parts, serve

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from gsplat_edu.errors import ArgumentError, CheckpointError, SplatError
-from gsplat_edu.files import described
-from gsplat_edu.headroom import shortage
-from gsplat_edu.text import install_command
+from gsplat_edu.base.errors import ArgumentError, CheckpointError, SplatError
+from gsplat_edu.base.files import described
+from gsplat_edu.base.headroom import shortage
+from gsplat_edu.base.text import install_command
 
 LOOPBACK = "127.0.0.1"
 

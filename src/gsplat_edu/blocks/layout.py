@@ -18,9 +18,9 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.json_fields import checked_text, checked_whole, number_within
-from gsplat_edu.reading import parse_json, read_text
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.json_fields import checked_text, checked_whole, number_within
+from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.runs.folder import RunFolder, write_json
 
 PLAN = "plan.json"

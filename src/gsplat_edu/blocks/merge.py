@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
 from gsplat_edu.blocks.seams import masks_of, pooled_psnr, strip_width
 from gsplat_edu.blocks.task import block_options
 from gsplat_edu.data.dataset import Dataset, load_dataset
-from gsplat_edu.errors import CheckpointError
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import load_ply, save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
@@ -26,6 +25,7 @@ from gsplat_edu.runs.identity import fingerprint
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.runs.training import Export, document
+from gsplat_edu.scene.gaussians import Gaussians
 
 Say = Callable[[str], None]
 

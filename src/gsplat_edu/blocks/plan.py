@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
+from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.blocks.layout import MOST_BLOCKS, PLAN
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import CheckpointError
 from gsplat_edu.evaluate.paths import common_up
-from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.runs.folder import write_json
+from gsplat_edu.scene.camera import Camera
 
 Points = Float64[np.ndarray, "N 3"]
 Pair = tuple[float, float]

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.blocks.plan import Area, Cell
-from gsplat_edu.camera import Camera
 from gsplat_edu.evaluate.metrics import MSE_FLOOR, Renderer
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.validation import ArrayLike
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 STRIP_SHARE = 0.05
 """Half the width of the strip along a cut, as a fraction of the mean side of the cells."""

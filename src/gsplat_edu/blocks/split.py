@@ -13,21 +13,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
 from gsplat_edu.blocks.layout import PLAN, BlocksFolder, file_digest
 from gsplat_edu.blocks.plan import Block, BlockPlan, automatic_count, measured_area
 from gsplat_edu.blocks.same import write_views
 from gsplat_edu.blocks.views import LEAST_VIEWS, assigned, in_any_view, seen_shares
 from gsplat_edu.budget.costs import wanted_gaussians
-from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import Dataset, load_dataset
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.start import scene_file, scene_start
-from gsplat_edu.shells import far_shell
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
 
 OPAQUE = 0.1
 """Gaussians of the coarse model above this opacity count as points of the scene."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gsplat_edu.base.reading import parse_json
 from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.plan import BlockPlan
-from gsplat_edu.reading import parse_json
 
 TAIL = 4096
 """Bytes at the end of a log in which its last whole line is looked for."""

@@ -10,15 +10,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.json_fields import checked_choice
+from gsplat_edu.base.locks import locked
+from gsplat_edu.base.reading import stored_path
 from gsplat_edu.blocks.layout import BlocksFolder, Done, file_digest
 from gsplat_edu.blocks.plan import BlockPlan
 from gsplat_edu.blocks.same import check_views
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.json_fields import checked_choice
-from gsplat_edu.kernels import REASON, native
-from gsplat_edu.locks import locked
-from gsplat_edu.reading import stored_path
+from gsplat_edu.ops.kernels import REASON, native
 from gsplat_edu.render.settings import BACKENDS
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from gsplat_edu.blocks.plan import Area, Block, Cell, halved
-from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.evaluate.paths import resized
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import MOST_CHANNELS, RenderOutput
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 
 Shares = Float64[np.ndarray, "V B"]
 Renderer = Callable[[Gaussians, Camera, Tensor], RenderOutput]

@@ -17,7 +17,7 @@ from jaxtyping import Int64
 from scipy.optimize import nnls
 
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.image_files import BYTES_PER_PIXEL
+from gsplat_edu.photos.image_files import BYTES_PER_PIXEL
 from gsplat_edu.train.capacity import PLANNED_VIEWS, planned_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.feed import REDUCED_ROOM

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from gsplat_edu.base.text import short_number, spelled_seconds
 from gsplat_edu.budget.costs import (
     Facts,
     Footprint,
@@ -17,7 +18,6 @@ from gsplat_edu.budget.costs import (
 from gsplat_edu.budget.probe import probe
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
 from gsplat_edu.runs.training import RunOptions
-from gsplat_edu.text import short_number, spelled_seconds
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.schedule import photo_factor
 

@@ -12,15 +12,15 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.text import spelled_seconds
 from gsplat_edu.budget.costs import LATER, Facts, Footprint, Measurements, reduced_bytes, wanted_gaussians
 from gsplat_edu.budget.deadline import Deadline
 from gsplat_edu.budget.forecast import Forecast, predict, spelled_bytes
 from gsplat_edu.budget.probe import probe, resident_bytes
 from gsplat_edu.data.dataset import load_dataset
-from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.runs.start import scene_start
 from gsplat_edu.runs.training import RunOptions
-from gsplat_edu.text import spelled_seconds
 from gsplat_edu.train.config import MILESTONES, ONLY_FOR, RECIPE_ITERATIONS, TrainConfig, recipe
 
 PLANNED = ("iterations", *MILESTONES, "densify_every", "max_gaussians", "resolution", "image_memory")

@@ -17,19 +17,20 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.budget.costs import Measurements, Speed, expected_counts
-from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import Dataset, scene_extent
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.images import save_png, side_by_side
 from gsplat_edu.evaluate.metrics import ImageScore, score_views
 from gsplat_edu.evaluate.report import Picture
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.surgery import split_children
@@ -37,7 +38,6 @@ from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.initialize import from_points
 from gsplat_edu.train.schedule import photo_factor
 from gsplat_edu.train.trainer import Trainer
-from gsplat_edu.views import View
 
 Bytes = UInt8[np.ndarray, "H W 3"]
 

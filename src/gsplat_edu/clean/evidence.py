@@ -21,11 +21,11 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.views import View
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 MOST_OPAQUE = 0.985
 """Opacities are lowered to this for the measurement: below the clamp of alpha, so that every pixel has a gradient."""

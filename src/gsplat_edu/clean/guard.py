@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int64, UInt8
 
-from gsplat_edu.buffers import reused_buffers
+from gsplat_edu.base.buffers import reused_buffers
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import in_range
 from gsplat_edu.clean.judge import Progress, Reason, Rules, Verdict, judge
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.validation import in_range
-from gsplat_edu.views import View
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 MAX_LOSS = 0.05
 """dB: loss of PSNR that cleaning may cost by default."""

@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, UInt8
 
+from gsplat_edu.base.constants import ALPHA_MIN
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.evidence import Evidence, gather, peak_weights
 from gsplat_edu.clean.settle import Doubtful, settle
-from gsplat_edu.constants import ALPHA_MIN
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.views import View
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 
 class Reason(IntEnum):

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.validation import whole_number
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 
 NEAREST, FARTHEST = 0.3, 0.8
 """Range of a floater's depth, as a fraction of the depth of the surface behind it."""

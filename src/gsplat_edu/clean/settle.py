@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Float64, Int64
 
 from gsplat_edu.clean.evidence import MOST_OPAQUE, residual_of
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.views import View
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 RATE = 0.25
 """Adam's step, in logits of a factor."""

@@ -16,15 +16,15 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO
 
+from gsplat_edu.base.errors import BackendWarning, SplatError
+from gsplat_edu.base.files import described
+from gsplat_edu.base.headroom import shortage
+from gsplat_edu.base.text import bounded, printable
 from gsplat_edu.cli.printing import complain, escape_unencodable_characters
 from gsplat_edu.cli.ranks import is_first, speaks_for_all
-from gsplat_edu.errors import BackendWarning, SplatError
-from gsplat_edu.files import described
-from gsplat_edu.headroom import shortage
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Failed, Interrupted
 from gsplat_edu.render.settings import BACKENDS
-from gsplat_edu.text import bounded, printable
 from gsplat_edu.viewer.serve import LOOPBACK
 
 EXIT_BUG = 1

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.locks import locked
 from gsplat_edu.blocks.cluster import AGAIN, ClusterOptions, run_on_cluster
 from gsplat_edu.blocks.layout import BlocksFolder
 from gsplat_edu.blocks.merge import merge_blocks
@@ -32,9 +34,7 @@ from gsplat_edu.cli.train import (
     with_choices,
     with_poses,
 )
-from gsplat_edu.errors import CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore
-from gsplat_edu.locks import locked
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.runs.training import CaptureRun, is_finished
 from gsplat_edu.viewer.export import check_target

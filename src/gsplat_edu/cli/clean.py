@@ -8,9 +8,9 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.guard import clean
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.formats import format_of
 from gsplat_edu.io.ply import ORIGIN, save_ply
 from gsplat_edu.jobs import emitter

@@ -12,6 +12,8 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
 from scipy.spatial.transform import Rotation
 
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.reading import read_text
 from gsplat_edu.cli.arguments import numbers_text
 from gsplat_edu.cli.exporting import check_and_say
 from gsplat_edu.cli.options.convert import MOVES
@@ -20,7 +22,6 @@ from gsplat_edu.edits.apply import Views, edited, placed, views_after
 from gsplat_edu.edits.document import Edits, read_edits
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.edits.operations import Measure
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.keyframes import KeyframePath, read_path
 from gsplat_edu.io.edit import IDENTITY, Filter, Similarity, joined
 from gsplat_edu.io.formats import LOD_META, TILESET
@@ -28,7 +29,6 @@ from gsplat_edu.io.lod.levels import LodOptions
 from gsplat_edu.io.lod.tiles import tile_options
 from gsplat_edu.io.ply import ORIGIN
 from gsplat_edu.jobs import emitter
-from gsplat_edu.reading import read_text
 from gsplat_edu.render.backends import resolve_backend
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.sfm.scale_text import points_of

@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.doctor.after import Trained, examine_run, view_lines
@@ -22,7 +23,6 @@ from gsplat_edu.doctor.finding import Diagnosis, Finding, advice_lines, diagnosi
 from gsplat_edu.doctor.moving import moved_parts
 from gsplat_edu.doctor.residuals import residuals
 from gsplat_edu.doctor.survey import prepare
-from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.io.ply import load_ply
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Diagnosed, Found

@@ -10,11 +10,11 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.locks import LOCK, locked
 from gsplat_edu.cli.terminal import Bar, Terminal
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
 from gsplat_edu.io.ply import load_ply
-from gsplat_edu.locks import LOCK, locked
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, resolve_backend
 from gsplat_edu.runs.dataset import run_dataset

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from gsplat_edu.base.constants import ALPHA_MIN
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.text import short_number
 from gsplat_edu.cli.terminal import Terminal
-from gsplat_edu.constants import ALPHA_MIN
 from gsplat_edu.data.dataset import DataSettings, load_dataset, scene_extent
 from gsplat_edu.data.scale import Scale
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import LOD_META, SOG_META, file_in, format_of, read_scene, stored_bytes
 from gsplat_edu.io.lod.codec import read_index
 from gsplat_edu.runs.folder import RunFolder
-from gsplat_edu.shells import far_shell
-from gsplat_edu.text import short_number
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
 
 PERCENTILES = (1, 25, 50, 75, 99)
 

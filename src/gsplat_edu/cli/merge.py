@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from gsplat_edu.base.locks import locked
 from gsplat_edu.cli.blocks import merge_and_report
 from gsplat_edu.cli.terminal import Terminal
-from gsplat_edu.locks import locked
 from gsplat_edu.viewer.export import check_target
 
 

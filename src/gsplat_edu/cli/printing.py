@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from gsplat_edu.text import bounded, printable
+from gsplat_edu.base.text import bounded, printable
 
 
 def say(sentence: str) -> None:

@@ -14,22 +14,21 @@ import torch
 from jaxtyping import Float
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
-from gsplat_edu.camera import WORLD_UP, Camera
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import check_writable
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.options.render import KEYFRAMES, ORBIT_FRAMES, RUNS_CAMERAS, SCENE_SIZE
 from gsplat_edu.cli.terminal import Bar, Field, Terminal
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.edits.apply import Views, edited, placed, views_after
 from gsplat_edu.edits.document import Edits, read_edits
 from gsplat_edu.edits.identity import identity_of
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.following import path_along
 from gsplat_edu.evaluate.images import VIDEO_SUFFIX, check_output, write_frames
 from gsplat_edu.evaluate.keyframes import FEWEST, Keyframe, KeyframePath, evenly_chosen, read_path, write_path
 from gsplat_edu.evaluate.map_files import write_list, write_maps
 from gsplat_edu.evaluate.path_curve import PathCurve
 from gsplat_edu.evaluate.paths import orbit_of_scene, resized
-from gsplat_edu.files import check_writable
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.edit import IDENTITY
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
@@ -41,8 +40,9 @@ from gsplat_edu.render.settings import MAPS, RenderSettings
 from gsplat_edu.runs.dataset import data_settings
 from gsplat_edu.runs.folder import RunFolder, image_file_names, render_settings
 from gsplat_edu.runs.source import file_settings, relative_to
-from gsplat_edu.shells import far_shell
-from gsplat_edu.validation import whole_number
+from gsplat_edu.scene.camera import WORLD_UP, Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
 
 MOST_FRAMES = 100_000
 """Most frames of a path unless --frames asks for more: an hour at 28 frames per second."""

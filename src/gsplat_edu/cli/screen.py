@@ -13,8 +13,8 @@ import urllib.parse
 import webbrowser
 from pathlib import Path
 
+from gsplat_edu.base.files import described
 from gsplat_edu.cli.printing import complain
-from gsplat_edu.files import described
 
 REDIRECT_SECONDS = 60.0
 """Seconds after which the file that leads a browser to its page is removed; a browser that starts takes a few."""

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
 
+from gsplat_edu.base.locks import locked
 from gsplat_edu.cli.options.sfm import options_from
 from gsplat_edu.cli.terminal import Bar, Terminal
 from gsplat_edu.jobs import emitter
-from gsplat_edu.locks import locked
 from gsplat_edu.sfm.reconstruct import reconstruct
 
 

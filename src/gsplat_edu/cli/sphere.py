@@ -15,25 +15,25 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import check_writable
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.options.demo import CHAPTER, REDUCED
 from gsplat_edu.cli.options.demo import Budget as Budget
 from gsplat_edu.data.synthetic import SphereCapture, sphere_capture
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.evaluate.figures import curves_figure, held_out_figure, save_figure
-from gsplat_edu.files import check_writable
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
-from gsplat_edu.losses import l1
+from gsplat_edu.ops.losses import l1
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend, resolve_backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.course import EXTENT, course_config
 from gsplat_edu.train.events import Event
 from gsplat_edu.train.initialize import random_ball
 from gsplat_edu.train.trainer import Callback, Trainer, TrainResult
-from gsplat_edu.validation import whole_number
 
 MAX_SEED = 2**63 - 1
 """Largest seed of torch's generators."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from gsplat_edu.base.locks import locked
 from gsplat_edu.cli.blocks import prepared
 from gsplat_edu.cli.terminal import Terminal
-from gsplat_edu.locks import locked
 
 
 def run(arguments: argparse.Namespace) -> None:

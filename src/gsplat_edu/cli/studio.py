@@ -7,10 +7,10 @@ import importlib
 import sys
 from dataclasses import replace
 
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.text import install_command
 from gsplat_edu.cli.printing import say
 from gsplat_edu.cli.screen import has_screen, open_in_browser
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.text import install_command
 from gsplat_edu.viewer.serve import exposure
 
 NEEDED = ("starlette", "uvicorn", "h11")

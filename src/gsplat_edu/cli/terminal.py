@@ -9,9 +9,9 @@ from rich.progress import Progress, ProgressColumn, Task, TaskID, TextColumn, Ti
 from rich.table import Column
 from rich.text import Text
 
+from gsplat_edu.base.text import printable
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Message
-from gsplat_edu.text import printable
 
 LINE_SECONDS = 30.0
 """Least seconds between two lines about one task, if there is no terminal for a progress bar."""

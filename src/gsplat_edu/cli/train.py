@@ -14,6 +14,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.locks import locked
 from gsplat_edu.budget.deadline import Deadline, stopwatch
 from gsplat_edu.budget.pace import Pace
 from gsplat_edu.budget.plan import PLANNED, Limits, Plan, plan
@@ -31,11 +33,9 @@ from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.doctor.finding import Remedy
 from gsplat_edu.doctor.moving import moved_line
 from gsplat_edu.doctor.remedies import CHOICES, ENOUGH, remedies_for, transients_for
-from gsplat_edu.errors import ArgumentError, CheckpointError
 from gsplat_edu.evaluate.metrics import ImageScore, psnr
 from gsplat_edu.jobs import emitter
 from gsplat_edu.jobs.events import Metric
-from gsplat_edu.locks import locked
 from gsplat_edu.render.api import render
 from gsplat_edu.runs.cleaning import cleaner
 from gsplat_edu.runs.evaluation import Evaluation

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_edu.constants import DILATION_MAX, SPLAT_LIMIT
-from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.gaussians import check_tensor
-from gsplat_edu.kernels import SUFFIXES
-from gsplat_edu.validation import flag, in_range, one_of, whole_number
+from gsplat_edu.base.constants import DILATION_MAX, SPLAT_LIMIT
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.validation import flag, in_range, one_of, whole_number
+from gsplat_edu.ops.kernels import SUFFIXES
+from gsplat_edu.scene.gaussians import check_tensor
 
 
 class RollingShutterType(Enum):

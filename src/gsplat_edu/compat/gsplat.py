@@ -31,6 +31,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from gsplat_edu.base.constants import SH_OFFSET
+from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.compat.checks import DEPTH_ONLY, Arguments, RollingShutterType, check_spreads
 from gsplat_edu.compat.harmonics import evaluate, spherical_harmonics
 from gsplat_edu.compat.images import Splats, absgrad_store, composite
@@ -38,8 +40,6 @@ from gsplat_edu.compat.parts import compute_relocation, proj, quat_scale_to_cova
 from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
 from gsplat_edu.compat.skipping import skipping_bad_gaussians, without_bad_gaussians
 from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles, rasterize_to_pixels
-from gsplat_edu.constants import SH_OFFSET
-from gsplat_edu.headroom import require_memory
 from gsplat_edu.render.api import BYTES_PER_PIXEL
 
 __all__ = [

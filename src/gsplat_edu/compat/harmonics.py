@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.compat.checks import MOST_DEGREE
-from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.gaussians import check_tensor
-from gsplat_edu.sh import basis_terms
-from gsplat_edu.validation import whole_number
+from gsplat_edu.scene.gaussians import check_tensor
+from gsplat_edu.scene.sh import basis_terms
 
 C4 = (
     0.75 * math.sqrt(35.0 / math.pi),

@@ -20,13 +20,13 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.constants import COLOR_LIMIT
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.compat.projection import Lens
-from gsplat_edu.constants import COLOR_LIMIT
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.render.cpu import render_covariances
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
 
 SETTINGS = RenderSettings(alpha_max=0.999, z_near=0.0, depth=False, stop="pixel")
 """gsplat's clamp of alpha, and its rule for the end of a pixel."""

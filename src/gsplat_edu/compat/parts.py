@@ -8,11 +8,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import first_index, flag
 from gsplat_edu.compat.checks import check_projection_options, check_size, expect, real_tensor
 from gsplat_edu.compat.projection import MARGIN, TRIANGLE
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import check_tensor, quat_to_R_t
-from gsplat_edu.validation import first_index, flag
+from gsplat_edu.scene.gaussians import check_tensor, quat_to_R_t
 
 
 def quat_scale_to_covar_preci(

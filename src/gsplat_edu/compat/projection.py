@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
+from gsplat_edu.base.constants import ALPHA_MIN, DET_FLOOR, THINNEST
+from gsplat_edu.base.validation import flag
 from gsplat_edu.compat.checks import (
     check_cameras,
     check_limits,
@@ -24,9 +26,7 @@ from gsplat_edu.compat.checks import (
     check_size,
     expect,
 )
-from gsplat_edu.constants import ALPHA_MIN, DET_FLOOR, THINNEST
-from gsplat_edu.gaussians import quat_to_R_t
-from gsplat_edu.validation import flag
+from gsplat_edu.scene.gaussians import quat_to_R_t
 
 MARGIN = 0.15
 """gsplat clamps x/z and y/z inside the Jacobian at the edge of the image, moved outwards by this fraction of its size.

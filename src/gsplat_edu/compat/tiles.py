@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.validation import flag, whole_number
 from gsplat_edu.compat.checks import MOST_PIXELS, check_size, expect, real_tensor
 from gsplat_edu.compat.images import Splats, absgrad_store, composite
 from gsplat_edu.compat.projection import Lens
-from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.gaussians import check_tensor
-from gsplat_edu.validation import flag, whole_number
+from gsplat_edu.scene.gaussians import check_tensor
 
 WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 """Dtypes of ids."""

@@ -12,15 +12,15 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import unreadable
 from gsplat_edu.data.images import UPRIGHT, PhotoFile, image_orientation, image_size, upright_size
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.notes import Note
 from gsplat_edu.data.panorama import FaceLens, face_rotations
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.data.settings import FACTOR_BELOW
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import unreadable
+from gsplat_edu.scene.camera import Camera
 
 ROTATION_SLACK = 1e-2
 """Largest entry of R R' - I that is accepted as a rotation written with few digits."""

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 from PIL import Image
 
-from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.data.city_paint import (
     PITCH,
     Buildings,
@@ -27,7 +27,7 @@ from gsplat_edu.data.city_paint import (
 )
 from gsplat_edu.data.outdoors import SUN, SUPERSAMPLING, box_hits, camera_rays, sky_colors
 from gsplat_edu.data.writers import write_model
-from gsplat_edu.validation import in_range, whole_number
+from gsplat_edu.scene.camera import Camera, look_at
 
 Rows = Float64[np.ndarray, "N 3"]
 

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import (
     Capture,
     Cloud,
@@ -44,9 +46,7 @@ from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.masks import MASKS, find_named
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note, OtherModels
 from gsplat_edu.data.panorama import FaceLens
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.gaussian_math import quat_to_R
-from gsplat_edu.text import legible
+from gsplat_edu.scene.gaussian_math import quat_to_R
 
 SPHERE = "EQUIRECTANGULAR"
 """The model whose images show all directions; they are read as several faces."""

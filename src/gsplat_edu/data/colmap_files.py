@@ -17,10 +17,10 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import unreadable
-from gsplat_edu.reading import open_file
-from gsplat_edu.text import decode_file_name
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import unreadable
+from gsplat_edu.base.reading import open_file
+from gsplat_edu.base.text import decode_file_name
 
 MODELS: tuple[tuple[str, str], ...] = (
     ("SIMPLE_PINHOLE", "f cx cy"),

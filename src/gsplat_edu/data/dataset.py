@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from gsplat_edu.camera import Camera, point_nearest_axes
-from gsplat_edu.camera import scene_extent as scene_extent
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.blender import TRAIN_FILE, read_blender
 from gsplat_edu.data.capture import (
     PHOTO_ENDINGS,
@@ -38,8 +37,9 @@ from gsplat_edu.data.points import finite_cloud, random_cloud, read_points_ply
 from gsplat_edu.data.scale import Scale, read_scale
 from gsplat_edu.data.settings import DataSettings as DataSettings
 from gsplat_edu.data.transforms import read_transforms
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, point_nearest_axes
+from gsplat_edu.scene.camera import scene_extent as scene_extent
+from gsplat_edu.scene.views import View
 
 TEST_EVERY = 8
 """Hold out every 8th view if the capture defines no split (the usual convention)."""

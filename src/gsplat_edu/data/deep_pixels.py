@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from gsplat_edu.headroom import require_memory
-from gsplat_edu.image_files import opened_image
+from gsplat_edu.base.headroom import require_memory
+from gsplat_edu.photos.image_files import opened_image
 
 DEEP_BYTES_PER_PIXEL = 24
 """Memory needed for decoding: two images of Pillow, two arrays and the result, and one band. Measured: 19 to 21."""

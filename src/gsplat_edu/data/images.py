@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt8
 from PIL import ExifTags, Image
 
+from gsplat_edu.base.errors import DatasetError, NotEnoughMemoryError, SplatError
 from gsplat_edu.data.colors import conversion_of, to_srgb
 from gsplat_edu.data.deep_pixels import DEEP_BYTES_PER_PIXEL, is_deep, rounded_image
 from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.data.panorama import FaceLens, cut_face
 from gsplat_edu.data.watch import FileWatch
-from gsplat_edu.errors import DatasetError, NotEnoughMemoryError, SplatError
-from gsplat_edu.image_files import (
+from gsplat_edu.photos.image_files import (
     BYTES_PER_PIXEL,
     HEIF,
     SPELLED,
@@ -29,8 +29,8 @@ from gsplat_edu.image_files import (
     opened_image,
     require_room,
 )
-from gsplat_edu.resizing import area_mean, premultiplied, smaller_mask, unweighted
-from gsplat_edu.views import Photo
+from gsplat_edu.photos.resizing import area_mean, premultiplied, smaller_mask, unweighted
+from gsplat_edu.scene.views import Photo
 
 AT_ONCE = 64_000_000
 """Pixels to decode at once; decoding takes about 10 bytes per pixel, and 25 more if alpha is resampled."""
@@ -167,7 +167,7 @@ def upright_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
 def decode(
     path: Path, orientation: int = UPRIGHT, smaller: int | None = None
 ) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
-    """Decode an image file in one of `gsplat_edu.image_files.FORMATS` to 8-bit sRGB.
+    """Decode an image file in one of `gsplat_edu.photos.image_files.FORMATS` to 8-bit sRGB.
 
     Every reader of photos calls this. 16 bits are rounded to 8, and colours of another profile are converted; all other
     pixels are as the file stores them.

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.lens_formulas import FORMULAS, Plane
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.intrinsics import Intrinsics
+from gsplat_edu.scene.intrinsics import Intrinsics
 
 PINHOLE_LIKE, FISHEYE = "perspective", "fisheye"
 """Two names of `gsplat_edu.data.lens_formulas.FORMULAS`."""

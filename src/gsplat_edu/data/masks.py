@@ -12,10 +12,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, Frame, entries, is_file, is_folder
 from gsplat_edu.data.notes import LossyMasks, Note, PhotosWithoutMask, UnclearMasks
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.text import legible
 
 MASK_ENDINGS = (*PHOTO_ENDINGS, ".bmp", ".pgm")
 """Suffixes of masks, in any case."""

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import Frame, fits_camera
 from gsplat_edu.data.images import UPRIGHT, image_orientation
-from gsplat_edu.errors import DatasetError
 
 QUARTER_TURNS = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""

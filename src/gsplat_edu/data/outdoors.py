@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.views import View
 
 Rows = Float64[np.ndarray, "N 3"]
 

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from gsplat_edu.base.errors import DatasetError, ShapeError
 from gsplat_edu.data.lens import MAX_REMAPPED, Lens
-from gsplat_edu.errors import DatasetError, ShapeError
-from gsplat_edu.intrinsics import Intrinsics
-from gsplat_edu.resizing import area_mean, premultiplied, smaller_mask, unweighted
+from gsplat_edu.photos.resizing import area_mean, premultiplied, smaller_mask, unweighted
+from gsplat_edu.scene.intrinsics import Intrinsics
 
 PITCHES = (33.0, -33.0)
 """Pitch of the two rings of faces, degrees; positive looks up. A face of 90 degrees reaches from 12 degrees across the

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.constants import C0
+from gsplat_edu.base.constants import C0
+from gsplat_edu.base.errors import DatasetError, SceneFormatError
+from gsplat_edu.base.ply_table import read_elements, read_rows
+from gsplat_edu.base.reading import open_file
 from gsplat_edu.data.capture import MAX_COORDINATE, Cloud, unit_colors
-from gsplat_edu.errors import DatasetError, SceneFormatError
-from gsplat_edu.ply_table import read_elements, read_rows
-from gsplat_edu.reading import open_file
 
 RANDOM_POINTS = 100_000
 """Size of a random initial cloud, as in Inria's code for Blender scenes."""

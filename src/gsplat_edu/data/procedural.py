@@ -10,11 +10,11 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera, look_at
-from gsplat_edu.gaussian_math import build_cov3d_batch, quat_to_R_batch
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.render.numpy_reference import render_gaussians
-from gsplat_edu.validation import whole_number
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, look_at
+from gsplat_edu.scene.gaussian_math import build_cov3d_batch, quat_to_R_batch
+from gsplat_edu.scene.views import View
 
 TARGET = (0.1, -0.05, 0.15)
 """Target of the cameras; not the origin, so that errors in the camera centre become visible."""

@@ -6,9 +6,9 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import unreadable, written_aside
-from gsplat_edu.reading import parse_json, read_text
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import unreadable, written_aside
+from gsplat_edu.base.reading import parse_json, read_text
 
 SCALE_FILE = "scale.json"
 """Name of the file in a capture's folder."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import float64_array, in_range, whole_number
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import float64_array, in_range, whole_number
 
 FACTOR_BELOW = 32
 """A resolution below this is a divisor of the size; from here on it is the longest side, px."""

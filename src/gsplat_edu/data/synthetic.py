@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsplat_edu.camera import Camera, orbit_camera
 from gsplat_edu.render.numpy_reference import render_gaussians
-from gsplat_edu.scenes import sphere_shell
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera, orbit_camera
+from gsplat_edu.scene.sphere_shell import sphere_shell
+from gsplat_edu.scene.views import View
 
 ORBIT_RADIUS = 3.0
 """Distance of the course's cameras to the sphere's centre, world units."""

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from gsplat_edu.camera import Camera, look_at
+from gsplat_edu.scene.camera import Camera, look_at
 
 BOX_FACES = np.array(
     [

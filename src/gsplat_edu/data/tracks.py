@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.scene.camera import Camera
 
 MOST_SEEN = 2_000
 """Points that a photo sees at most, taken evenly from the order of the points: about as many as matching finds. A cloud

@@ -17,6 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import unreadable
+from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.text import as_file_name, legible
 from gsplat_edu.data.capture import (
     PHOTO_ENDINGS,
     Capture,
@@ -34,10 +38,6 @@ from gsplat_edu.data.lens import FISHEYE, PINHOLE_LIKE, Lens, lens_of
 from gsplat_edu.data.masks import with_masks
 from gsplat_edu.data.notes import FilesOutside, MissingPhotos, Note
 from gsplat_edu.data.points import read_points_ply
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import unreadable
-from gsplat_edu.reading import parse_json, read_text
-from gsplat_edu.text import as_file_name, legible
 
 FISHEYE_MODEL = "OPENCV_FISHEYE"
 

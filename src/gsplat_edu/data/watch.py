@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.base.errors import DatasetError
 
 Stamp = tuple[int, int]
 """Size in bytes and modification time in ns; a file is hashed again only if one of them differs."""

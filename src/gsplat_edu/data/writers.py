@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.points import write_points_ply
 from gsplat_edu.data.tracks import UNMEASURED, Seen, seen_by, tracks_of
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import ArrayLike, float64_array
-from gsplat_edu.views import Photo, View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import Photo, View
 
 PINHOLE = 1
 """COLMAP's model number for a pinhole with two focal lengths."""

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsplat_edu.base.text import spelled_seconds
 from gsplat_edu.doctor.appearance import EXPOSURE
 from gsplat_edu.doctor.finding import NAMED, Diagnosis, Finding, Severity, command, counted, new_run
 from gsplat_edu.doctor.residuals import Residual
 from gsplat_edu.evaluate.report import OVERFITTED
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.shells import far_shell
-from gsplat_edu.text import spelled_seconds
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
 from gsplat_edu.train.config import DEFAULT_QUALITY, QUALITIES, RECIPE_ITERATIONS
 
 POOR = 20.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+from gsplat_edu.base.text import short_number
 from gsplat_edu.data.notes import Background, MissingPhotos
 from gsplat_edu.doctor.appearance import check_blur, check_duplicates, check_exposure
 from gsplat_edu.doctor.cameras import (
@@ -24,7 +25,6 @@ from gsplat_edu.doctor.files import check_missing, check_poses, check_readable, 
 from gsplat_edu.doctor.finding import Diagnosis, Finding, command, new_run
 from gsplat_edu.doctor.remedies import check_sky
 from gsplat_edu.doctor.survey import Survey
-from gsplat_edu.text import short_number
 from gsplat_edu.train.config import TrainConfig
 
 Check = Callable[[Survey], list[Finding]]

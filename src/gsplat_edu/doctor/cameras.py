@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 
+from gsplat_edu.base.text import short_number
 from gsplat_edu.data.dataset import TEST_EVERY
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.doctor.finding import Finding, Severity
 from gsplat_edu.doctor.geometry import FORWARD, INWARD, Geometry, inside
 from gsplat_edu.doctor.survey import Shot, Survey
 from gsplat_edu.evaluate.paths import common_up
-from gsplat_edu.text import short_number
 from gsplat_edu.train.capacity import advised_side
 
 OFF_CENTRE = 0.1

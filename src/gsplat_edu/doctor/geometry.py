@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import scene_extent
 from gsplat_edu.evaluate.following import point_nearest_most_axes
+from gsplat_edu.scene.camera import Camera
 
 SAMPLES = 300
 """Sample points per camera: enough to know a median of ratios to a tenth of their spread."""

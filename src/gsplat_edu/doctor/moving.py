@@ -7,11 +7,11 @@ from pathlib import Path
 
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.doctor.finding import command, counted
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.transient_masks import Compared, FeatureRenderer, find_masks
 from gsplat_edu.train.transients import FEWEST, reduced
-from gsplat_edu.views import View
 
 NOTABLE = 0.01
 """Photos of which less than this share differs are not reported."""

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from gsplat_edu.data.images import PhotoFile, decode, decode_mask
 from gsplat_edu.data.lens import undistortion
 from gsplat_edu.data.panorama import FaceLens, cut_face, face_side
-from gsplat_edu.views import Photo
+from gsplat_edu.scene.views import Photo
 
 WORK_SIDE = 1024
 """Longest side at which sharpness is measured, px. Blur that is invisible at this size hardly harms a scene, and photos

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.doctor.photos import BRIGHT, DARK, GAMMA
 from gsplat_edu.evaluate.metrics import Renderer, at_exposure_of, psnr, seen_through
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.shells import far_shell
-from gsplat_edu.validation import ArrayLike
-from gsplat_edu.views import View
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
+from gsplat_edu.scene.views import View
 
 SOLID = 0.5
 """A pixel has a depth if its splats block more than this share of the light."""

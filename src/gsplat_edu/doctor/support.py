@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.reading import open_file, read_bytes
+from gsplat_edu.base.text import decode_file_name, legible
 from gsplat_edu.data.colmap import find_model
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.reading import open_file, read_bytes
-from gsplat_edu.text import decode_file_name, legible
 
 _IMAGE = struct.Struct("<I7dI")
 _POINT = struct.Struct("<Q3d3Bd")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.capture import PHOTO_ENDINGS, Capture, Frame, entries, is_folder, photo_file
 from gsplat_edu.data.dataset import read_capture
 from gsplat_edu.data.images import image_header, image_size
@@ -23,7 +23,7 @@ from gsplat_edu.data.points import finite_cloud
 from gsplat_edu.doctor.geometry import Geometry
 from gsplat_edu.doctor.photos import PhotoStats, measure_photo
 from gsplat_edu.doctor.support import observed_points
-from gsplat_edu.errors import DatasetError
+from gsplat_edu.scene.camera import Camera
 
 WORKERS = 2
 """Photos decoded at the same time: a JPEG briefly takes up to 40 MB, other formats their full size."""

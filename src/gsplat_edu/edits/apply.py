@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, UInt8
 
-from gsplat_edu.camera import WORLD_UP
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.cells import Work
 from gsplat_edu.edits.membership import Members, Values, members
 from gsplat_edu.evaluate.keyframes import Keyframe, KeyframePath
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.edit import IDENTITY, Similarity
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.camera import WORLD_UP
+from gsplat_edu.scene.gaussians import Gaussians
 
 SELECTED, HIDDEN, DELETED = 1, 2, 4
 """States of a splat; at most one at a time. 0 is a splat that is merely there."""

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 
 SIDE = 64
 """Cells along each axis."""

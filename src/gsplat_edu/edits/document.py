@@ -10,15 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_edu.camera import ROTATION_TOLERANCE
-from gsplat_edu.constants import Z_NEAR
-from gsplat_edu.edits import operations as ops
-from gsplat_edu.edits.identity import Identity
-from gsplat_edu.edits.stored import MOST_BYTES
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.evaluate.keyframes import Keyframe, check_keyframe, parsed_keyframe, parsed_path
-from gsplat_edu.io.ply_comments import UNITS
-from gsplat_edu.json_fields import (
+from gsplat_edu.base.constants import Z_NEAR
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.json_fields import (
     as_json,
     check_keys,
     checked_choice,
@@ -30,7 +24,13 @@ from gsplat_edu.json_fields import (
     number_within,
     numbers_within,
 )
-from gsplat_edu.reading import open_file, parse_json
+from gsplat_edu.base.reading import open_file, parse_json
+from gsplat_edu.edits import operations as ops
+from gsplat_edu.edits.identity import Identity
+from gsplat_edu.edits.stored import MOST_BYTES
+from gsplat_edu.evaluate.keyframes import Keyframe, check_keyframe, parsed_keyframe, parsed_path
+from gsplat_edu.io.ply_comments import UNITS
+from gsplat_edu.scene.camera import ROTATION_TOLERANCE
 
 FORMAT = "gsplat_edu edits"
 VERSION = 1

@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.json_fields import as_json, check_keys, checked_object, checked_whole, numbers_within
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.json_fields import as_json, check_keys, checked_object, checked_whole, numbers_within
+from gsplat_edu.scene.gaussians import Gaussians
 
 ORDER = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 """Parameters in the order in which they are hashed."""

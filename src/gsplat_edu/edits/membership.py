@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float64
 from gsplat_edu.edits import operations as ops
 from gsplat_edu.edits.cells import Cells, Column, Work
 from gsplat_edu.edits.document import NEAR
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.gaussians import Gaussians
 
 Members = Bool[np.ndarray, " N"]
 

@@ -17,16 +17,16 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gsplat_edu.adam import adam_in_torch
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.evaluate.metrics import at_exposure_of, psnr, seen_through
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import photo_loss
-from gsplat_edu.moments import AdamNumbers
+from gsplat_edu.ops.adam import adam_in_torch
+from gsplat_edu.ops.losses import photo_loss
+from gsplat_edu.ops.moments import AdamNumbers
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.validation import ArrayLike
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 SQUARES = 8
 """Squares along each side of the chessboard."""

@@ -14,8 +14,8 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
-from gsplat_edu.files import written_aside
-from gsplat_edu.image_files import opened_image
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.photos.image_files import opened_image
 
 SEPARATOR_WIDTH = 4
 """Width of the line between two images side by side, px."""

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_image
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 
 
 def compare_scenes(

@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from gsplat_edu.files import written_aside
+from gsplat_edu.base.files import written_aside
 
 DPI = 150
 

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import remove_leftovers, written_aside
+from gsplat_edu.base.validation import ArrayLike, check_shape, in_range
 from gsplat_edu.evaluate.comparison import SEPARATOR_GREY, SEPARATOR_WIDTH
 from gsplat_edu.evaluate.metrics import to_bytes
 from gsplat_edu.evaluate.video import encode_video
-from gsplat_edu.files import remove_leftovers, written_aside
-from gsplat_edu.validation import ArrayLike, check_shape, in_range
 
 PICTURE_SIDE = 640
 """Pictures of a report are shrunk until their longer side has this many px."""

@@ -21,12 +21,12 @@ from typing import Any, NoReturn
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import ROTATION_TOLERANCE, Camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.files import written_aside
-from gsplat_edu.json_fields import as_json, check_keys, checked_number, checked_numbers
-from gsplat_edu.reading import parse_json, read_text
-from gsplat_edu.validation import ArrayLike, float64_array
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.json_fields import as_json, check_keys, checked_number, checked_numbers
+from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.validation import ArrayLike, float64_array
+from gsplat_edu.scene.camera import ROTATION_TOLERANCE, Camera
 
 FORMAT = "gsplat_edu path"
 VERSION = 1

@@ -11,9 +11,9 @@ import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import written_aside
 from gsplat_edu.evaluate.images import save_png
-from gsplat_edu.files import written_aside
 
 LIST = "maps.json"
 """What a value of each 16-bit PNG means."""

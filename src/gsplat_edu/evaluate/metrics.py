@@ -25,15 +25,15 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, UInt8
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import l1_ssim
-from gsplat_edu.recolor import Behind, recolored
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike, check_shape, float64_array
+from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
+from gsplat_edu.ops.losses import l1_ssim
+from gsplat_edu.ops.recolor import Behind, recolored
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.validation import ArrayLike, check_shape, float64_array
-from gsplat_edu.views import Photo, View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import Photo, View
 
 MSE_FLOOR = 1e-10
 """Smallest mean squared error: identical images have 100 dB, a finite number to average, plot and store."""
@@ -114,9 +114,9 @@ def psnr_fitted(
 ) -> float | None:
     """Return the PSNR of the right half of an image after a fit of its colours on the left half.
 
-    Each channel's gain is `gsplat_edu.exposure.measured_gains` of the left halves, which is applied to the right half.
-    So a held-out photo can be compared with a scene of another exposure, on pixels that the fit has not seen. Unlike
-    `psnr`, it covers only half of the image.
+    Each channel's gain is `gsplat_edu.ops.exposure.measured_gains` of the left halves, which is applied to the right
+    half. So a held-out photo can be compared with a scene of another exposure, on pixels that the fit has not seen.
+    Unlike `psnr`, it covers only half of the image.
 
     Arguments and errors are those of `psnr`.
 

@@ -24,10 +24,10 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.validation import ArrayLike, float64_array, whole_number
 from gsplat_edu.evaluate.keyframes import KeyframePath
-from gsplat_edu.gaussian_math import quat_to_R_batch
-from gsplat_edu.validation import ArrayLike, float64_array, whole_number
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussian_math import quat_to_R_batch
 
 STEPS = 64
 """Chords per segment whose sum approximates its length."""

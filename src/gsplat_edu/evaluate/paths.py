@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import WORLD_UP, Camera, as_camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.shells import far_shell
-from gsplat_edu.validation import ArrayLike, float64_array, whole_number
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike, float64_array, whole_number
+from gsplat_edu.scene.camera import WORLD_UP, Camera, as_camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.shells import far_shell
 
 Vector = Float64[np.ndarray, "3"]
 

@@ -19,15 +19,15 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from gsplat_edu.content_policy import content_policy, policy_element
+from gsplat_edu.base.content_policy import content_policy, policy_element
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import stored_path
+from gsplat_edu.base.text import write_text
 from gsplat_edu.evaluate.block_figures import blocks_table, cells_figure
 from gsplat_edu.evaluate.figures import run_curve_figures, svg_element
 from gsplat_edu.evaluate.images import small_jpeg
 from gsplat_edu.evaluate.masked import MaskedPicture, masked_figures
 from gsplat_edu.evaluate.metrics import ImageScore, best, worst
-from gsplat_edu.files import written_aside
-from gsplat_edu.reading import stored_path
-from gsplat_edu.text import write_text
 
 PICTURES = 8
 """Most test views shown in a report."""

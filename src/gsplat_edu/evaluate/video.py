@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import named_in_utf8
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.evaluate.metrics import to_bytes
-from gsplat_edu.files import named_in_utf8
-from gsplat_edu.validation import ArrayLike
 
 FOURCC = "vp09"
 

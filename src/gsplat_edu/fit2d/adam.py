@@ -11,9 +11,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.validation import in_range
 from gsplat_edu.fit2d.splats import PER_SPLAT, Splats2D
-from gsplat_edu.validation import in_range
 
 RATES_2D: Mapping[str, float] = MappingProxyType(
     {"means": 0.8, "log_scales": 0.1, "angles": 0.1, "colors": 0.05, "logit_opacities": 0.1}

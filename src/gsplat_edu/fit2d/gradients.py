@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.constants import ALPHA_MAX
+from gsplat_edu.base.constants import ALPHA_MAX
+from gsplat_edu.base.validation import ArrayLike, check_shape, float64_array
 from gsplat_edu.fit2d.splats import Footprint, Render2D, Splats2D, check_same_size
-from gsplat_edu.validation import ArrayLike, check_shape, float64_array
 
 Sums = Float64[np.ndarray, "9"]
 

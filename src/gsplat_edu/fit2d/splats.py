@@ -15,9 +15,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array, in_range, whole_number
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, DILATION
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import (
+    ArrayLike,
+    check_shape,
+    first_index,
+    float64_array,
+    in_range,
+    whole_number,
+)
 
 Array = Float64[np.ndarray, "..."]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.gaussians import Gaussians
 
 POSITION_SIGNS = (1.0, -1.0, -1.0)
 

@@ -28,17 +28,17 @@ import torch
 from jaxtyping import Float32, Float64, Int64, UInt8, UInt32
 from numpy.lib.recfunctions import structured_to_unstructured
 
-from gsplat_edu.constants import C0, SH_OFFSET
-from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import C0, SH_OFFSET
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.ply_table import Element, Header, read_elements, read_rows
+from gsplat_edu.base.reading import open_file
 from gsplat_edu.io.ply_comments import comments, read_comments
 from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.morton import morton_codes
-from gsplat_edu.ply_table import Element, Header, read_elements, read_rows
-from gsplat_edu.reading import open_file
-from gsplat_edu.shells import far_shell
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.morton import morton_codes
+from gsplat_edu.scene.shells import far_shell
 
 CHUNK = 256
 """Splats per chunk; the last chunk may have fewer."""

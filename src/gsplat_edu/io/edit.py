@@ -11,14 +11,14 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gsplat_edu.camera import Camera, as_camera
-from gsplat_edu.constants import SH_MAX_DEGREE
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.validation import ArrayLike, float64_array, in_range, whole_number
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.sh import num_coefficients, sh_rotation
-from gsplat_edu.threads import one_thread
-from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
+from gsplat_edu.scene.camera import Camera, as_camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.sh import num_coefficients, sh_rotation
 
 SHEAR = 1e-5
 """Largest entry of A A' / s² - I accepted for a similarity, to allow matrices typed with six digits."""

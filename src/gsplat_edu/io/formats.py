@@ -6,10 +6,10 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsplat_edu.constants import SH_MAX_DEGREE
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.gaussians import is_finite
+from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.scene import Scene
+from gsplat_edu.scene.gaussians import is_finite
 
 
 @dataclass(frozen=True)

@@ -30,15 +30,15 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsplat_edu.constants import SH_MAX_DEGREE
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.io.axes import POSITION_SIGNS, half_turned
 from gsplat_edu.io.quantize import unit_quats
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.ply_table import LFS_POINTER
-from gsplat_edu.reading import parse_json, read_bytes
+from gsplat_edu.scene.gaussians import Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 

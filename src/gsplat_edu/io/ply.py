@@ -25,15 +25,15 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from numpy.lib.recfunctions import structured_to_unstructured
 
-from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.ply_table import BLOCK, Element, read_blocks, read_elements
+from gsplat_edu.base.reading import open_file
+from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.io import compressed_ply
 from gsplat_edu.io.ply_comments import comments, read_comments
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.ply_table import BLOCK, Element, read_blocks, read_elements
-from gsplat_edu.reading import open_file
-from gsplat_edu.validation import ArrayLike, float64_array
+from gsplat_edu.scene.gaussians import Gaussians
 
 MEANS = ("x", "y", "z")
 SH0 = tuple(f"f_dc_{i}" for i in range(3))

@@ -17,7 +17,7 @@ import math
 import re
 from pathlib import Path
 
-from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.scene import Scene
 
 OURS = "gsplat_edu"

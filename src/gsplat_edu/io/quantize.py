@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Integer, UInt8
 
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.validation import first_index
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.validation import first_index
 
 OPACITY_EDGE = 0.25 / 255.0
 """Bytes 0 and 255 decode to opacities this far from 0 and 1 (a quarter of a step), whose logits are finite."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)

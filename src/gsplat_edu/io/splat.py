@@ -18,14 +18,14 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
 
-from gsplat_edu.constants import C0, SH_OFFSET
-from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import C0, SH_OFFSET
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.quantize import byte_to_logit, logit_to_byte, unit_quats
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.ply_table import LFS_POINTER
-from gsplat_edu.reading import read_bytes
+from gsplat_edu.scene.gaussians import Gaussians
 
 SPLAT = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 

@@ -36,15 +36,15 @@ import torch
 import zstandard
 from jaxtyping import Float, UInt8
 
-from gsplat_edu.camera import WORLD_UP
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io import spz_values as values
 from gsplat_edu.io.axes import half_turned
 from gsplat_edu.io.quantize import SMALL, byte_to_logit, check_expansion, logit_to_byte
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.reading import read_bytes
+from gsplat_edu.scene.camera import WORLD_UP
+from gsplat_edu.scene.gaussians import Gaussians
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"

@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float32, Int64, UInt8
 
-from gsplat_edu.constants import SH_MAX_DEGREE
+from gsplat_edu.base.constants import SH_MAX_DEGREE
 from gsplat_edu.io.quantize import unit_quats
 
 MAX_FRACTIONAL_BITS = 24

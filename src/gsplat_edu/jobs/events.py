@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsplat_edu.json_fields import LARGEST_NUMBER
-from gsplat_edu.reading import parse_json
+from gsplat_edu.base.json_fields import LARGEST_NUMBER
+from gsplat_edu.base.reading import parse_json
 
 EVENTS = "GSPLAT_EDU_EVENTS"
 """Environment variable that names the file of events."""

@@ -6,8 +6,8 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsplat_edu.base.reading import open_file
 from gsplat_edu.jobs.events import Event, Failed, Finished, Interrupted, Progress, Stage, Started, parse_line
-from gsplat_edu.reading import open_file
 
 PIECE = 1 << 20
 """Most bytes to read at once."""

@@ -19,8 +19,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.files import described, remove_leftovers
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import described, remove_leftovers
 from gsplat_edu.jobs.events import EVENTS, Failed, Finished, Interrupted
 from gsplat_edu.jobs.following import LAST, last_start, last_word
 from gsplat_edu.jobs.process import SIGNALS, carries, identity, is_running, send
@@ -53,7 +53,7 @@ PROGRAM = (sys.executable, "-m", "gsplat_edu")
 class JobQueue:
     """The jobs of a folder.
 
-    It may be used from any thread. Only one process may have a queue for a folder (see `gsplat_edu.locks`).
+    It may be used from any thread. Only one process may have a queue for a folder (see `gsplat_edu.base.locks`).
 
     Args:
         folder: One folder per job; created if missing.

@@ -19,10 +19,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.files import written_aside
-from gsplat_edu.reading import open_file, parse_json
-from gsplat_edu.text import printable, shortened
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import open_file, parse_json
+from gsplat_edu.base.text import printable, shortened
 
 VERSION = 2
 

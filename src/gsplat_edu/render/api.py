@@ -9,16 +9,16 @@ from typing import overload
 import torch
 from torch import Tensor
 
-from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians, check_tensor
-from gsplat_edu.headroom import require_memory
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.headroom import require_memory
+from gsplat_edu.base.validation import of_type
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput, RenderStack, check_features
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.validation import of_type
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
+from gsplat_edu.scene.gaussians import Gaussians, check_tensor
 
 BYTES_PER_PIXEL = 40
 """Memory for creating and using an image: 20 bytes as float32 with transmittance and depth, and as much again for its

@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 
 import torch
 
-from gsplat_edu.adam import AdamKernel
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import LossKernel
-from gsplat_edu.noise import NoiseKernel
-from gsplat_edu.recolor import RecolorKernel
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.ops.adam import AdamKernel
+from gsplat_edu.ops.losses import LossKernel
+from gsplat_edu.ops.noise import NoiseKernel
+from gsplat_edu.ops.recolor import RecolorKernel
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 
 Rasterize = Callable[[Gaussians, "Camera | CameraTensors", RenderSettings, Extra], RenderOutput]
 """Renders validated arguments; `gsplat_edu.render.api.render` validates them."""

@@ -11,13 +11,13 @@ import warnings
 import torch
 from torch import Tensor
 
-from gsplat_edu import kernels
-from gsplat_edu.adam import adam_in_torch, adam_natively
-from gsplat_edu.errors import BackendUnavailableError, BackendWarning
-from gsplat_edu.losses import l1_ssim, l1_ssim_in_torch
-from gsplat_edu.moments import AdamNumbers
-from gsplat_edu.noise import add_noise_in_torch, add_noise_natively
-from gsplat_edu.recolor import recolored_in_torch, recolored_natively
+from gsplat_edu.base.errors import BackendUnavailableError, BackendWarning
+from gsplat_edu.ops import kernels
+from gsplat_edu.ops.adam import adam_in_torch, adam_natively
+from gsplat_edu.ops.losses import l1_ssim, l1_ssim_in_torch
+from gsplat_edu.ops.moments import AdamNumbers
+from gsplat_edu.ops.noise import add_noise_in_torch, add_noise_natively
+from gsplat_edu.ops.recolor import recolored_in_torch, recolored_natively
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.self_check import cuda_failure
 from gsplat_edu.render.settings import BACKENDS as BACKENDS

@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu.camera import Camera, CameraLike, as_camera, jacobian_bound
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import check_tensor
-from gsplat_edu.validation import whole_number
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import whole_number
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera, jacobian_bound
+from gsplat_edu.scene.gaussians import check_tensor
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 """The entries of `CameraTensors.intrinsics`, px."""

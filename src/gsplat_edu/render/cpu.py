@@ -21,12 +21,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu.buffers import reusable_tensor
-from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians, check_tensor
-from gsplat_edu.kernels import SUFFIXES, kernel, native, native_array
-from gsplat_edu.moments import AdamInBackward, Moments
+from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.ops.kernels import SUFFIXES, kernel, native, native_array
+from gsplat_edu.ops.moments import AdamInBackward, Moments
 from gsplat_edu.render.camera_tensors import (
     GRADIENT_NUMBERS,
     CameraTensors,
@@ -36,6 +34,8 @@ from gsplat_edu.render.camera_tensors import (
 )
 from gsplat_edu.render.output import MOST_CHANNELS, STATISTICS, Extra, RenderOutput, check_features
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
+from gsplat_edu.scene.gaussians import Gaussians, check_tensor
 
 
 class _Waiting(NamedTuple):

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians, unchecked_rotations
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.api import render
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import MAPS, RenderSettings
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
+from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
 
 
 def facing_normals(gaussians: Gaussians, camera: CameraLike) -> Float[Tensor, "N 3"]:

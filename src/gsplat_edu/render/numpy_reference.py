@@ -12,8 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.constants import (
+from gsplat_edu.base.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     DILATION,
@@ -24,9 +23,10 @@ from gsplat_edu.constants import (
     TILE,
     Z_NEAR,
 )
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussian_math import project_cov3d
-from gsplat_edu.validation import ArrayLike, first_index, float64_array, in_range, one_of
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike, first_index, float64_array, in_range, one_of
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
+from gsplat_edu.scene.gaussian_math import project_cov3d
 
 Extent = Literal["box3sigma", "exact"]
 Stop = Literal["box", "tile", "none"]

@@ -9,9 +9,9 @@ from typing import NamedTuple
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.gaussians import check_tensor
-from gsplat_edu.moments import AdamInBackward
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.ops.moments import AdamInBackward
+from gsplat_edu.scene.gaussians import check_tensor
 
 MOST_CHANNELS = 32
 """Largest number of channels of features in one pass of the native kernels."""

@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_edu import kernels
-from gsplat_edu.camera import Camera
-from gsplat_edu.constants import ALPHA_MIN
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import ALPHA_MIN
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.ops import kernels
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 
 IMAGE_BOUND = 1.1 * ALPHA_MIN
 """Largest error of a pixel, relative to the brightest or 1. If float32 rounds an alpha across 1/255, a pixel loses or

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DILATION, DILATION_MAX, SH_MAX_DEGREE, Z_NEAR
-from gsplat_edu.errors import BackendUnavailableError
-from gsplat_edu.validation import flag, float64_array, in_range, one_of, quoted, whole_number
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, DILATION, DILATION_MAX, SH_MAX_DEGREE, Z_NEAR
+from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.base.validation import flag, float64_array, in_range, one_of, quoted, whole_number
 
 BACKENDS = ("cuda", "cpu", "torch")
 """All backends, fastest first: Triton kernels on a GPU; native SIMD kernels; the dense reference, which evaluates every
@@ -40,11 +40,11 @@ class RenderSettings:
         background: RGB colour behind everything.
         sh_degree: Highest SH degree to use; lower if the Gaussians store fewer coefficients.
         antialiased: Lower each opacity to compensate for the dilation (Mip-Splatting), see
-            `gsplat_edu.gaussian_math.opacity_compensation`.
+            `gsplat_edu.scene.gaussian_math.opacity_compensation`.
         depth: Also render expected depth. Training without a depth loss is faster without it.
         median_depth: Also render median depth.
         dilation: Added to both diagonal entries of every screen-space covariance, px², 0 to 1e6. Below 2e-6, Gaussians
-            thinner than 1/1000 px on the screen are not drawn (`gsplat_edu.constants.THINNEST`).
+            thinner than 1/1000 px on the screen are not drawn (`gsplat_edu.base.constants.THINNEST`).
         jacobian_limit: Clamp x/z and y/z inside the projection's Jacobian to this multiple of half the field of view
             (`Camera.jacobian_bounds`); 1.3 for captures, as in Kerbl et al.'s code; None disables clamping.
         alpha_max: Clamp of a splat's alpha in a pixel, 1/255 to 0.9999; gsplat uses 0.999.

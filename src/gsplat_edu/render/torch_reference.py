@@ -16,15 +16,15 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.camera import Camera, CameraLike, as_camera
-from gsplat_edu.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, SH_OFFSET, THINNEST
-from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.gaussians import Gaussians, check_tensor, quat_to_R_t
+from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, SH_OFFSET, THINNEST
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.validation import first_index, in_range, whole_number
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.sh import basis_terms, num_coefficients
-from gsplat_edu.validation import first_index, in_range, whole_number
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
+from gsplat_edu.scene.gaussians import Gaussians, check_tensor, quat_to_R_t
+from gsplat_edu.scene.sh import basis_terms, num_coefficients
 
 
 class DenseRender(NamedTuple):

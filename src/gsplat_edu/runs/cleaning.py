@@ -10,12 +10,11 @@ from typing import Any
 
 import torch
 
+from gsplat_edu.base.constants import C0, SH_OFFSET
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.clean.guard import Cleaning, clean
 from gsplat_edu.clean.judge import Reason
-from gsplat_edu.constants import C0, SH_OFFSET
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import FORMATS
 from gsplat_edu.render.api import render
 from gsplat_edu.render.settings import RenderSettings
@@ -24,6 +23,7 @@ from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.identity import capture_difference
 from gsplat_edu.runs.source import NamedCamera, Source, open_source, relative_to, run_of, scene_up
+from gsplat_edu.scene.gaussians import Gaussians
 
 SIGNALS = {
     Reason.UNSEEN: ("blue", (0.1, 0.35, 1.0)),

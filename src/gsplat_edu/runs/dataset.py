@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset, DataSettings, load_dataset
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.reading import stored_path
 
 KEYS = ("resolution", "test_every", "background", "image_memory", "train_views", "test_views")
 """Keys of the section "data" that are data settings."""

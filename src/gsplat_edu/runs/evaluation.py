@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.evaluate.comparison import save_comparison
 from gsplat_edu.evaluate.metrics import ImageScore, Renderer, score_views, summarize
 from gsplat_edu.evaluate.report import Picture, Report, write_report
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.runs.dataset import appearance_of
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.runs.transients import masked_pictures
-from gsplat_edu.validation import ArrayLike
-from gsplat_edu.views import View
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 Image = UInt8[np.ndarray, "H W 3"]
 

@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.recolor import recolored
+from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
+from gsplat_edu.ops.recolor import recolored
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.validation import ArrayLike
-from gsplat_edu.views import Photo, View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import Photo, View
 
 Render = Callable[[Gaussians, Camera], RenderOutput]
 """Renders Gaussians from a camera."""

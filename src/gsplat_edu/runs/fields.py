@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gsplat_edu.errors import CheckpointError
+from gsplat_edu.base.errors import CheckpointError
 
 LARGEST_WHOLE = 2**63
 """Integers must be smaller than this in absolute value."""

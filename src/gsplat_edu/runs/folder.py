@@ -9,7 +9,7 @@
     checkpoints/                                  states to resume from
     renders/                                      pictures
     report.html                                   the run on one page
-    .lock                                         names the process that writes here (`gsplat_edu.locks`); the file of
+    .lock                                         names the process that writes here (see base/locks.py); the file of
                                                   a killed process remains, but locks nothing
 
 Scenes and cameras.json are in the capture's own frame. Training may subtract an origin from the coordinates;
@@ -27,15 +27,15 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.files import written_aside
-from gsplat_edu.reading import parse_json, read_text
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import parse_json, read_text
+from gsplat_edu.base.text import as_file_name
+from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.fields import CONFIG, LOG, METRICS, checked
-from gsplat_edu.text import as_file_name
-from gsplat_edu.validation import ArrayLike, float64_array
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.views import View
 
 ORIGIN = (0.0, 0.0, 0.0)
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import CheckpointError
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import PhotoFile
-from gsplat_edu.errors import CheckpointError
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.train.config import ONLY_FOR, SETTINGS
 
 SAME = ("train", "render", "data")

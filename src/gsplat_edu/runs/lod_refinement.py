@@ -17,10 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.paths import resized
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.lod.levels import Node, leaves_of, level_of, with_levels
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backends import device_of, load_backend
@@ -29,9 +27,11 @@ from gsplat_edu.runs.exposed import at_exposure_of_scene
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.refined import with_camera
 from gsplat_edu.runs.source import Source, run_of
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.compose import Start, Views, training
 from gsplat_edu.train.config import FROM_SCENE, recipe
-from gsplat_edu.views import View
 
 MOST_JUDGED = 8
 """Views that a level is scored on, at most."""

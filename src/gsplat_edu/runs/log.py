@@ -10,8 +10,8 @@ from typing import Any, TextIO
 
 import torch
 
-from gsplat_edu.files import named_failure, written_aside
-from gsplat_edu.reading import parse_json, read_text
+from gsplat_edu.base.files import named_failure, written_aside
+from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.train.events import Event, StepEvent
 
 IMAGES_PER_LINE = 10

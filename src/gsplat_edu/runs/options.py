@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.data.settings import DataSettings
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.train.config import TrainConfig
-from gsplat_edu.validation import whole_number
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_edu.errors import ProcessLostError, SplatError
-from gsplat_edu.kernels import native
+from gsplat_edu.base.errors import ProcessLostError, SplatError
+from gsplat_edu.ops.kernels import native
 from gsplat_edu.train.team import ALONE, Alone
 
 PATIENCE = timedelta(hours=6)

@@ -7,15 +7,15 @@ from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.evaluate.alignment import aligned_psnr, mean_aligned_psnr
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.poses import Refinement
-from gsplat_edu.views import View
 
 
 def with_refined_cameras(refinement: Refinement, dataset: Dataset) -> Dataset:

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.dataset import Dataset
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.sky.find import SIDE, find_sky, scene_size
 from gsplat_edu.sky.shell import MOST, sky_splats
 from gsplat_edu.train.config import TrainConfig

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import torch
 
-from gsplat_edu.camera import WORLD_UP, Camera
-from gsplat_edu.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.evaluate.paths import common_up, orbit_of_scene, resized
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.ply import ORIGIN, load_ply
 from gsplat_edu.io.ply_comments import UNITS
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import RunFolder, render_settings
-from gsplat_edu.validation import ArrayLike, float64_array
+from gsplat_edu.scene.camera import WORLD_UP, Camera
+from gsplat_edu.scene.gaussians import Gaussians
 
 FARTHEST_ORIGIN = 1e30
 """World units: the largest origin, so that float32 means stay finite after the subtraction."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.io import ply
 from gsplat_edu.io.formats import file_in, format_of, read_scene
 from gsplat_edu.runs.folder import RunFolder, render_settings
 from gsplat_edu.runs.source import relative_to, run_of
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.initialize import from_gaussians
-from gsplat_edu.validation import ArrayLike
 
 
 def scene_file(path: Path) -> Path:

@@ -15,14 +15,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
+from gsplat_edu.base.files import check_folder, remove_leftovers
+from gsplat_edu.base.reading import stored_path
 from gsplat_edu.data.dataset import Dataset, load_dataset
-from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
 from gsplat_edu.evaluate.metrics import score_views, summarize
 from gsplat_edu.evaluate.report import machine_facts
-from gsplat_edu.files import check_folder, remove_leftovers
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.ply import save_ply
-from gsplat_edu.reading import stored_path
 from gsplat_edu.render.backends import load_backend
 from gsplat_edu.runs.dataset import as_trained
 from gsplat_edu.runs.evaluation import Evaluation, Judged, Progress, evaluate_run
@@ -35,6 +34,7 @@ from gsplat_edu.runs.skies import shell_around, start_sky, with_room_for
 from gsplat_edu.runs.source import Source, open_source
 from gsplat_edu.runs.start import scene_digest, scene_file, scene_start
 from gsplat_edu.runs.transients import write_masks
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.checkpoint import (
     list_checkpoints,
     load_checkpoint,
@@ -139,7 +139,7 @@ class CaptureRun:
 
     The object is complete once constructed, so any program can use it: `train` runs the remaining iterations, and
     `finish` writes the scene and evaluates it. `is_finished` tells beforehand whether anything remains to do. The
-    folder is not locked; see `gsplat_edu.locks.locked`.
+    folder is not locked; see `gsplat_edu.base.locks.locked`.
 
     Args:
         options: Options of the run.

@@ -11,20 +11,20 @@ import torch
 from jaxtyping import Bool
 from PIL import Image
 
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.text import as_file_name
+from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.data.capture import is_outside
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.data.images import PhotoFile, decode_mask
 from gsplat_edu.data.panorama import FaceLens
 from gsplat_edu.evaluate.masked import MaskedPicture
 from gsplat_edu.evaluate.metrics import Renderer, to_bytes
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.runs.folder import RunFolder, image_file_names
-from gsplat_edu.text import as_file_name
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.transient_masks import LARGEST_SHARE
 from gsplat_edu.train.transients import Transients, resized_mask
-from gsplat_edu.validation import ArrayLike
-from gsplat_edu.views import View
 
 PICTURES = 6
 """Most masked photos shown in a report."""

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_edu.errors import ArgumentError, DatasetError
-from gsplat_edu.text import install_command
+from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.text import install_command
 
 POLL = 0.25
 """Seconds between two queries of a job's progress."""

@@ -9,8 +9,8 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.data.colmap import read_cameras, read_images
-from gsplat_edu.errors import DatasetError
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call
 from gsplat_edu.sfm.source import FEWEST
 

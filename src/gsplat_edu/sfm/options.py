@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsplat_edu.base.validation import one_of, whole_number
 from gsplat_edu.sfm.scale_text import AUTO, check_scale
-from gsplat_edu.validation import one_of, whole_number
 
 MATCHERS = ("auto", "exhaustive", "sequential", "nearest")
 

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import written_aside
 from gsplat_edu.data.images import (
     decode,
     decode_mask,
@@ -25,9 +27,7 @@ from gsplat_edu.data.images import (
     upright_size,
 )
 from gsplat_edu.data.panorama import FACES, cut_face, face_rotations, face_side, is_panorama_size
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import written_aside
-from gsplat_edu.image_files import UNDECODABLE, opened_image
+from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
 from gsplat_edu.sfm.masks import find_masks
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts, taken_at
 

@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import unreadable, written_aside
 from gsplat_edu.data.capture import PHOTO_ENDINGS, PHOTO_FOLDERS, is_file
 from gsplat_edu.data.colors import conversion_of
 from gsplat_edu.data.images import (
@@ -27,11 +29,9 @@ from gsplat_edu.data.images import (
     stored_orientation,
     stored_size,
 )
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import unreadable, written_aside
-from gsplat_edu.image_files import HEIF, SPELLED, UNDECODABLE, is_image, opened_image
+from gsplat_edu.photos.image_files import HEIF, SPELLED, UNDECODABLE, is_image, opened_image
+from gsplat_edu.scene.views import Photo
 from gsplat_edu.sfm.masks import MASK_ENDING, counting, find_masks, turn_mask, upright_masks, write_mask
-from gsplat_edu.views import Photo
 
 PASSED_OVER = frozenset(("masks", *PHOTO_FOLDERS[1:]))
 """Folders that are skipped: their images are masks or smaller copies of the photos."""

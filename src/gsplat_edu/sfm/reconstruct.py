@@ -15,11 +15,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import remove_leftovers
 from gsplat_edu.data.images import UPRIGHT
 from gsplat_edu.data.notes import UnreadColors
 from gsplat_edu.data.scale import Scale
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import remove_leftovers
 from gsplat_edu.sfm import pairs
 from gsplat_edu.sfm.candidates import Candidates
 from gsplat_edu.sfm.colmap import COLMAP_SEED, call, forget_matches, limit_features, require_colmap

@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.data.colmap import read_cameras, read_images, read_points
 from gsplat_edu.data.images import AT_ONCE, UPRIGHT, PhotoFile, load_photo
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.scale import SCALE_FILE, write_scale
-from gsplat_edu.errors import ArgumentError, DatasetError
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussian_math import quat_to_R
-from gsplat_edu.intrinsics import Intrinsics
-from gsplat_edu.reading import parse_json, read_text
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussian_math import quat_to_R
+from gsplat_edu.scene.intrinsics import Intrinsics
 from gsplat_edu.sfm.colmap import call
 from gsplat_edu.sfm.masks import turn_mask
 from gsplat_edu.sfm.photos import HEIC_ENDINGS, JPEG_ENDINGS, PhotoFacts

@@ -9,11 +9,11 @@ from pathlib import PurePosixPath
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import Camera
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.data.lens import Lens
 from gsplat_edu.data.scale import Scale
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.io.edit import Similarity
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.align import upright
 from gsplat_edu.sfm.gps import TILT, GpsFit, east_north_up, fit_positions
 from gsplat_edu.sfm.photos import PhotoFacts

@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 
 AUTO, NONE = "auto", "none"
 

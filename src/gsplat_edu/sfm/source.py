@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.files import check_folder
+from gsplat_edu.base.reading import parse_json, read_text
 from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import entries, is_file, is_folder
 from gsplat_edu.data.colmap import find_model
-from gsplat_edu.errors import ArgumentError, DatasetError
-from gsplat_edu.files import check_folder
-from gsplat_edu.reading import parse_json, read_text
 from gsplat_edu.sfm.photos import is_photo, is_run, photo_files
 from gsplat_edu.sfm.result import PARTS, published
 from gsplat_edu.sfm.video import is_video

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import written_aside
-from gsplat_edu.json_fields import LARGEST_NUMBER
-from gsplat_edu.reading import parse_json, read_text
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.json_fields import LARGEST_NUMBER
+from gsplat_edu.base.reading import parse_json, read_text
 
 
 def _text(value: object) -> bool:

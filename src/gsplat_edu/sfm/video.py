@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import named_in_utf8, written_aside
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import named_in_utf8, written_aside
 
 VIDEO_ENDINGS = (
     ".mp4",

@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.evaluate.paths import common_up
+from gsplat_edu.scene.camera import Camera
 
 Vector = Float64[np.ndarray, "3"]
 Pixels = UInt8[np.ndarray, "_ _ 3"]

@@ -10,9 +10,9 @@ import json
 import os
 from pathlib import Path
 
-from gsplat_edu.files import written_aside
-from gsplat_edu.reading import parse_json, read_bytes
-from gsplat_edu.text import legible
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import parse_json, read_bytes
+from gsplat_edu.base.text import legible
 
 
 def list_file() -> Path:

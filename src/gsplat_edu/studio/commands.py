@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.text import shortened
 from gsplat_edu.jobs.record import Purpose, Work
 from gsplat_edu.sfm.options import CAMERA_MODELS, MAPPERS, MATCHERS, PANORAMA
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.library import Library, files_within, scene_file
 from gsplat_edu.studio.names import checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict
-from gsplat_edu.text import shortened
 from gsplat_edu.train.config import APPEARANCES, QUALITIES, REFINEMENTS, SKIES, STRATEGIES
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
 

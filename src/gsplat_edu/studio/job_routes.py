@@ -8,15 +8,15 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.reading import open_file
+from gsplat_edu.base.text import shortened, whole_of
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
-from gsplat_edu.reading import open_file
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
 from gsplat_edu.studio.replies import act
 from gsplat_edu.studio.state import Studio
 from gsplat_edu.studio.stream import event_document, job_document
-from gsplat_edu.text import shortened, whole_of
 
 MOST_EVENTS = 2_000
 """Events of a job in one answer: the latest ones."""

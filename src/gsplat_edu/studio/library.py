@@ -23,14 +23,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import open_file
+from gsplat_edu.base.text import legible, shortened, whole_of
 from gsplat_edu.data.capture import PHOTO_ENDINGS
-from gsplat_edu.files import written_aside
-from gsplat_edu.reading import open_file
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.adopted import adopted, note_adopted
 from gsplat_edu.studio.names import checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found
-from gsplat_edu.text import legible, shortened, whole_of
 
 KINDS = ("photos", "captures", "runs", "scenes")
 """Kinds of entries, and their folders."""

@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import CheckpointError
+from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.text import legible
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.library import extent_of, scene_file
-from gsplat_edu.text import legible
 
 
 def summary(kind: str, path: Path) -> dict[str, Any]:

@@ -16,10 +16,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.files import written_aside
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.jobs.record import ACTIVE, Job, State
-from gsplat_edu.reading import parse_json, read_bytes
 from gsplat_edu.studio.refusal import RefusedError, conflict
 from gsplat_edu.studio.replies import Json, act, answered
 from gsplat_edu.studio.scene_routes import BINARY, page_answer

@@ -9,8 +9,8 @@ from __future__ import annotations
 import unicodedata
 from pathlib import Path
 
+from gsplat_edu.base.text import as_file_name, printable
 from gsplat_edu.studio.refusal import RefusedError
-from gsplat_edu.text import as_file_name, printable
 
 LONGEST = 120
 """Bytes of the name of an entry in UTF-8; file systems have 255, and some names get an ending."""

@@ -8,13 +8,13 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.files import written_aside
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.text import legible
 from gsplat_edu.studio.library import Library, photo_names
 from gsplat_edu.studio.names import below, checked_path
 from gsplat_edu.studio.refusal import RefusedError, not_found
 from gsplat_edu.studio.workers import Worker
-from gsplat_edu.text import legible
 
 SIDES = (128, 256, 512, 1024)
 """Longest sides of thumbnails, px."""
@@ -92,7 +92,7 @@ def make_thumbnail(photo: str, side: int, out: str) -> dict[str, Any]:
     from PIL import Image
 
     from gsplat_edu.data.images import decode, image_orientation
-    from gsplat_edu.views import Photo
+    from gsplat_edu.scene.views import Photo
 
     path, target = Path(photo), Path(out)
     if target.is_file():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from http import HTTPStatus
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 
 
 class RefusedError(ArgumentError):

@@ -17,12 +17,12 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from gsplat_edu.errors import SplatError
-from gsplat_edu.files import described
-from gsplat_edu.reading import parse_json
+from gsplat_edu.base.errors import SplatError
+from gsplat_edu.base.files import described
+from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.text import bounded, legible, shortened, whole_of
 from gsplat_edu.studio.refusal import RefusedError, not_found, too_large
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.text import bounded, legible, shortened, whole_of
 
 MOST_JSON = 16 << 20
 """Bytes of a JSON body."""

@@ -10,6 +10,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
+from gsplat_edu.base.text import legible
 from gsplat_edu.jobs.events import Diagnosed, Found, Started
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import Job
@@ -20,7 +21,6 @@ from gsplat_edu.studio.refusal import RefusedError
 from gsplat_edu.studio.replies import act, entry_of, file_answer
 from gsplat_edu.studio.runs import compared, curves, held_out_views, view_picture
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.text import legible
 
 REPORT_POLICY = (
     "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'"

@@ -10,16 +10,16 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from gsplat_edu.errors import CheckpointError
+from gsplat_edu.base.errors import CheckpointError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import open_file, parse_json
+from gsplat_edu.base.text import whole_of
 from gsplat_edu.evaluate.comparison import comparison_size, read_comparison
-from gsplat_edu.files import written_aside
-from gsplat_edu.image_files import UNDECODABLE
-from gsplat_edu.reading import open_file, parse_json
+from gsplat_edu.photos.image_files import UNDECODABLE
 from gsplat_edu.runs.folder import RunFolder, image_file_names
 from gsplat_edu.studio.pictures import cache_name
 from gsplat_edu.studio.refusal import RefusedError, not_found
 from gsplat_edu.studio.workers import Worker
-from gsplat_edu.text import whole_of
 
 MOST_READ = 8 << 20
 """Bytes of a log in one answer."""

@@ -13,13 +13,14 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
 
+from gsplat_edu.base.errors import CheckpointError, SplatError
+from gsplat_edu.base.files import described, written_aside
+from gsplat_edu.base.reading import read_bytes
+from gsplat_edu.base.text import bounded, legible
 from gsplat_edu.edits.stored import MOST_BYTES, version_of
-from gsplat_edu.errors import CheckpointError, SplatError
-from gsplat_edu.files import described, written_aside
 from gsplat_edu.jobs.events import Metric
 from gsplat_edu.jobs.following import events_after
 from gsplat_edu.jobs.record import State
-from gsplat_edu.reading import read_bytes
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.studio.commands import EDITS, EXPORTS, FORMATS, scene_of
 from gsplat_edu.studio.library import Library
@@ -27,7 +28,6 @@ from gsplat_edu.studio.names import LONGEST_FILE, below, checked_name
 from gsplat_edu.studio.refusal import RefusedError, conflict, not_found, too_large
 from gsplat_edu.studio.replies import CLOSE, act, content_length, drain, entry_of, file_answer
 from gsplat_edu.studio.state import Studio
-from gsplat_edu.text import bounded, legible
 
 KEPT_PAGES = 12
 """Pages in the cache."""

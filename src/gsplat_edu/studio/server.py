@@ -14,7 +14,7 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from gsplat_edu.locks import locked
+from gsplat_edu.base.locks import locked
 from gsplat_edu.studio.app import application
 from gsplat_edu.studio.library import HIDDEN, check_own_folders
 from gsplat_edu.studio.state import Studio

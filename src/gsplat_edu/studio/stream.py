@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import AsyncIterator
 from typing import Any
 
+from gsplat_edu.base.text import whole_of
 from gsplat_edu.jobs.events import Event
 from gsplat_edu.jobs.following import Follower
 from gsplat_edu.jobs.queue import JobQueue
 from gsplat_edu.jobs.record import ACTIVE, Job
-from gsplat_edu.text import whole_of
 
 KEPT = 4_000
 """Events that a browser may have missed and still gets; after more it reads the list of jobs again."""

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.reading import open_file
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.reading import open_file
 from gsplat_edu.studio.names import checked_path
 from gsplat_edu.studio.refusal import RefusedError, too_large
 

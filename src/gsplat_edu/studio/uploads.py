@@ -15,7 +15,7 @@ from typing import Any
 from starlette.concurrency import run_in_threadpool
 
 from gsplat_edu.data.capture import PHOTO_ENDINGS
-from gsplat_edu.image_files import is_image
+from gsplat_edu.photos.image_files import is_image
 from gsplat_edu.sfm.video import VIDEO_ENDINGS
 from gsplat_edu.studio.library import SCENE_ENDINGS, Library, extent_of
 from gsplat_edu.studio.names import below, checked_path

@@ -17,10 +17,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import SplatError
-from gsplat_edu.files import described, written_aside
-from gsplat_edu.reading import parse_json, read_bytes
-from gsplat_edu.text import legible
+from gsplat_edu.base.errors import SplatError
+from gsplat_edu.base.files import described, written_aside
+from gsplat_edu.base.reading import parse_json, read_bytes
+from gsplat_edu.base.text import legible
 
 IDLE = 600.0
 """Seconds without a request after which the process ends."""
@@ -100,7 +100,7 @@ def make_picture(source: str, camera: Any, live: bool, threads: int = 0) -> dict
 
 def _snapshot(run: Path) -> tuple[Any, Any]:
     """Read the newest splats of a training, and the settings of its page."""
-    from gsplat_edu.errors import SceneFormatError
+    from gsplat_edu.base.errors import SceneFormatError
     from gsplat_edu.render.settings import RenderSettings
     from gsplat_edu.viewer import page_data
     from gsplat_edu.viewer.live_folder import LiveFolder, split

@@ -10,7 +10,7 @@ import threading
 from http import HTTPStatus
 from typing import Any
 
-from gsplat_edu.reading import parse_json
+from gsplat_edu.base.reading import parse_json
 from gsplat_edu.studio.refusal import RefusedError
 
 PATIENCE = 180.0

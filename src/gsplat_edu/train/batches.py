@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import one_thread
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.threads import one_thread
 from gsplat_edu.train.view_model import Rows
 
 Node = tuple[int, int]

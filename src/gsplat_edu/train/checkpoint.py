@@ -17,9 +17,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from gsplat_edu.errors import ArgumentError, CheckpointError
-from gsplat_edu.files import written_aside
-from gsplat_edu.headroom import shortage
+from gsplat_edu.base.errors import ArgumentError, CheckpointError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.headroom import shortage
 from gsplat_edu.train.trainer import Trainer
 
 KEPT = 2

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from gsplat_edu.base.validation import float64_array, in_range, one_of, whole_number
 from gsplat_edu.train.setting import Check
-from gsplat_edu.validation import float64_array, in_range, one_of, whole_number
 
 
 def accept_whole(low: int, high: int | None = None) -> Check:

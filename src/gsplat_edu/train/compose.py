@@ -12,11 +12,12 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from gsplat_edu.camera import scene_extent
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
+from gsplat_edu.scene.camera import scene_extent
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.capacity import planned_gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.surgery import sorted_in_space
@@ -26,7 +27,6 @@ from gsplat_edu.train.objective import make_objective
 from gsplat_edu.train.stepper import StepParts
 from gsplat_edu.train.team import ALONE, Team
 from gsplat_edu.train.trainer import Callback, Trainer
-from gsplat_edu.views import View
 
 
 @runtime_checkable

@@ -13,8 +13,9 @@ import dataclasses
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
-from gsplat_edu.constants import SH_MAX_DEGREE
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import one_of, whole_number
 from gsplat_edu.train.checks import (
     accept_at_least_1 as _at_least_1,
 )
@@ -50,7 +51,6 @@ from gsplat_edu.train.checks import (
 )
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS, Check
 from gsplat_edu.train.setting import Setting as Setting
-from gsplat_edu.validation import one_of, whole_number
 
 RECIPE_ITERATIONS = 30_000
 """Length of the run for which the recipe's milestones are defined."""

@@ -1,6 +1,6 @@
 """The exposure and white balance of each photo, measured while the scene is trained.
 
-y_i = A_i x,  where A_i applies the gains exp(l_i - mean(l)) to the channels; see `gsplat_edu.exposure`
+y_i = A_i x,  where A_i applies the gains exp(l_i - mean(l)) to the channels; see `gsplat_edu.ops.exposure`
 
 The render x of the scene becomes y_i, which is compared with photo i. Subtracting the mean fixes the gauge exactly: the
 geometric mean of the corrections is the identity, so the scene itself has the mean exposure of the capture, in any
@@ -11,7 +11,7 @@ Its geometric mean over the pixels of a photo is 1, so it does not touch the gau
 corrected as well: a place that is in the corner of one photo is in the middle of another.
 
 Of a photo that is not opaque, only the object is corrected, not the background before which it is compared; see
-`gsplat_edu.recolor`.
+`gsplat_edu.ops.recolor`.
 
 The l_i are measured whenever photo i is drawn, not learned by gradient descent. There is no rate to choose, and one
 draw is enough to know them. docs/RECIPE.md has what else was tried.
@@ -25,9 +25,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu.exposure import color_matrix, falloff, measured_gains, measured_vignetting
-from gsplat_edu.recolor import Behind, RecolorKernel
-from gsplat_edu.threads import one_thread
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
+from gsplat_edu.ops.recolor import Behind, RecolorKernel
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.optimizer import ParameterGroup
 from gsplat_edu.train.view_model import Identity, Rows, ViewRender

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.resizing import eroded
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.photos.resizing import eroded
+from gsplat_edu.scene.views import Photo, View
 from gsplat_edu.train.saved import check_entries, check_numpy_generator, check_whole
-from gsplat_edu.views import Photo, View
 
 DEVICE_SHARE = 0.25
 """Fraction of the GPU memory free at the start of training that photos may use. The rest is for the Gaussians."""

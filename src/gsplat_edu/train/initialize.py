@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.constants import C0, SH_OFFSET
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.noise import NoiseKernel, add_noise_natively
-from gsplat_edu.recolor import RecolorKernel, recolored
+from gsplat_edu.base.constants import C0, SH_OFFSET
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike, float64_array, whole_number
+from gsplat_edu.ops.noise import NoiseKernel, add_noise_natively
+from gsplat_edu.ops.recolor import RecolorKernel, recolored
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.adc import AdaptiveDensityControl
 from gsplat_edu.train.density.base import DensityStrategy
@@ -26,8 +28,6 @@ from gsplat_edu.train.poses import Refinement
 from gsplat_edu.train.transient_masks import FeatureRenderer
 from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import Chain, Identity, ViewModel
-from gsplat_edu.validation import ArrayLike, float64_array, whole_number
-from gsplat_edu.views import View
 
 START_SCALE = 0.09
 """Standard deviation of every start Gaussian, world units; a few hundred of them fill the unit ball."""

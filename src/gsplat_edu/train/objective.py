@@ -15,12 +15,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu.buffers import reusable_tensor
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.losses import LossKernel, photo_loss
+from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.ops.losses import LossKernel, photo_loss
 from gsplat_edu.render.output import RenderOutput
-from gsplat_edu.threads import one_thread
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.far import Shell
 from gsplat_edu.train.feed import Draw, Target
@@ -134,7 +134,7 @@ def make_objective(
 
 @dataclass(frozen=True)
 class PhotoTerm:
-    """The difference between image and photo: `gsplat_edu.losses.photo_loss`.
+    """The difference between image and photo: `gsplat_edu.ops.losses.photo_loss`.
 
     Args:
         ssim_weight: k, 0 to 1.

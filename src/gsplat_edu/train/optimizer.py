@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from gsplat_edu.adam import AdamKernel, adam_natively
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.moments import AdamInBackward, AdamNumbers, Moments
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.ops.adam import AdamKernel, adam_natively
+from gsplat_edu.ops.moments import AdamInBackward, AdamNumbers, Moments
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.saved import check_entries, check_not_negative, check_tensor_kind
 
 MOMENTS = ("first", "second")

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 
 GENERATOR_LAYOUT = "<QiiQ"
 """Start of a torch CPU generator's state: seed, numbers left before the next block, whether seeded, next index."""

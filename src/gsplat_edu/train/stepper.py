@@ -17,14 +17,14 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from gsplat_edu.adam import AdamKernel
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.moments import AdamInBackward
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.ops.adam import AdamKernel
+from gsplat_edu.ops.moments import AdamInBackward
 from gsplat_edu.render.api import render
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.threads import one_thread
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.batches import Batch
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Change

@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from gsplat_edu.adam import AdamKernel
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.threads import one_thread
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.ops.adam import AdamKernel
 from gsplat_edu.train.batches import Batch, Gradients, PartialSums, ViewResult
 from gsplat_edu.train.optimizer import MOMENTS, Adam, ParameterGroup
 

@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_edu.buffers import reused_buffers
-from gsplat_edu.errors import ArgumentError, DatasetError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.buffers import reused_buffers
+from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.render.backend import Backend
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import DensityStrategy
 from gsplat_edu.train.events import Event, Losses, StepEvent
@@ -31,7 +32,6 @@ from gsplat_edu.train.stepper import StepParts as StepParts
 from gsplat_edu.train.stepper import StepView, TensorStepper
 from gsplat_edu.train.transients import Transients
 from gsplat_edu.train.view_model import ViewModel
-from gsplat_edu.views import View
 
 Callback = Callable[["Trainer", Event], None]
 """Called after every step and every change of the Gaussians, with the trainer and the event."""

@@ -23,15 +23,15 @@ from jaxtyping import Bool, Float16, Float32, Int64, UInt16
 from scipy import ndimage
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.exposure import color_matrix, measured_gains
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.recolor import Behind, recolored
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.ops.exposure import color_matrix, measured_gains
+from gsplat_edu.ops.recolor import Behind, recolored
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.threads import one_thread
-from gsplat_edu.views import View
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 
 SMOOTH = 0.008
 """Sigma of the smoothing, as a fraction of the photo's diagonal."""

@@ -14,15 +14,15 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.camera_tensors import CameraTensors
 from gsplat_edu.render.settings import RenderSettings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.views import View
 from gsplat_edu.train.feed import Target
 from gsplat_edu.train.saved import check_entries, check_tensor_kind
 from gsplat_edu.train.transient_masks import Compared, FeatureRenderer, find_masks
-from gsplat_edu.views import View
 
 WHEN = (0.1, 0.2, 0.35, 0.5)
 """Shares of the run after which masks are found: early, before the scene shows passers-by as floaters, and until most

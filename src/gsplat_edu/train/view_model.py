@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
 from gsplat_edu.render.camera_tensors import CameraTensors
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.train.feed import Color, Target
 from gsplat_edu.train.optimizer import ParameterGroup
 

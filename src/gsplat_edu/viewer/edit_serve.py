@@ -11,11 +11,11 @@ import threading
 import urllib.parse
 from pathlib import Path
 
+from gsplat_edu.base.errors import ArgumentError, SplatError
+from gsplat_edu.base.files import described, written_aside
 from gsplat_edu.edits.document import parse_edits
 from gsplat_edu.edits.identity import Identity
 from gsplat_edu.edits.stored import MOST_BYTES, version_of
-from gsplat_edu.errors import ArgumentError, SplatError
-from gsplat_edu.files import described, written_aside
 from gsplat_edu.viewer.edit_page import read_content
 from gsplat_edu.viewer.guard import Guard
 from gsplat_edu.viewer.serve import PATIENCE, PageHandler, PageServer, _Request

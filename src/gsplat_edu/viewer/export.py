@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import check_folder
 from gsplat_edu.evaluate.fidelity import compare_scenes
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
-from gsplat_edu.files import check_folder
 from gsplat_edu.io import formats
 from gsplat_edu.io.formats import (
     FORMATS,

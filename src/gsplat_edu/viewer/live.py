@@ -30,12 +30,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError, SplatError
-from gsplat_edu.reading import parse_json
+from gsplat_edu.base.errors import ArgumentError, SplatError
+from gsplat_edu.base.reading import parse_json
+from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.training import CaptureRun
-from gsplat_edu.validation import in_range, whole_number
+from gsplat_edu.scene.camera import Camera
 from gsplat_edu.viewer import page, page_parts
 from gsplat_edu.viewer.guard import Guard
 from gsplat_edu.viewer.serve import CHUNK, LOOPBACK, PORT, PageHandler, PageServer, url_of

@@ -36,9 +36,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.files import written_aside
-from gsplat_edu.reading import open_file, parse_json, read_text
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import open_file, parse_json, read_text
 
 FRESH = 5.0
 """Seconds after which a touch of `wanted` no longer counts."""

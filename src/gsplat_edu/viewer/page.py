@@ -20,18 +20,18 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from gsplat_edu import constants
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.base import constants
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.files import written_aside
+from gsplat_edu.base.reading import parse_json, read_bytes
 from gsplat_edu.evaluate.keyframes import KeyframePath
-from gsplat_edu.files import written_aside
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.io.quantize import check_expansion
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.reading import parse_json, read_bytes
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.runs.folder import ORIGIN
 from gsplat_edu.runs.source import NamedCamera, file_settings
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.viewer import page_data
 from gsplat_edu.viewer.page_parts import filled, web
 from gsplat_edu.viewer.page_start import Start, first_camera, start_among, start_of, subjects_of

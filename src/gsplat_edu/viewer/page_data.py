@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float16, Float32, Int16
 
-from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.scene.gaussians import Gaussians
 
 QUAT_STEPS = 32767
 """Integer steps from 0 to 1 in a quaternion component."""

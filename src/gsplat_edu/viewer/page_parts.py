@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
-from gsplat_edu import constants
-from gsplat_edu.content_policy import content_policy, policy_element
+from gsplat_edu.base import constants
+from gsplat_edu.base.content_policy import content_policy, policy_element
 
 SCRIPTS = (
     "scene.js",
@@ -43,7 +43,7 @@ SHADER_CONSTANTS = (
     "C2",
     "C3",
 )
-"""Names in `gsplat_edu.constants` that the shaders use."""
+"""Names in `gsplat_edu.base.constants` that the shaders use."""
 
 FINITE = 3e38
 """Larger values count as infinite in a shader; float32 ends at 3.4e38."""

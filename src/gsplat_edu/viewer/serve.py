@@ -17,9 +17,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.reading import read_bytes
-from gsplat_edu.validation import whole_number
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.reading import read_bytes
+from gsplat_edu.base.validation import whole_number
 
 LOOPBACK = "127.0.0.1"
 

@@ -16,13 +16,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import SplatError
+from gsplat_edu.base.errors import SplatError
+from gsplat_edu.base.files import described
 from gsplat_edu.evaluate.metrics import psnr
-from gsplat_edu.files import described
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.runs.training import CaptureRun
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.events import Event, StepEvent
 from gsplat_edu.train.schedule import sh_degree
 from gsplat_edu.train.trainer import Trainer

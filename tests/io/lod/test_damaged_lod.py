@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.io.lod import codec
 from gsplat_edu.io.lod.levels import LodOptions

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.gaussians import Gaussians, cov3d_t
 from gsplat_edu.io.lod.merge import Blobs, areas, blobs_of, gaussians_of, halved, merged_pairs
+from gsplat_edu.scene.gaussians import Gaussians, cov3d_t
 from scene_files import random_scene
 
 

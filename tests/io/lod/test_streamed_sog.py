@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.gaussians import cov3d_t
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.formats import format_of, read_scene, stored_bytes, write_scene
 from gsplat_edu.io.lod import codec
 from gsplat_edu.io.lod.levels import (
@@ -21,7 +20,8 @@ from gsplat_edu.io.lod.levels import (
     with_levels,
 )
 from gsplat_edu.io.sog import codec as sog
-from gsplat_edu.morton import morton_codes
+from gsplat_edu.scene.gaussians import cov3d_t
+from gsplat_edu.scene.morton import morton_codes
 from scene_files import random_scene
 from systems import needs_posix
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io import spz
 from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.edit import Similarity

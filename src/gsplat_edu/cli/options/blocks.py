@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsplat_edu.base.errors import ArgumentError, CheckpointError, DatasetError
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.blocks.layout import MOST_BLOCKS, PLAN
 from gsplat_edu.cli.arguments import whole_number_text
-from gsplat_edu.errors import ArgumentError, CheckpointError, DatasetError
-from gsplat_edu.validation import whole_number
 
 LEAST_VIEWS = 50
 """Default of --min-views."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.errors import ArgumentError, DatasetError
-from gsplat_edu.validation import in_range
+from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.validation import in_range
 
 EXAMPLE = "example: gsplat-edu clean runs/plush --preview removed.html"
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsplat_edu.base.constants import SH_MAX_DEGREE
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import add_backend, numbers_text, whole_number_text
-from gsplat_edu.constants import SH_MAX_DEGREE
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.sfm.scale_text import POINTS
 
 EXAMPLE = "example: gsplat-edu convert runs/plush plush.spz --min-opacity 0.02 --verify"

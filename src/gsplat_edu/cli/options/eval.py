@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.cli.arguments import add_backend
-from gsplat_edu.errors import DatasetError
 from gsplat_edu.runs.folder import RunFolder
 
 EXAMPLE = "example: gsplat-edu eval out/plush"

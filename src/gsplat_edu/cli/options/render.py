@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.arguments import add_backend, whole_number_text
-from gsplat_edu.errors import ArgumentError
 from gsplat_edu.render.settings import MAPS
 
 EXAMPLE = "example: gsplat-edu render out/plush --orbit --frames 120 --out plush.mp4"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.ranks import num_processes, restarts_are_allowed
-from gsplat_edu.errors import ArgumentError
 
 
 def check_several(arguments: argparse.Namespace) -> None:

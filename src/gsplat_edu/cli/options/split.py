@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.cli.options import train
 from gsplat_edu.cli.options.blocks import add_blocks
-from gsplat_edu.errors import ArgumentError
 
 EXAMPLE = "example: gsplat-edu split captures/town --out runs/town --blocks 16 --quality high"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.cli.arguments import add_address, bytes_text, whole_number_text
-from gsplat_edu.validation import whole_number
 
 EXAMPLE = "example: gsplat-edu studio ~/scenes"
 

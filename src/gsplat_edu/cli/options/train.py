@@ -6,12 +6,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.validation import one_of
 from gsplat_edu.cli.arguments import add_backend, bytes_text, seconds_text, whole_number_text
 from gsplat_edu.cli.options.blocks import add_blocks, add_cluster, check_blocks
 from gsplat_edu.cli.options.several import check_several
 from gsplat_edu.cli.options.sfm import add_panorama, add_scale
 from gsplat_edu.data.settings import DataSettings
-from gsplat_edu.errors import ArgumentError, DatasetError
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.runs.options import RunOptions
 from gsplat_edu.sfm.options import PANORAMA
@@ -35,7 +36,6 @@ from gsplat_edu.train.config import (
     recipe,
 )
 from gsplat_edu.train.setting import OUTSIDE_MASKS, TRANSIENTS
-from gsplat_edu.validation import one_of
 
 EXAMPLE = "example: gsplat-edu train captures/plush --out runs/plush --quality high"
 

@@ -25,17 +25,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.files import named_failure, written_aside
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.files import named_failure, written_aside
+from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.edit import joined
 from gsplat_edu.io.lod.levels import Branch, Leaf, LodOptions, Node, build_levels, counts_of, leaves_of
 from gsplat_edu.io.lod.meta import LodMeta, from_json, rounded, to_json
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.sog import codec as sog
 from gsplat_edu.io.sog.files import META_NAME
-from gsplat_edu.ply_table import LFS_POINTER
-from gsplat_edu.reading import read_bytes
+from gsplat_edu.scene.gaussians import Gaussians
 
 
 def read_index(path: Path) -> LodMeta:

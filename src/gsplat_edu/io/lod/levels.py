@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
 
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.validation import whole_number
 from gsplat_edu.io.lod.merge import blobs_of, halved
-from gsplat_edu.morton import morton_codes
-from gsplat_edu.validation import whole_number
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.morton import morton_codes
 
 CHUNK = 512 * 1024
 """Most splats of a file."""

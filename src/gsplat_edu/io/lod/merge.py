@@ -30,9 +30,9 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gsplat_edu.constants import C0
-from gsplat_edu.gaussian_math import quat_to_R_batch
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import C0
+from gsplat_edu.scene.gaussian_math import quat_to_R_batch
+from gsplat_edu.scene.gaussians import Gaussians
 
 NEIGHBOURS = 8
 """Neighbours of a Gaussian that may become its partner."""

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.reading import parse_json
 from gsplat_edu.io.sog.files import META_NAME
 from gsplat_edu.io.sog.meta import GENERATOR, MOST_SPLATS, NAME
-from gsplat_edu.reading import parse_json
 
 LOD_META = "lod-meta.json"
 """The file's fixed name."""

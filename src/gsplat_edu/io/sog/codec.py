@@ -30,8 +30,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
 
-from gsplat_edu.errors import ArgumentError, SceneFormatError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.errors import ArgumentError, SceneFormatError
+from gsplat_edu.base.validation import first_index
 from gsplat_edu.io.quantize import byte_to_logit, check_expansion, logit_to_byte
 from gsplat_edu.io.scene import Scene
 from gsplat_edu.io.sog import files
@@ -44,8 +44,8 @@ from gsplat_edu.io.sog.values import (
     quats_to_pixels,
     steps_to_positions,
 )
-from gsplat_edu.morton import morton_codes
-from gsplat_edu.validation import first_index
+from gsplat_edu.scene.gaussians import Gaussians
+from gsplat_edu.scene.morton import morton_codes
 
 PER_ROW = 64
 """Palette entries per row of its image, with one pixel per coefficient."""

@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.files import named_failure, written_aside
-from gsplat_edu.image_files import UNDECODABLE, opened_image
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.files import named_failure, written_aside
+from gsplat_edu.base.ply_table import LFS_POINTER
+from gsplat_edu.base.reading import read_bytes
 from gsplat_edu.io.quantize import check_expansion
-from gsplat_edu.ply_table import LFS_POINTER
-from gsplat_edu.reading import read_bytes
+from gsplat_edu.photos.image_files import UNDECODABLE, opened_image
 
 META_NAME = "meta.json"
 

@@ -14,10 +14,10 @@ from typing import NoReturn
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from gsplat_edu.errors import SceneFormatError
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.reading import parse_json
 from gsplat_edu.io.sog.palette import CODEBOOK, MOST_ENTRIES
 from gsplat_edu.io.sog.values import LARGEST_LOG, Range
-from gsplat_edu.reading import parse_json
 
 VERSION = 2
 

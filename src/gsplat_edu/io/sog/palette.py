@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy.sparse import csr_matrix
 
-from gsplat_edu.threads import one_thread
+from gsplat_edu.base.threads import one_thread
 
 CODEBOOK = 256
 """Entries of a codebook, selected by a byte."""

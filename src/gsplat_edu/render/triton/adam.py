@@ -10,8 +10,8 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import check_shape
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import check_shape
 
 BLOCK = tl.constexpr(1024)
 

@@ -17,7 +17,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from gsplat_edu import constants
+from gsplat_edu.base import constants
 from gsplat_edu.render.triton.project import RECORD, SLOT
 
 TILE = tl.constexpr(constants.TILE)

@@ -10,7 +10,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from gsplat_edu import constants
+from gsplat_edu.base import constants
 
 C0 = tl.constexpr(constants.C0)
 C1 = tl.constexpr(constants.C1)

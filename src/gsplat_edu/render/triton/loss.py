@@ -24,9 +24,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu import constants
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import check_shape, in_range
+from gsplat_edu.base import constants
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import check_shape, in_range
 
 # A block's rows are read again for every vertical tap: its 26 rows for 16 stay in the L1 cache.
 ROWS = tl.constexpr(16)

@@ -15,7 +15,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from gsplat_edu import constants
+from gsplat_edu.base import constants
 from gsplat_edu.render.camera_tensors import GRADIENT_NUMBERS
 from gsplat_edu.render.triton.gaussian import (
     C0,

@@ -22,10 +22,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.constants import TILE
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import TILE
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.camera_tensors import CameraTensors, camera_gradients, split_camera
 from gsplat_edu.render.output import Extra, RenderOutput
 from gsplat_edu.render.settings import RenderSettings
@@ -38,6 +36,8 @@ from gsplat_edu.render.triton.project import (
     project_backward_kernel,
     project_kernel,
 )
+from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.gaussians import Gaussians
 
 BLOCK = 128
 """Gaussians per program of project, count and emit."""

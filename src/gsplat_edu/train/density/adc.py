@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import replace, split_children

@@ -6,8 +6,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from gsplat_edu.gaussians import Gaussians
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.events import Change
 from gsplat_edu.train.optimizer import Adam
 

@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsplat_edu.constants import ALPHA_MIN
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
+from gsplat_edu.base.constants import ALPHA_MIN
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import long_axis_children, replace

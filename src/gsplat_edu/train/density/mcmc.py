@@ -17,10 +17,10 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.gaussians import Gaussians
-from gsplat_edu.noise import NoiseKernel, NoiseNumbers, add_noise_natively
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.ops.noise import NoiseKernel, NoiseNumbers, add_noise_natively
 from gsplat_edu.render.output import RenderOutput
+from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.config import TrainConfig
 from gsplat_edu.train.density.base import State
 from gsplat_edu.train.density.surgery import replace

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gsplat_edu.gaussians import Gaussians, quat_to_R_t
-from gsplat_edu.morton import order_in_space
+from gsplat_edu.scene.gaussians import Gaussians, quat_to_R_t
+from gsplat_edu.scene.morton import order_in_space
 from gsplat_edu.train.optimizer import Adam
 
 

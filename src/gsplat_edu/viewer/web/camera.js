@@ -1,4 +1,4 @@
-// Cameras: {R, eye, fx, fy, cx, cy, W, H} as in gsplat_edu/camera.py, R from world to camera with rows (right, down,
+// Cameras: {R, eye, fx, fy, cx, cy, W, H} as in gsplat_edu/scene/camera.py, R from world to camera with rows (right, down,
 // forward).
 "use strict";
 

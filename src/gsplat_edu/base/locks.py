@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.files import check_folder, named_failure
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.files import check_folder, named_failure
 
 LOCK = ".lock"
 """Name of the lock file. It is removed at the end; a file left by a killed process locks nothing."""

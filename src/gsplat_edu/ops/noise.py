@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsplat_edu import kernels
-from gsplat_edu.gaussians import Gaussians, unchecked_rotations
-from gsplat_edu.threads import native_threads
+from gsplat_edu.base.threads import native_threads
+from gsplat_edu.ops import kernels
+from gsplat_edu.scene.gaussians import Gaussians, unchecked_rotations
 
 SHUT = 60.0
 """A gate below e^-60 counts as 0: a step that small changes no mean, and denormal numbers are slow."""

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path, PureWindowsPath
 from typing import Any, BinaryIO
 
-from gsplat_edu.headroom import require_memory
+from gsplat_edu.base.headroom import require_memory
 
 TOO_LARGE = "close other programs, or read it on a machine with more memory"
 """Advice for a file that does not fit into memory."""

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.camera import CameraLike, as_camera
-from gsplat_edu.constants import DET_FLOOR, DILATION, DILATION_MAX
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array, in_range
+from gsplat_edu.base.constants import DET_FLOOR, DILATION, DILATION_MAX
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike, check_shape, first_index, float64_array, in_range
+from gsplat_edu.scene.camera import CameraLike, as_camera
 
 
 def quat_to_R(quat: ArrayLike) -> Float64[np.ndarray, "3 3"]:
@@ -155,8 +155,8 @@ def opacity_compensation(cov2d: ArrayLike, dilation: float = DILATION) -> Float6
         dilation: d, px², 0 to 1e6.
 
     Returns:
-        (...) factors in (0, 1]. Those of Gaussians that are too thin to be drawn (`gsplat_edu.constants.THINNEST`) mean
-        nothing.
+        (...) factors in (0, 1]. Those of Gaussians that are too thin to be drawn (`gsplat_edu.base.constants.THINNEST`)
+        mean nothing.
 
     Raises:
         ShapeError: the last two axes are not (2, 2).

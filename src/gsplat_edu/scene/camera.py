@@ -15,9 +15,9 @@ from typing import Any, Protocol, SupportsFloat, SupportsIndex, runtime_checkabl
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.intrinsics import Intrinsics
-from gsplat_edu.validation import ArrayLike, float64_array, in_range, whole_number
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike, float64_array, in_range, whole_number
+from gsplat_edu.scene.intrinsics import Intrinsics
 
 WORLD_UP = (0.0, -1.0, 0.0)
 """The world's up direction: +y points down."""

@@ -18,10 +18,10 @@ from typing import BinaryIO
 
 from PIL import Image
 
-from gsplat_edu.errors import DatasetError
-from gsplat_edu.headroom import require_memory
-from gsplat_edu.reading import open_file
-from gsplat_edu.text import install_command
+from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.headroom import require_memory
+from gsplat_edu.base.reading import open_file
+from gsplat_edu.base.text import install_command
 
 HEIF = "HEIF"
 """Pillow's name for HEIC and HEIF, which pillow-heif decodes (extra `heic`)."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.resizing import area_mean, premultiplied, smaller_mask, unweighted
-from gsplat_edu.validation import ArrayLike, check_shape, first_index, float64_array
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.validation import ArrayLike, check_shape, first_index, float64_array
+from gsplat_edu.photos.resizing import area_mean, premultiplied, smaller_mask, unweighted
+from gsplat_edu.scene.camera import Camera
 
 Pixels = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.constants import C0, C1, C2, C3, SH_MAX_DEGREE, SH_OFFSET
-from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.validation import ArrayLike, first_index, float64_array, whole_number
+from gsplat_edu.base.constants import C0, C1, C2, C3, SH_MAX_DEGREE, SH_OFFSET
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.validation import ArrayLike, first_index, float64_array, whole_number
 
 UNIT_TOLERANCE = 1e-3
 """Largest deviation of a viewing direction's length from 1."""

@@ -25,10 +25,10 @@ import torch
 from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
-from gsplat_edu.camera import Camera
-from gsplat_edu.constants import SRGB_OFFSET
-from gsplat_edu.threads import one_thread
-from gsplat_edu.validation import check_shape
+from gsplat_edu.base.constants import SRGB_OFFSET
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.validation import check_shape
+from gsplat_edu.scene.camera import Camera
 
 SAMPLES = 1 << 12
 """Pixels on a grid that a step is measured at."""

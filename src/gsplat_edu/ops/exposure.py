@@ -4,8 +4,8 @@ y = g x + 0.055 (g - 1) for every channel, with g = s^(1/2.4)
 
 Exposure and white balance scale linear light by s. Above its short linear start, the sRGB curve is
 1.055 l^(1/2.4) - 0.055, so on encoded colours the scale is this line, exactly. As a matrix (3, 4) of colours it has
-the three gains on its diagonal; see `gsplat_edu.recolor`. Vignetting scales light likewise, by a factor that depends on
-the distance from the photo's centre.
+the three gains on its diagonal; see `gsplat_edu.ops.recolor`. Vignetting scales light likewise, by a factor that
+depends on the distance from the photo's centre.
 
 Source of the curve: IEC 61966-2-1.
 """
@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
-from gsplat_edu.constants import SRGB_OFFSET
-from gsplat_edu.threads import one_thread
-from gsplat_edu.validation import check_shape
+from gsplat_edu.base.constants import SRGB_OFFSET
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.validation import check_shape
 
 SRGB_POWER = 2.4
 """Exponent of the sRGB curve."""
@@ -105,7 +105,7 @@ def falloff(k: Float[Tensor, ""], height: int, width: int) -> Float[Tensor, "H W
         width: W, px.
 
     Returns:
-        (H, W) factors for `gsplat_edu.recolor.recolored`.
+        (H, W) factors for `gsplat_edu.ops.recolor.recolored`.
     """
     rows, columns = _squared_distances(height, width, 1, k)
     with one_thread():

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.validation import in_range, whole_number
+from gsplat_edu.base.validation import in_range, whole_number
 
 
 def sphere_shell(

@@ -10,7 +10,7 @@ import errno
 import os
 from pathlib import Path
 
-from gsplat_edu.errors import NotEnoughMemoryError
+from gsplat_edu.base.errors import NotEnoughMemoryError
 
 WORTH_ASKING = 64 * 2**20
 """Smaller requests are granted without a query, which takes about 0.1 ms."""

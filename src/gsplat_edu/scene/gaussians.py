@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsplat_edu.errors import ArgumentError, ShapeError
-from gsplat_edu.validation import Shape, check_shape, first_index
+from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.validation import Shape, check_shape, first_index
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +201,7 @@ def check_tensor(name: str, value: Tensor, shape: Shape, sizes: dict[str, int]) 
     """Validate a tensor argument.
 
     Raises:
-        ShapeError: the shape differs; see `gsplat_edu.validation.check_shape`.
+        ShapeError: the shape differs; see `gsplat_edu.base.validation.check_shape`.
         ArgumentError: it is not a tensor of real numbers, or an entry is NaN or infinite.
     """
     if not isinstance(value, Tensor):

@@ -20,12 +20,12 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu import kernels
-from gsplat_edu.buffers import reusable_tensor
-from gsplat_edu.constants import SRGB_OFFSET
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.threads import native_threads
-from gsplat_edu.validation import check_shape
+from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.constants import SRGB_OFFSET
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import native_threads
+from gsplat_edu.base.validation import check_shape
+from gsplat_edu.ops import kernels
 
 Color = tuple[float, float, float]
 

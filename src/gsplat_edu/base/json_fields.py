@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from gsplat_edu.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError
 
 LARGEST_NUMBER = 1e300
 """No number in a record is as large; a whole number may have more digits than a float can hold."""

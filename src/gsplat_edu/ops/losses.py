@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsplat_edu.buffers import reusable_tensor
-from gsplat_edu.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA
-from gsplat_edu.errors import ArgumentError
-from gsplat_edu.kernels import SUFFIXES, kernel, native_array
-from gsplat_edu.threads import one_thread
-from gsplat_edu.validation import check_shape, in_range
+from gsplat_edu.base.buffers import reusable_tensor
+from gsplat_edu.base.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA
+from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.validation import check_shape, in_range
+from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 
 SSIM_RADIUS = 5
 """Taps of SSIM's window on either side of its middle, px. (Wang et al. 2004: a window of 11)"""

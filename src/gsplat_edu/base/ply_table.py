@@ -13,9 +13,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from gsplat_edu.errors import SceneFormatError
-from gsplat_edu.headroom import require_memory
-from gsplat_edu.reading import TOO_LARGE
+from gsplat_edu.base.errors import SceneFormatError
+from gsplat_edu.base.headroom import require_memory
+from gsplat_edu.base.reading import TOO_LARGE
 
 FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 """Formats and their byte order in NumPy's notation."""

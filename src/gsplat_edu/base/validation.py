@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
-from gsplat_edu.errors import ArgumentError, ShapeError
+from gsplat_edu.base.errors import ArgumentError, ShapeError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike as _NumPyArrayLike

@@ -15,9 +15,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsplat_edu import kernels
-from gsplat_edu.moments import AdamNumbers
-from gsplat_edu.threads import one_thread
+from gsplat_edu.base.threads import one_thread
+from gsplat_edu.ops import kernels
+from gsplat_edu.ops.moments import AdamNumbers
 
 AdamKernel = Callable[[Tensor, Tensor, Tensor, Tensor, AdamNumbers], None]
 """Moves a parameter and its two moments in place, given the gradient and the numbers."""

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.utils.dlpack import to_dlpack  # type: ignore[attr-defined]  # documented, but not in its __all__
 
-from gsplat_edu.errors import BackendUnavailableError
-from gsplat_edu.headroom import available_memory
+from gsplat_edu.base.errors import BackendUnavailableError
+from gsplat_edu.base.headroom import available_memory
 
 _native: ModuleType | None
 REASON: str | None

@@ -1,0 +1,1 @@
+"""What everything else stands on: constants, errors, files, text, checks, threads and memory."""

@@ -1,0 +1,1 @@
+"""What is rendered, and from where: Gaussians, cameras, views, harmonics, and orders in space."""
