@@ -1,7 +1,9 @@
 """The documents' examples run, and the documents name everything that exists."""
 
+import importlib.util
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,19 @@ from gsplat_edu.base import constants
 from gsplat_edu.cli.main import build_parser
 
 ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "src" / "gsplat_edu"
 README = (ROOT / "README.md").read_text()
+
+
+def tool(name):
+    """Import a script of tools/, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+module_map = tool("module_map")
 EXAMPLES = {
     f"{name}-{number}": example
     for name in ("README.md", "docs/PYTHON.md", "docs/GSPLAT.md")
@@ -67,44 +81,32 @@ def test_every_constant_is_in_the_decisions():
         assert f"| `{name}` | {getattr(constants, name)}" in decisions, name
 
 
-def undescribed(architecture, modules):
-    """Find the modules that the tree of ARCHITECTURE.md does not name in their folder.
-
-    Args:
-        architecture: The document. Its first indented tree has a line for each top-level module or package; the
-            contents of a package follow on that line or further to the right.
-        modules: Paths within src/gsplat_edu, without the __init__ files.
-    """
-    (tree,) = re.findall(r"^src/gsplat_edu/\n(.*?)^\S", architecture, flags=re.MULTILINE | re.DOTALL)
-    entries = {}
-    for entry in re.split(r"^  (?=\S)", tree, flags=re.MULTILINE)[1:]:
-        entries[entry.split()[0]] = entry
-    missing = []
-    for path in modules:
-        *folders, name = path.parts
-        text = entries.get(f"{folders[0]}/" if folders else name, "")
-        for folder in folders[1:]:
-            text = re.split(rf"(?<![\w./]){folder}/", text, maxsplit=1)[-1] if f"{folder}/" in text else ""
-        if not re.search(rf"(?<![\w.-]){re.escape(name)}", text):
-            missing.append(str(path))
-    return missing
+def test_the_map_of_modules_is_current():
+    assert module_map.document() == (ROOT / "docs" / "MODULES.md").read_text()
 
 
-def test_every_module_is_in_the_architecture():
-    package = ROOT / "src" / "gsplat_edu"
-    modules = [path.relative_to(package) for path in package.rglob("*.py") if path.name != "__init__.py"]
-    # The tree states once that a command's options are in a module of the command's name.
-    modules = [path for path in modules if path.parts[:2] != ("cli", "options")]
-    assert len(modules) > 100
-    assert undescribed((ROOT / "ARCHITECTURE.md").read_text(), modules) == []
+def test_the_map_of_modules_needs_docstrings(tmp_path, monkeypatch):
+    monkeypatch.setattr(module_map, "ROOT", tmp_path)
+    (tmp_path / "mute.py").write_text("x = 1\n")
+    with pytest.raises(SystemExit, match=r"mute\.py: has no docstring"):
+        module_map.first_sentence(tmp_path / "mute.py")
 
 
-def test_a_module_named_in_another_folder_counts_as_missing():
-    tree = "src/gsplat_edu/\n  camera.py  x\n  io/  ply.py, zip.py\n    sog/  files.py\n  runs/  log.py\ntests/\n"
-    paths = ["camera.py", "io/ply.py", "io/sog/files.py", "runs/log.py"]
-    assert undescribed(tree, map(Path, paths)) == []
-    others = ["ply.py", "io/log.py", "runs/files.py", "io/sog/zip.py", "render/camera.py", "io/y.py"]
-    assert undescribed(tree, map(Path, others)) == others
+def test_the_architecture_shows_the_layers_of_the_contract():
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        (layers,) = (
+            contract["layers"]
+            for contract in tomllib.load(file)["tool"]["importlinter"]["contracts"]
+            if contract["type"] == "layers"
+        )
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    block = text[text.index("```\n__main__\n") + 4 :].split("\n```")[0]
+    assert [re.split(r"\s{2,}", line)[0] for line in block.splitlines()] == layers
+
+
+def test_the_architecture_is_short():
+    lines = (ROOT / "ARCHITECTURE.md").read_text().splitlines()
+    assert len(lines) <= 130 and max(map(len, lines)) <= 160
 
 
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("conformance/*.md")])
@@ -118,4 +120,7 @@ def test_files_that_documents_name_exist(path):
     for target in linked:
         assert (path.parent / target).exists(), target
     for target in named:
-        assert (ROOT / target).exists(), target
+        assert (ROOT / target).exists() or (PACKAGE / target).exists(), target
+    for room, target in re.findall(r"`((?:gsplat_edu/)?(\w+)/[\w/]+\.py)`", text):
+        if (PACKAGE / target).is_dir():
+            assert any((root / room).exists() for root in (ROOT, PACKAGE, PACKAGE.parent)), room

@@ -39,15 +39,15 @@ def test_the_contracts_hold(copy):
 @pytest.mark.parametrize(
     ("file", "line"),
     [
-        ("camera.py", "import gsplat_edu.scene.sphere_shell"),
+        ("scene/camera.py", "import gsplat_edu.scene.sphere_shell"),
         ("train/trainer.py", "import gsplat_edu.data.synthetic"),
         ("train/trainer.py", "import gsplat_edu.cli.main"),
         ("train/density/surgery.py", "import gsplat_edu.render.torch_reference"),
         ("train/optimizer.py", "from gsplat_edu.render.triton.adam import adam_triton"),
         ("train/optimizer.py", "import gsplat_edu.ops.kernels"),
         ("render/torch_reference.py", "import gsplat_edu.render.numpy_reference"),
-        ("sh.py", "import torch"),
-        ("losses.py", "import gsplat_edu.data"),
+        ("scene/sh.py", "import torch"),
+        ("ops/losses.py", "import gsplat_edu.data"),
         ("train/density/surgery.py", "import gsplat_edu.train.density.adc"),
     ],
 )
