@@ -8,8 +8,9 @@ GSPLAT_EDU_BASE names another base.
 - A changed test file is touched. A changed conftest.py touches the tests of its folder, and so do data beside tests.
 - A helper of tests touches the test files that import it, also through other helpers.
 - src/gsplat_edu/PACKAGE touches tests/PACKAGE, tests/test_PACKAGE.py and what ELSEWHERE names.
-- A module without tests of its own, and one of the root package, touches the test files that import it. If at most
-  FEW packages import it, their tests are touched as well. With more users (errors.py), the other tests wait their turn.
+- A module of a package without a folder of tests (base, scene, ops, photos) touches tests/test_MODULE.py and the test
+  files that import it. If at most FEW packages import it, their tests are touched as well. With more users (errors.py),
+  the other tests wait their turn.
 - A chapter or a benchmark touches the cases that carry its name; other files touch what ELSEWHERE names.
 """
 
@@ -140,22 +141,28 @@ def users(root: Path, module: str, seen: frozenset[str] = frozenset()) -> set[Pa
     return found
 
 
-def of_package(root: Path, name: str) -> set[Path]:
-    """Return the tests of a package or of a module of the root package, and those of the few packages that need it."""
+def of_package(root: Path, parts: tuple[str, ...]) -> set[Path]:
+    """Return the tests of a package; or, for a module of one without tests, its own and those of the few that need it.
+
+    Args:
+        root: The repository.
+        parts: The file's path below src/gsplat_edu.
+    """
     tests, package = root / "tests", root / "src" / "gsplat_edu"
 
     def own(name: str) -> set[Path]:
         return test_files(tests / name) | {path for path in [tests / f"test_{name}.py"] if path.is_file()}
 
-    if (tests / name).is_dir():
-        return own(name)
+    if (tests / parts[0].removesuffix(".py")).is_dir():
+        return own(parts[0].removesuffix(".py"))
+    module = ".".join(("gsplat_edu", *parts)).removesuffix(".py").removesuffix(".__init__")
     needing = {
         path.relative_to(package).parts[0].removesuffix(".py")
         for path in package.rglob("*.py")
-        if imports(path, f"gsplat_edu.{name}")
-    } - {name, "__init__"}
+        if imports(path, module)
+    } - {parts[0].removesuffix(".py"), "__init__"}
     dependents = set().union(*map(own, needing)) if len(needing) <= FEW else set()
-    return own(name) | users(root, f"gsplat_edu.{name}") | dependents
+    return own(module.rsplit(".", 1)[-1]) | users(root, module) | dependents
 
 
 def of_test_folder(root: Path, path: Path) -> set[Path]:
@@ -187,7 +194,7 @@ def tests_of(root: Path, changed: Iterable[str]) -> set[str]:
         if path.parts[0] == "tests":
             found |= of_test_folder(root, root / path)
         if path.parts[:2] == ("src", "gsplat_edu"):
-            found |= of_package(root, path.parts[2].removesuffix(".py"))
+            found |= of_package(root, path.parts[2:])
         for key, places in ELSEWHERE.items():
             if path.is_relative_to(key):
                 found |= set().union(*(test_files(root / "tests" / place) for place in places))
